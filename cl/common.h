@@ -16,15 +16,6 @@
 
 #define BACKGROUND 1.0f  // every feature of a pixel without hits
 
-// A well mixed integer (lowbias32 by Chris Wellons).
-static inline uint scramble(uint x) {
-    x ^= x >> 16;
-    x *= 0x7feb352du;
-    x ^= x >> 15;
-    x *= 0x846ca68bu;
-    return x ^ (x >> 16);
-}
-
 // The upper half of a 16-vector lane by lane, for (float8)(...): Oclgrind 21.10 takes lane 11 of a
 // shuffle for undefined.
 #define UPPER_HALF(v) (v).s8, (v).s9, (v).sa, (v).sb, (v).sc, (v).sd, (v).se, (v).sf

@@ -19,8 +19,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.crop": 256,
     },
     "paper": {
-        # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
-        # decay, and the delays of 0, 500 and 1000 steps.
+        # Stated by the supplemental, as are the default of train.sh_rate, and what is the same in
+        # all presets: gamma, the decay of the SH's rates and their delays of 0, 500 and 1000 steps
+        # (training/schedule.py).
         "points.count": 4_000_000,
         "points.opacity": 1.0,
         "raster.blend": "softmax",
@@ -36,7 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "network.rate": (3e-4, 5e-5),
         "train.iterations": 50_000,
         "train.crop": 0,
-        # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
+        # Ours: the supplemental mentions no jitter, smoothing or averaging, and no rule
         # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
         "train.smooth_l1": 0.0,
         "train.sh_eps": 0.0197,
@@ -44,7 +45,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.opacity_rate_steps": 0,
         "train.offset_rate": (0.0, 0.0),
         "train.pixel_jitter": False,
-        "train.dropout": 0.0,
         "train.sh_smoothing": 0.0,
         "train.ema": False,
         "train.mask_weight": 0.0,

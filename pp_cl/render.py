@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Reading, Table, grown
+from pp_cl.device.buffers import Buffers, Reading, grown
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.picture import Picture
@@ -21,9 +21,9 @@ from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
 from pp_cl.raster.blend import blend_backward, blend_forward, offset_backward, shade_forward
 from pp_cl.raster.depth import depth_forward
-from pp_cl.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
-from pp_cl.raster.project import ProjectedPoints, project_grid, projection_table
-from pp_cl.raster.weights import BlendWeights, blend_weights, weights_table
+from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
+from pp_cl.raster.project import ProjectedPoints, project_grid
+from pp_cl.raster.weights import BlendWeights, blend_weights
 from pp_cl.scene.camera import Camera
 from pp_cl.settings import RasterConfig
 
@@ -96,36 +96,12 @@ class Renderer:
         """Free the buffers; the next view makes them anew."""
         self._buffers = Buffers(self.dev)
 
-    @staticmethod
-    def tables(
-        settings: RasterConfig,
-        n: int,
-        size: tuple[int, int],
-        pairs: int,
-        shaded: int,
-        by_pair: bool,
-    ) -> dict[str, Table]:
-        """The renderer's buffers, grouped by their line in the memory plan, for n points, a padded
-        image of size (height, width) and estimated numbers of pairs and of visible points; the true
-        ones are known once a view has been projected. by_pair: as forward() has it for training.
-        """
-        pixels, room = size[0] * size[1], pairs if by_pair else 1
-        roles = room if settings.early_stop > 0 or settings.max_tracked > 0 else 1
-        return {
-            "projection": projection_table(n),
-            "pairs (estimate)": pairs_table(n, pixels, pairs),
-            "blend weights (estimate)": weights_table(n, pixels, room, roles),
-            "features (estimate)": _view_table(size) | _shaded_table(shaded),
-        }
-
     def forward(
         self,
         camera: Camera,
         gamma: float,
         *,
         until: Literal["weights", "features", "image"] = "image",
-        dropout: float = 0.0,
-        seed: int = 0,
         early_stop: float | None = None,
         depth_range: tuple[float, float] | None = None,
         training: bool = False,
@@ -134,9 +110,9 @@ class Renderer:
         """Render a camera, which is padded to multiples of 4 pixels.
 
         until: the last stage wanted: blend weights, blended features or the network's image.
-        gamma: depth sharpness of the softmax, unused by alpha compositing. dropout: share of the
-        points left out, at random by `seed`. early_stop: instead of the settings'. depth_range:
-        instead of the model's, for cameras that see beyond it; the softmax needs the model's.
+        gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
+        the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
+        softmax needs the model's.
         training: keep what backward() needs. gradient_tiles: returns that argument of
         UNet.plan_tiles(); called after the wait for the device.
         """
@@ -153,7 +129,7 @@ class Renderer:
             self._by_pair = by_pair
             self.release()
         b = self._buffers
-        b.require(_view_table(size))
+        b.require({"camera_buffer": ((20,), np.float32), "features": ((*size, 16), np.float32)})
         dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
         with dev.stage("project"):
             points = project_grid(
@@ -165,8 +141,6 @@ class Renderer:
                 point_id=cloud.ids,
                 cloud_offset=cloud.offset,
                 radius=point_radius(self.settings, self.model.grid.edge, self.model.depth_range),
-                dropout=dropout,
-                seed=seed,
             )
         pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop)
         result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)
@@ -175,7 +149,7 @@ class Renderer:
         with dev.stage("shade"):
             shaded = weights.shaded
             room = self._shaded_room[by_pair] = grown(self._shaded_room[by_pair], shaded.size)
-            b.require(_shaded_table(min(room, cloud.count)))
+            b.require({"shaded_features": ((min(room, cloud.count), 16), np.float32)})
             shade_forward(dev, points, shaded, cloud.sh, shaded_features=b.shaded_features)
         with dev.stage("blend"):
             blend_forward(dev, pairs, weights, b.shaded_features, b.features)
@@ -291,16 +265,3 @@ class Renderer:
         alpha, depth, median = (result.cropped(dev.download(array)) for array in arrays)
         shown = result.cropped(dev.download(result.features)) if features else None
         return Picture(result.clamped(), alpha, depth, median, features=shown)
-
-
-def _view_table(size):
-    """Buffers that each view overwrites and that belong to no single stage."""
-    return {
-        "camera_buffer": ((20,), np.float32),
-        "features": ((*size, 16), np.float32),
-    }
-
-
-def _shaded_table(shaded):
-    """Features of a number of visible points."""
-    return {"shaded_features": ((shaded, 16), np.float32)}

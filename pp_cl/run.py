@@ -59,9 +59,7 @@ class Run:
     @property
     def gamma(self) -> float:
         """Depth sharpness of the blend at the run's last step."""
-        return gamma_at(
-            self.header["step"], self.config.train.iterations, *self.config.raster.gamma
-        )
+        return gamma_at(self.header["step"], self.config.train.iterations)
 
     def scene(self, split: str) -> Scene:
         """The run's scene with one split. Raises UserError where it is missing, broken or another

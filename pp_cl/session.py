@@ -1,10 +1,9 @@
-"""Runs a training in the folder of a run: the initial hull or a checkpoint, then Trainer's steps
-with log, previews and checkpoints.
+"""Runs a training in the folder of a run: begun with a visual hull or resumed from a checkpoint,
+then Trainer's steps with log, previews and checkpoints.
 """
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,16 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import (
-    RANDOM,
-    Config,
-    assign,
-    configure,
-    load_config,
-    preset,
-    sections,
-    text_of,
-)
+from pp_cl.config import Config, assign, configure, load_config, preset, sections
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import Diverged, UserError
@@ -35,38 +25,27 @@ from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
-from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import Agreement, Hull, agreeing, build_grid, depth_range, spacing_pixels
+from pp_cl.scene.hull import agreeing
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.load import (
-    DEMO,
+    Listing,
     list_split,
     measured_split,
     open_scene,
     preset_downscale,
     scene_box,
 )
-from pp_cl.scene.outline import picture
 from pp_cl.scene.views import View
-from pp_cl.settings import NetworkConfig
 from pp_cl.train import Trainer
 from pp_cl.training.budget import Budget
 from pp_cl.training.checkpoint import load_run_state, opened_run
 from pp_cl.training.memory import Room
-from pp_cl.training.schedule import bound_to_end
+from pp_cl.training.start import NEVER, begin_network, fitting_hull, picture_of_masks
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
-OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
-# train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
-REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
-FINEST, COARSEST = 1.25, 1.5
-COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1.7 times less points
-LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
-# what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
-DEMO_NETWORK = Path(__file__).with_name("network") / "demo.npz"
 PLACES = (("scene", "path"), ("scene", "masks"), ("scene", "ignore"))
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
@@ -234,9 +213,7 @@ class Training:
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         header |= {"exposed": True} if trainer.is_exposed else {}
-        config = self.config
-        is_whole = finished and bound_to_end(config.network, config.raster, config.train)
-        self.folder.save(header, trainer.model.arrays() if is_whole else trainer.arrays())
+        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
         self._expect_save()
         self._saved = trainer.step
 
@@ -255,190 +232,115 @@ class Training:
         return image
 
 
+# ---- to begin and to resume: nothing is written
+
+
 def open_training(
     dev: Device, folder: RunFolder, config: Config, stored: Stored | None
 ) -> Training:
-    """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
+    """resume_training() from the folder's checkpoint `stored` where it has one, else
+    begin_training().
+    """
+    if stored is None:
+        return begin_training(dev, folder, config)
+    return resume_training(dev, folder, config, stored)
 
-    A finished training is extended to config.train.iterations: as if it had been asked for them
-    from its beginning, if its checkpoint holds its state, else with new moments and without
-    refinements. Raises UserError for a scene or checkpoint that does not fit, for too little
-    memory, for a folder that may not be written, and for pictures in it that would be lost.
+
+def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
+    """A training in `folder` from its beginning; an open config.train.refine_at is decided.
+
+    Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
+    written, and for pictures in it that would be lost.
     """
     check_writable(folder.path)
-    folder.check_pictures(stored[0]["step"] if stored else 0)
-    begun, goal = 0, config
-    if stored is not None:
-        header, arrays = stored
-        begun = header.get("extended_from", 0)
-        if header["finished"] and not any(name.startswith("state.") for name in arrays):
-            begun = header["step"]
-        if begun:
-            goal = replace(config, train=replace(config.train, refine_at=NEVER))
+    folder.check_pictures(0)
     net = UNet.of_settings(dev, config.network, seed=config.train.seed)
-    if stored is None:
-        begin_network(net, config)
+    begin_network(net, config)
     listing = list_split(config.scene.path)
-    photographs = listing.photographs
-    room = Room(goal, net, photographs)
-    if stored is None:
-        room.check_unseen()
-    else:
-        grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
-        room.check_points(grid, points, header["depth_range"], header["step"])
-    listed, read = {"train": listing}, KeptViews(folder.views)
-    scene = open_scene(dev, config, ("train",), listed=listed, kept=read)
-    views = scene.splits["train"]
-    measured = []
-    if config.train.eval_every:
-        split = measured_split(config.scene.path)  # val, else test
-        measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
-    if stored and (mismatch := difference(header, photographs, views)):
-        raise UserError(
-            f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
-            " use another --out"
-        )
-    info = identity(views, photographs) | ({"notes": scene.notes} if scene.notes else {})
-    if stored is None:
-        agreement = agreeing(dev, views, scene_box(config))
-        trainer, hull = _start(config, agreement, views, net, room)
-        left_out = list(agreement.left_out)
-        points = trainer.model.cloud.count
-    else:
-        left_out = header.get("left_out", [])
-        kept = [view for view in views if view.name not in left_out]
-        trainer, hull = _resume(goal, kept, net, stored, begun), None
-        points = header["initial_points"]
-    info["initial_points"] = points
-    info |= {"extended_from": begun} if begun else {}
-    info |= {"left_out": left_out} if left_out else {}
-    return Training(folder, config, trainer, info, room, hull, measured, read)
+    room = Room(config, net, listing.photographs)
+    room.check_unseen()
+    views, info, kept = _read_views(dev, folder, config, listing)
 
-
-def begin_network(net: UNet, config: Config) -> None:
-    """Give net the parameters that network.start names; those of the demo only where the scene is
-    another and they fit. Raises UserError for a run whose network has another shape.
-    """
-    settings, folder = config.network, RunFolder(config.network.start)
-    if settings.start == DEMO:
-        if config.scene.path != DEMO and not _unlike(settings, NetworkConfig()):
-            with np.load(DEMO_NETWORK) as stored:
-                for name, parameter in net.parameters.items():
-                    net.dev.write(parameter, stored[f"net.{name}"].astype(np.float32))
-    elif settings.start != RANDOM:
-        other = load_config(folder.config)
-        for key, ours, theirs in _unlike(settings, other.network):
-            raise UserError(
-                f"network.start: {folder} has {key}={theirs}, this training {ours}; set {key}"
-                " alike, or begin with another network"
-            )
-        with opened_run(folder, other) as run:
-            for name, parameter in net.parameters.items():
-                net.dev.write(parameter, run.array(f"net.{name}"))
-
-
-def _unlike(ours, theirs):
-    """[(key, our value, their value)] of the settings by which two networks differ in shape."""
-    pairs = [(n, getattr(ours, n), getattr(theirs, n)) for n in ("widths", "blocks")]
-    return [(f"network.{n}", text_of(a), text_of(b)) for n, a, b in pairs if a != b]
-
-
-def _start(config, agreement, views, net, room):
-    """(Trainer, HullFacts) of a training from its beginning."""
-    dev, points, start = net.dev, config.points, time.perf_counter()
-    hull, near_far = _first_level(dev, config, agreement, room)
+    start = time.perf_counter()
+    agreement = agreeing(dev, views, scene_box(config))
+    hull, depth_range = fitting_hull(dev, config, agreement, room)
     seconds = time.perf_counter() - start
-    facts = HullFacts(hull.capped, seconds, _picture_of_masks(dev, views, hull, agreement.left_out))
+    picture = picture_of_masks(dev, views, hull, agreement.left_out)
+
+    points = config.points
     model = Model.create(
         dev,
         hull.grid,
         hull.ids,
-        near_far,
+        depth_range,
         net=net,
         degree=points.sh_degree,
         opacity=points.opacity,
     )
-    return Trainer(dev, config, model, agreement.views), facts
+    trainer = Trainer(dev, config, model, agreement.views)
+    info["initial_points"] = model.cloud.count
+    if agreement.left_out:
+        info["left_out"] = list(agreement.left_out)
+    facts, measured = HullFacts(hull.capped, seconds, picture), _measured_views(dev, config)
+    return Training(folder, config, trainer, info, room, facts, measured, kept)
 
 
-def first_hull(
-    dev: Device, config: Config, agreement: Agreement, coarsest: float = COARSEST
-) -> tuple[Hull, tuple[float, float]]:
-    """(the hull that a training starts from, its train.refine_at).
+def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
+    """The training in `folder` from its checkpoint on.
 
-    Where the settings leave train.refine_at open, there are as many refinements as bring points
-    `coarsest` pixels of the images close, and the hull has the spacing from which these lead to
-    FINEST to `coarsest`.
-    """
-    points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
-    views, _, forgiven = agreement
-    hull = build_grid(dev, views, points, box, forgiven)
-    if shares != OPEN:
-        return hull, shares
-    cameras = [view.camera for view in views]
-    spacing = spacing_pixels(hull.grid, cameras)
-    smallest = min(min(camera.width, camera.height) for camera in cameras)
-    possible = [n for n in range(1, len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
-    times = sum(spacing > coarsest * 2 ** (n - 1) for n in possible)
-    first = min(max(spacing, 2**times * FINEST), 2**times * coarsest)
-    if times and first != spacing:
-        hull = build_grid(dev, views, round(points * (spacing / first) ** 3), box, forgiven)
-    return hull, REFINE_AT[times]
-
-
-def _first_level(dev, config, agreement, room):
-    """first_hull() and its (near, far); config.train.refine_at becomes what it says. Where memory
-    is too small for points COARSEST pixels apart in the end, they are as close as it allows. Raises
-    UserError as Room.check_points() does.
-    """
-    is_open, train, coarsest = config.train.refine_at == OPEN, config.train, COARSEST
-    while True:
-        hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
-        try:
-            return _checked(room, agreement.views, hull)
-        except UserError:
-            if not is_open or train.refine_at == NEVER:
-                raise
-        train.refine_at, coarsest = OPEN, COARSER * coarsest
-
-
-def _checked(room, views, hull):
-    """(hull, its (near, far)). Raises UserError where a training with it does not fit."""
-    near_far = depth_range(views, hull)
-    room.check_points(hull.grid, len(hull.ids), near_far)
-    return hull, near_far
-
-
-def _picture_of_masks(dev, views, hull, left_out):
-    """Warn of masks that disagree with the others; return their picture, None if all agree."""
-    found = disagreements(views, hull.grid.box)
-    rejecting = {one.view.name: one.share for one in found if one.view.name not in left_out}
-    for what, shares in (
-        ("lie beside what the other views agree on, and are left out of the training", left_out),
-        ("reject what the other views agree on", rejecting),
-    ):
-        if shares:
-            worst = listing([f"{name} ({share:.0%} of it)" for name, share in shares.items()])
-            warnings.warn(
-                f"masks {what}: {worst}; see {MASKS_PICTURE} in the run's folder", stacklevel=2
-            )
-    return picture(dev, views, hull, found) if found or left_out else None
-
-
-def _resume(config, views, net, stored, begun):
-    """Trainer of a training that resumes. begun: the last step of the finished training that it
-    extends, 0 if it extends none.
+    A finished one is extended to config.train.iterations, with new moments and without refinements:
+    every schedule ends at the last step, so it is not what it would have been from its beginning.
+    Raises UserError as begin_training() does, and for a checkpoint of another scene.
     """
     header, arrays = stored
+    check_writable(folder.path)
+    folder.check_pictures(header["step"])
+    begun = header["step"] if header["finished"] else header.get("extended_from", 0)
+    extended = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
+
+    net = UNet.of_settings(dev, config.network)
+    listing = list_split(config.scene.path)
+    room = Room(extended, net, listing.photographs)
+    grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
+    room.check_points(grid, points, header["depth_range"], header["step"])
+    views, info, kept = _read_views(dev, folder, config, listing)
+    if mismatch := difference(header, listing.photographs, views):
+        raise UserError(
+            f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
+            " use another --out"
+        )
+
     for name, array in arrays.items():
         if name.startswith("points.") and array.dtype == np.float16:  # of a compressed run
             arrays[name] = array.astype(np.float32)
-    model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
-    trainer = Trainer(net.dev, config, model, views)
+    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+    left_out = header.get("left_out", [])
+    trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])
     trainer.restore(header["step"], arrays, begun)
-    if header["finished"] and trainer.step % config.train.prune_every == 0:
-        trainer.prune()  # the last step of a training leaves that to its end
-    return trainer
+    info["initial_points"] = header["initial_points"]
+    info |= {"extended_from": begun} if begun else {}
+    info |= {"left_out": left_out} if left_out else {}
+    measured = _measured_views(dev, config)
+    return Training(folder, config, trainer, info, room, None, measured, kept)
+
+
+def _read_views(dev: Device, folder: RunFolder, config: Config, listing: Listing):
+    """(the training views, what a checkpoint's header holds of them, their images that a resume
+    need not read again).
+    """
+    kept = KeptViews(folder.views)
+    scene = open_scene(dev, config, ("train",), listed={"train": listing}, kept=kept)
+    views = scene.splits["train"]
+    info = identity(views, listing.photographs)
+    return views, info | ({"notes": scene.notes} if scene.notes else {}), kept
+
+
+def _measured_views(dev, config):
+    """The views on which train.eval_every measures PSNR: of the split val, else test."""
+    if not config.train.eval_every:
+        return []
+    split = measured_split(config.scene.path)
+    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
 
 
 def train_scene(
@@ -473,6 +375,9 @@ def train_scene(
     return load_run(dev, out)
 
 
+# ---- what is asked for, and what there is
+
+
 def run_config(
     folder: RunFolder,
     scene: str,
@@ -481,45 +386,59 @@ def run_config(
     *,
     extends: bool = False,
 ) -> Config:
-    """Config of a training in `folder`: its stored one if it has one, else the preset's, with the
-    given settings. Where these do not say scene.downscale, a new one reduces the images to about
-    the preset's size.
+    """Config of a training in `folder`: that of the run which has a checkpoint there, else the
+    preset's, with the given settings.
 
     scene: a folder, or the word demo. given: (key, value or its text, origin); a run that has a
     checkpoint must have the same values. extends: whether train.iterations of a finished run may
     change: with more of them it goes on, with fewer it stays finished. Raises UserError naming the
     first setting that differs or makes no sense, or what is wrong with the scene's files.
     """
-    stored = load_config(folder.config) if folder.config.exists() else None
-    if stored and preset_name not in (None, stored.preset):
-        if folder.checkpoint.exists():
-            raise UserError(
-                f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
-                " another --out"
-            )
-        stored = None
-    config = load_config(folder.config) if stored else preset(preset_name or "tiny")
     given = list(given)
-    configure(config, scene, given)
     origins = {key: origin for key, _, origin in given}
     if "train.iterations" in origins and "train.minutes" in origins:
         raise UserError(
             f"{origins['train.minutes']}: the iterations follow from the minutes; leave one out"
         )
-    if not stored and "scene.downscale" not in origins:
+    if folder.config.exists() and folder.checkpoint.exists():
+        return _config_to_resume(folder, scene, preset_name, given, extends)
+    return _config_to_begin(folder, scene, preset_name, given)
+
+
+def _config_to_begin(folder, scene, preset_name, given):
+    """That of a run that was stopped before its first checkpoint, if it is of this preset; else the
+    preset's, which reduces the images to about its size unless scene.downscale is given.
+    """
+    if folder.config.exists():
+        stored = load_config(folder.config)
+        if preset_name in (None, stored.preset):
+            return configure(stored, scene, given)
+    config = configure(preset(preset_name or "tiny"), scene, given)
+    if "scene.downscale" not in [key for key, _, _ in given]:
         downscale = preset_downscale(config.scene.path, config.preset)
         assign(config, "scene.downscale", downscale, "preset")
-    if stored and folder.checkpoint.exists():
-        if stored.train.minutes:  # planned meanwhile, as train.iterations are
-            config.train.refine_at = stored.train.refine_at
-        if extends and config.train.iterations != stored.train.iterations:
-            with opened_run(folder, stored) as run:
-                if run.header["step"] == stored.train.iterations:
-                    most = max(config.train.iterations, stored.train.iterations)
-                    for one in (config, stored):
-                        assign(one, "train.iterations", most, "settings")
-                        assign(one, "train.minutes", 0, "settings")
-        _check_same(config, stored, folder)
+    return config
+
+
+def _config_to_resume(folder, scene, preset_name, given, extends):
+    """That of the run, which may change in nothing but the iterations of a finished one."""
+    stored, config = load_config(folder.config), load_config(folder.config)
+    if preset_name not in (None, stored.preset):
+        raise UserError(
+            f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
+            " another --out"
+        )
+    configure(config, scene, given)
+    if stored.train.minutes:  # planned meanwhile, as train.iterations are
+        config.train.refine_at = stored.train.refine_at
+    if extends and config.train.iterations != stored.train.iterations:
+        with opened_run(folder, stored) as run:
+            if run.header["step"] == stored.train.iterations:
+                most = max(config.train.iterations, stored.train.iterations)
+                for one in (config, stored):
+                    assign(one, "train.iterations", most, "settings")
+                    assign(one, "train.minutes", 0, "settings")
+    _check_same(config, stored, folder)
     return config
 
 

@@ -84,9 +84,6 @@ class RasterConfig:
         "alpha: compositing from front to back; softmax: the paper's Eq. (1)",
         choices=("softmax", "alpha"),
     )
-    gamma: tuple = setting(
-        (0.1, 0.01), "depth sharpness of the softmax at the first and the last step", 1e-5, 1
-    )
     max_tracked: int = setting(
         0,
         "number of a pixel's nearest hits that receive gradients (0: all)",
@@ -173,13 +170,9 @@ class TrainConfig:
     )
     sh_rate: tuple = setting(
         (0.5, 0.25, 0.125),
-        "first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",
+        "first learning rate of SH degrees 0, 1, 2, ten times the last; at rate 0 a degree stays 0",
         0,
         100,
-    )
-    sh_rate_decay: float = setting(0.1, "last over first learning rate of the SH", 1e-6, 1)
-    sh_delay: tuple = setting(
-        (0.0, 0.01, 0.02), "warm-up of SH degrees 0, 1, 2, as a share of the iterations", 0, 1
     )
     sh_eps: float = setting(
         0.01,
@@ -206,7 +199,6 @@ class TrainConfig:
         0,
         10**8,
     )
-    dropout: float = setting(0.0, "share of the points left out at random in each step", 0, 0.95)
     sh_smoothing: float = setting(
         0.03,
         "per step, pull the SH towards the mean of the grid neighbours by this times their"
@@ -214,15 +206,13 @@ class TrainConfig:
         0,
         0.25,
     )
-    sh_smoothing_every: int = setting(64, "steps between two smoothings", 1, 10**8)
     prune_weight: float = setting(
         0.05,
         "prune points whose blend weight, summed over a step's pixels, has not reached this in any"
-        " step (0: off)",
+        " step, or whose opacity is below 0.01 (0: off)",
         0,
         1e6,
     )
-    prune_opacity: float = setting(0.01, "prune points with an opacity below this", 0, 1)
     prune_every: int = setting(250, "steps between two prunings", 1, 10**8)
     prune_looks: int = setting(
         100, "steps that must have had a point in view before it may be pruned", 1, 10**8

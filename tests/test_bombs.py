@@ -26,7 +26,7 @@ UNDER = 2**62  # a count that no memory holds
 READ = """
 import sys
 from pathlib import Path
-import pp_cl.facts.info, pp_cl.metrics.compare  # their memory is to be there before a bomb
+import pp_cl.commands.info_facts, pp_cl.metrics.compare  # their memory is to be there before a bomb
 from pp_cl import cli
 from pp_cl.device.host import at_most_more
 from pp_cl.errors import UserError

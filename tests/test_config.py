@@ -7,6 +7,7 @@ import pytest
 from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS
+from pp_cl.training import schedule
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -23,11 +24,11 @@ def test_paper_preset_keeps_the_supplementals_numbers():
     paper = preset("paper")
     assert paper.points.count == 4_000_000 and paper.points.sh_degree == 2
     raster = paper.raster
-    assert raster.radius == 0.0015 and raster.gamma == (0.1, 0.01)
+    assert raster.radius == 0.0015 and schedule.GAMMA == (0.1, 0.01)
     assert raster.max_tracked == 64 and raster.early_stop == 0.001
     assert paper.network.widths == (128, 256, 512)
-    assert paper.train.sh_rate == (0.5, 0.25, 0.125) and paper.train.sh_rate_decay == 0.1
-    assert [d * paper.train.iterations for d in paper.train.sh_delay] == [0, 500, 1000]
+    assert paper.train.sh_rate == (0.5, 0.25, 0.125) and schedule.SH_DECAY == 0.1
+    assert [d * paper.train.iterations for d in schedule.SH_DELAY] == [0, 500, 1000]
 
 
 @pytest.mark.parametrize(
@@ -60,7 +61,7 @@ def test_assign_converts_text(key, text, value):
         ("network.widths", 8, "3 values"),
         ("train.pixel_jitter", "perhaps", "true or false"),
         ("raster.radius", "nan", "finite number"),
-        ("raster.gamma", "0.1,x", "finite number"),
+        ("network.rate", "0.1,x", "finite number"),
         ("scene.masks", "a\0b", "word"),
     ],
 )
@@ -77,11 +78,9 @@ def test_assign_refuses(key, text, message):
         ("train.crop", 130),
         ("raster.footprint", "gauss"),
         ("network.blocks", "triple"),
-        ("raster.gamma", (0.1, 0.0)),
         ("network.widths", (0, 1, 1)),
         ("raster.footprint", ["soft"]),
-        ("train.dropout", 1.0),
-        ("train.sh_delay", (0.0, 0.0, 1.1)),
+        ("train.refine_at", (0.0, 1.1)),
         ("points.count", 2**28),
         ("network.rate", (0.0, 0.0)),
     ],
@@ -137,9 +136,9 @@ VALUES = {
     "train.iterations": [True, "60", 60.5, 10**400, None, 0],
     "train.crop": [130],
     "train.ema": [1, "true"],
-    "train.dropout": [float("nan"), float("inf")],
+    "train.smooth_l1": [float("nan"), float("inf")],
     "raster.radius": [False, [1.0]],
-    "raster.gamma": ["0.1,0.01", [0.1], [0.1, True]],
+    "network.rate": ["0.1,0.01", [0.1], [0.1, True]],
     "network.widths": [{"0": 16}],
     "raster.blend": ["fog", 3],
     "scene.path": ["", "a\0b", "\ud800", "x" * 10**5],

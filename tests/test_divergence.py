@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 import pytest
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, rows
 
 from pp_cl.cli import main
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.training.optim import Optimiser
 
 KEPT = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"

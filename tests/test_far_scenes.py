@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 from support.ball_views import ball_camera
+from support.checkpoints import load_checkpoint
 from support.runs import arguments
 from support.scenes import move_scene, write_ball_scene
 
@@ -16,7 +17,6 @@ from pp_cl.export.gltf import write_glb
 from pp_cl.export.mesh import Mesh, write_mesh
 from pp_cl.export.points import coloured_points, in_world, write_ply
 from pp_cl.export.splat import splats, write_splat_glb
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.shape import read_mesh
 from pp_cl.model import Model
 from pp_cl.run import load_run

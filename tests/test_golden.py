@@ -24,9 +24,7 @@ SETTINGS = {
     "network.rate": "3e-3,3e-4",
     "train.iterations": 60,
     "train.crop": 40,
-    "train.dropout": 0.3,
     "train.sh_smoothing": 0.25,
-    "train.sh_smoothing_every": 1,
     "train.prune_every": 20,
     "train.prune_looks": 5,
     "train.final_prune_weight": 0.2,
@@ -43,7 +41,9 @@ def measure(folder):
     """{"loss": {step: loss}, "psnr": dB on the test views, "points": their final number}."""
     scene = write_ball_scene(folder / "ball", views=12, size=96)
     out = folder / "run"
-    assert main(["train", scene, "--out", str(out), *set_words(SETTINGS)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pp_cl.train.SMOOTHING_EVERY", 1)
+        assert main(["train", scene, "--out", str(out), *set_words(SETTINGS)]) == 0
     assert main(["eval", str(out)]) == 0
     rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     metrics = json.loads((out / "eval" / "metrics.json").read_text())

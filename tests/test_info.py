@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.facts.info import LEAST_WIDTH
-from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.commands.info_facts import LEAST_WIDTH
 from pp_cl.files.contact_sheet import GAP, HEADER
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.outline import OUTLINE

@@ -102,21 +102,20 @@ def test_python_renders_each_at_its_size(dev, trained):
     assert [shape[1::-1] for shape in sizes] == list(SIZES)
 
 
-@pytest.mark.parametrize("crop, side", [(0, 48), (24, 24), (64, 48)])
-def test_the_memory_plan_is_for_the_largest(dev, scene, crop, side):
+def test_memory_is_planned_for_the_largest(dev, scene):
     config = preset("tiny")
-    settings = {"points.count": "400", "network.widths": "16,16,16", "train.crop": str(crop)}
+    settings = {"points.count": "400", "network.widths": "16,16,16", "train.crop": "0"}
     for key, value in settings.items():
         assign(config, key, value, "test")
     views = load_scene(scene).splits["train"]
     hull = build_grid(dev, views, 400)
     net = UNet(dev, config.network.widths)
-    frames, plans = scene_frames(scene), []
-    for order in (frames, frames[::-1]):
-        plans.append(Room(config, net, order).plan_points(hull.grid, len(hull.ids), (2, 6)))
-    assert plans[0] == plans[1]
-    told = plans[0].peak.tables
-    assert f"network at {side}x{side}" in told and "previews at 48x48" in told
+    frames = scene_frames(scene)
+    orders = frames, frames[::-1], [max(frames, key=lambda one: one.camera.width)] * len(frames)
+    mixed, turned, largest = (
+        Room(config, net, order).need_of(hull.grid, len(hull.ids), (2, 6)) for order in orders
+    )
+    assert mixed == turned and 0.9 * largest.device < mixed.device <= largest.device
 
 
 def test_info_lists_the_sizes(scene, capsys, tmp_path):

@@ -8,10 +8,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from support.checkpoints import load_checkpoint
 
 from pp_cl.config import Config, assign, load_config, preset, sections, text_of
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
-from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid

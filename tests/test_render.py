@@ -137,15 +137,9 @@ def test_a_call_may_see_beyond_the_models_depth_range(dev, rng):
     assert seen.pairs.total > 0
 
 
-def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
+def test_pictures_are_repeatable(dev, rng):
     model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, RasterConfig())
-    everyone = renderer.forward(camera, GAMMA, until="weights").pairs.point_offset.get()
-    some = renderer.forward(
-        camera, GAMMA, until="weights", dropout=0.5, seed=1
-    ).pairs.point_offset.get()
-    everyone, some = (np.count_nonzero(np.diff(offsets)) for offsets in (everyone, some))
-    assert 0.35 * everyone < some < 0.65 * everyone
     first = renderer.render(camera, GAMMA)
     np.testing.assert_array_equal(first, renderer.render(camera, GAMMA))
     np.testing.assert_array_equal(first, Renderer(dev, model, RasterConfig()).render(camera, GAMMA))

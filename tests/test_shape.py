@@ -10,8 +10,8 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.commands.shape_facts import mesh_shape, run_shape
 from pp_cl.errors import UserError
-from pp_cl.facts.shape import mesh_shape, run_shape
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
 from pp_cl.scene.hull import build_grid

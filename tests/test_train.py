@@ -7,16 +7,16 @@ import shutil
 
 import numpy as np
 import pytest
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
 from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.config import preset
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.network.unet import UNet
 from pp_cl.scene.grid import Grid
-from pp_cl.session import DEMO_NETWORK, begin_network
-from pp_cl.train import SPECK
+from pp_cl.training.prune import SPECK
+from pp_cl.training.start import DEMO_NETWORK, begin_network
 
 
 def test_a_run_learns_and_leaves_its_files(finished):

@@ -10,8 +10,7 @@ from support.models import drawn_alone
 import pp_cl.network.unet
 from pp_cl.config import configure, preset
 from pp_cl.device.buffers import Reading
-from pp_cl.device.device import Device
-from pp_cl.device.launch import Program
+from pp_cl.device.device import Device, Program
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session import open_training
 
@@ -21,7 +20,7 @@ EVERY_STEP = {  # so that a step of any number does what most do
     "points.count": 300,
     "train.iterations": 1000,
     "train.prune_every": 900,
-    "train.sh_smoothing_every": 900,
+    "train.sh_smoothing": 0,
 }
 SETTINGS = {
     "tiny": {},

@@ -31,9 +31,15 @@ from unittest.mock import patch
 
 from pp_cl.bench.timing import CopyBandwidth, PeakFlops
 from pp_cl.cli import main as pp_cl
-from pp_cl.device.device import INTEL_PLATFORM, STANDARD, Device, kernel_folder, vendor_options
+from pp_cl.device.device import (
+    INTEL_PLATFORM,
+    STANDARD,
+    Device,
+    Program,
+    kernel_folder,
+    vendor_options,
+)
 from pp_cl.device.discover import open_device
-from pp_cl.device.launch import Program
 from pp_cl.scene.demo import demo_views
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.selftest.run import CASES, run_cases

@@ -21,6 +21,7 @@ from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import multiplications
 from pp_cl.raster.weights import DROPPED
+from pp_cl.render import NETWORK_MULTIPLE
 from pp_cl.session import open_training, run_config, stored_state
 
 UNTIMED, TIMED = 4, 15  # steps; the first ones build kernels and grow buffers
@@ -100,10 +101,10 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
         for name, taken in seconds.items()
         if len(taken) >= TIMED  # what every step does; pairs anew where there was too little room
     ]
-    size = trainer.network_size
+    padded, _, _ = trainer.crops.draw(0).camera.padded(NETWORK_MULTIPLE)
     return {
         "points": cloud.count,
-        "size": f"{size[1]}x{size[0]}",
+        "size": f"{padded.width}x{padded.height}",
         "copy_gbs": copied * 1e-6,
         "gflops": computed * 1e-6,
         "stages": rows,

@@ -69,7 +69,6 @@ ALWAYS_INLINE bool project(
     const floats y,
     const floats z,
     const floats radius,
-    const ints wanted,
     Footprints *f) {
     const floats vx = x - cam->eye.x, vy = y - cam->eye.y, vz = z - cam->eye.z;
     const floats cx = cam->right.x * vx + cam->right.y * vy + cam->right.z * vz;
@@ -78,7 +77,7 @@ ALWAYS_INLINE bool project(
     const floats t = sqrt(cx * cx + cy * cy + cz * cz);
     const floats front = t - radius;
     const ints kept =
-        wanted & (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
+        (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
     const floats wide = fmax(radius, LEAST_RADIUS * t / least_focal(cam));
     const floats reach = FOOTPRINT == SPHERE ? radius : wide;
     const ints near_image = reaches_image(cx, cz, wide, cam->fx, cam->cx, cam->width) &
@@ -161,25 +160,22 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
 // hits and, if any is above 0, their radii, camera-space positions and distances, and boxes.
 kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint n,                       // points
-    const uint dropout,                 // a point is left out where its random uint is below this
-    const uint seed,                    // of the random uints
     global const float *camera,         // (20) camera.h
     global const float *grid,           // (8) grid.h
     global const uint *point_id,        // (N)
     const float radius,                 // of a point without offsets, world units
     global const float4 *cloud_offset,  // (N, 4) from the vertex, in edges; log of the radius
     global float *point_radius,         // (N)
-    global float4 *point_camera,        // (N, 4) x, y, z, t; t = -1: culled or dropped out
+    global float4 *point_camera,        // (N, 4) x, y, z, t; t = -1: culled
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count)   // (N)
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
-    const uint count = min((uint)LANES, n - first), stream = scramble(seed);
+    const uint count = min((uint)LANES, n - first);
     const Camera cam = camera_load(camera);
     uint id[LANES];
     float offset[4][LANES], radii[LANES];
-    int wanted[LANES];
     for (uint j = 0; j < LANES; j++) {
         const size_t row = first + min(j, count - 1);
         id[j] = point_id[row];
@@ -187,7 +183,6 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
         offset[1][j] = cloud_offset[row].y;
         offset[2][j] = cloud_offset[row].z;
         offset[3][j] = cloud_offset[row].w;
-        wanted[j] = -(scramble(id[j] + stream) >= dropout);
     }
     // as grid_position() has it
     uints i = LANES_FROM(id);
@@ -198,7 +193,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
         &cam, grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0])),
         grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1])),
         grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])),
-        radius * exp(LANES_FROM(offset[3])), LANES_FROM(wanted), &f);
+        radius * exp(LANES_FROM(offset[3])), &f);
     store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
     if (!any_hit) return;
     LANES_INTO(radii, f.radius);
@@ -213,7 +208,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_spheres(
     global const float *camera,        // (20) camera.h
     global const float *positions,     // (N, 3) world
     global const float *point_radius,  // (N)
-    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled or dropped out
+    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count)   // (N)
 {
@@ -230,7 +225,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_spheres(
         radius[j] = point_radius[i];
     }
     Footprints f;
-    const bool any_hit = project(
-        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), (ints)(-1), &f);
+    const bool any_hit =
+        project(&cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), &f);
     store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
 }

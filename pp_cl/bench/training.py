@@ -14,7 +14,7 @@ from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import open_scene, scene_box
 from pp_cl.train import Trainer
-from pp_cl.training.schedule import Rates
+from pp_cl.training.schedule import GAMMA, Rates
 
 STEP = 2000  # whose learning rates are taken; all SH degrees move
 WIDTHS = (16, 16, 16)  # of the network, which is updated, but not run
@@ -49,7 +49,7 @@ def bench_step(
                 seconds.clear()  # the first round builds the programs
             for i in range(views):
                 view = trainer.views[len(trainer.views) * i // views]
-                result = renderer.forward(view.camera, config.raster.gamma[1], until="features")
+                result = renderer.forward(view.camera, GAMMA[1], until="features")
                 if i not in grads:
                     values = np.random.default_rng(i).normal(size=result.features.shape) * 1e-6
                     grads[i] = dev.upload(values, np.float32)
@@ -69,7 +69,7 @@ def bench_step(
         "scene": config.scene.path,
         "points": cloud.count,
         "size": max(result.size),
-        "gamma": config.raster.gamma[1],
+        "gamma": GAMMA[1],
         "blend": config.raster.blend,
         "pairs": result.pairs.total,
         "shaded": int(result.weights.shaded.size),

@@ -41,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print the row. Raises UserError for options that do not fit the subject."""
+    from pp_cl.commands.shape_facts import mesh_shape, run_shape
     from pp_cl.config import nearby_run
     from pp_cl.device.discover import open_device
-    from pp_cl.facts.shape import mesh_shape, run_shape
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.metrics.shape import read_mesh
 

@@ -59,7 +59,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also write the curves to RUN/tensorboard (needs tensorboardX)",
     )
     add("--view", action="store_true", help="watch in the browser, as with `pp-cl view RUN`")
-    add("-v", "--verbose", action="store_true", help="print the memory plan buffer by buffer")
     shared.add_set(parser, "any other setting, listed by --help")
     shared.add_device(parser)
 
@@ -70,7 +69,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.files.scalars import writer_class
     from pp_cl.session import is_finished, open_training, run_config, stored_state
-    from pp_cl.training.memory import plan_lines
+    from pp_cl.training.memory import memory_line
     from pp_cl.view.serve import serve_in_background
 
     if options.tensorboard:
@@ -98,8 +97,7 @@ def run(options: argparse.Namespace) -> None:
         print(_extended_line(training))
     if training.hull and (told := _left_out_line(config.train)):
         print(told)
-    lines = plan_lines(training.room.plan, dev)
-    print("\n".join(lines if options.verbose else lines[:1]), flush=True)
+    print(memory_line(training.room), flush=True)
     with serve_in_background(folder.path, options.device) if options.view else nullcontext():
         seconds = _run(training, options)
     print(
@@ -138,14 +136,10 @@ def _first_line(training):
 
 def _extended_line(training):
     """A line of text: how an extended training differs from one that was as long from its start."""
-    from pp_cl.training.schedule import bound_to_end
-
-    config, begun = training.config, training.trainer.begun
-    bound = ["the optimiser's moments, which begin anew"]
-    bound += bound_to_end(config.network, config.raster, config.train)
     return (
-        f"extends a finished training of {begun} steps; {config.train.iterations} from the start"
-        f" differ in {', '.join(bound)}"
+        f"extends a finished training of {training.trainer.begun} steps;"
+        f" {training.config.train.iterations} from the start would differ, as all schedules end at"
+        " the last step and the optimiser's moments begin anew"
     )
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from pp_cl.compress.reduction import Original, measured_psnr, nbytes
 from pp_cl.errors import UserError
-from pp_cl.facts.info import read_metrics
 from pp_cl.run import Run, scene_is_there
 from pp_cl.scene.load import scene_splits
 from pp_cl.scene.views import View, evenly
@@ -103,7 +102,7 @@ def _known_psnr(run):
     """Of the run against photographs, as its last evaluation or else the log of its training
     says.
     """
-    measured = read_metrics(run.folder)
+    measured = run.folder.measured()
     if measured and "psnr" in measured["mean"] and measured["step"] == run.header["step"]:
         return measured["mean"]["psnr"]
     for row in reversed(run.folder.rows()):

@@ -1,5 +1,5 @@
-"""Device arrays by many: declared as a table, {name: (shape, dtype)}, which the memory plan counts
-too; packed into one buffer; read without waiting; and their rows gathered, kept or read piecewise.
+"""Device arrays by many: declared as a table, {name: (shape, dtype)}; packed into one buffer; read
+without waiting; and their rows gathered, kept or read piecewise.
 """
 
 from __future__ import annotations
@@ -174,14 +174,6 @@ def read_later(
 
 
 # ---- rows; none of it takes a second array of a model's size, which may not fit into memory
-
-
-def compact_table(n: int, row_bytes: int) -> Table:
-    """What compact_rows() of arrays of n rows takes at most: the list of the rows that stay, and
-    the scratch. row_bytes: of the array with the largest rows.
-    """
-    scratch = min(SCRATCH_BYTES, n * row_bytes)
-    return {"keep": ((n,), np.uint32), "scratch": ((scratch,), np.uint8)}
 
 
 def compact_rows(dev: Device, array: Array, keep: Array) -> Array:

@@ -2,7 +2,10 @@
 works around the faults of drivers.
 """
 
+from __future__ import annotations
+
 import atexit
+import math
 import os
 import sys
 import time
@@ -19,13 +22,16 @@ from numpy.typing import ArrayLike, DTypeLike
 from pyopencl.array import Array
 
 from pp_cl.device.host import ask_for_huge_pages
-from pp_cl.device.launch import Kernel, Program
-from pp_cl.errors import UserError
+from pp_cl.device.kernel import Kernel, cut, parse_signatures, quiet_compiler
+from pp_cl.errors import BuildError, UserError
 
 SMALLER = "lower --points or raise --downscale"
 FINISH = "finish its work"  # what drivers of GPUs often fail at, for lack of memory
 HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
-STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
+# Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
+# multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
+MOST_MULTIPLY_ADDS = 25e9
+STANDARD = ("-cl-std=CL1.2",)  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
 INTEL_PLATFORM = "Intel(R) OpenCL"
 # Files with a kernel that spills, or becomes narrow, with the 128 registers that a thread has there
@@ -430,10 +436,6 @@ class Device:
                         f"{kernel.label}: {p.name} has {bad.size} NaN or Inf, first at {bad[0]}"
                     )
 
-    def profile(self) -> dict[str, list[float]]:
-        """{kernel label "file.cl:kernel": [seconds of each launch]} gathered at PP_DEBUG >= 1."""
-        return dict(self._seconds)
-
     def print_profile(self) -> None:
         """A table on stderr, longest first: passes, median and total time of stages and, at
         PP_DEBUG 1, of kernel files, else of kernels.
@@ -448,6 +450,78 @@ class Device:
                 f"{label:40s} {len(seconds):7d} x {median:9.3f} ms, {total:9.3f} s in all",
                 file=sys.stderr,
             )
+
+
+class Program:
+    """One built cl/*.cl file."""
+
+    def __init__(
+        self,
+        device: Device,
+        name: str,
+        source: str,
+        *,
+        options: list[str],
+        defines: dict[str, Any],
+    ):
+        self.device = device
+        self.name = name
+        signatures = parse_signatures(source, f"cl/{name}.cl")
+        try:
+            with quiet_compiler():
+                built = cl.Program(device.context, source).build(options=options)
+        except cl.RuntimeError as error:
+            raise BuildError(
+                f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}", str(error)
+            ) from error
+        self.built = built
+        self.kernels = {
+            k: Kernel(getattr(built, k), device.device, p, defines=defines, label=f"{name}.cl:{k}")
+            for k, p in signatures.items()
+        }
+
+    def launch(
+        self,
+        kernel_name: str,
+        size: int | tuple[int, ...],
+        local: int | tuple[int, ...] | None = None,
+        *,
+        multiply_adds: float = 0,
+        along: int = 0,
+        **arguments,
+    ) -> None:
+        """Enqueue one kernel.
+
+        size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
+        tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
+        multiply_adds: at most so many in all; where they may take too long for a watchdog, several
+        launches share the work-items, cut along the dimension `along`, in which the kernel must use
+        global ids alone. arguments: by parameter name. Raises TypeError (names, dtypes) and
+        ValueError (shapes) before anything is enqueued, UserError when the work-group is too large
+        for the device or the driver gives up.
+        """
+        kernel = self.kernels[kernel_name]
+        values = kernel.arguments(arguments)
+        ranges = kernel.ranges(size, local)
+        if ranges is None:
+            return
+        size, local = ranges
+        watched = multiply_adds > 0 and self.device.has_watchdog
+        parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if watched else 1
+        for offset, part in cut(size, local, parts, along) if parts > 1 else [(None, size)]:
+            event = self.device.attempt(
+                f"run {kernel.label}",
+                kernel.kernel,
+                self.device.queue,
+                part,
+                local,
+                *values,
+                global_offset=offset,
+            )
+            if watched:  # what drivers hand to the system together is timed together
+                self.device.queue.flush()
+            if self.device.debug:
+                self.device.observe(kernel, event, arguments)
 
 
 def _is_complete(event):

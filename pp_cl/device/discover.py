@@ -16,7 +16,6 @@ from pp_cl.device.drivers import (
     devices_of,
     identity,
     in_conda,
-    left_out,
     load,
     runtime_library,
     try_drivers,
@@ -51,31 +50,22 @@ def list_devices(*, again: bool = False) -> list[tuple[str, cl.Device, str | Non
     """
     _give_cache()
     tried = try_drivers(again=again)
-    devices = [
-        (f"{p}:{d}", device)
-        for p, found in enumerate(load(tried))
-        for d, device in enumerate(devices_of(found))
-    ]
-    problems = _problems(tried, devices)
-    if not again and UNSEEN in problems:  # another version, or a device more
-        problems = _problems(try_drivers(again=True), devices)
-    return [
-        (index, device, problem) for (index, device), problem in zip(devices, problems, strict=True)
-    ]
-
-
-def _problems(tried, devices):
-    """The problem of each device, of several that are alike in their order."""
-    known = {}
-    for *name, problem in (row for rows in tried.values() for row in rows):
+    known: dict[tuple[str, ...], list[str | None]] = {}  # of devices that are alike in their order
+    for *name, problem in (row for rows in tried.values() if type(rows) is list for row in rows):
         known.setdefault(tuple(name), []).append(problem)
-    alike = (known.get(identity(device), []) for _, device in devices)
-    return [problems.pop(0) if problems else UNSEEN for problems in alike]
+    found: list[tuple[str, cl.Device, str | None]] = []
+    for p, owner in enumerate(load(tried)):
+        for d, device in enumerate(devices_of(owner)):
+            problems = known.get(identity(device))
+            if not problems and not again:  # another version, or a device more
+                return list_devices(again=True)
+            found.append((f"{p}:{d}", device, problems.pop(0) if problems else UNSEEN))
+    return found
 
 
 def list_left_out() -> list[tuple[str, str]]:
     """[(driver, problem)] of the drivers that crash or hang."""
-    return left_out(try_drivers())
+    return [(name, rows) for name, rows in try_drivers().items() if type(rows) is str]
 
 
 def separate_devices() -> list[str]:

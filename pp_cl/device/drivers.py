@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
-from pp_cl.device.launch import quiet_compiler
+from pp_cl.device.kernel import quiet_compiler
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import cache_folder, make_cache_folder, write_json
 from pp_cl.files.untrusted import read_regular
@@ -37,7 +37,8 @@ LEAST_CONSTANT = 64  # bytes of constant memory, which the kernels' tables take
 # fails every build.
 PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
 
-_tried: dict[str, list[list[Any]]] = {}  # by this process, or read from the file: {key: rows}
+Found = dict[str, Any]  # what try_drivers() returns
+_tried: Found = {}  # by this process, or read from the file; by _key()
 
 
 def runtime_library() -> Path | None:
@@ -77,67 +78,47 @@ def in_conda() -> bool:
     return Path(sys.prefix, "conda-meta").is_dir()
 
 
-def try_drivers(*, again: bool = False) -> dict[str, list[list[Any]]]:
-    """{driver: [[platform, device, version, problem or None]]}. A platform, or a driver, that
-    crashed or hung has "" for what it did not tell. What was found is kept in the user's cache, and
-    found anew where it is not known yet, where nothing works, or if it is asked for `again`.
+def try_drivers(*, again: bool = False) -> Found:
+    """{driver: [[platform, device, version, problem or None]], or why it is left out}. What was
+    found is kept in the user's cache, and found anew where it is not known yet, where nothing
+    works, or if it is asked for `again`.
     """
     drivers = find_drivers()
     keys = {name: _key(name, library) for name, library in drivers.items()}
     if not _tried:
         _tried.update(_read())
-    unknown = [name for name in drivers if again or keys[name] not in _tried]
-    works = any(row[3] is None for key in keys.values() for row in _tried.get(key, []))
-    if unknown or not works:
-        rows = _try({name: drivers[name] for name in (unknown if works else drivers)})
-        for key in [key for key in _tried if json.loads(key)[0] in rows]:
-            del _tried[key]
-        _tried.update({keys[name]: found for name, found in rows.items()})
+    found = {name: _tried[key] for name, key in keys.items() if key in _tried and not again}
+    if not any(row[3] is None for rows in found.values() if type(rows) is list for row in rows):
+        found = {}
+    if unknown := {name: drivers[name] for name in drivers if name not in found}:
+        found |= _probe(unknown)
+        _tried.clear()
+        _tried.update({keys[name]: rows for name, rows in found.items()})
         with suppress(UserError):  # without a cache they are tried at each start
             write_json(make_cache_folder() / "drivers.json", _tried)
-    return {name: _tried[keys[name]] for name in drivers}
+    return {name: found[name] for name in drivers}
 
 
 def _key(name, library):
     """What another version of a driver changes."""
     file = next((f for f in (library, name) if os.path.isfile(f)), None)
     about = os.stat(file) if file else None
-    return json.dumps(
-        [name, library, about and [about.st_size, about.st_mtime_ns], cl.VERSION_TEXT]
-    )
+    return json.dumps([name, library, about and about.st_mtime_ns, cl.VERSION_TEXT])
 
 
 def _read():
     """What was found before; {} without the file, or if it is damaged."""
     try:
         tried = json.loads(read_regular(cache_folder() / "drivers.json", MOST_BYTES))
-        sound = all(
-            isinstance(json.loads(key)[0], str) and all(len(row) == 4 for row in rows)
-            for key, rows in tried.items()
-        )
-        return tried if sound else {}
-    except (OSError, ValueError, TypeError, LookupError, AttributeError):
+        rows = [row for rows in tried.values() if type(rows) is list for row in rows]
+        return tried if all(len(row) == 4 for row in rows) else {}
+    except (OSError, ValueError, TypeError, AttributeError):
         return {}
 
 
-def left_out(tried: dict[str, list[list[Any]]]) -> list[tuple[str, str]]:
-    """[(driver and platform, problem)] of what crashed or hung."""
-    return [
-        (f"{name} ({row[0]})" if row[0] else name, row[3])
-        for name, rows in tried.items()
-        for row in rows
-        if not row[1] and row[3]
-    ]
-
-
-def load(tried: dict[str, list[list[Any]]]) -> list[cl.Platform]:
+def load(tried: Found) -> list[cl.Platform]:
     """The platforms of the drivers that neither crash nor hang."""
-    drivers = find_drivers()
-    harmful = {name for name in drivers if any(row[:2] == ["", ""] for row in tried[name])}
-    good = {name: library for name, library in drivers.items() if name not in harmful}
-    untouched = {row[0] for rows in tried.values() for row in rows if not row[1] and row[3]}
-    platforms = _platforms(good)
-    return [platform for platform in platforms if platform.name.strip() not in untouched]
+    return _platforms({n: lib for n, lib in find_drivers().items() if type(tried[n]) is list})
 
 
 def _platforms(drivers):
@@ -200,73 +181,50 @@ def devices_of(platform: cl.Platform) -> list[cl.Device]:
         return []  # a platform without devices says so with an error
 
 
-def _try(drivers):
-    """{driver: rows}: each is tried by a process of its own, all at the same time. Where one ends
-    at a platform, another goes on with the next.
+def _probe(drivers):
+    """{driver: rows, or why it is left out}: each is tried by a process of its own, all at the same
+    time.
     """
-    rows, first = {name: [] for name in drivers}, dict.fromkeys(drivers, 0)
-    while first:
-        end = time.monotonic() + SECONDS
-        children = {name: _start(name, drivers[name], i) for name, i in first.items()}
+    end, found = time.monotonic() + SECONDS, {}
+    children = {name: _start(name, library) for name, library in drivers.items()}
+    for name, child in children.items():
         try:
-            for name, (child, log) in children.items():
-                problem = _ending(child, end)
-                lines = [json.loads(line) for line in Path(log).read_text("utf-8").splitlines()]
-                begun = [line for line in lines if len(line) == 2]
-                rows[name] += [line for line in lines if len(line) == 4]
-                if [] in lines:
-                    del first[name]
-                elif begun:
-                    first[name] = begun[-1][0] + 1
-                    rows[name].append([begun[-1][1], "", "", problem])
-                else:
-                    del first[name]
-                    rows[name].append(["", "", "", problem])
-        finally:
-            for child, log in children.values():
-                child.kill()
-                with suppress(OSError):  # Windows keeps what a process that hangs has open
-                    os.remove(log)
-    return rows
+            said, _ = child.communicate(timeout=max(0.1, end - time.monotonic()))
+            found[name] = _rows(said) if child.returncode == 0 else _ending(child.returncode)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            found[name] = f"does not answer within {SECONDS} seconds"
+    return found
 
 
-def _start(name, library, first):
-    """A process that runs report(), and the file that it writes."""
-    descriptor, log = tempfile.mkstemp(prefix="pp-cl-driver-")
-    os.close(descriptor)
+def _start(name, library):
+    """A process that runs report()."""
     code = (
         f"import sys; sys.path[:] = {sys.path!r}; from pp_cl.device import drivers;"
-        f" drivers.report({name!r}, {library!r}, {first}, {log!r})"
+        f" drivers.report({name!r}, {library!r})"
     )
-    nowhere = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-    return subprocess.Popen([sys.executable, "-c", code], **nowhere), log
+    silent = {"stdin": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, **silent)
 
 
-def _ending(child, end):
-    """How a process ended, at a time at the latest."""
-    try:
-        status = child.wait(max(0, end - time.monotonic()))
-    except subprocess.TimeoutExpired:
-        return f"does not answer within {SECONDS} seconds"
+def _rows(said):
+    """What report() said, after whatever the driver has printed."""
+    return json.loads(said.splitlines()[-1])
+
+
+def _ending(status):
     how = signal.Signals(-status).name if status < 0 else f"status {status:#x}"
     return f"crashes ({how})"
 
 
-def report(name: str, library: str, first: int, log: str) -> None:
-    """Try a driver from its platform `first` on, and write JSON lines: [number, platform] before
-    each, [platform, device, version, problem or None] after each device, [] at the end.
-    """
-    with open(log, "w", encoding="utf-8", buffering=1) as file:
-
-        def say(*line):
-            file.write(json.dumps(line) + "\n")
-
-        for i, platform in enumerate(_platforms({name: library})):
-            if i >= first:
-                say(i, platform.name.strip())
-                for device in devices_of(platform):
-                    say(*identity(device), find_problem(device))
-        say()
+def report(name: str, library: str) -> None:
+    """Try a driver and print its rows as JSON: [[platform, device, version, problem or None]]."""
+    rows = [
+        [*identity(device), find_problem(device)]
+        for platform in _platforms({name: library})
+        for device in devices_of(platform)
+    ]
+    print(f"\n{json.dumps(rows)}", flush=True)  # noqa: T201 - read by _probe()
     os._exit(0)  # some drivers crash when a process ends
 
 

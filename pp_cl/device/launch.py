@@ -1,427 +1,12 @@
-"""Kernels launched by argument name, with shapes checked against the comments of their signatures,
-which are parsed from the source; and how many values a work-item takes, on CPUs and on GPUs.
-"""
+"""How many values a work-item takes and how many work together, on CPUs and on GPUs."""
 
-import functools
-import math
-import operator
-import re
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
-from types import CodeType
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-import pyopencl as cl
-import pyopencl.array as cl_array
-
-from pp_cl.errors import BuildError, UserError
-
-if TYPE_CHECKING:
-    from pp_cl.device.device import Device
-
-# Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to
-# them, because PoCL compiles a kernel again for every new work-group size; hence the tail guards.
-DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
-
-# Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
-# multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
-MOST_MULTIPLY_ADDS = 25e9
+from pp_cl.device.device import Device
 
 SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
 LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
 
-# Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once: more
-# than a network's layers have. The numbers of visible points, new in each step, would fill memory.
-REMEMBERED = 64
 
-
-SCALARS = {
-    "char": np.int8,
-    "uchar": np.uint8,
-    "short": np.int16,
-    "ushort": np.uint16,
-    "int": np.int32,
-    "uint": np.uint32,
-    "long": np.int64,
-    "ulong": np.uint64,
-    "half": np.float16,
-    "float": np.float32,
-    "double": np.float64,
-}
-
-_KERNEL = re.compile(
-    r"^(?:__)?kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s*)?void\s+(\w+)\s*\(", re.MULTILINE
-)
-_PARAMETER = re.compile(
-    r"^(?:(global|constant|local)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
-    r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$"
-)
-_SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
-_FORMULA = re.compile(r"\(*\w+\)*(?: ?[-+*/] ?\(*\w+\)*)*")
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One kernel parameter. shape: the dimensions of its comment as text, such as "N+1"; None for
-    a scalar or for `(...)`.
-    """
-
-    name: str
-    space: str  # "global", "constant", "local", or "" for a scalar
-    dtype: type
-    width: int  # of the OpenCL vector
-    const: bool  # what it points at
-    shape: tuple | None
-
-    @cached_property
-    def limits(self) -> tuple[int, int] | None:
-        """The least and the largest integer of its type, None for a float."""
-        if not issubclass(self.dtype, np.integer):
-            return None
-        return int(np.iinfo(self.dtype).min), int(np.iinfo(self.dtype).max)
-
-
-def parse_signatures(source: str, file: str) -> dict[str, list[Parameter]]:
-    """{kernel name: [Parameter, ...]} of an OpenCL C source that follows docs/conventions.md.
-
-    Raises ValueError naming the file, kernel and line of a parameter that does not.
-    """
-    signatures = {}
-    for match in _KERNEL.finditer(source):
-        parameters = []
-        for line in source[match.end() :].split("\n"):
-            code, _, comment = line.partition("//")
-            code = code.strip()
-            last = code.rstrip(" {").endswith(")")
-            code = code.rstrip(" {").rstrip(")").rstrip(",").strip()
-            if code:
-                parameters.append(
-                    _parse_parameter(code, comment.strip(), f"{file}: {match.group(1)}")
-                )
-            if last:
-                break
-        signatures[match.group(1)] = parameters
-    return signatures
-
-
-def _parse_parameter(code, comment, where):
-    found = _PARAMETER.match(code)
-    if not found or found.group(3) not in SCALARS:
-        raise ValueError(f"{where}: cannot read parameter {code!r}; one parameter per line")
-    space, qualifiers, base, width, star, name = found.groups()
-    if bool(space) != bool(star) or (width and not star):
-        raise ValueError(
-            f"{where}: {code!r} is neither a global, constant or local pointer nor a scalar"
-        )
-    shape = None
-    if star:
-        words = _SHAPE.match(comment)
-        if not words:
-            raise ValueError(f"{where}: buffer {name!r} has no shape in its comment")
-        shape = tuple(w.strip() for w in words.group(1).split(",") if w.strip())
-        shape = None if shape == ("...",) else shape
-        try:
-            [compile_formula(word) for word in shape or () if word != "?"]
-        except ValueError as error:
-            raise ValueError(f"{where}: {name}: {error}") from None
-    return Parameter(
-        name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape
-    )
-
-
-@functools.cache
-def compile_formula(text: str) -> CodeType:
-    """A dimension in a buffer's comment, such as `N+1`, `c1 + c2` or `(H-1)/2`, for eval().
-    co_names are the names in it; the division is one of whole numbers.
-
-    Raises ValueError for what is no formula of integers, names, brackets and + - * /.
-    """
-    try:
-        if not _FORMULA.fullmatch(text):
-            raise SyntaxError
-        return compile(text.replace("/", "//"), text, "eval")
-    except SyntaxError:
-        raise ValueError(f"{text!r} is no formula of integers, names and + - * /") from None
-
-
-class Kernel:
-    """A compiled kernel that is called with named arguments."""
-
-    def __init__(
-        self,
-        kernel: cl.Kernel,
-        device: cl.Device,
-        parameters: list[Parameter],
-        *,
-        defines: dict[str, Any],
-        label: str,
-    ):
-        # with their types pyopencl packs scalars itself; without, ten of them take it 40 us
-        kernel.set_scalar_arg_dtypes([None if p.space else p.dtype for p in parameters])
-        self.kernel = kernel
-        limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
-        self.largest_group: Any = kernel.get_work_group_info(limit, device)  # work-items
-        self.parameters = parameters
-        self.names = {p.name for p in parameters}
-        self.label = label
-        self._device_name = device.name.strip()
-        words = {word for p in parameters for word in p.shape or () if word != "?"}
-        names = {name for word in words for name in compile_formula(word).co_names}
-        self._macros = {name: int(defines[name]) for name in names & defines.keys()}
-        letters = {name.lower() for name in names}
-        # (parameter, dtype of a buffer, letter that a scalar gives a size to) in order
-        self._slots = [
-            (
-                p,
-                np.dtype(p.dtype) if p.space in ("global", "constant") else None,
-                p.name.lower() if not p.space and p.name.lower() in letters else None,
-            )
-            for p in parameters
-        ]
-        # (parameter, axis, dimension as text, its formula), letters first: others are computed of
-        # them
-        dimensions = [
-            (p, axis, word, compile_formula(word))
-            for p in parameters
-            for axis, word in enumerate(p.shape or ())
-            if word != "?" and p.space in ("global", "constant")
-        ]
-        self._dimensions = sorted(dimensions, key=lambda d: not d[2].isidentifier())
-        self._checked: set[Any] = set()  # shapes and sizes already found right
-        self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
-
-    def arguments(self, values: dict[str, Any]) -> list[Any]:
-        """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises
-        TypeError, ValueError.
-        """
-        if values.keys() != self.names:
-            missing = [p.name for p in self.parameters if p.name not in values]
-            unknown = [n for n in values if n not in self.names]
-            raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
-        arguments, shapes, sizes = [], [], {}
-        for p, dtype, letter in self._slots:
-            value = values[p.name]
-            if dtype:
-                if not isinstance(value, cl_array.Array) or value.dtype != dtype:
-                    raise TypeError(
-                        f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
-                        f"{dtype}"
-                    )
-                arguments.append(value.data)
-                shapes.append((value.shape, value.strides))
-            elif p.space == "local":
-                arguments.append(value)
-            else:
-                quick = type(value) is int and p.limits and p.limits[0] <= value <= p.limits[1]
-                number = value if quick else self._scalar(p, value)
-                arguments.append(number)
-                if letter:
-                    sizes[letter] = int(number)
-        key = (*shapes, *sizes.values())
-        if key not in self._checked:
-            self._check_buffers(values, sizes)
-            if len(self._checked) > REMEMBERED:
-                self._checked.clear()
-            self._checked.add(key)
-        return arguments
-
-    def ranges(
-        self, size: int | tuple[int, ...], local: int | tuple[int, ...] | None
-    ) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-        """(work-items, work-group) to enqueue, of those given to launch(); None for no work-item.
-
-        Raises UserError when the work-group is too large for the device.
-        """
-        key = size, local
-        if key not in self._ranges:
-            if len(self._ranges) > REMEMBERED:
-                self._ranges.clear()
-            self._ranges[key] = self._rounded(size, local)
-        return self._ranges[key]
-
-    def _rounded(self, size, local):
-        size = (int(size),) if np.isscalar(size) else tuple(int(s) for s in size)
-        if local is None:
-            local = self._default_group(len(size))
-        else:
-            local = (local,) if np.isscalar(local) else tuple(local)
-        if 0 in size:
-            return None
-        if math.prod(local) > self.largest_group:
-            raise UserError(
-                f"{self.label}: a work-group of {math.prod(local)} work-items, but"
-                f" {self._device_name} runs at most {self.largest_group} of this kernel: choose"
-                " another device (`pp-cl devices`)"
-            )
-        return tuple(-(-s // group) * group for s, group in zip(size, local, strict=True)), local
-
-    def _default_group(self, dimensions):
-        """The default work-group, halved until the device runs it: rusticl's software renderer runs
-        32 work-items of some kernels.
-        """
-        local = list(DEFAULT_LOCAL[dimensions])
-        while math.prod(local) > max(1, self.largest_group):
-            local[local.index(max(local))] //= 2
-        return tuple(local)
-
-    def _scalar(self, p, value):
-        try:
-            if p.limits is None:
-                return float(value)
-            number = int(operator.index(value))  # index() refuses the 2.5 that int() cuts to 2
-            if not p.limits[0] <= number <= p.limits[1]:
-                raise OverflowError("out of range")
-            return number
-        except (TypeError, OverflowError) as error:
-            raise TypeError(
-                f"{self.label}: {p.name} = {value!r} is no {np.dtype(p.dtype)}: {error}"
-            ) from error
-
-    def _check_buffers(self, values, sizes):
-        """Compare the arrays with their parameters. sizes: {letter: size} of the scalars; the sizes
-        of the other letters are added.
-        """
-        for p, dtype, _ in self._slots:
-            if dtype is None:
-                continue
-            array = values[p.name]
-            if not array.flags.c_contiguous:
-                raise ValueError(
-                    f"{self.label}: {p.name} has shape {array.shape} and strides {array.strides}:"
-                    " not contiguous"
-                )
-            if p.shape is not None and len(array.shape) != len(p.shape):
-                raise ValueError(
-                    f"{self.label}: {p.name} has shape {array.shape}, expected rank"
-                    f" {len(p.shape)} {p.shape}"
-                )
-        for p, axis, word, formula in self._dimensions:
-            size = values[p.name].shape[axis]
-            known = {n: self._macros.get(n, sizes.get(n.lower())) for n in formula.co_names}
-            if None in known.values():  # a letter's first buffer
-                expected = sizes.setdefault(word.lower(), size)
-            elif word in known:
-                expected = known[word]
-            else:
-                expected = eval(formula, {}, known)  # noqa: S307 - checked by compile_formula()
-            if size != expected:
-                raise ValueError(
-                    f"{self.label}: {p.name} has shape {values[p.name].shape}, expected {p.shape}"
-                    f" with {word} = {expected}"
-                )
-
-
-def _kind(value):
-    return (
-        f"an array of {value.dtype}"
-        if isinstance(value, cl_array.Array)
-        else f"a {type(value).__name__}"
-    )
-
-
-def cut(
-    size: tuple[int, ...], local: tuple[int, ...], parts: int, along: int
-) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """(offset, work-items) of about so many launches that share `size` work-items, cut between the
-    work-groups along one dimension.
-    """
-    step = -(-size[along] // (local[along] * parts)) * local[along]
-    for first in range(0, size[along], step):
-        offset, part = [0] * len(size), list(size)
-        offset[along], part[along] = first, min(step, size[along] - first)
-        yield tuple(offset), tuple(part)
-
-
-@contextmanager
-def quiet_compiler() -> Iterator[None]:
-    """Silences the warning about compiler output, which Intel's compiler gives at every build.
-    PYOPENCL_COMPILER_OUTPUT=1 shows what it said.
-    """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Non-empty compiler output", cl.CompilerWarning)
-        yield
-
-
-class Program:
-    """One built cl/*.cl file."""
-
-    def __init__(
-        self,
-        device: "Device",
-        name: str,
-        source: str,
-        *,
-        options: list[str],
-        defines: dict[str, Any],
-    ):
-        self.device = device
-        self.name = name
-        signatures = parse_signatures(source, f"cl/{name}.cl")
-        try:
-            with quiet_compiler():
-                built = cl.Program(device.context, source).build(options=options)
-        except cl.RuntimeError as error:
-            raise BuildError(
-                f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}", str(error)
-            ) from error
-        self.built = built
-        self.kernels = {
-            k: Kernel(getattr(built, k), device.device, p, defines=defines, label=f"{name}.cl:{k}")
-            for k, p in signatures.items()
-        }
-
-    def launch(
-        self,
-        kernel_name: str,
-        size: int | tuple[int, ...],
-        local: int | tuple[int, ...] | None = None,
-        *,
-        multiply_adds: float = 0,
-        along: int = 0,
-        **arguments,
-    ) -> None:
-        """Enqueue one kernel.
-
-        size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
-        tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
-        multiply_adds: at most so many in all; where they may take too long for a watchdog, several
-        launches share the work-items, cut along the dimension `along`, in which the kernel must use
-        global ids alone. arguments: by parameter name. Raises TypeError (names, dtypes) and
-        ValueError (shapes) before anything is enqueued, UserError when the work-group is too large
-        for the device or the driver gives up.
-        """
-        kernel = self.kernels[kernel_name]
-        values = kernel.arguments(arguments)
-        ranges = kernel.ranges(size, local)
-        if ranges is None:
-            return
-        size, local = ranges
-        watched = multiply_adds > 0 and self.device.has_watchdog
-        parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if watched else 1
-        for offset, part in cut(size, local, parts, along) if parts > 1 else [(None, size)]:
-            event = self.device.attempt(
-                f"run {kernel.label}",
-                kernel.kernel,
-                self.device.queue,
-                part,
-                local,
-                *values,
-                global_offset=offset,
-            )
-            if watched:  # what drivers hand to the system together is timed together
-                self.device.queue.flush()
-            if self.device.debug:
-                self.device.observe(kernel, event, arguments)
-
-
-# ---- how much a work-item does
-
-
-def lanes(dev: "Device", on_gpu: int = 1) -> int:
+def lanes(dev: Device, on_gpu: int = 1) -> int:
     """LANES of kernels (cl/lanes.h): neighbouring values that one work-item takes. on_gpu: how many
     on GPUs, 1 or 4.
 
@@ -432,13 +17,13 @@ def lanes(dev: "Device", on_gpu: int = 1) -> int:
     return 16 if dev.is_cpu else on_gpu
 
 
-def row_parts(dev: "Device", on_gpu: int = 1) -> int:
+def row_parts(dev: Device, on_gpu: int = 1) -> int:
     """Work-items for the 16 channels of a row, LANES each. on_gpu: as for lanes()."""
     return 16 // lanes(dev, on_gpu)
 
 
 def channel_ranges(
-    dev: "Device", height: int, width: int, channels: int
+    dev: Device, height: int, width: int, channels: int
 ) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
     """(work-items, work-group) of a kernel with an item per (LANES channels, x, y) of a feature map
     (height, width, channels). On GPUs those in step are neighbours in memory.
@@ -447,14 +32,14 @@ def channel_ranges(
     return size, (1, 16, 4) if dev.is_cpu else (16, 4, 1)
 
 
-def group_ranges(dev: "Device", groups: int, members: int) -> tuple[int, int | None]:
+def group_ranges(dev: Device, groups: int, members: int) -> tuple[int, int | None]:
     """(work-items, work-group) of a kernel in which groups of `members` work-items cooperate; on
     CPUs a group is one work-item. A work-group holds one or more groups as a whole.
     """
     return (groups, None) if dev.is_cpu else (groups * members, max(members, SMALL_GROUP))
 
 
-def group_items(dev: "Device") -> int:
+def group_items(dev: Device) -> int:
     """GROUP of kernels (cl/group.h): work-items that sum or scan together; a power of two on GPUs,
     1 on CPUs. Of kernels that the device runs in fewer, launch_groups() takes less.
     """
@@ -464,7 +49,7 @@ def group_items(dev: "Device") -> int:
 
 
 def launch_groups(
-    dev: "Device",
+    dev: Device,
     name: str,
     kernel: str,
     groups: int,

@@ -1,12 +1,10 @@
 """The file format of checkpoints: a .npz of uncompressed arrays and a JSON header, written
-atomically and checked when read.
+atomically; what is read is compared with the size of its part of the file first.
 """
 
 import errno
-import io
 import json
 import math
-import stat
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -17,15 +15,11 @@ import numpy as np
 
 from pp_cl.errors import Diverged, UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
-from pp_cl.files.untrusted import strict_json
+from pp_cl.files.untrusted import opened_zip, strict_json
 
 FORMAT = 1  # raised when the arrays change meaning
-MOST_HEADER = 2**24  # bytes
+MOST_HEADER = 2**24  # bytes; a view takes some 250
 MEND = "delete it to train anew, or restore a copy"
-
-PIECE_BYTES = 2**24
-# bytes of a zip's directory: each entry takes about ten times its part of it as zipfile keeps it
-MOST_DIRECTORY = 2**24
 
 
 class Rows(Protocol):
@@ -94,59 +88,40 @@ class Form(NamedTuple):
 
 class Checkpoint:
     """An opened checkpoint. header: its JSON object; forms: {name: Form} of the other arrays, none
-    of which has been read. Every array is as large as its part of the file, and no part is of two.
+    of which has been read.
 
     Raises ValueError, and what zipfile raises, for anything else than save_checkpoint() writes.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
         self.path, self._archive = path, archive
-        self.forms: dict[str, Form] = {}
-        self._starts: dict[str, int] = {}
         entries = archive.infolist()
-        for entry in entries:
-            self._add(entry)
         if sum(entry.file_size for entry in entries) > path.stat().st_size:
-            raise ValueError("two of its arrays share a part of the file")
-        self.header = self._read_header()
-
-    def _add(self, entry):
-        name = entry.filename.removesuffix(".npy")
-        if name == entry.filename or name in self.forms:
-            raise ValueError(f"holds {shown(entry.filename, 40)}, which does not belong there")
-        stored = entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1
-        if not stored or entry.file_size != entry.compress_size:
-            raise ValueError(f"{shown(name, 40)} is not stored as it is")
-        with self._archive.open(entry) as member:
-            form, start = _read_form(member)
-        if start + math.prod(form.shape) * form.dtype.itemsize != entry.file_size:
-            raise ValueError(f"{shown(name, 40)} is not as large as {form}")
-        self.forms[name], self._starts[name] = form, start
-
-    def _read_header(self):
-        """The header, of a format that is read."""
-        form = self.forms.get("header")
-        if form is None or form.dtype != np.uint8 or math.prod(form.shape) > MOST_HEADER:
+            raise ValueError("it unfolds to more than the file holds")
+        self.forms = {entry.filename.removesuffix(".npy"): self._form(entry) for entry in entries}
+        text = self.forms.pop("header", None)
+        if text is None or text.dtype != np.uint8 or math.prod(text.shape) > MOST_HEADER:
             raise ValueError("it has no header")
-        header = strict_json(self._read("header").tobytes())
-        if not isinstance(header, dict):
+        self.header = strict_json(self._read("header").tobytes())
+        if not isinstance(self.header, dict):
             raise ValueError("its header is no JSON object")
-        if header.get("format") != FORMAT:
-            found = quoted(header.get("format"), 40)
-            raise UserError(f"{self.path}: format {found}, this version reads {FORMAT}; train anew")
-        del self.forms["header"]
-        return header
+        if self.header.get("format") != FORMAT:
+            found = quoted(self.header.get("format"), 40)
+            raise UserError(f"{path}: format {found}, this version reads {FORMAT}; train anew")
+
+    def _form(self, entry):
+        """The Form of an array, which is as large as its part of the file."""
+        with self._archive.open(entry) as member:
+            if np.lib.format.read_magic(member) != (1, 0):  # others have headers of up to 4 GiB
+                raise ValueError("holds an array of another version than 1.0")
+            shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+            if member.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
+                raise ValueError(f"{shown(entry.filename, 40)} is not as large as {shape} {dtype}")
+        return Form(shape, dtype)
 
     def _read(self, name):
-        form = self.forms[name]
-        array = np.empty(form.shape, form.dtype)
-        values = memoryview(array.reshape(-1).view(np.uint8))
         with self._archive.open(f"{name}.npy") as member:
-            member.read(self._starts[name])
-            for first in range(0, len(values), PIECE_BYTES):
-                piece = values[first : first + PIECE_BYTES]
-                piece[:] = member.read(len(piece))
-        return array
+            return np.lib.format.read_array(member, allow_pickle=False)
 
     def array(self, name: str) -> np.ndarray:
         """One of its arrays. Raises UserError naming file and array where it cannot be read, or
@@ -158,15 +133,9 @@ class Checkpoint:
             raise UserError(f"{self.path}: {name} holds NaN or Inf; {MEND}")
         return array
 
-
-def _read_form(member):
-    """(Form, bytes before the values) of an opened array."""
-    if np.lib.format.read_magic(member) != (1, 0):  # others have headers of up to 4 GiB
-        raise ValueError("holds an array of another version than 1.0")
-    shape, by_columns, dtype = np.lib.format.read_array_header_1_0(member)
-    if by_columns or dtype.kind not in "fiu" or dtype.byteorder == ">" or min(shape, default=0) < 0:
-        raise ValueError("holds an array of another kind than numbers row by row")
-    return Form(shape, dtype), member.tell()
+    def arrays(self) -> dict[str, np.ndarray]:
+        """{name: array} of all. Raises UserError as array() does."""
+        return {name: self.array(name) for name in self.forms}
 
 
 @contextmanager
@@ -183,14 +152,6 @@ def opened_checkpoint(path: Path | str) -> Iterator[Checkpoint]:
         with _refused(path):
             checkpoint = Checkpoint(path, stack.enter_context(opened_zip(path)))
         yield checkpoint
-
-
-def load_checkpoint(path: Path | str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(header, {name: numpy array}) of a checkpoint of any run. Raises UserError as
-    opened_checkpoint and Checkpoint.array do.
-    """
-    with opened_checkpoint(path) as stored:
-        return stored.header, {name: stored.array(name) for name in stored.forms}
 
 
 @contextmanager
@@ -210,23 +171,3 @@ def _refused(path):
             ) from None
         reason = shown(str(error)) or type(error).__name__
         raise UserError(f"{path}: corrupt checkpoint ({reason}); {MEND}") from None
-
-
-class _Pieces(io.FileIO):
-    """An opened file, of which at most MOST_DIRECTORY bytes are read at once."""
-
-    def read(self, size: int | None = -1) -> bytes:
-        if size is not None and size > MOST_DIRECTORY:
-            raise ValueError(f"its directory is larger than {MOST_DIRECTORY} bytes")
-        return super().read(size)
-
-
-@contextmanager
-def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The zip file, until the block ends. Raises OSError where it cannot be read, ValueError
-    for a directory of more than MOST_DIRECTORY bytes, and what zipfile raises.
-    """
-    if stat.S_ISFIFO(path.stat().st_mode):  # it would never end
-        raise ValueError("is no regular file")
-    with _Pieces(path) as file, zipfile.ZipFile(file) as archive:
-        yield archive

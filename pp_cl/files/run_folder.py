@@ -17,7 +17,7 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import mend, remove_leftovers, write_text
 from pp_cl.files.checkpoint import Rows, save_checkpoint
 from pp_cl.files.manifest import begin_manifest, check_ours, remove_ours
-from pp_cl.files.untrusted import read_regular, strict_json
+from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
 MASKS_PICTURE = "masks.png"
 MOST_OWNER = 1000  # bytes of the line that names the owner
@@ -50,6 +50,38 @@ class RunFolder:
     def metrics(self, split: str) -> Path:
         """What the evaluation of a split has measured."""
         return self.evaluation(split) / "metrics.json"
+
+    def measured(self) -> dict[str, Any] | None:
+        """{"mean": {metric: value}, "step", "finished", "points" that were left, "device"} of the
+        evaluation of the test split, None where there is none. Raises UserError for a broken one.
+        """
+        file = self.metrics("test")
+        if not file.exists():
+            return None
+        try:
+            result = json.loads(read_json_text(file, MOST_METRICS))
+            found = {
+                "mean": {name: float(value) for name, value in result["mean"].items()},
+                "step": result["step"],
+                "finished": result["finished"],
+                "points": result["points"]["final"],
+                "device": result["device"],
+            }
+            kinds = {"step": int, "finished": bool, "points": int, "device": str}
+            is_right = all(type(found[key]) is kind for key, kind in kinds.items())
+            if not (is_right and all(map(math.isfinite, found["mean"].values()))):
+                raise ValueError("values of another kind")
+        except (
+            OSError,
+            ValueError,
+            LookupError,
+            TypeError,
+            AttributeError,
+            ArithmeticError,
+            RecursionError,
+        ) as error:
+            raise refusal(file, error, "metrics", f"run `pp-cl eval {self}` again") from None
+        return found
 
     def check_usable(self) -> None:
         """Raise UserError if the folder is a file, or holds files that belong to no run."""

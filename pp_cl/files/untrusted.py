@@ -1,9 +1,11 @@
 """Opens files of other programs, after checking that they are regular files and small enough."""
 
 import errno
+import io
 import json
 import os
 import stat
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +15,8 @@ from pp_cl.errors import UserError, shown
 
 MOST_REASON = 120  # characters
 MOST_VALUES = 2**22  # of a JSON file: 100,000 cameras of 40; with its text they take 1 GiB at most
+# bytes of a zip's directory: each entry takes about ten times its part of it as zipfile keeps it
+MOST_DIRECTORY = 2**24
 MOST_PIXELS = 2 * 89_478_485  # of an image; Pillow refuses more. The largest sensors have 151 M
 
 
@@ -29,6 +33,26 @@ def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
         raise OSError(errno.EINVAL, "Not a regular file", str(path))
     with open(descriptor, "rb") as file:
         yield file
+
+
+class _Pieces(io.FileIO):
+    """An opened file, of which at most MOST_DIRECTORY bytes are read at once."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        if size is not None and size > MOST_DIRECTORY:
+            raise ValueError(f"its directory is larger than {MOST_DIRECTORY} bytes")
+        return super().read(size)
+
+
+@contextmanager
+def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
+    """The zip file, until the block ends. Raises OSError where it cannot be read, ValueError
+    for a directory of more than MOST_DIRECTORY bytes, and what zipfile raises.
+    """
+    if stat.S_ISFIFO(path.stat().st_mode):  # it would never end
+        raise ValueError("is no regular file")
+    with _Pieces(path) as file, zipfile.ZipFile(file) as archive:
+        yield archive
 
 
 def read_regular(path: Path | str, most: int, encoding: str = "utf-8") -> str:

@@ -10,8 +10,8 @@ from itertools import cycle
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.device import Device
-from pp_cl.device.launch import Program, group_ranges, lanes, row_parts
+from pp_cl.device.device import Device, Program
+from pp_cl.device.launch import group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
 from pp_cl.layers.choice import blocking_of, choose
 from pp_cl.layers.conv_direct import ConvShape, Direction, pack_weights

@@ -55,14 +55,11 @@ def project_grid(
     point_id: Array,
     cloud_offset: Array,
     radius: float,
-    dropout: float = 0.0,
-    seed: int = 0,
 ) -> ProjectedPoints:
     """Project the points, each in the cell of a grid's vertex, into a camera.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
-    PointCloud.offset. radius: of points without offsets, world units. dropout: probability in
-    [0, 1) with which a point is left out, at random by (seed, id). seed: uint32.
+    PointCloud.offset. radius: of points without offsets, world units.
     """
     n = point_id.size
     b.require(projection_table(n))
@@ -71,8 +68,6 @@ def project_grid(
         "project_grid",
         -(-n // lanes(dev)),
         n=n,
-        dropout=round(dropout * 2**32),
-        seed=seed,
         camera=camera_buffer,
         grid=grid_buffer,
         point_id=point_id,

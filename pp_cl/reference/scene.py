@@ -135,24 +135,3 @@ def distance(positions: np.ndarray) -> np.ndarray:
         spoke = np.cos(angle) * MERIDIAN + np.sin(angle) * WHEEL_V
         solids.append(_segment(p, 0.2 * spoke, 0.54 * spoke) - 0.011)
     return np.min(solids, axis=0)
-
-
-def coverage(camera: Any) -> tuple[np.ndarray, np.ndarray]:
-    """((H, W) share of 4x4 rays a pixel that come within 4e-4 of the object, (H, W) the same for
-    1e-5).
-    """
-    sub = (np.arange(4) + 0.5) / 4
-    x = (np.arange(camera.width)[:, None] + sub).ravel()
-    y = (np.arange(camera.height)[:, None] + sub).ravel()
-    x, y = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ camera.pose[:, :3].T
-    t, closest = np.full(len(rays), 1.0), np.full(len(rays), np.inf)
-    marching = np.arange(len(rays))
-    for _ in range(400):
-        d = distance(camera.eye + t[marching, None] * rays[marching])
-        closest[marching] = np.minimum(closest[marching], d)
-        t[marching] += d
-        marching = marching[(d > 1e-5) & (t[marching] < 8)]
-    tiles = closest.reshape(camera.height, 4, camera.width, 4)
-    return (tiles < 4e-4).mean((1, 3)), (tiles <= 1e-5).mean((1, 3))

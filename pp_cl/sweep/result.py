@@ -4,7 +4,6 @@ from typing import Any
 
 from pp_cl.config import load_config
 from pp_cl.errors import UserError
-from pp_cl.facts.info import read_metrics
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job
@@ -33,7 +32,7 @@ def finished_row(job: Job) -> dict[str, Any] | None:
     if load_config(folder.config).scene.path != config.scene.path:
         return None  # for the training to refuse or, if it is the same scene, to go on with
     try:
-        result = read_metrics(folder)
+        result = folder.measured()
     except UserError:
         return None  # is measured again
     if not (result and result["finished"] and result["step"] == config.train.iterations):

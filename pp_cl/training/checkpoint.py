@@ -1,125 +1,48 @@
-"""Reads the checkpoint of a run and checks its arrays against the run's settings before anything
-uses them.
-"""
+"""Reads the checkpoint of a run and compares it with the run's settings before anything uses it."""
 
 import math
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from pp_cl.config import Config
-from pp_cl.errors import UserError, quoted, shown
+from pp_cl.errors import UserError, shown
 from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import parameter_table, unet_layers
-from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, sh_blocks
-from pp_cl.scene.grid import MOST_VERTICES
-from pp_cl.scene.identity import DIGITS, kept_views
+from pp_cl.raster.points import SH_DEGREES, sh_blocks
+from pp_cl.scene.grid import MOST_VERTICES, Grid
+from pp_cl.scene.identity import kept_views
 from pp_cl.training.exposure import decided_at
-from pp_cl.training.schedule import bound_to_end, ema_start
+from pp_cl.training.schedule import ema_start
 from pp_cl.training.state import PointState
 
-LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no products of others
-LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
-MOST_TEXT = 1000
-DIGEST = re.compile(f"[0-9a-f]{{{DIGITS}}}")
-OPTIONAL = {"format", "extended_from", "exposed", "left_out", "notes"}  # keys of a header
-GRID = ("origin", "edge", "dims")
-
-
-class StoredRun:
-    """The opened checkpoint of a run with these settings. header: see _header_rules(); forms:
-    {name: Form}, exactly those of stored_forms().
-
-    Raises UserError naming the file, and what in it is not as it must be.
-    """
-
-    def __init__(self, checkpoint: Checkpoint, config: Config) -> None:
-        self.header, self.forms = checkpoint.header, checkpoint.forms
-        self._checkpoint = checkpoint
-        self._check_header(config)
-        self._check_forms(config)
-
-    def array(self, name: str) -> np.ndarray:
-        """One of its arrays. Raises UserError naming file and array where it cannot be read, or
-        holds what it cannot hold.
-        """
-        array = self._checkpoint.array(name)
-        rule = _array_rule(name, self.header)
-        if rule and not rule[0](array):
-            self._refuse(f"{name} holds other than {rule[1]}")
-        return array
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """{name: array} of all. Raises UserError as array() does."""
-        return {name: self.array(name) for name in self.forms}
-
-    def _refuse(self, what, mend=MEND):
-        raise UserError(f"{self._checkpoint.path}: {what}; {mend}")
-
-    def _check_header(self, config):
-        header, rules = self.header, _header_rules(config)
-        missing = [key for key in rules if key not in header]
-        if missing:
-            self._refuse(f"its header lacks {', '.join(missing)}")
-        unknown = sorted(header.keys() - rules.keys() - OPTIONAL)
-        if unknown:
-            self._refuse(f"its header holds {shown(unknown[0], 40)}, which this version knows not")
-        if "extended_from" in header:
-            rules["extended_from"] = (
-                lambda x: type(x) is int and 1 <= x <= header["step"],  # which is checked before
-                "a step that is done",
-            )
-        if "exposed" in header:
-            rules["exposed"] = (lambda x: x is True, "true")
-        if "notes" in header:
-            rules["notes"] = (_are_texts, "lines of text")
-        if "left_out" in header:
-            rules["left_out"] = (
-                lambda x: _are_some(x, kept_views(header["views"])),  # which is checked before
-                "names of some of its views",
-            )
-        for key, (is_right, expected) in rules.items():
-            if not is_right(header[key]):
-                self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
-        if header["step"] == config.train.iterations and not header["finished"]:
-            self._refuse(
-                f"it is not finished at step {header['step']}, the last in its config.json"
-            )
-
-    def _check_forms(self, config):
-        """Compare names, shapes and dtypes with what the settings call for."""
-        ids = self.forms.get("points.ids")
-        n = ids.shape[0] if ids and len(ids.shape) == 1 else 0
-        header, mend = self.header, "its config.json may belong to another run"
-        refined = sum(0 < share < 1 for share in config.train.refine_at)
-        most = min(math.prod(header["grid"]["dims"]), header["initial_points"] * 8**refined)
-        if not 0 < n <= most:
-            self._refuse(f"points.ids is {ids or 'missing'}, expected 1 to {most} points")
-        half = self.forms.get("points.sh0", ids).dtype == np.float16
-        ends = header["finished"] and bound_to_end(config.network, config.raster, config.train)
-        is_bare = ends or (header["finished"] and "state.last_step" not in self.forms)
-        step = None if is_bare else header["step"]
-        gains = 0 if step is None else _views_with_gains(header, config)
-        expected = stored_forms(config, n, step, half and header["finished"], gains)
-        for name in sorted(expected.keys() | self.forms.keys()):
-            found, wanted = self.forms.get(name), expected.get(name)
-            if wanted is None:
-                self._refuse(f"holds {shown(name, 40)}, which does not belong there", mend)
-            if found != wanted:
-                self._refuse(f"{name} is {found or 'missing'}, expected {wanted}", mend)
+MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
+# {key of the header: its type as JSON has it}; those that it may lack
+NEEDED: dict[str, Any] = {"scene": str, "views": list, "step": int, "finished": bool}
+NEEDED |= {"initial_points": int, "grid": dict, "depth_range": list, "pixels": dict | None}
+OPTIONAL = {"format": int, "extended_from": int, "exposed": bool, "left_out": list, "notes": list}
+OTHER_RUN = "its config.json may belong to another run"
 
 
 @contextmanager
-def opened_run(folder: RunFolder, config: Config) -> Iterator[StoredRun]:
-    """The checkpoint in the folder of a run with these settings, until the block ends. Raises
-    UserError as opened_checkpoint and StoredRun do.
+def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
+    """The checkpoint in the folder of a run with these settings, until the block ends. Its header
+    has the keys of NEEDED, and its forms are exactly those of stored_forms().
+
+    Raises UserError as opened_checkpoint does, and naming what in the file is not of this run.
     """
-    with opened_checkpoint(folder.checkpoint) as checkpoint:
-        yield StoredRun(checkpoint, config)
+    with opened_checkpoint(folder.checkpoint) as stored:
+        problem, mend = _problem_of_header(stored.header, config.train.iterations), MEND
+        if not problem:
+            problem, mend = _problem_of_forms(stored, config), OTHER_RUN
+        if not problem and not _are_ids(stored.array("points.ids"), stored.header["grid"]):
+            problem, mend = "points.ids are no vertices of its grid in ascending order", MEND
+        if problem:
+            raise UserError(f"{folder.checkpoint}: {problem}; {mend}")
+        yield stored
 
 
 def load_run_state(
@@ -130,6 +53,69 @@ def load_run_state(
     """
     with opened_run(folder, config) as stored:
         return stored.header, stored.arrays()
+
+
+def _problem_of_header(header, steps):
+    """What in a header is not as a training of so many steps writes it; "" where all is."""
+    for key, kind in (NEEDED | OPTIONAL).items():
+        if key in NEEDED and key not in header:
+            return f"its header lacks {key}"
+        if key not in header:
+            continue
+        is_flag = isinstance(header[key], bool)  # which Python takes for a whole number
+        if not isinstance(header[key], kind) or is_flag != (kind is bool):
+            return f"{key} in its header is of another kind"
+    if unknown := sorted(header.keys() - NEEDED.keys() - OPTIONAL.keys()):
+        return f"its header holds {shown(unknown[0], 40)}, which this version does not know"
+    if not 1 <= header["step"] <= steps:
+        return f"it is of step {shown(str(header['step']))}, of {steps} in its config.json"
+    try:
+        views, grid = kept_views(header["views"]), Grid.of_header(header["grid"])
+        near, far = header["depth_range"]
+        lengths = [*grid.origin, grid.edge, near, far]
+        names, left_out = {view.name for view in views}, set(header.get("left_out", []))
+        sound = (
+            all(abs(length) < MOST_LENGTH for length in lengths)
+            and grid.edge > 0 <= near < far
+            and [type(n) for n in grid.dims] == [int, int, int]
+            and min(grid.dims) > 0
+            and math.prod(grid.dims) <= MOST_VERTICES
+            and 0 < header["initial_points"] <= MOST_VERTICES
+            and 0 <= header.get("extended_from", 0) <= header["step"]
+            and left_out < names
+        )
+    except (KeyError, TypeError, ValueError, OverflowError):
+        sound = False
+    return "" if sound else "its header holds numbers or names that no training writes"
+
+
+def _problem_of_forms(stored, config):
+    """How the names, shapes and dtypes of a checkpoint differ from what the settings call for; ""
+    where they do not.
+    """
+    header, forms = stored.header, stored.forms
+    ids = forms.get("points.ids")
+    n = ids.shape[0] if ids and len(ids.shape) == 1 else 0
+    refined = sum(0 < share < 1 for share in config.train.refine_at)
+    most = min(math.prod(header["grid"]["dims"]), header["initial_points"] * 8**refined)
+    if not 0 < n <= most:
+        return f"points.ids is {ids or 'missing'}, expected 1 to {most} points"
+    half = forms.get("points.sh0", ids).dtype == np.float16
+    step = None if header["finished"] else header["step"]
+    gains = 0 if step is None else _views_with_gains(header, config)
+    expected = stored_forms(config, n, step, half and header["finished"], gains)
+    for name in sorted(expected.keys() | forms.keys()):
+        found, wanted = forms.get(name), expected.get(name)
+        if wanted is None:
+            return f"holds {shown(name, 40)}, which does not belong there"
+        if found != wanted:
+            return f"{name} is {found or 'missing'}, expected {wanted}"
+    return ""
+
+
+def _are_ids(ids, grid):
+    """Whether they are what kernels may index a grid with."""
+    return bool((ids[1:] > ids[:-1]).all() and ids[-1] < math.prod(grid["dims"]))
 
 
 def _views_with_gains(header, config):
@@ -173,113 +159,3 @@ def _training_state(config, n, step, network):
         points |= {f"a.{name}": row for name, row in PointState.ema_table(n, blocks).items()}
         table |= {f"average.{name}": row for name, row in network.items()}
     return table | {f"state.{name}": row for name, row in points.items()}
-
-
-# --------------------------------------------------------------------------------------------------
-
-Rule = tuple[Callable[[Any], bool], str]  # whether a value is right, and what it should be
-
-
-def _header_rules(config: Config) -> dict[str, Rule]:
-    """{key of the header: Rule}, beside those of OPTIONAL."""
-    steps = config.train.iterations
-    return {
-        "scene": (lambda x: type(x) is str and 0 < len(x) <= MOST_TEXT, "a text"),
-        "views": (_are_views, "names and cameras of training views"),
-        "pixels": (_are_digests, "the digests of photographs"),
-        "step": (_whole_in(1, steps), f"one of the {steps} steps of its config.json"),
-        "finished": (lambda x: type(x) is bool, "true or false"),
-        "initial_points": (_whole_in(1, MOST_VERTICES), "a number of points"),
-        "grid": (_is_grid, "three numbers, a length and three numbers of vertices"),
-        "depth_range": (_is_depth_range, "near and far"),
-    }
-
-
-def _are_views(views):
-    try:
-        return bool(kept_views(views))
-    except ValueError:
-        return False
-
-
-def _are_some(names, views):
-    known = {view.name for view in views}
-    return (
-        isinstance(names, list)
-        and all(type(name) is str for name in names)
-        and 0 < len(set(names) & known) == len(names) < len(known)
-    )
-
-
-def _are_texts(lines):
-    return isinstance(lines, list) and all(
-        type(line) is str and len(line) <= MOST_TEXT for line in lines
-    )
-
-
-def _are_digests(pixels):
-    """Whether it is what identity() gives."""
-    return pixels is None or (
-        isinstance(pixels, dict)
-        and len(pixels) > 0
-        and all(type(x) is str and DIGEST.fullmatch(x) for x in pixels.values())
-    )
-
-
-def _whole_in(least, most):
-    return lambda x: type(x) is int and least <= x <= most
-
-
-def _are_numbers(values, count):
-    return (
-        isinstance(values, list)
-        and len(values) == count
-        and all(type(x) in (int, float) and abs(x) < MOST_LENGTH for x in values)
-    )
-
-
-def _is_grid(grid):
-    if not isinstance(grid, dict) or sorted(grid) != sorted(GRID):
-        return False
-    origin, edge, dims = (grid[key] for key in GRID)
-    return (
-        _are_numbers(origin, 3)
-        and _are_numbers([edge], 1)
-        and edge > LEAST_LENGTH
-        and _are_numbers(dims, 3)
-        and all(type(n) is int and n > 0 for n in dims)
-        and math.prod(dims) <= MOST_VERTICES
-    )
-
-
-def _is_depth_range(values):
-    if not _are_numbers(values, 2):
-        return False
-    near, far = values
-    return near >= 0 and far > LEAST_LENGTH and far - near > LEAST_SHARE * far
-
-
-def _array_rule(name: str, header: dict[str, Any]) -> Rule | None:
-    """What the numbers of an array must be beside finite."""
-    if name == "points.ids":
-        vertices = math.prod(header["grid"]["dims"])
-        return (
-            lambda a: bool((a[1:] > a[:-1]).all() and a[-1] < vertices),
-            "vertices of its grid in ascending order",
-        )
-    if name in ("points.offset", "state.a.offset"):
-        return (
-            lambda a: np.abs(a).max() <= MOST_OFFSET,
-            f"offsets of up to {MOST_OFFSET}",
-        )
-    if name in ("points.opacity", "state.a.opacity"):
-        return lambda a: a.min() >= 0 and a.max() <= 1, "opacities from 0 to 1"
-    if name == "state.last_step":
-        return lambda a: a.max() <= header["step"], "steps that are done"
-    if name == "exposure":
-        return lambda a: a[..., 1:3].min() >= 0 and a[..., 3].min() > 0, "gains above 0"
-    if name in ("state.max_weight", "state.times_seen") or name.startswith(
-        ("state.v.", "moment.v.")
-    ):
-        return lambda a: a.min() >= 0, "numbers from 0 on"
-    return None

@@ -1,9 +1,11 @@
 """Gains of photographs that differ in exposure or white balance, and whether they do."""
 
+import warnings
+
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.device.launch import launch_groups
 from pp_cl.training.loss import corner_of
@@ -31,19 +33,13 @@ class Exposure:
         self.state = dev.upload(np.tile([0, 0, 0, 1], (views, 3, 1)), np.float32)
         self._buffers = Buffers(dev)
 
-    @staticmethod
-    def table(height: int, width: int) -> Table:
-        """The scratch for a photograph of this size."""
-        shapes = {"target": (height, width, 3), "row_products": (3, height, 4)}
-        return {name: (shape, np.float32) for name, shape in shapes.items()}
-
     def target(self, view: int, photograph: Array, alpha: Array) -> Array:
         """(H, W, 3) float32: a photograph divided by its view's gains, valid until the next call.
 
         view: its index. photograph: (H, W, 3) float32, over white. alpha: (H, W) float32.
         """
         height, width = alpha.shape
-        self._buffers.require(self.table(height, width))
+        self._buffers.require({"target": ((height, width, 3), np.float32)})
         self.dev.program("training/exposure").launch(
             "exposure_divide",
             height * width,
@@ -68,7 +64,7 @@ class Exposure:
         lies at offset = (left, top).
         """
         (height, width), b = alpha.shape, self._buffers
-        b.require(self.table(height, width))
+        b.require({"row_products": ((3, height, 4), np.float32)})
         launch_groups(
             self.dev,
             "training/exposure",
@@ -103,6 +99,19 @@ class Exposure:
         common = (tt.sum(0) - pt.sum(0) ** 2 / np.maximum(pp.sum(0), TINY)).sum()
         own = (tt - pt**2 / np.maximum(pp, TINY)).sum()
         return float(1 - own / common) if common > TINY else 0.0
+
+    def decided(self) -> "Exposure | None":
+        """Itself, applied from now on, if gains explain enough of the error, else None."""
+        share = self.explained()
+        if share <= LEAST_SHARE:
+            return None
+        self.is_applied = True
+        warnings.warn(
+            f"the photographs differ in exposure or white balance ({share:.0%} of their error);"
+            " a gain of each view and channel is found beside the model (train.exposure)",
+            stacklevel=2,
+        )
+        return self
 
 
 def decided_at(begun: int, views: int) -> int:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Reading, Table, read_later
+from pp_cl.device.buffers import Buffers, Reading, read_later
 from pp_cl.device.device import Device
 from pp_cl.device.launch import group_items, lanes, launch_groups
 from pp_cl.errors import Diverged
@@ -37,31 +37,6 @@ class Loss:
         self._added: list[str] = []  # of FURTHER, in this step
         self._buffers = Buffers(dev)
 
-    @staticmethod
-    def table(
-        prediction_shape: tuple[int, ...],
-        target_shape: tuple[int, ...],
-        ssim_weight: float,
-        values: int,
-    ) -> Table:
-        """The scratch for a prediction (PH, PW, 3) and a target (H, W, 3), and the gradient.
-
-        values: lanes_of_loss(), those that a work-item handles.
-        """
-        height, width, _ = target_shape
-        has_ssim = ssim_weight != 0 and min(height, width) >= TAPS
-        window_rows = height - TAPS + 1 if has_ssim else 0
-        blocks = (-(-3 * width // 16) * 16 + MARGIN) // values  # vectors in a scratch row
-        shapes = {
-            "moments": (window_rows, 4, blocks, values),
-            "slopes": (window_rows, 3, blocks, values),
-            "row_slopes": (window_rows, 3, blocks, values),
-            "partial_terms": (window_rows + height, blocks, 4),
-            "row_terms": (window_rows + height, 4),
-            "grad_prediction": tuple(prediction_shape),
-        }
-        return {name: (shape, np.float32) for name, shape in shapes.items()}
-
     def forward_backward(
         self, prediction: Array, target: Array, left: int = 0, top: int = 0
     ) -> Array:
@@ -74,8 +49,18 @@ class Loss:
         corner = corner_of(prediction.shape, target.shape, left, top)
         (height, width, _), pw, b = target.shape, prediction.shape[1], self._buffers
         values = lanes_of_loss(self.dev)
-        b.require(self.table(prediction.shape, target.shape, self.ssim_weight, values))
-        window_rows, _, blocks, _ = b.moments.shape
+        has_ssim = self.ssim_weight != 0 and min(height, width) >= TAPS
+        window_rows = height - TAPS + 1 if has_ssim else 0
+        blocks = (-(-3 * width // 16) * 16 + MARGIN) // values  # vectors in a scratch row
+        shapes = {
+            "moments": (window_rows, 4, blocks, values),
+            "slopes": (window_rows, 3, blocks, values),
+            "row_slopes": (window_rows, 3, blocks, values),
+            "partial_terms": (window_rows + height, blocks, 4),
+            "row_terms": (window_rows + height, 4),
+            "grad_prediction": prediction.shape,
+        }
+        b.require({name: (shape, np.float32) for name, shape in shapes.items()})
         program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
         program.launch(
             "loss_moments",
@@ -227,14 +212,6 @@ class MaskLoss:
         self.weight = weight
         self._buffers = Buffers(dev)
 
-    @staticmethod
-    def table(height: int, width: int) -> Table:
-        """The scratch for a padded image of this size."""
-        return {
-            "grad_alpha": ((height * width,), np.float32),
-            "row_term": ((height,), np.float32),
-        }
-
     def forward_backward(
         self,
         transmittance: Array,
@@ -252,7 +229,10 @@ class MaskLoss:
         1, weight of pixels whose alpha is below the mask.
         """
         (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
-        self._buffers.require(self.table(height, width))
+        pixels = height * width
+        self._buffers.require(
+            {"grad_alpha": ((pixels,), np.float32), "row_term": ((height,), np.float32)}
+        )
         launch_groups(
             self.dev,
             "training/mask",

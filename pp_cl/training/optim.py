@@ -12,7 +12,7 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import DeviceRows, Table
+from pp_cl.device.buffers import DeviceRows
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 from pp_cl.model import Model
@@ -41,12 +41,6 @@ class Optimiser:
         self.state = state
         self.moments = {kind: dev.zeros(model.net.all_parameters.shape) for kind in "mv"}
         self.averages: dict[str, Array] = {}
-
-    @staticmethod
-    def table(parameters: Array, ema: bool) -> Table:
-        """The arrays for all parameters of a network. ema: averages among them."""
-        kinds = ("m", "v", "ema") if ema else ("m", "v")
-        return dict.fromkeys(kinds, (parameters.shape, np.float32))
 
     def update(
         self,

@@ -9,8 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pp_cl.settings import NetworkConfig, RasterConfig, TrainConfig
+from pp_cl.settings import NetworkConfig, TrainConfig
 
+GAMMA = (0.1, 0.01)  # depth sharpness of the softmax, first and last step (supplemental)
+SH_DECAY = 0.1  # last over first learning rate of the SH (supplemental)
+SH_DELAY = (0.0, 0.01, 0.02)  # warm-up of SH degrees 0, 1, 2, as a share of the iterations
+SMOOTHING_EVERY = 64  # steps
 EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
@@ -34,12 +38,10 @@ class Rates:
         """The rates of a step from 0 on."""
         steps = train.iterations
         sh = tuple(
-            learning_rate(
-                step, steps, first, first * train.sh_rate_decay, delay_steps=round(delay * steps)
-            )
+            learning_rate(step, steps, first, first * SH_DECAY, delay_steps=round(delay * steps))
             if first
             else 0.0
-            for first, delay in zip(train.sh_rate, train.sh_delay, strict=True)
+            for first, delay in zip(train.sh_rate, SH_DELAY, strict=True)
         )
         # opacities travel about as far in a long training as in a short one
         scale = math.sqrt(min(1.0, train.opacity_rate_steps / steps or 1.0))
@@ -49,27 +51,6 @@ class Rates:
             scale * learning_rate(step, steps, *train.opacity_rate),
             learning_rate(step, steps, *network.rate),
         )
-
-
-def bound_to_end(network: NetworkConfig, raster: RasterConfig, train: TrainConfig) -> list[str]:
-    """What of a training depends on its number of steps, in words; nothing where a longer one goes
-    through the same steps first.
-    """
-    rates = network.rate, train.opacity_rate, train.offset_rate
-    constant = all(first == last for first, last in rates)
-    constant = constant and train.sh_rate_decay == 1 and not train.opacity_rate_steps
-    delayed = any(r and d for r, d in zip(train.sh_rate, train.sh_delay, strict=True))
-    is_alpha = raster.blend == "alpha"
-    depends = {
-        "learning rates": not constant or delayed,
-        "gamma": not is_alpha and raster.gamma[0] != raster.gamma[1],
-        "the mask's and the spread's weights": is_alpha
-        and (train.mask_weight > 0 or train.spread_weight > 0),
-        "refinements": any(share < 1 for share in train.refine_at),
-        "averages": train.ema,
-        "the last pruning": train.final_prune_weight > 0,
-    }
-    return [what for what, does in depends.items() if does]
 
 
 def learning_rate(
@@ -90,14 +71,10 @@ def prunings(train: TrainConfig, start: int, end: int) -> int:
     """How many prunings between the steps `start` and `end` may drop points, if the points are seen
     in every step since `start`.
     """
-    if not _prunes(train):
+    if train.prune_weight == 0:
         return 0
     every, last = train.prune_every, min(end, train.iterations - 1)
     return max(0, last // every - -(-(start + train.prune_looks) // every) + 1)
-
-
-def _prunes(train):
-    return train.prune_weight > 0 or train.prune_opacity > 0
 
 
 def refine_steps(train: TrainConfig) -> list[int]:
@@ -110,16 +87,14 @@ def refine_steps(train: TrainConfig) -> list[int]:
     steps = sorted({max(1, round(share * train.iterations)) for share in shares})
     found = steps[:1]
     for step in steps[1:]:
-        if prunings(train, found[-1], step) or not _prunes(train):
+        if prunings(train, found[-1], step) or train.prune_weight == 0:
             found.append(step)
     return found
 
 
-def gamma_at(step: int, steps: int, first: float, last: float) -> float:
-    """Depth sharpness gamma of the softmax, exponential from `first` to `last` (PlenopticPoints
-    supplemental).
-    """
-    return learning_rate(step, steps, first, last)
+def gamma_at(step: int, steps: int) -> float:
+    """Depth sharpness gamma of the softmax, exponential along GAMMA."""
+    return learning_rate(step, steps, *GAMMA)
 
 
 def rising_weight(step: int, steps: int, last: float = 1.0) -> float:

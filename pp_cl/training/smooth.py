@@ -5,7 +5,6 @@ from the optimiser, whose moments stay as they are.
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 
@@ -18,9 +17,8 @@ class Smoother:
     """
 
     def __init__(self, dev: Device, grid: Array, ids: Array):
-        n, buffers = len(ids), Buffers(dev)
-        buffers.require(self.table(n))
-        self.neighbours, self._colour = buffers.neighbours, buffers.colour
+        n = len(ids)
+        self.neighbours, self._colour = dev.empty((n, 6), np.uint32), dev.empty((n,), np.uint8)
         self._program = dev.program("training/smooth", LANES=lanes(dev))
         self._parts = row_parts(dev)
         self._program.launch(
@@ -32,11 +30,6 @@ class Smoother:
             neighbours=self.neighbours,
             colour=self._colour,
         )
-
-    @staticmethod
-    def table(n: int) -> Table:
-        """The arrays for n points."""
-        return {"neighbours": ((n, 6), np.uint32), "colour": ((n,), np.uint8)}
 
     def smooth(self, sh: Array, amount: float) -> None:
         """Move every coefficient f, in place: f += amount * (mean of the existing neighbours' f -

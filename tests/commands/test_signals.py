@@ -4,11 +4,11 @@ import signal
 from pathlib import Path
 
 import pytest
+from support.checkpoints import load_checkpoint
 from support.runs import arguments
 
 from pp_cl.cli import main
 from pp_cl.commands.progress import first_signal
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.train import Trainer
 
 ROOT = Path(__file__).parents[2]

@@ -10,12 +10,12 @@ import time
 from pathlib import Path
 
 import pytest
+from support.checkpoints import load_checkpoint
 from support.scenes import write_ball_scene
 from support.sweeps import jobs_of, pretend, words_of
 
 from pp_cl.cli import main
 from pp_cl.device.discover import open_device
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import evaluate, load_run
 from pp_cl.session import open_training, run_config

@@ -270,13 +270,13 @@ def debugged(session_device, tiny, monkeypatch):
 
 @pytest.mark.parametrize("level, labels", [("0", []), ("3", ["tiny.cl:divide"])])
 def test_debug_0_measures_nothing_and_3_is_content_with_numbers(debugged, level, labels):
-    assert list(debugged(level, [1, 2, 3]).profile()) == labels
+    assert list(debugged(level, [1, 2, 3])._seconds) == labels
 
 
 @pytest.mark.parametrize("level, label", [("1", "tiny.cl "), ("2", "tiny.cl:divide ")])
 def test_debug_1_times_files_and_2_times_kernels(debugged, capsys, level, label):
     device = debugged(level, [1, 2, 0])
-    seconds = device.profile()["tiny.cl:divide"]
+    seconds = device._seconds["tiny.cl:divide"]
     assert len(seconds) == 1
     assert 0 <= seconds[0] < 10
     device.print_profile()

@@ -89,33 +89,6 @@ def test_a_driver_that_hangs(vendors):
     assert [row["index"] for row in found.values() if row["problem"] is None]
 
 
-def test_a_platform_that_crashes_where_others_do_not(vendors, monkeypatch):
-    """As on Windows, where one loader shows all platforms."""
-    vendors("broken")
-    monkeypatch.setenv("OCL_ICD_PLATFORM_SORT", "none")
-    crash = (
-        "import os; from pp_cl.device import drivers; old = drivers.devices_of;"
-        "drivers.devices_of = lambda p: os.abort() if p.name == 'Broken' else old(p);"
-    )
-    real = drivers._start
-
-    def start(name, library, first):
-        monkeypatch.setattr(sys, "executable", str(wrapper))
-        return real(name, library, first)
-
-    wrapper = Path(os.environ["OCL_ICD_VENDORS"]).parent / "python"
-    wrapper.write_text(f'#!/bin/sh\nexec {sys.executable} -c "{crash}$2"\n')
-    wrapper.chmod(0o755)
-    monkeypatch.setattr(drivers, "_start", start)
-    monkeypatch.setattr(drivers, "find_drivers", lambda: {drivers.REST: ""})
-    rows = drivers._try({drivers.REST: ""})[drivers.REST]
-    assert [row[3] for row in rows if row[0] == "Broken"] == ["crashes (SIGABRT)"]
-    assert [row[3] for row in rows if row[0] != "Broken"] == [None]
-    assert drivers.left_out({drivers.REST: rows}) == [
-        (f"{drivers.REST} (Broken)", "crashes (SIGABRT)")
-    ]
-
-
 def test_intels_runtime_is_found_beside_pp_cl(tmp_path, monkeypatch):
     """As pip lays it out, with a driver of the tests in its place; not where drivers are chosen."""
     compiled(tmp_path / "libintelocl.so")
@@ -131,7 +104,7 @@ def test_intels_runtime_is_found_beside_pp_cl(tmp_path, monkeypatch):
     assert "unbuilding" not in listed()
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{", '{"a": 1}', '{"[1]": [[]]}'])
+@pytest.mark.parametrize("content", ["", "[]", "{", '{"a": 1}', '{"a": [[]]}'])
 def test_a_damaged_file_of_what_was_found_is_made_anew(
     session_device, tmp_path, monkeypatch, content
 ):

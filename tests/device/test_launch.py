@@ -9,17 +9,8 @@ import pytest
 from support.toy_kernels import SOURCE
 
 from pp_cl.device import device as device_module
-from pp_cl.device import launch
-from pp_cl.device.launch import (
-    SCALARS,
-    channel_ranges,
-    cut,
-    group_items,
-    group_ranges,
-    lanes,
-    parse_signatures,
-    row_parts,
-)
+from pp_cl.device.kernel import SCALARS, cut, parse_signatures
+from pp_cl.device.launch import channel_ranges, group_items, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
@@ -140,7 +131,7 @@ def test_a_range_is_cut_between_work_groups(size, local, parts, along, expected)
 def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
     program, rows, dev, monkeypatch, *, has_watchdog, multiply_adds, launched
 ):
-    monkeypatch.setattr(launch, "MOST_MULTIPLY_ADDS", 100)
+    monkeypatch.setattr(device_module, "MOST_MULTIPLY_ADDS", 100)
     monkeypatch.setattr(dev, "has_watchdog", has_watchdog)
     seen, flushed, kernel, queue = [], [], program.kernels["rows"].kernel, dev.queue
 

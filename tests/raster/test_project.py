@@ -1,32 +1,12 @@
-"""Points to camera axes: which are culled, dropout and boxes."""
+"""Points to camera axes: which are culled, and boxes."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pp_cl.device.buffers import Buffers
-from pp_cl.raster import project
 from pp_cl.raster.project import FOOTPRINTS
-from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
-from pp_cl.selftest.raster import GRID
-
-
-def seen_vertices(dev, camera, ids, **options):
-    """(N,) bool: which vertices of the grid hit a pixel."""
-    points = project.project_grid(
-        dev,
-        Buffers(dev),
-        "disc",
-        dev.upload(camera.packed(oracle.DEPTH_RANGE)),
-        dev.upload(GRID.packed()),
-        point_id=dev.upload(ids, np.uint32),
-        cloud_offset=dev.zeros((len(ids), 4)),
-        radius=0.0,
-        **options,
-    )
-    return points.point_count.get() > 0
 
 
 def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
@@ -39,19 +19,6 @@ def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
     positions = np.array([[0, 0, 2.0], [0, 0, 1.9999], [0, 0, 4.0], [0, 0, 4.0001]])
     assert kept(positions, 0.0) == [True, False, True, False]
     assert kept(positions + [0, 0, 0.5], 0.5) == [True, False, True, False]
-
-
-def test_dropout_is_a_function_of_seed_and_id(dev):
-    camera = make_camera()
-    ids = np.arange(20000)
-    ids = ids[seen_vertices(dev, camera, ids)]
-    assert len(ids) > 8000 and seen_vertices(dev, camera, ids, dropout=0.0, seed=5).all()
-    kept = seen_vertices(dev, camera, ids, dropout=0.15, seed=5)
-    assert abs(kept.mean() - 0.85) < 0.01
-    some = np.arange(len(ids))[::7][::-1]
-    assert np.array_equal(seen_vertices(dev, camera, ids[some], dropout=0.15, seed=5), kept[some])
-    other = seen_vertices(dev, camera, ids, dropout=0.15, seed=6)
-    assert abs((other | kept).mean() - (1 - 0.15**2)) < 0.005
 
 
 @pytest.mark.parametrize("kind", FOOTPRINTS)

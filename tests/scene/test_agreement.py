@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.ball_views import CENTRE, RADIUS, ball_views
+from support.checkpoints import load_checkpoint
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.facts.info import describe_scene
-from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.commands.info_facts import describe_scene
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import agreeing, build_grid

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, spoken
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.scene.edits import Edits, read_edits, write_edits
 from pp_cl.scene.load import scene_box, scene_frames
 

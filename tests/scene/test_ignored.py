@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from support.checkpoints import load_checkpoint
 from support.runs import SETTINGS, set_words, spoken
 from support.scenes import write_ball_scene
 
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.views import View
 

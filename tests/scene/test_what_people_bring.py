@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.checkpoints import load_checkpoint
 from support.runs import SETTINGS, set_words, spoken
 from support.same_scene import held_out
 from support.scenes import ball_image, ring_cameras
 
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.image import ORIENTATION
 from pp_cl.scene.convention import GL_FROM_CV
 from pp_cl.scene.views import View

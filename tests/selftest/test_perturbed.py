@@ -5,7 +5,7 @@ named.
 import pytest
 
 from pp_cl.device import device as device_module
-from pp_cl.device.launch import Program
+from pp_cl.device.device import Program
 from pp_cl.selftest.run import CASES, run_cases
 
 KERNELS = device_module.kernel_folder()

@@ -9,7 +9,7 @@ import pytest
 
 from pp_cl.config import preset
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import save_checkpoint
+from pp_cl.files.checkpoint import opened_checkpoint, save_checkpoint
 from pp_cl.scene.demo import demo_frames
 from pp_cl.scene.identity import packed_camera
 from pp_cl.training.checkpoint import load_run_state, stored_forms
@@ -59,6 +59,12 @@ def contents(config, step=STEP, n=POINTS):
     if "state.last_step" in arrays:
         arrays["state.last_step"] = rng.integers(0, step + 1, n).astype(np.uint32)
     return HEADER | {"step": step, "finished": finished}, arrays
+
+
+def load_checkpoint(path):
+    """(header, {name: numpy array}) of a checkpoint of any run."""
+    with opened_checkpoint(path) as stored:
+        return stored.header, stored.arrays()
 
 
 def write_run(folder, config, header, arrays):

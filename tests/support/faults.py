@@ -15,11 +15,11 @@ import sys
 from pathlib import Path
 from unittest.mock import patch
 
+from support.checkpoints import load_checkpoint
 from support.runs import spoken
 
 from pp_cl.cli import program
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import read_row
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import runs
+from support.checkpoints import load_checkpoint
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pp_cl.device import launch
+from pp_cl.device import device
 
 
 def check_parts(dev, monkeypatch, kernel, run):
@@ -17,7 +17,7 @@ def check_parts(dev, monkeypatch, kernel, run):
         return attempt(what, function, *args, **named)
 
     with monkeypatch.context() as patch:
-        patch.setattr(launch, "MOST_MULTIPLY_ADDS", 1)
+        patch.setattr(device, "MOST_MULTIPLY_ADDS", 1)
         patch.setattr(dev, "has_watchdog", True)
         patch.setattr(dev, "attempt", counted)
         parts = run()

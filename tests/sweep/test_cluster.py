@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+from support.checkpoints import load_checkpoint
 from support.scenes import write_ball_scene
 from support.sweeps import jobs_of
 
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.sweep import cluster
 from pp_cl.sweep.result import finished_row

@@ -1,8 +1,8 @@
 """tools/keep_network.py: what it keeps is the network of the run."""
 
 import numpy as np
+from support.checkpoints import load_checkpoint
 
-from pp_cl.files.checkpoint import load_checkpoint
 from tools import keep_network as TOOL
 
 

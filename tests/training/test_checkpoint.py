@@ -6,7 +6,6 @@ import io
 import json
 import shutil
 import tracemalloc
-import warnings
 import zipfile
 
 import numpy as np
@@ -19,6 +18,7 @@ from support.checkpoints import (
     contents,
     header_text,
     ids,
+    load_checkpoint,
     refusal,
     settings,
     write_run,
@@ -29,10 +29,10 @@ from support.viewing import asking
 from pp_cl.cli import main
 from pp_cl.config import load_config
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import save_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
-from pp_cl.training.checkpoint import load_run_state, opened_run, stored_forms
+from pp_cl.training.checkpoint import load_run_state, stored_forms
 from pp_cl.training.exposure import decided_at
 from pp_cl.view.live_run import LiveRun
 from pp_cl.view.messages import read_request
@@ -62,12 +62,6 @@ def npy(array, **options):
     file = io.BytesIO()
     np.save(file, array, **options)
     return file.getvalue()
-
-
-def with_header_text(path, text):
-    """Replace the header of a checkpoint by bytes that need not be JSON."""
-    header = npy(np.frombuffer(text, np.uint8))
-    rewritten(path, lambda members: members | {"header.npy": header})
 
 
 # ---- whole ones
@@ -112,77 +106,48 @@ def test_a_training_writes_what_is_expected(scene, tmp_path, monkeypatch, every,
 # ---- broken headers
 
 HEADERS = {
-    "depth range of one": ({"depth_range": [2.0]}, "depth_range"),
-    "far before near": ({"depth_range": [6.0, 2.0]}, "depth_range"),
-    "near behind the eye": ({"depth_range": [-1.0, 2.0]}, "depth_range"),
-    "depth of NaN": ({"depth_range": [2.0, float("nan")]}, "corrupt checkpoint"),
-    "no depth": ({"depth_range": [0.0, 1e-300]}, "depth_range"),
-    "near and far as one": ({"depth_range": [2.0, 2.0 + 1e-9]}, "depth_range"),
-    "dims as a text": ({"grid": HEADER["grid"] | {"dims": "987"}}, "grid"),
-    "no vertices": ({"grid": HEADER["grid"] | {"dims": [9, 8, 0]}}, "grid"),
-    "dims that are no whole numbers": ({"grid": HEADER["grid"] | {"dims": [9.0, 8, 7]}}, "grid"),
-    "more vertices than ids": ({"grid": HEADER["grid"] | {"dims": [2**20, 2**20, 2]}}, "grid"),
-    "negative edge": ({"grid": HEADER["grid"] | {"edge": -0.25}}, "grid"),
-    "edge of NaN": ({"grid": HEADER["grid"] | {"edge": float("nan")}}, "corrupt checkpoint"),
-    "no grid": ({"grid": [1, 2]}, "grid"),
-    "step as a text": ({"step": "50"}, "step"),
-    "step past the end": ({"step": 10**9}, "step"),
-    "step of true": ({"step": True}, "step"),
-    "finished of 1": ({"finished": 1}, "finished"),
-    "extended from nowhere": ({"extended_from": 0}, "extended_from"),
-    "extended from a step to come": ({"extended_from": STEP + 1}, "extended_from"),
-    "a view left out that it never had": ({"left_out": ["nobody"]}, "left_out"),
-    "names of nothing": ({"left_out": 3}, "left_out"),
-    "not finished at its end": ({"step": STEPS}, "not finished at step 60"),
-    "no points at the start": ({"initial_points": 0}, "initial_points"),
-    "fewer points at the start than now": ({"initial_points": 39}, "points.ids"),
-    "scene without end": ({"scene": "x" * 10**6}, "scene"),
-    "views of nothing": ({"views": []}, "views"),
-    "a view without a camera": ({"views": [["r_0.png"]]}, "views"),
-    "a camera of zeros": ({"views": [["r_0.png", "A" * 192]]}, "views"),
-    "pixels of a list": ({"pixels": ["0" * 16]}, "pixels"),
-    "pixels of another length": ({"pixels": {"r_0.png": "0" * 17}}, "pixels"),
-    "pixels of other letters": ({"pixels": {"r_0.png": "g" * 16}}, "pixels"),
-    "an unknown key": ({"col\nour\x1b[31m": 1}, "header holds col our?[31m"),
-    "another format": ({"format": 2}, "format 2"),
+    "far before near": {"depth_range": [6.0, 2.0]},
+    "depth of NaN": {"depth_range": [2.0, float("nan")]},
+    "depth of texts": {"depth_range": ["2", "6"]},
+    "no vertices": {"grid": HEADER["grid"] | {"dims": [9, 8, 0]}},
+    "dims that are no whole numbers": {"grid": HEADER["grid"] | {"dims": [9.0, 8, 7]}},
+    "more vertices than ids": {"grid": HEADER["grid"] | {"dims": [2**20, 2**20, 2]}},
+    "a grid without an edge": {"grid": {"origin": [0, 0, 0], "dims": [9, 8, 7]}},
+    "a list for a grid": {"grid": [1, 2]},
+    "step as a text": {"step": "50"},
+    "step past the end": {"step": 10**9},
+    "step of true": {"step": True},
+    "finished of 1": {"finished": 1},
+    "extended from a step to come": {"extended_from": STEP + 1},
+    "a view left out that it never had": {"left_out": ["nobody"]},
+    "all views left out": {"left_out": [name for name, _ in HEADER["views"]]},
+    "fewer points at the start than now": {"initial_points": 4},
+    "views of nothing": {"views": []},
+    "a camera of zeros": {"views": [["r_0.png", "A" * 192]]},
+    "an unknown key": {"col\nour\x1b[31m": 1},
+    "another format": {"format": 2},
 }
 
 
-@pytest.mark.parametrize("change, told", HEADERS.values(), ids=HEADERS)
-def test_a_header_that_cannot_be_is_refused(folder, config, change, told):
+@pytest.mark.parametrize("change", HEADERS.values(), ids=HEADERS)
+def test_a_header_that_no_training_writes_is_refused(folder, config, change):
     header, arrays = contents(config)
     write_run(folder, config, header | change, arrays)
-    assert told in refusal(folder, config)
+    refusal(folder, config)
 
 
-@pytest.mark.parametrize("key", HEADER)
-def test_a_header_that_lacks_a_key_is_refused(folder, config, key):
+def test_a_header_that_lacks_a_key_is_refused(folder, config):
     header, arrays = contents(config)
-    del header[key]
+    del header["grid"]
     write_run(folder, config, header, arrays)
-    assert f"its header lacks {key}" in refusal(folder, config)
+    assert "its header lacks grid" in refusal(folder, config)
 
 
-TEXTS = {
-    "a list": b"[]",
-    "a text": b'"header"',
-    "nothing": b"",
-    "no UTF-8": b"\xff\xfe{}",
-    "half": header_text()[:80],
-    "deep": b"[" * 10**5,
-    "an infinite step": header_text(step="1e999"),
-    "Infinity": header_text(step="Infinity"),
-    "5000 digits": header_text(step="9" * 5000),
-    "a deep grid": header_text(grid='{"origin": ' + "[" * 900 + "]" * 900 + "}"),
-}
-
-
-@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+@pytest.mark.parametrize("text", [b"[]", b"", b"\xff\xfe{}", header_text()[:80], b"[" * 10**5])
 def test_a_header_of_other_text_is_refused(folder, config, text):
     write_run(folder, config, *contents(config))
-    with_header_text(folder.checkpoint, header_text())
-    load_run_state(folder, config)
-    with_header_text(folder.checkpoint, text)
+    header = npy(np.frombuffer(text, np.uint8))
+    rewritten(folder.checkpoint, lambda members: members | {"header.npy": header})
     refusal(folder, config)
 
 
@@ -195,25 +160,15 @@ ARRAYS = {
     "ids outside": ("points.ids", lambda a: np.append(a[:-1], ids(9 * 8 * 7)), "vertices"),
     "ids with a sign": ("points.ids", lambda a: a.astype(np.int32), "int32 (40,)"),
     "ids in two columns": ("points.ids", lambda a: a.reshape(20, 2), "expected 1 to 50 points"),
-    "one id without a row": ("points.ids", lambda a: np.array(a[0]), "points.ids is "),
     "no points": ("points.ids", lambda a: a[:0], "expected 1 to 50 points"),
     "no ids": ("points.ids", None, "points.ids is missing"),
-    "an id less than opacities": ("points.ids", lambda a: a[:-1], "expected float32 (39,"),
-    "negative opacity": ("points.opacity", lambda a: a - 1, "opacities from 0 to 1"),
-    "another's cell": ("points.offset", lambda a: a + 1, "offsets of up to"),
     "opacity of NaN": ("points.opacity", lambda a: a * np.float32("nan"), "NaN or Inf"),
     "colours of doubles": ("points.sh1", lambda a: a.astype(float), "float64 (40, 3, 16)"),
     "no degree 2": ("points.sh2", None, "points.sh2 is missing, expected float32 (40, 5, 16)"),
-    "a layer less": ("net.up1.bias", None, "net.up1.bias is missing"),
     "a layer more": ("net.enc3.a.bias", ONE, "holds net.enc3.a.bias"),
-    "moments of halves": ("moment.v.out.bias", lambda a: a.astype(np.float16), "float16"),
     "moments of fewer": ("state.v.sh", lambda a: a[1:], "state.v.sh is float32 (39, 16)"),
-    "negative squares": ("state.v.sh", lambda a: -a, "state.v.sh holds other than"),
-    "negative squares inside": ("moment.v.dec0.a.bias", lambda a: -a, "moment.v.dec0.a.bias"),
-    "a step to come": ("state.last_step", lambda a: a + np.uint32(STEP + 1), "steps that are done"),
-    "negative weights": ("state.max_weight", lambda a: -a, "state.max_weight holds other than"),
     "an average too early": ("average.out.bias", ONE, "holds average.out.bias"),
-    "texts": ("net.out.bias", lambda a: np.array(["x"] * 16), "corrupt checkpoint"),
+    "texts": ("net.out.bias", lambda a: np.array(["x"] * 16), "net.out.bias is <U1"),
 }
 
 
@@ -274,27 +229,14 @@ def claimed(path):
     path.write_bytes(data[: place + 20] + size + data[place + 28 :])
 
 
-def twice(path):
-    with warnings.catch_warnings(), zipfile.ZipFile(path, "a") as archive:
-        warnings.simplefilter("ignore")
-        archive.writestr("points.ids.npy", npy(ids(range(40))))
-
-
-def encrypted(path):
-    data = bytearray(path.read_bytes())
-    data[data.rindex(b"PK\x01\x02") + 8] |= 1
-    path.write_bytes(data)
-
-
 def with_member(name, data):
     return lambda path: rewritten(path, lambda members: members | {name: data})
 
 
-def with_header(old, new):
+def with_shape(new):
     """Change the text of the opacities' own header, of the same length."""
-    assert len(old) == len(new)
     name = "points.opacity.npy"
-    return lambda path: rewritten(path, lambda m: m | {name: m[name].replace(old, new)})
+    return lambda path: rewritten(path, lambda m: m | {name: m[name].replace(b"(40,)", new)})
 
 
 FILES = {
@@ -304,28 +246,13 @@ FILES = {
     "an array alone": lambda path: path.write_bytes(npy(np.zeros(5))),
     "an empty zip": lambda path: rewritten(path, lambda members: {}),
     "a readme": with_member("README.txt", b"hello"),
-    "a readme that ends like an array": with_member("README.npy", b"hello"),
-    "a folder": with_member("points/", b""),
-    "a path outside": with_member("../../x.npy", npy(ONE)),
-    "a name that leaves the line": with_member("a\n\x1b[2J.npy", npy(ONE)),
     "a pickle": with_member("x.npy", npy(np.array([{}], object), allow_pickle=True)),
-    "columns first": with_member("points.sh1.npy", npy(np.asfortranarray(np.ones((40, 3, 16))))),
-    "big-endian": with_member("points.opacity.npy", npy(np.zeros(40, ">f4"))),
-    "no header": lambda path: rewritten(
-        path, lambda m: {name: data for name, data in m.items() if name != "header.npy"}
-    ),
     "a header of numbers": with_member("header.npy", npy(np.zeros(5))),
-    "fewer values than said": with_header(b"(40,)", b"(41,)"),
-    "more values than said": with_header(b"(40,)", b"(39,)"),
-    "less than none": with_header(b"(40,)", b"(-4,)"),
-    "code": with_header(b"'<f4'", b"f(4) "),
-    "python 2": with_header(b"(40,)", b"(4L,)"),
-    "brackets": with_header(b"(40,)", b"((((("),
-    "compressed": lambda path: rewritten(path, lambda members: members, zipfile.ZIP_DEFLATED),
+    "fewer values than said": with_shape(b"(41,)"),
+    "less than none": with_shape(b"(-4,)"),
+    "brackets": with_shape(b"((((("),
     "a bomb": bomb,
     "4 GiB claimed": claimed,
-    "an array twice": twice,
-    "encrypted": encrypted,
 }
 
 
@@ -370,8 +297,8 @@ BROKEN = {
     "step": lambda header, arrays: header.update(step=-5),
 }
 TOLD = {
-    "ids": "points.ids holds other than vertices of its grid in ascending order",
-    "step": "step in its header is -5, expected one of the 60 steps",
+    "ids": "points.ids are no vertices of its grid in ascending order",
+    "step": "it is of step -5, of 60 in its config.json",
 }
 
 
@@ -446,15 +373,3 @@ def test_a_model_that_overflows_is_told_by_the_viewer(trained, dev, tmp_path):
     camera = load_run(dev, trained[0]).cameras("train")[0]
     with pytest.raises(UserError, match="the image holds NaN"):
         live.draw(read_request(json.dumps(asking(camera))))
-
-
-def test_only_what_is_asked_for_is_read(folder, config):
-    """info reads no array: what is wrong with their values does not keep it from telling."""
-    header, arrays = contents(config)
-    arrays["points.opacity"][0] = 2
-    write_run(folder, config, header, arrays)
-    with opened_run(folder, config) as stored:
-        assert stored.forms["points.opacity"].shape == (40,)
-        np.testing.assert_array_equal(stored.array("points.ids"), arrays["points.ids"])
-        with pytest.raises(UserError, match="opacities from 0 to 1"):
-            stored.array("points.opacity")

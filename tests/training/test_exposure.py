@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, train_and_interrupt
 
 from pp_cl.cli import main
 from pp_cl.device.discover import open_device
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.psnr_ssim import exposed_alike
 from pp_cl.scene.demo import demo_views
 from pp_cl.scene.readers.transforms import write_scene

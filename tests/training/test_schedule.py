@@ -48,7 +48,7 @@ def test_rate_stays_after_the_end():
 
 
 def test_gamma():
-    gammas = [gamma_at(step, 50000, 0.1, 0.01) for step in (0, 25000, 50000)]
+    gammas = [gamma_at(step, 50000) for step in (0, 25000, 50000)]
     assert gammas == pytest.approx([0.1, 0.031623, 0.01], abs=5e-7)
 
 
@@ -67,7 +67,7 @@ def test_the_spread_weight_rises_from_nothing():
         ("0.33,0.67", 500, {}, [165]),  # the pruning at 250 finds points that were seen 85 times
         ("0.33,0.67", 2, {}, [1]),
         ("0.35,1", 100, {}, [35]),
-        ("0.33,0.67", 60, {"train.prune_weight": 0, "train.prune_opacity": 0}, [20, 40]),
+        ("0.33,0.67", 60, {"train.prune_weight": 0}, [20, 40]),
         ("0.5,0.5", 100, {"train.prune_weight": 0}, [50]),
         ("1,1", 8000, {}, []),
         ("0,0", 8000, {}, []),  # not known yet

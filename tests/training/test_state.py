@@ -14,13 +14,14 @@ from pp_cl.raster.points import PointCloud
 from pp_cl.scene.grid import Grid
 from pp_cl.session import open_training
 from pp_cl.settings import TrainConfig
-from pp_cl.training.state import PointState, final_points_to_keep, points_to_keep
+from pp_cl.training.prune import final_points_to_keep, points_to_keep
+from pp_cl.training.state import PointState
 
 pytestmark = pytest.mark.kernels  # of refine.cl
 
 
-def kept(dev, weights, least_weight, opacities, least_opacity, seen=None, least=1):
-    settings = TrainConfig(final_prune_weight=least_weight, prune_opacity=least_opacity)
+def kept(dev, weights, least_weight, opacities, seen=None, least=1):
+    settings = TrainConfig(final_prune_weight=least_weight)
     arrays = weights, seen or [1] * len(weights), opacities
     arrays = (dev.upload(np.asarray(a, np.float32)) for a in arrays)
     indices = final_points_to_keep(dev, *arrays, settings, least)
@@ -39,10 +40,10 @@ def filled(dev, cloud, rng):
 
 
 def test_keep_needs_weight_and_opacity(dev):
-    assert kept(dev, [1, 0, 1, 0.5, 2], 0.5, [1, 1, 0, 0.5, 0.6], 0.5) == [0, 3, 4]
-    assert kept(dev, [1, 0, 1], 0, [1, 1, 0], 0) == [0, 1, 2]
-    assert kept(dev, [np.nan, 1, 1], 0, [1, 1, np.nan], 0) == [1]
-    assert kept(dev, [1, 1, 1], 0.5, [1, 1, 1], 0, seen=[1, 2, 0], least=2) == [1]
+    assert kept(dev, [1, 0, 1, 0.5, 2], 0.5, [1, 1, 0.009, 0.01, 0.6]) == [0, 3, 4]
+    assert kept(dev, [1, 0, 1], 0, [1, 1, 0]) == [0, 1]
+    assert kept(dev, [np.nan, 1, 1], 0, [1, 1, np.nan]) == [1]
+    assert kept(dev, [1, 1, 1], 0.5, [1, 1, 1], seen=[1, 2, 0], least=2) == [1]
 
 
 @pytest.mark.parametrize(
@@ -50,7 +51,7 @@ def test_keep_needs_weight_and_opacity(dev):
     [([1, 3, 2], 1), ([0, 0, 0], 0), ([np.nan, 1, 2], 2), ([np.nan] * 3, 0)],
 )
 def test_one_point_always_survives(dev, weights, survivor):
-    assert kept(dev, weights, 5, [0, 0, 0], 0.01) == [survivor]
+    assert kept(dev, weights, 5, [0, 0, 0]) == [survivor]
 
 
 @pytest.mark.parametrize("share", [2, 10])
@@ -89,7 +90,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
 
 def test_only_what_was_seen_is_judged(dev):
     """By the highest weight in a step, and counted anew; the rest keeps its counts."""
-    settings = TrainConfig(prune_weight=0.1, prune_looks=10, prune_opacity=0.01, sh_rate=(1, 0, 0))
+    settings = TrainConfig(prune_weight=0.1, prune_looks=10, sh_rate=(1, 0, 0))
     cloud = PointCloud.create(dev, np.arange(6), 0)
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))

@@ -13,9 +13,14 @@ import numpy as np
 from tqdm import tqdm
 
 from pp_cl.errors import UserError, quoted, shown
-from pp_cl.files.checkpoint import opened_zip
 from pp_cl.files.image import ENDINGS, same_shape
-from pp_cl.files.untrusted import opened_regular, read_json_text, read_regular, refusal
+from pp_cl.files.untrusted import (
+    opened_regular,
+    opened_zip,
+    read_json_text,
+    read_regular,
+    refusal,
+)
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.found import Fail
 

@@ -1,6 +1,5 @@
 """The facts about a run or a scene that `pp-cl info` prints, as numbers for JSON."""
 
-import json
 import math
 import warnings
 from collections import Counter
@@ -13,8 +12,7 @@ import numpy as np
 from pp_cl.config import assign, configure, load_config, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.files.run_folder import MOST_METRICS, RunFolder
-from pp_cl.files.untrusted import read_json_text, refusal
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import check_scene, load_run, scene_is_there
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
@@ -35,8 +33,8 @@ from pp_cl.scene.outline import SHOWN_VIEWS, picture
 from pp_cl.scene.overview import overview
 from pp_cl.scene.sparse import sparse_points
 from pp_cl.scene.views import MASK_THRESHOLD, View, evenly
-from pp_cl.session import first_hull
 from pp_cl.training.checkpoint import opened_run
+from pp_cl.training.start import first_hull
 
 SHOWN_POINTS = 20_000  # of a hull
 HULL_COLOUR = (230, 140, 200)
@@ -55,7 +53,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     scene: where its scene is now, if it has moved. Raises UserError naming the file that is missing
     or broken.
     """
-    config, rows, measured = _config(folder, scene), folder.rows(), read_metrics(folder)
+    config, rows, measured = _config(folder, scene), folder.rows(), folder.measured()
     last = rows[-1] if rows else {}
     facts = {
         "run": str(folder),
@@ -141,39 +139,6 @@ def _files(folder):
 def _image_sizes(photographs):
     """{WxH: how many images have it}."""
     return dict(Counter(f"{p.camera.width}x{p.camera.height}" for p in photographs))
-
-
-def read_metrics(folder: RunFolder) -> Facts | None:
-    """{"mean": {metric: value}, "step", "finished", "points" that were left, "device"} of the
-    evaluation of the test split, None where there is none. Raises UserError for a broken one.
-    """
-    file = folder.metrics("test")
-    if not file.exists():
-        return None
-    try:
-        result = json.loads(read_json_text(file, MOST_METRICS))
-        found = {
-            "mean": {name: float(value) for name, value in result["mean"].items()},
-            "step": result["step"],
-            "finished": result["finished"],
-            "points": result["points"]["final"],
-            "device": result["device"],
-        }
-        kinds = {"step": int, "finished": bool, "points": int, "device": str}
-        is_right = all(type(found[key]) is kind for key, kind in kinds.items())
-        if not (is_right and all(map(math.isfinite, found["mean"].values()))):
-            raise ValueError("values of another kind")
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:
-        raise refusal(file, error, "metrics", f"run `pp-cl eval {folder}` again") from None
-    return found
 
 
 # --------------------------------------------------------------------------------------------------

@@ -1,1 +1,0 @@
-"""What a run or a scene is, in numbers."""
