@@ -31,6 +31,7 @@ SIZES = {"half": 0.5, "as trained": 1.0, "double": 2.0}
 FPS = 30  # of a path, as `pp-cl render` has it
 MOST_ROWS = 500  # of the curve
 LOGGED = ("step", "psnr", "loss")
+BLUE, ORANGE, GREY = "#7fb4ff", "#ffb86b", "#a0a4ab"
 
 
 @dataclass
@@ -118,17 +119,18 @@ class ModelPage:
             gui.add_button("Remove the last").on_click(self._remove_key)
             self._seconds = gui.add_slider("Seconds", min=1, max=60, step=1, initial_value=4)
             gui.add_button("Save path.json").on_click(self._send_path)
-        names = {"PSNR": "#7fb4ff", "loss": "#ffb86b"}
         self._curve = gui.add_uplot(
             tuple(np.zeros((len(LOGGED), 0))),
-            ({"label": "step"}, *({"label": n, "scale": n, "stroke": c} for n, c in names.items())),
-            scales={"x": {"time": False}, "PSNR": {}, "loss": {"distr": 3}},  # 3: logarithmic
+            (
+                {"label": "step"},
+                {"label": "PSNR", "scale": "dB", "stroke": BLUE},
+                {"label": "loss", "scale": "loss", "stroke": ORANGE},
+            ),
+            scales={"x": {"time": False}, "dB": {}, "loss": {"distr": 3}},  # 3: logarithmic
             axes=(
-                {"stroke": "#a0a4ab"},
-                *(
-                    {"scale": n, "stroke": c, "side": 3 - 2 * (n == "loss")}
-                    for n, c in names.items()
-                ),
+                {"stroke": GREY},
+                {"scale": "dB", "stroke": BLUE},
+                {"scale": "loss", "stroke": ORANGE, "side": 1},  # 1: on the right
             ),
             aspect=1.5,
             visible=False,

@@ -99,7 +99,7 @@ def test_the_optical_axes_meet_where_the_cameras_look(rng):
 
 
 def test_a_path_goes_smoothly_through_its_cameras():
-    keys = [camera.with_angle(0.5 + 0.1 * i) for i, camera in enumerate(ring_cameras(4, 48))]
+    keys = [camera.with_angle(0.5 + 0.1 * i) for i, camera in enumerate(ring_cameras(9, 48)[:4])]
     path = through(keys, 31)
     for key, camera in zip(keys, path[::10], strict=True):
         np.testing.assert_allclose(camera.pose, key.pose, atol=1e-9)
@@ -107,5 +107,5 @@ def test_a_path_goes_smoothly_through_its_cameras():
     for camera in path:
         np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-9)
     steps = np.linalg.norm(np.diff([camera.eye for camera in path], axis=0), axis=1)
-    assert steps.max() < 2 * steps.min()
+    assert np.abs(np.diff(steps)).max() < 0.2 * steps.max()  # no jerk
     assert len(through(keys[:2], 5)) == 5 and through(keys[:1], 5) == keys[:1]
