@@ -13,9 +13,9 @@ from pp_cl.commands import options as shared
 from pp_cl.view.server import LOOPBACK, PORT
 
 HELP = "look at a run, also while it is trained, or at a scene in the browser"
-EPILOG = """A scene: its cameras, and sparse points or visual hull. Its box can be moved and views dropped;
-both are written to pp_cl.json in its folder, which training, info and all other commands obey.
-Whoever reaches the port sees and steers the page."""
+EPILOG = """A scene: its cameras, and sparse points or visual hull. Its box can be moved and views
+dropped; both are written to pp_cl.json in its folder, which training, info and all other commands
+obey. Whoever reaches the port sees and steers the page."""
 LOOPBACKS = (LOOPBACK, "localhost", "::1")
 BROWSERS = ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")  # without these one for terminals would answer
 

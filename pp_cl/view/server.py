@@ -37,19 +37,18 @@ def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterat
             with socket.create_server((host, port), family=family) as tried:
                 port = tried.getsockname()[1]
         except OSError as error:
-            raise UserError(
-                f"--host {host} --port {port}: {error.strerror}; give another"
-            ) from None
+            reason = str(error.strerror).partition(" (")[0]
+            raise UserError(f"--host {host} --port {port}: {reason}; give another") from None
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # broken requests
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # of a tab just closed
     with redirect_stdout(io.StringIO()):
         server: Any = viser.ViserServer(host, PORT if port is None else port, label, verbose=False)
     # else a tab could have the server publish itself through a machine of viser's authors
     server.request_share_url = lambda verbose=True: None
-    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-    server.gui.main_panel.dock_right()
     name = socket.gethostname() if host in ANY else host
     try:
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
         yield server, f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
     finally:
         with redirect_stdout(io.StringIO()):
