@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from pp_cl.scene.camera import Camera
 
 FARTHEST = 1e6  # of an eye from the origin of the page, in its units
-FRUSTUM = 0.2  # its length, in the page's units
+FRUSTUM = 0.3  # its length, in the page's units
 VIEW, CHOSEN = (61, 127, 216), (255, 138, 31)  # colours of frustums
 THUMBNAIL = 256  # pixels of the longer side
 

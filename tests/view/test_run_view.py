@@ -227,6 +227,7 @@ def test_a_run_whose_photographs_are_gone_is_still_shown(served, dev, copied):
     with looking(view, served[1]) as opened:
         drawn(view)
         assert (opened.picture() < 200).any()
+        assert len([node for node in opened.nodes.values() if "fov" in node["props"]]) == 8
         opened.set("Show", "error")
         wait(lambda: view.page._show.value == "error")
         drawn(view)
