@@ -1,13 +1,11 @@
 """A run folder by itself: what works without the scene, and on another machine."""
 
-import asyncio
 import json
 import shutil
 
 import pytest
 from support.runs import arguments, spoken
 from support.scenes import write_ball_scene
-from support.viewing import asking, served
 
 from pp_cl.cli import main
 from pp_cl.files.image import read_rgba
@@ -71,22 +69,6 @@ def test_a_run_alone_is_compressed_by_what_it_rendered(alone, tmp_path):
     losses = [trial["loss"] for trial in report["trials"] if trial["taken"]]
     assert losses[-1] == report["loss"] <= 1 and max(losses) > 0.05
     assert spoken(["info", out])[0] == 0
-
-
-def test_a_run_alone_is_viewed_with_its_cameras(dev, alone):
-    async def scenario():
-        async with served(dev, alone) as here, here.tab() as socket:
-            client = await here.ready(socket)
-            around = client.last["surroundings"]
-            assert [view["name"] for view in around["views"]] == [
-                f"train/r_{i}.png" for i in range(8)
-            ]
-            _, image = await client.ask(around["views"][3]["camera"])
-            assert (image < 200).any()
-            await socket.send_str(json.dumps(asking(around["camera"], show="photograph")))
-            assert "ball" in (await client.receive("refused"))["line"]
-
-    asyncio.run(scenario())
 
 
 @pytest.mark.parametrize("words", [["eval"], ["render", "--path", "test"]])

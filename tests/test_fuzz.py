@@ -57,7 +57,6 @@ from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job, plan, read_varied
 from pp_cl.sweep.result import finished_row
 from pp_cl.training.checkpoint import load_run_state
-from pp_cl.view.messages import read_request
 
 MOST_MEMORY = 2**26  # bytes of pixels that a small file may unfold to without a word
 KEYS = [f"{section}.{name}" for section, values in sections(Config()) for name in vars(values)]
@@ -423,24 +422,6 @@ def test_a_sweep(world, varied, scenes):
         for one_job in jobs:
             assert os.path.realpath(one_job.folder).startswith(os.path.realpath(out) + "/")
         assert len({one_job.folder for one_job in jobs}) == len(jobs)
-
-
-@fuzzed(2)
-@given(data=st.data())
-def test_a_message_of_the_viewer(world, data):
-    message = {
-        "kind": "frame", "number": 3, "show": "colour", "draft": False,
-        "camera": frame_keys(ball_views()["train"][0].stored_camera),
-        "tau": 0.0, "early_stop": 0.0, "kept": 1, "exposure": 0,
-    }  # fmt: skip
-    with world.watched():
-        text = damage.damaged_json(data.draw, message)
-        if rarely(data.draw, 3):
-            text = damage.damaged_text(data.draw, text)
-        request = taken(lambda: read_request(text.decode("utf-8", "replace")))
-        if request is not None:
-            check_camera(request.camera)
-            check_finite(numbers=(request.early_stop, request.kept, request.exposure))
 
 
 @fuzzed(2)

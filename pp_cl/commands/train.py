@@ -3,9 +3,10 @@
 import argparse
 import math
 import signal
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 
 from pp_cl.commands import options as shared
+from pp_cl.commands.view import open_browser
 from pp_cl.config import help_lines, load_config
 from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS, SHORT
@@ -58,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also write the curves to RUN/tensorboard (needs tensorboardX)",
     )
-    add("--view", action="store_true", help="watch in the browser, as with `pp-cl view RUN`")
+    add("--view", action="store_true", help="watch in the browser, live between steps")
     shared.add_set(parser, "any other setting, listed by --help")
     shared.add_device(parser)
 
@@ -70,8 +71,10 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.files.scalars import writer_class
     from pp_cl.session import is_finished, open_training, run_config, stored_state
     from pp_cl.training.memory import memory_line
-    from pp_cl.view.serve import serve_in_background
+    from pp_cl.view.server import check_installed
 
+    if options.view:
+        check_installed()
     if options.tensorboard:
         writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)
@@ -98,8 +101,7 @@ def run(options: argparse.Namespace) -> None:
     if training.hull and (told := _left_out_line(config.train)):
         print(told)
     print(memory_line(training.room), flush=True)
-    with serve_in_background(folder.path, options.device) if options.view else nullcontext():
-        seconds = _run(training, options)
+    seconds = _run(training, options)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
         f" {training.trainer.model.cloud.count} points"
@@ -194,6 +196,13 @@ def _run(training, options):
         if options.tensorboard:
             scalars = Scalars(folder.path / "tensorboard", trainer.step)
             followers.append(stack.enter_context(scalars))
+        if options.view:
+            from pp_cl.view.run_view import shown_training
+
+            address, show = stack.enter_context(shown_training(training))
+            print(f"watch at {address}", flush=True)
+            open_browser(address)
+            followers.append(show)
         caught = stack.enter_context(first_signal())
 
         def on_step(step, row):

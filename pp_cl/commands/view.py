@@ -1,24 +1,23 @@
 """`pp-cl view`: shows a run or a scene in the browser."""
 
 import argparse
-import html
 import os
+import signal
 import sys
-import tempfile
 import threading
 import webbrowser
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import suppress
 from pathlib import Path
 
 from pp_cl.commands import options as shared
+from pp_cl.view.server import LOOPBACK, PORT
 
 HELP = "look at a run, also while it is trained, or at a scene in the browser"
-EPILOG = """A scene: its cameras and sparse points. Its box can be moved and views dropped; both are
-written to pp_cl.json in its folder, which training, info and all other commands obey."""
-LOOPBACK = "127.0.0.1"
+EPILOG = """A scene: its cameras, and sparse points or visual hull. Its box can be moved and views
+dropped; both are written to pp_cl.json in its folder, which training, info and all other commands
+obey. Whoever reaches the port sees and steers the page."""
 LOOPBACKS = (LOOPBACK, "localhost", "::1")
-PORT = 8733
+BROWSERS = ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")  # without these one for terminals would answer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,63 +38,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"address to listen on (default {LOOPBACK}: this machine only)",
     )
     add("--open", action="store_true", help="open the page in the default browser")
-    add("--wait", action="store_true", help="wait for RUN to begin; end when a piped input ends")
     shared.add_run_scene(parser)
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
-    from pp_cl.view.serve import serve
+    from pp_cl.config import load_config
+    from pp_cl.device.discover import open_device
+    from pp_cl.errors import UserError
+    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.run import check_scene
+    from pp_cl.scene.load import scene_splits
+    from pp_cl.view.run_view import RunView
+    from pp_cl.view.scene_page import ScenePage
+    from pp_cl.view.server import check_installed, started
 
+    check_installed()
+    folder, scene = Path(options.run_folder), options.scene
+    is_scene = folder.is_dir() and not RunFolder(folder).config.exists()
+    if is_scene and scene is not None:
+        raise UserError("--scene: only of a run; leave it out")
+    if is_scene:
+        scene_splits(folder)
+    else:
+        load_config(RunFolder(folder).config)
+    if scene is not None:
+        check_scene(scene)
     if options.host not in LOOPBACKS:
         print(
-            f"pp-cl: --host {options.host}: whoever can reach this address and learns the token can"
-            " look on; nothing is encrypted",
+            f"pp-cl: --host {options.host}: whoever can reach this address sees the viewer and"
+            " steers it; nothing is encrypted",
             file=sys.stderr,
         )
-
-    def announce(address):
+    # a job in the background ignores Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    with (
+        suppress(KeyboardInterrupt),
+        started(folder.resolve().name, options.host, options.port) as (server, address),
+    ):
+        view: ScenePage | RunView
+        if is_scene:
+            view = ScenePage(server, folder, options.device)
+        else:
+            view = RunView(server, open_device(options.device), RunFolder(folder), scene)
         print(f"{options.run_folder}: {address}  (Ctrl-C ends)", flush=True)
-        if options.open and _has_windows():
-            file = stack.enter_context(_redirect(address))
-            # some browsers answer only when they are closed, and must not keep the server waiting
-            threading.Thread(target=webbrowser.open, args=(file.as_uri(),), daemon=True).start()
-
-    with ExitStack() as stack:
-        serve(
-            options.run_folder,
-            host=options.host,
-            port=options.port,
-            announce=announce,
-            device=options.device,
-            scene=options.scene,
-            wait=options.wait,
-        )
+        if options.open:
+            open_browser(address)
+        view.serve()
 
 
-def _has_windows():
-    """Whether a browser would answer that is not one for terminals."""
-    windows = sys.platform in ("win32", "darwin")
-    return windows or any(os.environ.get(n) for n in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
-
-
-@contextmanager
-def _redirect(address) -> Iterator[Path]:
-    """A page that leads to the address, for this user alone to read: everybody sees the arguments
-    of a browser, and the address holds the token. It is there until the block ends. It lies in the
-    user's home, where there is one: browsers in a sandbox (snap) see neither /tmp nor hidden files.
-    """
-    home = os.path.expanduser("~")  # which stays what it is without one
-    there = home if os.access(home, os.W_OK) else None
-    number, name = tempfile.mkstemp(".html", "pp-cl-view-", there)  # of mode 0600
-    address = html.escape(address)
-    with open(number, "w", encoding="utf-8") as file:
-        file.write(
-            f'<!DOCTYPE html><meta http-equiv="refresh" content="0;url={address}">'
-            f'<a href="{address}">{address}</a>\n'
-        )
-    try:
-        yield Path(name)
-    finally:
-        Path(name).unlink(missing_ok=True)
+def open_browser(address: str) -> None:
+    """Open an address in the browser, where there is one with windows."""
+    if sys.platform in ("win32", "darwin") or any(name in os.environ for name in BROWSERS):
+        # some browsers answer only when they are closed, and must not keep the server waiting
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()

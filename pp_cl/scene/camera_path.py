@@ -1,10 +1,14 @@
-"""Camera paths around an object (orbit, spiral, ...), made from the cameras of its photographs."""
+"""Camera paths: around an object (orbit, spiral), made from the cameras of its photographs, and
+through given cameras.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from pp_cl.scene.camera import Camera, look_at
 
@@ -88,6 +92,24 @@ class Surroundings:
         across = np.abs(x) * 2 * camera.fx / (MARGIN * camera.width) - z
         down = np.abs(y) * 2 * camera.fy / (MARGIN * camera.height) - z
         return float(max(across.max(), down.max()))
+
+
+def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A smooth path through cameras, as long from each to the next, with the size of the first; of
+    one camera that camera alone.
+    """
+    if len(cameras) == 1:
+        return list(cameras)
+    first, times = cameras[0], np.linspace(0, len(cameras) - 1, frames)
+    at = np.arange(len(cameras))
+    eyes = CubicSpline(at, [camera.eye for camera in cameras])(times)
+    axes = np.stack([camera.pose[:, :3] for camera in cameras])
+    turns = RotationSpline(at, Rotation.from_matrix(axes))(times).as_matrix()
+    widths = np.interp(times, at, [camera.fx / camera.width for camera in cameras])
+    return [
+        replace(first.with_angle(2 * math.atan(0.5 / width)), pose=np.column_stack([turn, eye]))
+        for turn, eye, width in zip(turns, eyes, widths, strict=True)
+    ]
 
 
 def level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from support.ball_views import CENTRE, ball_camera
 from support.scenes import ring_cameras
 
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.camera_path import MARGIN, Surroundings, looked_at, up_of
+from pp_cl.scene.camera_path import MARGIN, Surroundings, looked_at, through, up_of
 
 
 def turned(cameras, rotation, shift):
@@ -96,3 +96,16 @@ def test_the_optical_axes_meet_where_the_cameras_look(rng):
     cameras = [ball_camera(CENTRE + 4 * d, CENTRE) for d in rng.normal(size=(7, 3))]
     np.testing.assert_allclose(looked_at(cameras), CENTRE, atol=1e-9)
     assert np.isfinite(looked_at(cameras[:1])).all()
+
+
+def test_a_path_goes_smoothly_through_its_cameras():
+    keys = [camera.with_angle(0.5 + 0.1 * i) for i, camera in enumerate(ring_cameras(9, 48)[:4])]
+    path = through(keys, 31)
+    for key, camera in zip(keys, path[::10], strict=True):
+        np.testing.assert_allclose(camera.pose, key.pose, atol=1e-9)
+        np.testing.assert_allclose(camera.fx, key.fx)
+    for camera in path:
+        np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-9)
+    steps = np.linalg.norm(np.diff([camera.eye for camera in path], axis=0), axis=1)
+    assert np.abs(np.diff(steps)).max() < 0.2 * steps.max()  # no jerk
+    assert len(through(keys[:2], 5)) == 5 and through(keys[:1], 5) == keys[:1]

@@ -1,15 +1,21 @@
 """A headless Chromium, driven over the DevTools protocol."""
 
 import asyncio
+import base64
 import contextlib
+import io
+import json
 import os
 import re
 import shutil
 import signal
 import tempfile
+import urllib.request
 
-import aiohttp
+import numpy as np
 import pytest
+import websockets
+from PIL import Image
 
 SECONDS = 60
 OPTIONS = (
@@ -53,7 +59,8 @@ class Page:
         """The result of a method of the protocol."""
         number = len(self._answers) + 1
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
-        await self._socket.send_json({"id": number, "method": method, "params": parameters})
+        message = {"id": number, "method": method, "params": parameters}
+        await self._socket.send(json.dumps(message))
         return await asyncio.wait_for(answer, SECONDS)
 
     async def evaluate(self, expression):
@@ -109,9 +116,14 @@ class Page:
         await self.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=key)
         await self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
 
+    async def screenshot(self):
+        """(H, W, 3) uint8 of the window."""
+        found = await self.call("Page.captureScreenshot")
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(found["data"]))).convert("RGB"))
+
     async def _read(self):
         async for message in self._socket:
-            event = message.json()
+            event = json.loads(message)
             if "id" in event:
                 self._answers[event["id"]].set_result(event.get("result", event))
             else:
@@ -133,19 +145,26 @@ class Page:
 class Browser:
     """A running browser."""
 
-    def __init__(self, place, session):
-        self._place, self._session = place, session
+    def __init__(self, place):
+        self._place = place
 
     @contextlib.asynccontextmanager
     async def page(self):
         """A new Page, closed at the end."""
-        async with self._session.put(f"http://{self._place}/json/new?about:blank") as response:
-            target = await response.json()
+        target = json.loads(await self._ask("new?about:blank", "PUT"))
         address = target["webSocketDebuggerUrl"]
-        async with self._session.ws_connect(address, max_msg_size=0) as socket:
+        async with websockets.connect(address, max_size=None) as socket:
             yield Page(socket)
-        async with self._session.get(f"http://{self._place}/json/close/{target['id']}"):
-            pass
+        await self._ask(f"close/{target['id']}", "GET")
+
+    async def _ask(self, path, method):
+        request = urllib.request.Request(f"http://{self._place}/json/{path}", method=method)
+
+        def answer():
+            with urllib.request.urlopen(request, timeout=SECONDS) as response:  # noqa: S310
+                return response.read()
+
+        return await asyncio.to_thread(answer)
 
 
 @contextlib.asynccontextmanager
@@ -165,8 +184,7 @@ async def chromium(*options):
         try:
             place = await asyncio.wait_for(_place(process.stderr), SECONDS)
             reader = asyncio.create_task(process.stderr.read())  # so that its pipe stays empty
-            async with aiohttp.ClientSession() as session:
-                yield Browser(place, session)
+            yield Browser(place)
         finally:
             with contextlib.suppress(ProcessLookupError):
                 if hasattr(os, "killpg"):

@@ -1,105 +1,127 @@
-"""The server of `pp-cl view` in this process, and a tab without a browser."""
+"""A tab of the viewer without a browser: viser's messages over a websocket."""
 
-import asyncio
 import contextlib
 import io
-import json
-import socket
+import threading
+import time
 
-import aiohttp
+import msgspec
 import numpy as np
-from aiohttp import WSMsgType, web
+import viser
+import zstandard
 from PIL import Image
-
-from pp_cl.scene.readers.frame import frame_keys
-from pp_cl.view.access import Access
-from pp_cl.view.live_run import LiveRun
-from pp_cl.view.server import ViewServer
+from scipy.spatial.transform import Rotation
+from support.scenes import ring_cameras
+from websockets.sync.client import connect
 
 SECONDS = 60  # that an answer may take on a machine that does other things, too
 
 
-def asking(camera, **changes):
-    """A request for a camera's picture, as the page writes it."""
-    facts = camera if isinstance(camera, dict) else frame_keys(camera)
-    request = {"number": 1, "kind": "frame", "show": "colour", "draft": False, "camera": facts}
-    return request | {"early_stop": 0.01, "kept": 1, "exposure": 0} | changes
-
-
-def decoded(data):
-    """(H, W, 3) int array of an image file."""
-    return np.array(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
-
-
-class Client:
-    """A tab: its websocket, and the last message of each type that it got."""
+class Tab:
+    """handles: {label of a switch or button: its message}, nodes: {name: its message}, as the
+    server has sent them.
+    """
 
     def __init__(self, socket):
-        self.socket = socket
-        self.last = {}
+        self.handles, self.nodes = {}, {}
+        self._socket, self._unread = socket, []
 
-    async def receive(self, kind):
-        """The next message of a type; (facts, file) of a frame or snapshot."""
+    def send(self, kind, **fields):
+        """Send a message."""
+        self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def look(self, camera, space=None):
+        """Move the tab's camera to the place of another, with its pixels. space: of the page."""
+        position = space.page(camera.eye) if space else camera.eye
+        self.send(
+            "ViewerCameraMessage",
+            wxyz=np.roll(Rotation.from_matrix(camera.pose[:, :3]).as_quat(), 1).tolist(),
+            position=position.tolist(),
+            fov=float(2 * np.arctan(camera.height / 2 / camera.fy)),
+            near=0.01,
+            far=1000.0,
+            image_height=camera.height,
+            image_width=camera.width,
+            look_at=[0.0, 0.0, 0.0],
+            up_direction=[0.0, 0.0, 1.0],
+        )
+
+    def set(self, label, value):
+        """Set a switch; True presses a button."""
+        self.send("GuiUpdateMessage", uuid=self.handles[label]["uuid"], updates={"value": value})
+
+    def receive(self, kind, accept=lambda _message: True):
+        """The next message of a type that is accepted."""
+        deadline = time.monotonic() + SECONDS
         while True:
-            message = await asyncio.wait_for(self.socket.receive(), SECONDS)
-            if message.type is WSMsgType.BINARY:
-                length = int.from_bytes(message.data[:4], "little")
-                found = json.loads(message.data[4 : 4 + length]), message.data[4 + length :]
-                self.last[found[0]["type"]] = found
-            elif message.type is WSMsgType.TEXT:
-                found = json.loads(message.data)
-                self.last[found["type"]] = found
-            else:
-                raise ConnectionError(f"{message.type} {message.data}")
-            if (found[0] if isinstance(found, tuple) else found)["type"] in kind.split():
-                return found
+            while self._unread:
+                message = self._unread.pop(0)
+                if message["type"] == kind and accept(message):
+                    return message
+            self._read(deadline - time.monotonic())
 
-    async def ask(self, camera, **changes):
-        """(facts, image) of a request."""
-        await self.socket.send_str(json.dumps(asking(camera, **changes)))
-        facts, data = await self.receive(changes.get("kind", "frame"))
-        return facts, decoded(data)
+    def picture(self, accept=lambda _image: True):
+        """The next picture behind the frustums that is accepted, (H, W, 3) int."""
+        found = []
 
+        def take(message):
+            image = Image.open(io.BytesIO(message["rgb_data"])).convert("RGB")
+            found.append(np.array(image).astype(int))
+            return accept(found[-1])
 
-class Served:
-    """A ViewServer that listens."""
+        self.receive("BackgroundImageMessage", take)
+        return found[-1]
 
-    def __init__(self, server, access, session):
-        self.server = server
-        self.access = access
-        self.session = session
+    def file(self):
+        """(name, content) of the next file that is sent."""
+        name = self.receive("FileTransferStartDownload")["filename"]
+        return name, self.receive("FileTransferPart")["content"]
 
-    @property
-    def origin(self):
-        return f"http://127.0.0.1:{self.access.port}"
-
-    def tab(self, **headers):
-        """Context manager of the websocket of a tab."""
-        headers = {"Origin": self.origin} | headers
-        return self.session.ws_connect(f"{self.access.address}socket", headers=headers)
-
-    async def ready(self, socket):
-        """The Client of a websocket, when the model is loaded."""
-        client = Client(socket)
-        await client.receive("surroundings")
-        return client
+    def _read(self, seconds):
+        data = self._socket.recv(timeout=max(seconds, 0.01))
+        length = int.from_bytes(data[8:16], "little")
+        inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + length])
+        for message in msgspec.msgpack.decode(inner)["messages"]:
+            if "label" in (props := message.get("props") or {}) and "uuid" in message:
+                self.handles[props["label"]] = message
+            elif "name" in message and props:
+                self.nodes[message["name"]] = message
+            self._unread.append(message)
 
 
-@contextlib.asynccontextmanager
-async def served(dev, folder, stand_in=lambda live: live):
-    """Served for the run in a folder. stand_in: what is drawn with, of the LiveRun."""
-    with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as listening:
-        access = Access("127.0.0.1", listening.getsockname()[1])
-        server = ViewServer(stand_in(LiveRun(dev, folder)), access)
-        runner = server.runner()
-        await runner.setup()
-        drawing = asyncio.create_task(server.draw())
-        try:
-            await web.SockSite(runner, listening).start()
-            async with aiohttp.ClientSession() as session:
-                yield Served(server, access, session)
-        finally:
-            await runner.cleanup()
-            drawing.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await drawing
+@contextlib.contextmanager
+def tab(address):
+    """A Tab of the server at an address that has got all that the page has."""
+    place, version = address.replace("http", "ws"), f"viser-v{viser.__version__}"
+    with connect(place, subprotocols=[version], max_size=None, compression=None) as socket:
+        opened = Tab(socket)
+        opened.receive("ReplayDoneMessage")
+        opened.look(ring_cameras(1, 32)[0])  # before it viser takes no notice of the tab
+        yield opened
+
+
+def wait(condition):
+    """Wait until condition() holds."""
+    deadline = time.monotonic() + SECONDS
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def drawing(page):
+    """Draw what tabs of a ModelPage want, in another thread, until the block ends."""
+    done = threading.Event()
+
+    def draw():
+        while not done.is_set():
+            if not page.draw_next():
+                page.woken.wait(0.02)
+
+    thread = threading.Thread(target=draw)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()

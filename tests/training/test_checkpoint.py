@@ -3,7 +3,6 @@ line that names the file, whoever reads it, before memory is taken for it.
 """
 
 import io
-import json
 import shutil
 import tracemalloc
 import zipfile
@@ -24,7 +23,6 @@ from support.checkpoints import (
     write_run,
 )
 from support.runs import arguments, train_and_interrupt
-from support.viewing import asking
 
 from pp_cl.cli import main
 from pp_cl.config import load_config
@@ -34,8 +32,7 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
 from pp_cl.training.checkpoint import load_run_state, stored_forms
 from pp_cl.training.exposure import decided_at
-from pp_cl.view.live_run import LiveRun
-from pp_cl.view.messages import read_request
+from pp_cl.view.drawing import draw
 
 
 @pytest.fixture
@@ -328,8 +325,6 @@ def test_every_reader_says_the_same(scene, trained, dev, tmp_path, capsys, kind)
         expected = f"pp-cl: {folder / 'checkpoint.npz'}: {TOLD[kind]}"
         assert error[-1].startswith(expected), words
         assert len([line for line in error if line.startswith("pp-cl: ")]) == 1
-    live = LiveRun(dev, finished)
-    assert live.refresh() and TOLD[kind] in live.waiting
 
 
 def overflow(path):
@@ -365,11 +360,8 @@ def test_finite_weights_that_overflow_are_one_line(trained, tmp_path, monkeypatc
 
 
 def test_a_model_that_overflows_is_told_by_the_viewer(trained, dev, tmp_path):
-    """In place of the picture, and the render thread lives on."""
     shutil.copytree(trained[0], tmp_path / "run")
     overflow(tmp_path / "run" / "checkpoint.npz")
-    live = LiveRun(dev, tmp_path / "run")
-    assert live.refresh()
-    camera = load_run(dev, trained[0]).cameras("train")[0]
+    run = load_run(dev, tmp_path / "run")
     with pytest.raises(UserError, match="the image holds NaN"):
-        live.draw(read_request(json.dumps(asking(camera))))
+        draw(run, [], run.cameras("train")[0])

@@ -1,6 +1,8 @@
-"""One small run for the tests of the viewer."""
+"""One small run for the tests of the viewer, and a server."""
 
 import pytest
+
+from pp_cl.view.server import started
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +17,10 @@ def copied(trained, tmp_path):
     for name in ("config.json", "checkpoint.npz", "log.jsonl"):
         (tmp_path / name).write_bytes((trained / name).read_bytes())
     return tmp_path
+
+
+@pytest.fixture
+def served():
+    """(viser's server with an empty page, its address)."""
+    with started("test", port=0) as found:
+        yield found

@@ -1,20 +1,16 @@
-"""The page of a scene: who may change it, and what it writes, also from a real browser."""
+"""The page of a scene: what it shows, and what its users write."""
 
-import asyncio
-import contextlib
 import json
 import shutil
-import socket
+from pathlib import Path
 
-import aiohttp
 import numpy as np
 import pytest
-from aiohttp import web
-from support.chromium import chromium, find_chromium
+from support.runs import spoken
+from support.viewing import tab, wait
 
 from pp_cl.scene.load import scene_frames
-from pp_cl.view.access import Access
-from pp_cl.view.scene_server import SceneServer, ShownScene
+from pp_cl.view.scene_page import DROPPED, ScenePage, hull_points
 
 
 @pytest.fixture
@@ -30,100 +26,121 @@ def folder(scene, tmp_path):
     return tmp_path / "ball"
 
 
-@contextlib.asynccontextmanager
-async def served(folder):
-    """(Access, session) of a scene that is served."""
-    with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as listening:
-        access = Access("127.0.0.1", listening.getsockname()[1])
-        runner = SceneServer(ShownScene(folder), access).runner()
-        await runner.setup()
-        try:
-            await web.SockSite(runner, listening).start()
-            async with aiohttp.ClientSession() as session:
-                yield access, session
-        finally:
-            await runner.cleanup()
+@pytest.fixture
+def page(served, folder):
+    return ScenePage(served[0], folder)
 
 
-def test_who_has_the_token_reads_and_writes(folder):
-    async def scenario():
-        async with served(folder) as (access, session):
-            origin = f"http://127.0.0.1:{access.port}"
-            async with session.get(f"{access.address}scene.json") as answer:
-                facts = await answer.json()
-            assert len(facts["views"]) == 10 and not facts["is_given"]
-            np.testing.assert_allclose(facts["box"], [[-0.48] * 3, [0.48] * 3], atol=0.01)
-            async with session.get(f"{access.address}photograph/3") as answer:
-                assert (await answer.read())[:2] == b"\xff\xd8"  # JPEG
-            async with session.get(f"{access.address}photograph/99") as answer:
-                assert answer.status == 404
-            async with session.get(f"{origin}/wrong/scene.json") as answer:
-                assert answer.status == 403
-            edits = {"box": [[-1, -1, -1], [1, 1, 2]], "dropped": ["train/r_2.png"]}
-            async with session.post(f"{origin}/wrong/edits", json=edits) as answer:
-                assert answer.status == 403
-            assert not (folder / "pp_cl.json").exists()
-            headers = {"Host": "hub.example", "Origin": "https://hub.example"}  # behind a proxy
-            names = [view["name"] for view in facts["views"] if view["split"] == "train"]
-            wrong = {"box": [[1, 1, 1], [0, 2, 2]]}, {"box": 3}, {"dropped": names}, [], {"x": 1}
-            for bad in wrong:
-                post = session.post(f"{access.address}edits", json=bad, headers=headers)
-                async with post as answer:
-                    assert answer.status == 400 and "\n" not in await answer.text()
-            async with session.post(f"{access.address}edits", json=edits, headers=headers) as post:
-                assert post.status == 204
-            assert json.loads((folder / "pp_cl.json").read_text()) == edits
-            (folder / "pp_cl.json").write_text('{"dropped": ["train/r_4.png"]}')  # in an editor
-            async with session.post(f"{access.address}edits", json={}, headers=headers) as post:
-                assert post.status == 400 and "reload the page" in await post.text()
-            assert "r_4" in (folder / "pp_cl.json").read_text()
-            async with session.get(f"{access.address}scene.json") as answer:
-                assert answer.status == 200
-            async with session.post(f"{access.address}edits", json={}, headers=headers) as post:
-                assert post.status == 204 and not (folder / "pp_cl.json").exists()
-
-    asyncio.run(scenario())
+@pytest.fixture
+def opened(page, served):
+    """A Tab of the page."""
+    with tab(served[1]) as found:
+        yield found
 
 
-def test_a_side_is_pulled_and_a_view_dropped_in_the_browser(folder):
-    find_chromium()
+def edits(folder):
+    file = folder / "pp_cl.json"
+    return json.loads(file.read_text()) if file.exists() else {}
 
-    async def scenario():
-        async with served(folder) as (access, _), chromium() as browser, browser.page() as page:
-            await page.open(access.address)
-            await page.until("document.body.dataset.drawn > 0")
-            ink = await page.evaluate(
-                "(() => { const c = document.getElementById('picture'); const d ="
-                " c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
-                " return d.reduce((n, v, i) => n + (i % 4 == 3 && v > 0), 0); })()"
-            )
-            assert ink > 1000
-            place = await place_of_a_dot(page)
-            await page.drag(place, [(4, 3)] * 10)
-            await page.until("document.body.dataset.saved == 1")
-            pulled = json.loads((folder / "pp_cl.json").read_text())["box"]
-            assert (np.abs(np.subtract(pulled, [[-0.48] * 3, [0.48] * 3])) > 0.02).sum() == 1
-            await page.evaluate(
-                "(() => { const s = document.getElementById('views'); s.selectedIndex = 4;"
-                " s.dispatchEvent(new Event('change')); })()"
-            )
-            await page.key("d")
-            await page.until("document.body.dataset.saved == 2")
-            assert json.loads((folder / "pp_cl.json").read_text())["dropped"] == ["train/r_4.png"]
-            assert [one.name for one in scene_frames(folder)].count("train/r_4.png") == 0
-            await page.until("document.getElementById('photograph').naturalWidth == 48")
-            assert not page.said
 
-    async def place_of_a_dot(page):
-        """Where the pointer is over something, but not over a camera."""
-        for x in range(200, 500, 10):
-            for y in range(200, 500, 10):
-                await page.mouse("mouseMoved", x, y)
-                if await page.evaluate(
-                    "document.getElementById('stage').classList.contains('over')"
-                    " && !document.getElementById('caption').textContent"
-                ):
-                    return x, y
-        raise AssertionError("no dot in the picture")
+def told(opened, words):
+    """Wait until the page says something."""
+    opened.receive("GuiUpdateMessage", lambda m: words in str(m["updates"].get("_markdown")))
 
-    asyncio.run(scenario())
+
+def test_cameras_points_and_a_suggested_box_are_shown(page, opened, folder):
+    names = [view.name for split in ("train", "test") for view in scene_frames(folder, split)]
+    frustums = [name for name, node in opened.nodes.items() if "fov" in node["props"]]
+    assert frustums == [f"/views/{name}" for name in names] and len(names) == 10
+    assert "10 of 10 views, box suggested" in page._status.content
+    assert {"/points", "/box", "/corner 0", "/corner 1"} <= opened.nodes.keys()
+    np.testing.assert_allclose(
+        [corner.value for corner in page._corners], [[-0.48] * 3, [0.48] * 3], atol=0.01
+    )
+    page.fill()
+    assert opened.receive("SceneNodeUpdateMessage", lambda m: m["updates"].get("_image_data"))
+
+
+def test_a_box_is_set_dragged_and_removed(page, opened, folder):
+    opened.set("From", [-1, -1, -1])
+    opened.set("To", [1, 1, 2])
+    opened.set("Set", True)
+    told(opened, "box given\n\nwritten to pp_cl.json")
+    assert edits(folder) == {"box": [[-1, -1, -1], [1, 1, 2]]}
+    place = page._space.page((-1, -1, -3)).tolist()
+    names = {"name": "/corner 0", "owner": opened.nodes["/corner 0"].get("owner", "")}
+    opened.send("TransformControlsDragStartMessage", **names)
+    opened.send("TransformControlsUpdateMessage", wxyz=[1, 0, 0, 0], position=place, **names)
+    opened.send("TransformControlsDragEndMessage", **names)
+    wait(lambda: np.allclose(edits(folder)["box"], [[-1, -1, -3], [1, 1, 2]]))
+    opened.set("Remove", True)
+    told(opened, "box suggested\n\nwritten")
+    assert edits(folder) == {}
+
+
+def test_what_is_no_box_is_refused_and_the_page_shows_what_is(page, opened, folder):
+    opened.set("From", [9, -1, -1])
+    opened.set("Set", True)
+    told(opened, "must be two corners")
+    assert edits(folder) == {} and page._corners[0].value[0] < 0
+
+
+def test_views_are_dropped_and_taken_back(page, opened, folder):
+    opened.set("Name", "train/r_4.png")
+    wait(lambda: page._view.value == "train/r_4.png")
+    opened.set("Drop", True)
+    told(opened, "9 of 10 views, box suggested\n\nwritten")
+    assert edits(folder) == {"dropped": ["train/r_4.png"]} and page._drop.label == "Take back"
+    assert tuple(page._frustums["train/r_4.png"].color) == DROPPED
+    assert "train/r_4.png" not in [view.name for view in scene_frames(folder)]
+    # what an editor has written meanwhile stays
+    (folder / "pp_cl.json").write_text('{"dropped": ["train/r_1.png", "train/r_4.png"]}')
+    opened.set("Drop", True)
+    wait(lambda: edits(folder) == {"dropped": ["train/r_1.png"]})
+    opened.set("Keep all", True)
+    told(opened, "10 of 10 views, box suggested\n\nwritten")
+    assert edits(folder) == {}
+
+
+def test_one_view_of_each_split_stays(page, opened, folder):
+    names = [view.name for view in scene_frames(folder)]
+    (folder / "pp_cl.json").write_text(json.dumps({"dropped": names[1:]}))
+    opened.set("Drop", True)
+    told(opened, "no view of split train would be left")
+    assert edits(folder) == {"dropped": names[1:]}
+
+
+def test_a_click_chooses_a_view(page, opened):
+    opened.send(
+        "SceneNodeClickMessage",
+        name="/views/train/r_5.png",
+        instance_index=None,
+        ray_origin=[0, 0, 0],
+        ray_direction=[0, 0, 1],
+        screen_pos=[0, 0],
+        modifier=None,
+    )
+    opened.receive("GuiUpdateMessage", lambda m: m["updates"].get("value") == "train/r_5.png")
+
+
+def test_a_broken_file_is_told(page, opened, folder):
+    (folder / "pp_cl.json").write_text("{")
+    opened.set("Drop", True)
+    told(opened, "pp_cl.json")
+    assert (folder / "pp_cl.json").read_text() == "{"
+
+
+def test_without_sparse_points_the_hull_is_shown(dev, served, scene):
+    points = hull_points(None, scene)
+    assert 15_000 < len(points) < 25_000
+    assert 0.7 < np.linalg.norm(points, axis=1).max() < 1.2  # the ball has a radius of 0.8
+    page = ScenePage(served[0], Path(scene))
+    with tab(served[1]) as opened:
+        assert "/points" not in opened.nodes
+        page.fill()
+        opened.receive("PointCloudMessage")
+
+
+def test_the_run_of_a_scene_is_not_asked_for(folder):
+    status, lines = spoken(["view", folder, "--scene", folder])
+    assert status == 2 and "--scene: only of a run" in lines[-1]
