@@ -98,7 +98,7 @@ def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
     """
     trainer, model = training.trainer, training.trainer.model
     header = training.info | {"step": trainer.step, "finished": False}
-    run = Run(trainer.dev, training.folder, training.config, header, model, model.net.policy)
+    run = Run(trainer.dev, training.folder, training.config, header, model)
     run.renderer = trainer.renderer  # not one of its own, which would freeze the network
     cameras = [view.camera for view in trainer.views]
     most = max(camera.width * camera.height for camera in cameras)  # what memory is planned for
