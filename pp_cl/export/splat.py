@@ -100,7 +100,9 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     columns |= {"rot_0": nothing + 1} | dict.fromkeys(("rot_1", "rot_2", "rot_3"), nothing)
     element = plyfile.PlyElement.describe(table_of(columns), "vertex")
     with atomic_file(path) as file:
-        plyfile.PlyData([element], byte_order="<").write(file)
+        # brush turns a model by this comment; others take y for the vertical axis anyway
+        comments = ["Vertical axis: y"]
+        plyfile.PlyData([element], byte_order="<", comments=comments).write(file)
 
 
 def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> None:

@@ -43,6 +43,7 @@ def test_the_header_is_that_of_the_training_code(ply):
     assert header == [
         "ply",
         "format binary_little_endian 1.0",
+        "comment Vertical axis: y",
         f"element vertex {count}",
         *(f"property float {name}" for name in LAYOUT),
     ]
