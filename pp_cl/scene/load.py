@@ -243,6 +243,8 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     notes.check(len(photographs), LEAST_VIEWS if split == "train" else 1)
     photographs = _masked(folder, reader, photographs, notes)
     photographs = _ignoring(folder, IGNORE_FOLDERS, photographs, split)
+    if in_part := [one.name for one in photographs if one.ignore and not one.ignores_black]:
+        notes.done["pixels are ignored where the masks in ignore are white"] = in_part
     return Listing(photographs, notes.lines(len(photographs)))
 
 
