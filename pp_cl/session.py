@@ -129,13 +129,13 @@ class Training:
             )
 
     def _run(self, on_step, is_stopped):
-        trainer, settings = self.trainer, self.config.train
+        trainer, train = self.trainer, self.config.train
         with self.folder.open_log(trainer.step) as log:
             pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
-            seconds, budget = log.seconds, Budget(settings, pixels)
+            seconds, budget = log.seconds, Budget(train, pixels)
             first = trainer.step + 1
             self._expect_save()
-            while trainer.step < settings.iterations:
+            while trainer.step < train.iterations:
                 try:
                     self.room.check_growth(trainer.model, trainer.step)
                 except UserError:  # the next step would not fit the memory
@@ -145,7 +145,7 @@ class Training:
                 terms = trainer.train_step()
                 took = time.perf_counter() - start
                 seconds += took
-                is_planned = settings.minutes and not trainer.begun
+                is_planned = train.minutes and not trainer.begun
                 if is_planned and budget.plan(trainer.step, seconds, took):
                     trainer.take_plan()
                     self.folder.configure(self.config.to_json())
@@ -154,7 +154,7 @@ class Training:
                 row = self._after_step(log, terms, seconds)
                 if on_step:
                     on_step(trainer.step, row)
-                if is_stopped() and trainer.step < settings.iterations:
+                if is_stopped() and trainer.step < train.iterations:
                     self._save(finished=False)
                     return seconds
             check_finite(trainer.arrays())  # before the EMA replaces the parameters
@@ -172,18 +172,18 @@ class Training:
         """Write the log's row, the preview and the checkpoint that are due; return the row or None.
         The checkpoint comes last: resuming from it does not make the others again.
         """
-        trainer, settings = self.trainer, self.config.train
-        step, last, row = trainer.step, trainer.step == settings.iterations, None
-        is_measured = settings.eval_every and step % settings.eval_every == 0
+        trainer, train = self.trainer, self.config.train
+        step, last, row = trainer.step, trainer.step == train.iterations, None
+        is_measured = train.eval_every and step % train.eval_every == 0
         measured = self._measure() if is_measured else {}
-        if step % settings.log_every == 0 or last or is_measured:
+        if step % train.log_every == 0 or last or is_measured:
             state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
             row = self._row(seconds) | terms.get() | state | measured
             log.write(row)
-        due = settings.previews and step % -(-settings.iterations // settings.previews) == 0
+        due = train.previews and step % -(-train.iterations // train.previews) == 0
         if last or due or time.monotonic() >= self._preview_by:
             self._preview()
-        due = step % settings.checkpoint_every == 0 or time.monotonic() >= self._save_by
+        due = step % train.checkpoint_every == 0 or time.monotonic() >= self._save_by
         if due and not last:
             self._save(finished=False)
         return row

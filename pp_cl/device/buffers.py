@@ -77,18 +77,14 @@ def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]
     """(octets, arrays of these shapes and dtypes that lie in them), all zeros: one launch or
     transfer handles them all. The arrays are valid as long as the octets are held.
     """
-    whole = dev.zeros((packed_bytes(dev, rows),), np.uint8)
+    starts = _packed_starts(dev, rows)
+    whole = dev.zeros((starts.pop(),), np.uint8)
     data: Any = whole.base_data
     arrays: list[Array] = []
-    for start, (shape, dtype) in zip(_packed_starts(dev, rows), rows, strict=False):
+    for start, (shape, dtype) in zip(starts, rows, strict=True):
         region = data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
         arrays.append(QueuedArray(dev.queue, shape, dtype, data=region))
     return whole, arrays
-
-
-def packed_bytes(dev: Device, rows: Sequence[Row]) -> int:
-    """The octets that packed_arrays() takes."""
-    return _packed_starts(dev, rows)[-1]
 
 
 def _packed_starts(dev, rows):

@@ -174,10 +174,6 @@ class DirectConv:
             return packed_shape(k, co, ci)
         return parts_shape(image_parts(self.shape)[0], k, ci, co)
 
-    def scratch_floats(self) -> int:
-        """Floats of Device.scratch() that the kernels take."""
-        return 0
-
     def laid_out(self, weight: Array) -> Array:
         """A layer's weights (ceil(CO/16), K, K, CI, 16) as the kernels read them: a new array, or
         itself where they read them as they are.

@@ -63,7 +63,7 @@ class WinogradConv(DirectConv):
         return (POSITIONS * (ci * co + VECTOR),)
 
     def scratch_floats(self) -> int:
-        """See DirectConv; of SLICES."""
+        """Floats of Device.scratch() that the kernels take as SLICES."""
         ci, co = self.shape.ci, self.shape.co
         vectors = POSITIONS * ((ci + co) // VECTOR * self._at_once + 3)
         if self.shape.direction is Direction.BACKWARD_WEIGHTS:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays, Table, packed_arrays, packed_bytes
+from pp_cl.device.buffers import PackedArrays, packed_arrays
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, blocking_of, choose
 from pp_cl.layers.conv_direct import (
@@ -36,12 +36,10 @@ from pp_cl.layers.simple import (
     upsample2_backward,
     upsample2_forward,
 )
-from pp_cl.layers.tiles import all_tiles_buffers
 from pp_cl.network.layers import (
     array_shapes,
     convolutions,
     gradient_of,
-    levels_of,
     lifetimes,
     parameter_table,
     share_buffers,
@@ -53,7 +51,6 @@ from pp_cl.settings import NetworkConfig
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
-PARAMETERS = "parameters", "gradients of parameters"  # in the memory plan
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
 Size = tuple[int, int]  # (height, width)
@@ -399,24 +396,3 @@ class UNet:
                 conv = choose(self.dev, shape, self.variant)(self.dev, self.blocking, shape)
                 found[layer.name, direction, source] = conv
         return found
-
-    def memory_plan(self, height: int, width: int, training: bool) -> Table:
-        """All device buffers of this network once it has run at this size, what its convolutions
-        share with others among them.
-
-        Gradients of parameters are among them without training too: they are made with the network.
-        """
-        size = (height, width)
-        shared = share_buffers(lifetimes(self.layers, training), array_shapes(self.layers, size))
-        table: Table = {" = ".join(b.names): ((b.floats,), np.float32) for b in shared}
-        table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))
-        work = self.work(size, training)
-        scratch = max(conv.scratch_floats() for conv in work.values())
-        table["scratch of convolutions"] = (scratch,), np.float32
-        octets = packed_bytes(self.dev, [*_work_table(work).values()])
-        table["weights as kernels read them"] = (octets,), np.uint8
-        table["sums of gradients"] = (len(convolutions(self.layers)), 8), np.int32
-        for level in set(levels_of(self.layers).values()):
-            tiles = all_tiles_buffers(height >> level, width >> level)
-            table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}
-        return table
