@@ -26,7 +26,7 @@ from pp_cl.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 
 STILL = 0.2  # seconds without movement until the full resolution is drawn
 DRAFT = 4  # times fewer pixels each way while the camera moves
-MOST_SIDE, MOST_PIXELS = 4096, 2**23  # of a picture
+MOST_PIXELS = 2**23  # of a picture
 SIZES = {"half": 0.5, "as trained": 1.0, "double": 2.0}
 FPS = 30  # of a path, as `pp-cl render` has it
 MOST_ROWS = 500  # of the curve
@@ -226,7 +226,6 @@ class ModelPage:
         width, height = camera.width, camera.height
         scale = min(
             SIZES.get(self._size.value, 1.0) * self._focal / camera.fy,
-            MOST_SIDE / max(width, height),
             (self._most_pixels / (width * height)) ** 0.5,
         )
         width, height = (max(MIN_SIDE, round(scale * side)) for side in (width, height))
