@@ -31,7 +31,7 @@ from pp_cl.scene.edits import FILE as EDITS
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.kept import KeptViews
-from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, of_size
+from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, named_mask, of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import read_json
 from pp_cl.scene.readers.found import (
@@ -41,6 +41,7 @@ from pp_cl.scene.readers.found import (
     find_masks,
     folder_named,
 )
+from pp_cl.scene.silhouette import within_silhouettes
 from pp_cl.scene.views import (
     MASK_THRESHOLD,
     MIN_SIDE,
@@ -72,6 +73,8 @@ LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measu
 
 INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
 BESIDE = 0.5  # of what is transparent, that a mask which is not of the object holds
+NO_MASK = "no mask"
+OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
 LEAST_VIEWS = 8  # for training that are left where some are left out
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
@@ -438,19 +441,29 @@ def load_scene(
         dev = open_device()
     lock = Lock()
     with ThreadPoolExecutor(reading(photographs, masks, factor)[0]) as pool:
-        found = pool.map(
+        reads = pool.map(
             lambda one: _read_view(dev, lock, folder, one, masks, factor, kept), photographs
         )
         bar = tqdm(
-            found, "reading images", len(photographs), unit="image", leave=False, disable=None
+            reads, "reading images", len(photographs), unit="image", leave=False, disable=None
         )
-        found = iter(list(bar))
-    read, is_some = {}, masks.source == "given" and any(one.mask for one in photographs)
+        found = list(bar)
+    is_some = any(isinstance(view, View) and view.is_masked for view in found)
+    if masks.folder and not is_some:
+        named_mask(Path(masks.folder), photographs[0].name)
+    read, left = {}, iter(found)
     for split, some in chosen.items():
-        notes = Notes()
-        pairs = [(folder, one, next(found), is_some) for one in some]
+        notes, is_whole = Notes(), split == "train" and most is None
+        pairs = [(folder, one, next(left), masks if is_some else None) for one in some]
         read[split] = list(notes.usable(pairs, lambda all: _usable(*all), lambda all: all[1].name))
-        notes.check(len(read[split]), LEAST_VIEWS if split == "train" and most is None else 1)
+        notes.check(len(read[split]), LEAST_VIEWS if is_whole else 1)
+        if is_whole and NO_MASK in notes.left_out:
+            bare = [view for _, one, view, _ in pairs if one.name in notes.left_out[NO_MASK]]
+            with suppress(UserError):  # whoever carves a hull with these masks is told
+                filled = within_silhouettes(dev or open_device(), read[split], bare)
+                notes.done[OF_OTHERS] = notes.left_out.pop(NO_MASK)
+                order = {one.name: i for i, one in enumerate(some)}
+                read[split] = sorted([*read[split], *filled], key=lambda view: order[view.name])
         lines += [f"{split}: {line}" for line in notes.lines(len(read[split]))]
     _tell(folder, lines)
     scene = Scene(folder.resolve().name, folder, read, lines)
@@ -487,14 +500,17 @@ def _check_alike(folder, photographs):
             )
 
 
-def _usable(folder, photograph, view, is_some):
-    """The view of a photograph that was read. is_some: others have masks. Raises Unusable."""
+def _usable(folder, photograph, view, masks):
+    """The view of a photograph that was read. masks: by which others have one. Raises Unusable."""
     if isinstance(view, Unusable):
         raise view
-    if is_some and photograph.mask is None:
+    if masks is None or view.is_masked:
+        return view
+    with _unusable(NO_MASK):
+        if masks.folder:
+            named_mask(Path(masks.folder), photograph.name)
         image = folder / photograph.name
-        raise Unusable(f"{image}: has no mask, as others have; add it, or remove all", "no mask")
-    return view
+        raise UserError(f"{image}: has no mask, as others have; add it, or remove all")
 
 
 @contextmanager
@@ -513,7 +529,8 @@ def _read_view(dev, lock, folder, photograph, masks, factor, kept):
     """
     file, camera, lens = folder / photograph.name, photograph.camera, photograph.distortion
     try:
-        with _unusable("no mask"):
+        mask = None
+        with suppress(UserError):  # of a folder that lacks it
             mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
         ignore = photograph.ignore and folder / photograph.ignore
         files = [file, mask, ignore]

@@ -193,7 +193,7 @@ TRAINS = {
     "masks for some images": (
         "colmap",
         gone("masks/000003.png.png", "masks/000005.png.png"),
-        "2 of 12 views left out: no mask (images/000003.png, images/000005.png)",
+        "but for a rim (images/000003.png, images/000005.png)",
     ),
     "dense/0": ("colmap", moved(("sparse/0", "dense/0/sparse"), ("images", "dense/0/images")), ""),
     "input": ("colmap", moved(("images", "input")), ""),

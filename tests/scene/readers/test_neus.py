@@ -167,5 +167,5 @@ def test_masks_belong_to_images_of_their_number(scene):
         Path(name).stem[3:] for name in before
     ]
     (scene / "mask" / "010.png").rename(scene / "mask" / "011.png")
-    with pytest.warns(UserWarning, match=r"1 of 9 views left out: no mask .image/000010\.png"):
-        assert len(load_scene(scene).splits["train"]) == 8
+    with pytest.warns(UserWarning, match=r"without a mask, .* .image/000010\.png"):
+        load_scene(scene)

@@ -1,0 +1,61 @@
+"""Photographs without a mask among others that have one: what the others' visual hull tells of
+them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from pp_cl.device.device import Device
+from pp_cl.scene.hull import agreeing, build_grid, silhouette
+from pp_cl.scene.views import View, fitting_downscale
+
+POINTS, SIDE = 250_000, 400  # of the hull, and pixels of the images in which it is looked at
+# The rim of a silhouette that is ignored: the hull is larger than the object, by 1 to 4 % of its
+# pixels. Outside a few pixels tell that its points are of some size.
+INWARD, OUTWARD = 0.03, 0.005  # of the image's longer side
+
+
+def within_silhouettes(dev: Device, views: Sequence[View], bare: Sequence[View]) -> list[View]:
+    """The views without a mask, transparent outside of the hull that the masks of the others leave,
+    opaque well inside of it; between, and in a rim, they are ignored. With ethiopian_head's and
+    dtu_scan37's masks of a third of the views gone this wins 0.2 and 0.5 dB over leaving these out.
+
+    Raises UserError as build_grid() does.
+    """
+    agreement = agreeing(dev, views)
+    hull = build_grid(dev, agreement.views, POINTS, None, agreement.forgiven)
+    filled = []
+    for view in bare:
+        size = view.stored_camera.width, view.stored_camera.height
+        small = replace(view, downscale=fitting_downscale(size, SIDE))
+        covered = silhouette(hull.grid, hull.ids, small.camera)
+        side = max(covered.shape)
+        is_inside = _distance(covered) > INWARD * side
+        is_outside = _distance(~covered) > max(OUTWARD * side, 1)
+        inside, rim = (
+            _enlarged(a, size, small.downscale) for a in (is_inside, ~is_inside & ~is_outside)
+        )
+        image, ignored = view.image.copy(), rim if view.ignored is None else rim | view.ignored
+        image[..., 3] = np.where(inside, image[..., 3], 0)
+        image[ignored] = 0
+        filled.append(replace(view, image=image, ignored=ignored, is_masked=True))
+    return filled
+
+
+def _distance(covered):
+    """(H, W) pixels from each covered one to the nearest that is not; it may go on outside of the
+    image.
+    """
+    if covered.all():
+        return np.full(covered.shape, np.inf)
+    return distance_transform_edt(covered)
+
+
+def _enlarged(values, size, times):
+    """(H, W) of the pixels of a reduced image, for those of the image of a (width, height)."""
+    whole = values.repeat(times, axis=0).repeat(times, axis=1)
+    beyond = [(0, n - m) for n, m in zip(size[::-1], whole.shape, strict=True)]
+    return np.pad(whole, beyond, mode="edge")
