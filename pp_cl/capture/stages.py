@@ -122,8 +122,8 @@ class Capture:
                 new = self._new() if stage == "frames" else ""
                 self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
             for name in changed:
-                first = OPTIONS[name][0]
-                self.tell(f"{_option(name)} has changed: {first} and all after it are repeated")
+                redone = OPTIONS[name][0]
+                self.tell(f"{_option(name)} has changed: {redone} and all after it are repeated")
             for stage in left:
                 start = time.monotonic()
                 found = getattr(self, f"_{stage}")()
