@@ -161,7 +161,7 @@ class Run:
         if np.isnan(image).any():
             raise UserError(
                 f"{self.folder.checkpoint}: its parameters are too large, the image holds NaN;"
-                " restore a copy, or train anew with a lower network.rate or train.sh_rate"
+                " restore a copy, or train again with a lower network.rate or train.sh_rate"
             )
         return image
 

@@ -86,13 +86,13 @@ class RasterConfig:
     )
     max_tracked: int = setting(
         0,
-        "number of a pixel's nearest hits that receive gradients (0: all)",
+        "number of a pixel's nearest fragments that receive gradients (0: all)",
         0,
         2**31 - 1,
     )
     early_stop: float = setting(
         0.01,
-        "stop blending a pixel once no further hit can weigh more than this share (0: never)",
+        "stop blending a pixel once no further fragment can weigh more than this share (0: never)",
         0,
         0.5,
     )
@@ -148,8 +148,8 @@ class TrainConfig:
     smooth_l1: float = setting(0.05, "errors below this count by their square (0: L1)", 0, 1)
     exposure: str = setting(
         "auto",
-        "find a gain for each view and channel, as photographs differ in exposure; auto: where"
-        " that explains a quarter of the error",
+        "exposure compensation: a gain for each view and channel; auto: where photographs differ so"
+        " much in exposure that gains explain a quarter of the error",
         choices=("auto", "on", "off"),
     )
     mask_weight: float = setting(
@@ -162,9 +162,9 @@ class TrainConfig:
     )
     spread_weight: float = setting(
         0.6,
-        "spread term of the loss: how far a pixel's weights lie apart along its ray, as a share"
-        " of the grid's diagonal; rises from 0 during training; needs raster.blend=alpha (0:"
-        " off)",
+        "weight of the distortion loss: how far a pixel's blend weights lie apart along its ray, as"
+        " a share of the grid's diagonal; rises from 0 during training; needs raster.blend=alpha"
+        " (0: off)",
         0,
         1e3,
     )
@@ -186,7 +186,7 @@ class TrainConfig:
     )
     offset_rate: tuple = setting(
         (1e-2, 1e-3),
-        "learning rate of the points' offsets in edges, and of the logarithm of their radii,"
+        "learning rate of the points' offsets in voxels, and of the logarithm of their radii,"
         " first and last step; needs raster.blend=alpha and raster.footprint=soft (0: points stay"
         " on the grid, with one radius)",
         0,

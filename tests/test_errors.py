@@ -61,8 +61,8 @@ def test_every_message_is_one_line(text, line):
 
 
 def test_a_long_message_keeps_its_file_and_its_mend():
-    message = str(UserError(f"a.json: {'x' * 10**6}; copy it anew"))
+    message = str(UserError(f"a.json: {'x' * 10**6}; copy it again"))
     assert len(message) == MOST_LINE
-    assert message.startswith("a.json: xxx") and message.endswith("xxx; copy it anew")
+    assert message.startswith("a.json: xxx") and message.endswith("xxx; copy it again")
     assert str(UserError(message)) == message
     assert str(UserError("x" * MOST_LINE)) == "x" * MOST_LINE

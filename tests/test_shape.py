@@ -89,4 +89,4 @@ def test_the_command_prints_and_writes_the_row(mesh, trained, tmp_path, capsys):
     assert [line.split()[0] for line in lines[-3:]] == ["training", "before", "after"]
     assert lines[-1].split()[1:3] == [str(facts["after"]["points"]), f"{facts['after']['iou']:.4f}"]
     assert main(["shape", str(file), "--edge", "0.2", "--samples", "1000"]) == 0
-    assert "edge 0.2" in capsys.readouterr().out
+    assert "voxel size 0.2" in capsys.readouterr().out

@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("scene", help="folder of a scene, or the word demo")
     parser.add_argument("out", type=Path, help="new folder")
     parser.add_argument("--format", required=True, choices=FORMATS)
-    parser.add_argument("--hold-out", action="store_true", help="deal the splits anew")
+    parser.add_argument("--hold-out", action="store_true", help="deal out the splits again")
     options = parser.parse_args(arguments)
     try:
         config = configure(preset("tiny"), options.scene)

@@ -370,20 +370,24 @@ def timed(found: dict[str, Found]) -> list[dict]:
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
     """{name: contents} of docs/results/, but for origin()."""
-    quality = "means over the held-out views, 8-bit images over white; minutes of training alone"
-    blended = "milliseconds, medians in turn, and the largest error against float64"
+    quality = (
+        "means over the held-out views, 8-bit images composited on white; minutes of training alone"
+    )
+    blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
     steps = "; ".join(
         f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['copy_gbs']:.1f} GB/s,"
         f" {run['gflops']:.0f} GFLOP/s"
         for preset, run in found["stages"].items()
     )
-    passes = "medians in turn; GFLOP/s count the multiplications of the direct convolution"
+    passes = (
+        "medians of interleaved runs; GFLOP/s count the multiplications of the direct convolution"
+    )
     parts = {
         "scenes": (quality, QUALITY, [found[name] for name in SHOWN]),
         "trainings": (quality, QUALITY, trained(found)),
         "rasteriser": (blended, RASTERISER, found["rasteriser"]),
         "network": (passes, NETWORK, found["network"]),
-        "pytorch": ("ours and PyTorch's, medians in turn", PYTORCH, found["pytorch"]),
+        "pytorch": ("ours and PyTorch's, medians of interleaved runs", PYTORCH, found["pytorch"]),
         "stages": (f"medians of a step on lego ({steps})", STAGES, by_preset(found["stages"])),
         "memory": ("the most memory that a few steps take", MEMORY, found["memory"]),
         "demo": ("runs of the demo", DEMO, found["demo"]),

@@ -2,7 +2,7 @@
 
 # {stage: what it finds}, in their order
 STAGES = {
-    "frames": "upright photographs, the sharpest frames of a film",
+    "frames": "upright photographs, the sharpest frames of a video",
     "features": "what can be found again in other images",
     "matches": "pairs of images that show the same",
     "poses": "where each image was taken",

@@ -115,7 +115,7 @@ def _photographs(folder, images, scene):
     if not files:
         raise UserError(
             f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
-            " or a film"
+            " or a video"
         )
     stems = [file.relative_to(folder).with_suffix("").as_posix() for file in files]
     if sorted(stems) != stems:  # 10 after 9: matching takes neighbours by name
@@ -250,7 +250,7 @@ def _sharpest(film):
     bar = tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
     sharpness = [_look(Image.fromarray(frame[..., 0]))["sharpness"] for frame in bar]
     if not sharpness:
-        raise UserError(f"{film}: holds no frames; give another film")
+        raise UserError(f"{film}: holds no frames; give another video")
     count = len(sharpness)
     intervals = groupby(range(count), lambda number: number * FRAMES // max(count, FRAMES))
     is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)
@@ -274,8 +274,8 @@ def _decoded(film: Path, filters: str, pixels: str, channels: int) -> tuple[dict
         lines = [line for line in str(error).splitlines() if "rror" in line or "nvalid" in line]
         said = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
         return UserError(
-            f"{film}: cannot be read as a film ({shown(said, 100)}); give an MP4, MOV or WebM, or a"
-            " folder of photographs"
+            f"{film}: cannot be read as a video ({shown(said, 100)}); give an MP4, MOV or WebM,"
+            " or a folder of photographs"
         )
 
     try:

@@ -134,14 +134,14 @@ def _of_program(words, image, shape):
         try:
             done = subprocess.run(words, capture_output=True, timeout=SECONDS, check=False)
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise UserError(f"{who}: {error}; mend the command") from None
+            raise UserError(f"{who}: {error}; fix the command") from None
         if done.returncode or not mask.is_file():
             said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word of it"]
             what = f"status {done.returncode}" if done.returncode else "no mask written"
-            raise UserError(f"{who}: {what}: {shown(said[-1])}; mend the command")
+            raise UserError(f"{who}: {what}: {shown(said[-1])}; fix the command")
         found = read_mask(mask)
     if found.shape != shape:
-        raise UserError(f"{who}: its mask has another size than the photograph; mend the command")
+        raise UserError(f"{who}: its mask has another size than the photograph; fix the command")
     return found
 
 
@@ -154,7 +154,7 @@ def program_words(command: str) -> list[str]:
     try:
         words = list(lexer)
     except ValueError as error:
-        raise UserError(f"--mask-command {command}: {error}; mend the quotes") from None
+        raise UserError(f"--mask-command {command}: {error}; fix the quotes") from None
     if not words or "{image}" not in command or "{mask}" not in command:
         raise UserError(f"--mask-command {command}: write it as 'PROGRAM {{image}} {{mask}}'")
     return words

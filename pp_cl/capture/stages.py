@@ -101,8 +101,8 @@ class Capture:
             mended = self._mended() if "masks" in left else []
             if mended and "images" in left and not replace_masks:
                 raise UserError(
-                    f"{mended[0]}: was made or changed by hand, for images that are made anew; move"
-                    " it away, or add --replace-masks"
+                    f"{mended[0]}: was made or changed by hand, for images that are made again;"
+                    " move it away, or add --replace-masks"
                 )
             files = {stage: self._files(stage) for stage in left}
             for stage in left:
@@ -122,7 +122,8 @@ class Capture:
                 new = self._new() if stage == "frames" else ""
                 self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
             for name in changed:
-                self.tell(f"{_option(name)} is another than before: {OPTIONS[name][0]} and on anew")
+                redone = OPTIONS[name][0]
+                self.tell(f"{_option(name)} has changed: {redone} and all after it are repeated")
             for stage in left:
                 start = time.monotonic()
                 found = getattr(self, f"_{stage}")()
@@ -139,7 +140,7 @@ class Capture:
         files = frames.listed(self.source, self.scene) if self.source.is_dir() else []
         names = [file.relative_to(self.source).as_posix() for file in files]
         new = [name for name in names if name not in known]
-        return f"; {listing(new)} came later: --from frames takes all anew" if new else ""
+        return f"; {listing(new)} came later: --from frames takes all of them again" if new else ""
 
     @contextmanager
     def _locked(self):
@@ -171,7 +172,7 @@ class Capture:
         if "source" in changed and begin != "frames" and self._file("frames").is_file():
             raise UserError(
                 f"{self.scene}: was made from {before['source']}; choose another --out, or begin"
-                " anew with --from frames"
+                " again with --from frames"
             )
         return changed
 

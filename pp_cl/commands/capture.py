@@ -5,7 +5,7 @@ from typing import Any
 
 from pp_cl.capture import STAGES
 
-HELP = "make a scene from photographs or a film: cameras, box and masks"
+HELP = "make a scene from photographs or a video: cameras, box and masks"
 EPILOG = "\n".join(
     (
         "stages, each done once; the same command goes on where it stopped:",
@@ -21,7 +21,7 @@ AUTO = "auto"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
-    add("source", metavar="INPUT", help="folder of photographs, or a film")
+    add("source", metavar="INPUT", help="folder of photographs, or a video")
     add("--out", required=True, metavar="SCENE", help="folder of the scene")
     add("--from", dest="begin", choices=STAGES, help="repeat this stage and all after it")
     add(
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--replace-masks",
         action="store_true",
-        help="make the masks anew, also those that were mended by hand",
+        help="make the masks again, also those that were fixed by hand",
     )
     add(
         "--box",
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
 
     source = Path(options.source)
     if not source.exists():
-        raise UserError(f"{source}: no such folder or film; give the photographs")
+        raise UserError(f"{source}: no such folder or video; give the photographs")
     given: dict[str, Any] = {"source": str(source.resolve())}
     if options.turntable is not None:
         given["turntable"] = options.turntable

@@ -84,7 +84,7 @@ def _line(name, text):
 
 
 def _grid_text(grid):
-    dims, edge = "x".join(map(str, grid["dims"])), f"edge {grid['edge']:.6g}"
+    dims, edge = "x".join(map(str, grid["dims"])), f"voxel size {grid['edge']:.6g}"
     return f"{dims}, {edge} ({grid['edge_pixels']:.2f} pixels)"
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
 
-HELP = "render a run along a path of cameras: a film, or frames with alpha and depth"
+HELP = "render a run along a path of cameras: a video, or frames with alpha and depth"
 EPILOG = """paths:
   orbit       a circle around the object, at the height of the photographs
   spiral      two turns, from the lowest photographs to the highest
@@ -45,13 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--out",
         metavar="NAME",
-        help="a film (.mp4, .webm, .webp, .gif), else a folder for frames (default: in RUN/render,"
+        help="a video (.mp4, .webm, .webp, .gif), else a folder for frames (default: in RUN/render,"
         " named after path and size)",
     )
     add(
         "--format",
         choices=(*FILMS, *IMAGES),
-        help="a film (mp4, webm, webp, gif) or frames (png, exr); by --out, else mp4",
+        help="a video (mp4, webm, webp, gif) or frames (png, exr); by --out, else mp4",
     )
     add("--size", type=shared.size, metavar="WxH", help="pixels (default: those of the training)")
     add(
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace) -> None:
     sizes = {(camera.width, camera.height) for camera in cameras}
     if kind in FILMS and len(sizes) > 1:
         raise UserError(
-            f"--path {options.path}: its images differ in size, which no film does; give --size"
+            f"--path {options.path}: its images differ in size, which no video does; give --size"
             " WxH, or --format png"
         )
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
@@ -142,19 +142,19 @@ def _format(options):
     suffix = Path(options.out).suffix[1:].lower() if options.out else ""
     if suffix in FILMS and options.format not in (None, suffix):
         raise UserError(
-            f"--out {options.out}: is a film by its name, --format {options.format} is another;"
+            f"--out {options.out}: is a video by its name, --format {options.format} is another;"
             " leave one of them out"
         )
     if options.out and suffix not in FILMS and options.format in FILMS:
         raise UserError(
-            f"--out {options.out}: --format {options.format} is a film; name it"
+            f"--out {options.out}: --format {options.format} is a video; name it"
             f" {options.out}.{options.format}"
         )
     if suffix in FILMS or not options.out:
         return suffix or options.format or FILMS[0]
     if (mimetypes.guess_type(options.out)[0] or "").startswith(("video/", "image/")):
         raise UserError(
-            f"--out {options.out}: films end in .mp4, .webm, .webp or .gif, frames go into a"
+            f"--out {options.out}: videos end in .mp4, .webm, .webp or .gif, frames go into a"
             " folder; name one of these"
         )
     return options.format or IMAGES[0]

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--edge",
         type=shared.number(1e-30, 1e30),
         metavar="E",
-        help="of a mesh: the grid's edge in its units (default: 2^27 cells)",
+        help="of a mesh: voxel size of the grid in its units (default: 2^27 cells)",
     )
     add(
         "--samples",
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
 def _lines(facts):
     grid = facts["grid"]
     lines = [
-        f"grid      {'x'.join(map(str, grid['dims']))}, edge {grid['edge']:.6g}",
+        f"grid      {'x'.join(map(str, grid['dims']))}, voxel size {grid['edge']:.6g}",
         f"surface   {facts['surface']} vertices, by {facts['samples']} samples",
     ]
     if "before" in facts:

@@ -129,7 +129,7 @@ def _first_line(training):
         f", then {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
     )
     return (
-        f"hull: {points} points on a {'x'.join(map(str, grid.dims))} grid, edge"
+        f"hull: {points} points on a {'x'.join(map(str, grid.dims))} grid, voxel size"
         f" {grid.edge:.6g} ({spacing:.2f} pixels{finer}), depth {near:.3f} to {far:.3f}"
         f" ({hull.seconds:.1f} s)"
         f"{capped if hull.capped else ''}"
@@ -141,7 +141,7 @@ def _extended_line(training):
     return (
         f"extends a finished training of {training.trainer.begun} steps;"
         f" {training.config.train.iterations} from the start would differ, as all schedules end at"
-        " the last step and the optimiser's moments begin anew"
+        " the last step and the optimiser's moments start again"
     )
 
 
@@ -212,7 +212,7 @@ def _run(training, options):
         try:
             seconds = training.run(on_step, lambda: bool(caught))
         except KeyboardInterrupt:
-            kept = "goes on from" if folder.checkpoint.exists() else "begins anew, there is no"
+            kept = "goes on from" if folder.checkpoint.exists() else "starts over, there is no"
             raise Stopped(
                 f"stopped at once; the same command {kept} {folder.checkpoint}",
                 128 + signal.SIGINT,

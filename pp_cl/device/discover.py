@@ -105,7 +105,7 @@ def _give_cache():
         temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE)
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         warnings.warn(
-            f"{folder}: {error.strerror}; kernels are built anew: set XDG_CACHE_HOME to keep them",
+            f"{folder}: {error.strerror}; kernels are built again: set XDG_CACHE_HOME to keep them",
             stacklevel=3,
         )
 

@@ -19,7 +19,7 @@ from pp_cl.files.untrusted import opened_zip, strict_json
 
 FORMAT = 1  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 250
-MEND = "delete it to train anew, or restore a copy"
+MEND = "delete it to train again, or restore a copy"
 
 
 class Rows(Protocol):
@@ -107,7 +107,7 @@ class Checkpoint:
             raise ValueError("its header is no JSON object")
         if self.header.get("format") != FORMAT:
             found = quoted(self.header.get("format"), 40)
-            raise UserError(f"{path}: format {found}, this version reads {FORMAT}; train anew")
+            raise UserError(f"{path}: format {found}, this version reads {FORMAT}; train again")
 
     def _form(self, entry):
         """The Form of an array, which is as large as its part of the file."""

@@ -67,7 +67,7 @@ def read_exr_rgba(path: Path | str) -> np.ndarray:
                 if not broken:
                     image[low - top : high - top, begin - left : end - left] = _straight(planes)
     if broken:
-        raise UserError(f"{path}: {broken} pixels are NaN or infinite; mend or remove the image")
+        raise UserError(f"{path}: {broken} pixels are NaN or infinite; fix or remove the image")
     return image
 
 
@@ -114,7 +114,7 @@ def _size(path, window):
     if width < 1 or height < 1 or width * height > MOST_PIXELS:
         raise UserError(
             f"{path}: {width}x{height} pixels, which must be 1 to {MOST_PIXELS}; copy the file"
-            " anew, or reduce it"
+            " again, or reduce it"
         )
     return width, height
 

@@ -167,7 +167,7 @@ def _opened(path, checked=True):
         text = f"{path}: more than {MOST_PIXELS} pixels; reduce the image"
         raise Unusable(text, UNREADABLE) from None
     except UnidentifiedImageError:  # by its first bytes, whatever it is called
-        text = f"{path}: is no {', '.join(FORMATS)}; convert it, or copy it anew"
+        text = f"{path}: is no {', '.join(FORMATS)}; convert it, or copy it again"
         raise Unusable(text, UNREADABLE) from None
     # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
     except Exception as error:

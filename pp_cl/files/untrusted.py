@@ -85,7 +85,9 @@ def _refuse_constant(name):
     raise ValueError(f"holds {name}, which is no number")
 
 
-def refusal(path: Path | str, error: Exception, kind: str, mend: str = "copy it anew") -> UserError:
+def refusal(
+    path: Path | str, error: Exception, kind: str, mend: str = "copy it again"
+) -> UserError:
     """The UserError about a file that could not be read as `kind`: by the system's word, which has
     another mend than a content that is broken.
     """

@@ -20,7 +20,7 @@ CONVERTED = "scale=out_color_matrix=bt709:out_range=tv"
 TAGGED = "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 COLOURS = ["-vf", f"{CONVERTED},{TAGGED}"]
 MISSING = (
-    "films need imageio and imageio-ffmpeg; install them with `pip install imageio imageio-ffmpeg`"
+    "videos need imageio and imageio-ffmpeg; install them with `pip install imageio imageio-ffmpeg`"
 )
 
 

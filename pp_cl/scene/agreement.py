@@ -55,7 +55,7 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
     empty = [view.name for view in views if view.hull_alpha.max() <= MASK_THRESHOLD]
     if empty:
         return (
-            f"{listing(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): mend or remove"
+            f"{listing(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): fix or remove"
             " the image"
         )
     _, on_mask, beside = mask_votes(views, box)

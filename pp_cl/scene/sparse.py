@@ -60,7 +60,7 @@ def _read_model(folder):
         rows = _bounded(colmap.text_points(text))
     table = np.array(rows, np.float64).reshape(-1, 6)
     if not (np.abs(table) < MOST).all():
-        raise UserError(f"{folder}: its points3D hold NaN, Inf or a huge number; copy it anew")
+        raise UserError(f"{folder}: its points3D hold NaN, Inf or a huge number; copy it again")
     return np.pad(table[:, :3], ((0, 0), (0, 1)), constant_values=1), _bytes(table[:, 3:])
 
 
@@ -85,5 +85,5 @@ def _read_ply(file):
     except Exception as error:  # plyfile meets broken bytes with whatever comes up
         raise refusal(file, error, "points of a .ply") from None
     if not (np.abs(points) < MOST).all():
-        raise UserError(f"{file}: holds NaN, Inf or a huge number; write it anew")
+        raise UserError(f"{file}: holds NaN, Inf or a huge number; write it again")
     return points, _bytes(colours)

@@ -17,7 +17,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 
-SHOWN = ("colour", "alpha", "depth", "normals", "hits", "error", "photograph")
+SHOWN = ("colour", "alpha", "depth", "normals", "fragments", "error", "photograph")
 OWN_CAMERA = SHOWN[5:]  # are shown from the nearest training view's own camera
 DARK = np.array([23, 24, 27]) / 255  # sRGB, where nothing is
 LEAST_ALPHA = 0.5  # of a pixel that has a depth to look at: those below mix edge and background
@@ -66,12 +66,12 @@ def draw(
 def _rendered(run, renderer, camera, show, early_stop, truth):
     """(image, its scale) of what is rendered."""
     options = {"early_stop": early_stop, "depth_range": run.depth_range(camera)}
-    if show == "hits":
+    if show == "fragments":
         # the whole view, as until="weights" would change the buffers that a training goes on with
         drawn = renderer.forward(camera, run.gamma, **options)
         hits = np.diff(drawn.pairs.pixel_offset.get().astype(np.int64))
         hits = drawn.cropped(hits.reshape(drawn.size))
-        return colour_scale(hits, 0, hits.max(), hits > 0), f"0 to {hits.max()} hits"
+        return colour_scale(hits, 0, hits.max(), hits > 0), f"0 to {hits.max()} fragments"
     picture = renderer.picture(camera, run.gamma, **options)
     colour, is_known = run.checked(picture.colour), picture.alpha >= LEAST_ALPHA
     if show == "alpha":

@@ -199,7 +199,8 @@ def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys)
     capsys.readouterr()
     assert main([*words, "--box=-0.5,-0.5,-0.5,0.5,0.5,0.5"]) == 0
     told = capsys.readouterr().out
-    assert "--box is another than before: box and on anew" in told and "poses: 12 of 12" in told
+    assert "--box has changed: box and all after it are repeated" in told
+    assert "poses: 12 of 12" in told
     assert found(scene, "masks")["line"].startswith(f"{COUNT} given")
     assert main([*words, "--from", "scene"]) == 0
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]

@@ -1,4 +1,4 @@
-"""docs/capture.md says how exact a capture is: the row of the photographs, found anew."""
+"""docs/capture.md says how exact a capture is: the row of the photos, measured again."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ from tools.capture_demo import compare, write_photographs
 
 PAGE = Path(__file__).parents[2] / "docs" / "capture.md"
 ROW = re.compile(
-    r"\| 64 photographs, 400x400 \| ([\d.]+) units, at most ([\d.]+) degrees \| ([\d.]+) \|"
+    r"\| 64 photos, 400x400 \| ([\d.]+) units, at most ([\d.]+) degrees \| ([\d.]+) \|"
 )
 
 

@@ -251,7 +251,7 @@ def test_a_film_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primari
 def test_what_is_no_film_is_one_line_without_the_programs_banner(tmp_path):
     (tmp_path / "film.mov").write_bytes(b"no film" * 100)
     with pytest.raises(
-        UserError, match=r"cannot be read as a film \(Error opening input"
+        UserError, match=r"cannot be read as a video \(Error opening input"
     ) as caught:
         take_images(tmp_path / "film.mov", tmp_path / "images")
     assert "ffmpeg version" not in str(caught.value)

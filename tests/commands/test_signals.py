@@ -71,7 +71,7 @@ def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch, at,
     monkeypatch.setattr(Trainer, "train_step", stepping)
     assert main(arguments(scene, tmp_path / "run")) == 130
     *_, line = capsys.readouterr().err.splitlines()
-    assert ("goes on from" if kept else "begins anew") in line
+    assert ("goes on from" if kept else "starts over") in line
     assert load_checkpoint(file)[0]["step"] == kept if kept else not file.exists()
 
 

@@ -63,10 +63,10 @@ def test_the_mend_fits_the_reason():
         "a.png: cannot be read (Permission denied); check its permissions and the disk"
     )
     assert str(refusal("a.png", OSError("image file is truncated"), "PNG")) == (
-        "a.png: cannot be read as PNG (image file is truncated); copy it anew"
+        "a.png: cannot be read as PNG (image file is truncated); copy it again"
     )
     broken = BadZipFile("two\nlines " + "x" * 500)
-    said = str(refusal("a.npz", broken, "arrays", "write it anew"))
+    said = str(refusal("a.npz", broken, "arrays", "write it again"))
     assert said.startswith("a.npz: cannot be read as arrays (two lines xxx")
-    assert said.endswith("...); write it anew") and len(said) < MOST_REASON + 60
+    assert said.endswith("...); write it again") and len(said) < MOST_REASON + 60
     assert "(EOFError)" in str(refusal("a", EOFError(), "JSON"))

@@ -149,7 +149,7 @@ def test_a_stopped_run_goes_on_and_is_measured(job):
 @pytest.mark.parametrize(
     "error, said",
     [
-        (UserError("x: mend it"), "x: mend it"),
+        (UserError("x: fix it"), "x: fix it"),
         (OSError(28, "No space left", "a.npz"), "OSError: [Errno 28] No space left: 'a.npz'; see"),
         (TypeError("a\nbug"), "TypeError: a bug; see"),
     ],

@@ -67,12 +67,12 @@ def test_the_error_is_that_of_the_nearest_view_from_its_own_camera(run, views):
         draw(run, [], near, "error")
 
 
-def test_hits_are_those_of_the_pairs(run):
+def test_fragments_are_those_of_the_pairs(run):
     camera = replace(CAMERA, width=45, height=43)  # is padded
-    image, line = draw(run, [], camera, "hits")
+    image, line = draw(run, [], camera, "fragments")
     view = run.renderer.forward(camera, run.gamma, until="weights")
     hits = view.cropped(np.diff(view.pairs.pixel_offset.get().astype(int)).reshape(view.size))
-    assert line == f"0 to {hits.max()} hits" and hits.max() > 1
+    assert line == f"0 to {hits.max()} fragments" and hits.max() > 1
     np.testing.assert_array_equal(image, colour_scale(hits, 0, hits.max(), hits > 0))
 
 

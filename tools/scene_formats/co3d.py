@@ -45,7 +45,7 @@ def _check(splits, version):
     if set(splits) - known or not {"train", "test"} <= filled:
         raise UserError(
             f"a sequence of CO3D {version} has the splits {', '.join(sorted(known))}, this scene"
-            f" {', '.join(sorted(filled))}; deal them anew with --hold-out"
+            f" {', '.join(sorted(filled))}; deal them out again with --hold-out"
         )
 
 

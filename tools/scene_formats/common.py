@@ -19,7 +19,7 @@ def ordered(splits: dict[str, list[View]]) -> list[View]:
     if not fits:
         raise UserError(
             f"the format knows no splits: every {HELD_OUT}th view is test; add --hold-out to deal"
-            " the views anew"
+            " the views again"
         )
     return [(test if i % HELD_OUT == 0 else train).pop(0) for i in range(count)]
 

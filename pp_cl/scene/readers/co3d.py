@@ -139,7 +139,7 @@ def _objects(opened):
 def _number(frame):
     number = frame.number("frame_number")
     if number is None:
-        raise frame.error("frame_number", "is missing; copy the annotations anew")
+        raise frame.error("frame_number", "is missing; copy the annotations again")
     return number
 
 
@@ -238,7 +238,7 @@ def _listed(file, sequence):
         }
     except (AttributeError, TypeError, ValueError):
         raise UserError(
-            f"{file}: must be lists of [sequence, frame number, path]; copy it anew"
+            f"{file}: must be lists of [sequence, frame number, path]; copy it again"
         ) from None
 
 

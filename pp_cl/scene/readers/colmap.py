@@ -68,7 +68,7 @@ MOST_PIXELS = 2**20  # a side; beyond it a number is no size
 MOST_ENTRIES = 2**17  # of a file, cameras or images
 MOST_NAME = 1024  # bytes of an image's name
 MOST_LINE = 2**22  # characters of a line: 150,000 2D points
-UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it anew"
+UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it again"
 POINT2D_BYTES = 24  # x, y and the id of a 3D point
 TRACK_BYTES = 8  # the ids of an image and of a point in it
 
@@ -160,7 +160,7 @@ def _photograph(folder, model, lenses, image):
     fx, fy, cx, cy, distortion = _intrinsics(folder, model, lens)
     length = np.linalg.norm(image.pose[:4]) if _are_numbers(image.pose) else 0
     if abs(length - 1) > 1e-3:
-        raise Unusable(str(fail("its pose is no unit quaternion and place; mend it")), "no pose")
+        raise Unusable(str(fail("its pose is no unit quaternion and place; fix it")), "no pose")
     w, x, y, z, *translation = image.pose
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ translation])
@@ -232,11 +232,11 @@ def _lens(where, model, size, parameters):
     `where`.
     """
     if not all(1 <= side < MOST_PIXELS for side in size):
-        raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file anew")
+        raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file again")
     if len(parameters) != MODELS[model] or not _are_numbers(parameters):
         return Unusable(
             f"{where}: {model} has {MODELS[model]} parameters, finite and not huge; copy the file"
-            " anew",
+            " again",
             BROKEN_CAMERA,
         )
     return Lens(model, *size, tuple(parameters))
@@ -282,7 +282,7 @@ def _text_cameras(file):
             parameters = [float(word) for word in words[4:]]
         except (IndexError, ValueError, OverflowError):
             raise UserError(
-                f"{where}: is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; copy the file anew"
+                f"{where}: is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; copy the file again"
             ) from None
         if model not in MODELS:
             raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
@@ -300,7 +300,7 @@ def _text_images(file):
             numbers, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9]
         except (IndexError, ValueError, OverflowError):
             raise UserError(
-                f"{where}: is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; copy the file anew"
+                f"{where}: is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; copy the file again"
             ) from None
         number, line = next(lines, (number, ""))
         points = line.split()
@@ -322,7 +322,7 @@ def text_points(file: Path) -> Iterator[tuple[float, ...]]:
                 yield x, y, z, red, green, blue
             except ValueError:
                 raise UserError(
-                    f"{file}: line {number}: is not POINT3D_ID X Y Z R G B; copy the file anew"
+                    f"{file}: line {number}: is not POINT3D_ID X Y Z R G B; copy the file again"
                 ) from None
 
 

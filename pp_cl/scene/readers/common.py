@@ -78,7 +78,7 @@ def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
     width, height = camera.width, camera.height
     if not same_shape(size, (width, height)):
         is_turned = same_shape(size[::-1], (width, height))
-        what = "another shape; copy the images anew"
+        what = "another shape; copy the images again"
         what = "turned; write the images upright" if is_turned else what
         raise fail(
             f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, {what}"
@@ -185,7 +185,7 @@ def _read_array(opened, most):
 
 def _checked(file, name, array):
     if not (np.abs(array) < MOST).all():
-        raise UserError(f"{file}: {name}holds NaN, Inf or a huge number; write it anew")
+        raise UserError(f"{file}: {name}holds NaN, Inf or a huge number; write it again")
     return array
 
 
@@ -203,7 +203,7 @@ def read_numbers(file: Path) -> list[list[float]]:
             rows.append([float(word) for word in line.split()])
         except ValueError:
             raise UserError(
-                f"{file}: line {number}: {line[:60]!r} are no numbers; write it anew"
+                f"{file}: line {number}: {line[:60]!r} are no numbers; write it again"
             ) from None
         _checked(file, f"line {number}: ", np.array(rows[-1]))
     return [row for row in rows if row]

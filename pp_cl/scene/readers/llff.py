@@ -50,7 +50,8 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     if (places := numbered(names, count)) is None:
         raise UserError(
             f"{file}: has shape {rows.shape}, but {images}/ has {len(names)} images; must be"
-            f" {len(names)}x{NUMBERS} numbers; remove the images without a pose, or find poses anew"
+            f" {len(names)}x{NUMBERS} numbers; remove the images without a pose, or find the"
+            " poses again"
         )
 
     def read(index):

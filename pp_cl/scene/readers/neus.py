@@ -52,7 +52,7 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     if (places := numbered(names, count)) is None:
         raise UserError(
             f"{file}: has {count} world_mat_i, but {images}/ has {len(names)} images; copy both"
-            " anew"
+            " again"
         )
 
     def read(index):
