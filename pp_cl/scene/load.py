@@ -459,7 +459,7 @@ def load_scene(
         notes.check(len(read[split]), LEAST_VIEWS if is_whole else 1)
         if is_whole and NO_MASK in notes.left_out:
             bare = [view for _, one, view, _ in pairs if one.name in notes.left_out[NO_MASK]]
-            with suppress(UserError):  # whoever carves a hull with these masks is told
+            with suppress(UserError):  # else they stay left out
                 filled = within_silhouettes(dev or open_device(), read[split], bare)
                 notes.done[OF_OTHERS] = notes.left_out.pop(NO_MASK)
                 order = {one.name: i for i, one in enumerate(some)}
