@@ -110,23 +110,19 @@ def _seeds(one, box, points, inside, seen):
         cv2.fillConvexPoly(labels, outline, cv2.GC_PR_BGD)
     radius = max(1, round(SEED * CUT_SIDE))
     foot = box[0, 2] + FOOT * np.linalg.norm(box[1] - box[0])
-    near = _dots(one, one.pixels(points[inside & (points[:, 2] > foot)]), radius)
+    near = _dots(one, points[inside & (points[:, 2] > foot)], radius)
     near = _closed(near, round(NEAR * CUT_SIDE))
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
     shown_inside = inside[seen]
     sure = seen[shown_inside & (points[seen, 2] > foot)]
-    labels[_dots(one, one.pixels(points[seen[~shown_inside]]), radius)] = cv2.GC_BGD
-    labels[_dots(one, one.pixels(points[sure]), radius)] = cv2.GC_FGD
+    labels[_dots(one, points[seen[~shown_inside]], radius)] = cv2.GC_BGD
+    labels[_dots(one, points[sure], radius)] = cv2.GC_FGD
     return labels
 
 
-def _dots(one, places, radius):
-    """(H, W) bool: discs around places (N, 2) in pixels."""
-    marked = np.zeros(one.image.shape[:2], np.uint8)
-    x, y = np.floor(np.nan_to_num(places, nan=-1)).astype(int).T
-    found = (x >= 0) & (y >= 0) & (x < marked.shape[1]) & (y < marked.shape[0])
-    marked[y[found], x[found]] = 1
-    return dilated(marked, radius)
+def _dots(one, positions, radius):
+    """(H, W) bool: discs around the pixels that show world positions (N, 3)."""
+    return dilated(one.marked(positions), radius)
 
 
 def _eroded(marked, radius):
@@ -218,10 +214,7 @@ def gap_of(one: Window, hull: np.ndarray, edge: float) -> int:
 
 def silhouette(one: Window, hull: np.ndarray, gap: int) -> np.ndarray:
     """(H, W) bool: where a window shows vertices of a hull (N, 3), so many pixels apart."""
-    held = np.zeros(one.image.shape[:2], bool)
-    _, rows, columns = one.inside(hull)
-    held[rows, columns] = True
-    return _closed(held, gap)
+    return _closed(one.marked(hull), gap)
 
 
 def _marked(labels, standing_out):

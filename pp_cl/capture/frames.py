@@ -26,15 +26,8 @@ ENDINGS = (
     *(".jpg", ".jpeg", ".jfif", ".png", ".webp", ".tif", ".tiff", ".bmp"),
     *(".avif", ".heic", ".heif"),
 )
-FORMATS = (
-    "JPEG",
-    "PNG",
-    "WEBP",
-    "TIFF",
-    "BMP",
-    "AVIF",
-    "HEIF",
-)  # JPEG opens MPO, which phones write, too
+# of Pillow; JPEG opens MPO, which phones write, too
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "HEIF")
 KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
 MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769
 FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
@@ -92,15 +85,10 @@ def take_images(source: Path, images: Path, scene: Path | None = None) -> dict[s
                 f" needed ({'; '.join(why) or 'nothing is wrong with them'}); take 30 or more all"
                 " around the object"
             )
-    told = ("name", "source", "lens", "focal", "size", "sharpness")
-    return {
-        "images": [_of(one, told) for one in kept],
-        "left_out": [_of(one, ("source", "reason")) for one in left_out],
-    }
-
-
-def _of(facts, keys):
-    return {key: facts[key] for key in keys}
+    for one in kept:
+        del one["small"]
+    reasons = [{"source": one["source"], "reason": one["reason"]} for one in left_out]
+    return {"images": kept, "left_out": reasons}
 
 
 # Photographs --------------------------------------------------------------------------------------

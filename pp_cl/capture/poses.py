@@ -141,15 +141,9 @@ def _most_matches(database):
     with opened(database) as db:
         best = {image.image_id: 0 for image in db.read_all_images()}
         for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
-            for one in _images_of(pair):
+            for one in needed("pycolmap").pair_id_to_image_pair(pair):
                 best[one] = max(best[one], matches)
     return best
-
-
-def _images_of(pair):
-    from pycolmap import pair_id_to_image_pair
-
-    return pair_id_to_image_pair(pair)
 
 
 def photographs(model: Any, folder: str) -> list[Photograph]:

@@ -70,6 +70,13 @@ class Window:
         )
         return found, y[found].astype(int), x[found].astype(int)
 
+    def marked(self, positions: np.ndarray) -> np.ndarray:
+        """(H, W) bool: the pixels that show world positions (N, 3)."""
+        _, rows, columns = self.inside(positions)
+        shown = np.zeros(self.image.shape[:2], bool)
+        shown[rows, columns] = True
+        return shown
+
 
 def place_of(photograph: Photograph, box: np.ndarray) -> tuple[int, int, int, int] | None:
     """(x0, y0, x1, y1) around the projected box (2, 3) in a photograph; None where it is

@@ -20,19 +20,18 @@ def _decibels(text):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("run_folder", metavar="RUN", help="folder of a finished run")
-    parser.add_argument(
+    add = parser.add_argument
+    add("run_folder", metavar="RUN", help="folder of a finished run")
+    add(
         "--max-loss",
         type=_decibels,
         metavar="DB",
         default=0.1,
         help="the most that PSNR may lose, in dB, as 0.1 or 0.1dB (0.1)",
     )
-    parser.add_argument(
-        "--out", metavar="DIR", help="new folder of the compressed run (RUN-compressed)"
-    )
+    add("--out", metavar="DIR", help="new folder of the compressed run (RUN-compressed)")
     shared.add_run_scene(parser)
-    parser.add_argument("-v", "--verbose", action="store_true", help="also print what is tried")
+    add("-v", "--verbose", action="store_true", help="also print what is tried")
     shared.add_device(parser)
 
 

@@ -12,18 +12,13 @@ OTHER_LPIPS = "lpips_alex"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("run_folder", metavar="RUN", help="folder of the run")
+    add = parser.add_argument
+    add("run_folder", metavar="RUN", help="folder of the run")
     shared.add_metrics(parser)
-    parser.add_argument("--split", default="test", help="train, val or test (default)")
+    add("--split", default="test", help="train, val or test (default)")
     shared.add_run_scene(parser)
-    parser.add_argument(
-        "--out",
-        metavar="FOLDER",
-        help="folder to write to, instead of RUN/eval",
-    )
-    parser.add_argument(
-        "--save-images", action="store_true", help="write every view to RUN/eval/images/"
-    )
+    add("--out", metavar="FOLDER", help="folder to write to, instead of RUN/eval")
+    add("--save-images", action="store_true", help="write every view to RUN/eval/images/")
     shared.add_json(parser)
     shared.add_open(parser)
     shared.add_device(parser)

@@ -23,19 +23,15 @@ OF_POINTS = ("ply", "glb")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument(
-        "run_folders",
-        metavar="RUN",
-        nargs="+",
-        help="folder of the run; several for a gallery",
-    )
-    parser.add_argument("--format", required=True, choices=FORMATS, help="see below")
-    parser.add_argument(
+    add = parser.add_argument
+    add("run_folders", metavar="RUN", nargs="+", help="folder of the run; several for a gallery")
+    add("--format", required=True, choices=FORMATS, help="see below")
+    add(
         "--out",
         metavar="PATH",
         help="file, or folder of scene and gallery (default: in RUN/export)",
     )
-    parser.add_argument(
+    add(
         "--min-weight",
         type=shared.number(0, 1e6),
         metavar="W",

@@ -34,12 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("scenes", nargs="+", metavar="SCENE", help="folder of a scene, or the word demo")
-    add(
-        "--out",
-        required=True,
-        metavar="DIR",
-        help="folder of the runs and the table",
-    )
+    add("--out", required=True, metavar="DIR", help="folder of the runs and the table")
     add(
         "--seeds",
         type=shared.several(shared.integer(0, 2**32 - 1)),

@@ -23,19 +23,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--preset",
         choices=PRESETS,
-        help=(
-            "tiny (default): images of about 200 pixels, minutes on a CPU; small: of 400, and full:"
-            " of 800, longer; paper: the paper's numbers"
-        ),
+        help="tiny (default): images of about 200 pixels, minutes on a CPU; small: of 400, and"
+        " full: of 800, longer; paper: the paper's numbers",
     )
     add("--iterations", metavar="N", help="training steps; more of them extend a finished run")
     add(
         "--minutes",
         metavar="N",
-        help=(
-            "minutes for the steps, instead of --iterations; kept within a quarter (reading the"
-            " scene and `pp-cl eval` come on top)"
-        ),
+        help="minutes for the steps, instead of --iterations; kept within a quarter (reading the"
+        " scene and `pp-cl eval` come on top)",
     )
     add("--points", metavar="N", help="points wanted in the visual hull")
     add(
@@ -48,11 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="begin with the network of another run of yours (default: the demo's), or random",
     )
     add("--seed", metavar="S", help="seed of all random choices (0)")
-    add(
-        "--memory",
-        metavar="GIB",
-        help="most device memory to use",
-    )
+    add("--memory", metavar="GIB", help="most device memory to use")
     add("--eval-every", metavar="N", help="measure a few test views every N steps (never)")
     add(
         "--tensorboard",
@@ -188,14 +180,14 @@ def _run(training, options):
     """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
     from pp_cl.commands.progress import Progress, first_signal
     from pp_cl.errors import Stopped
-    from pp_cl.files.scalars import Scalars
+    from pp_cl.files.scalars import curves
 
     trainer, folder = training.trainer, training.folder
     with ExitStack() as stack:
         followers = [stack.enter_context(Progress(training))]
         if options.tensorboard:
-            scalars = Scalars(folder.path / "tensorboard", trainer.step)
-            followers.append(stack.enter_context(scalars))
+            drawn = curves(folder.path / "tensorboard", trainer.step)
+            followers.append(stack.enter_context(drawn))
         if options.view:
             from pp_cl.view.run_view import shown_training
 

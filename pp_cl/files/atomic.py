@@ -37,17 +37,33 @@ def atomic_file(path: Path | str, *, noted: bool = True) -> Iterator[BinaryIO]:
     naming the file when the disk is full or may not be written; nothing half-written stays behind.
     """
     path = Path(path)
-    temporary = _temporary(path)
+    with _named(_temporary(path), path, noted) as temporary, open(temporary, "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path of the same suffix for a library to write to, whose file appears under
+    `path` only when the block ends well.
+
+    Raises UserError naming the file when the library cannot write it.
+    """
+    with _named(_temporary(path, path.suffix), path) as temporary:
+        yield temporary
+
+
+@contextmanager
+def _named(temporary, path, noted=True):
+    """The temporary path; what is written there gets its name when the block ends well."""
     try:
-        with open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield temporary
         if noted:
             note(temporary, path)
         _replace(temporary, path)
         _sync_folder(path.parent)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # libraries in C++ raise the latter
         raise _refusal(path, error) from error
     finally:
         _remove(temporary)
@@ -65,9 +81,9 @@ def _replace(temporary, path):
             time.sleep(0.1)
 
 
-def _temporary(path):
+def _temporary(path, suffix=""):
     """The name under which a file is written."""
-    return path.parent / f".{path.name}.{os.getpid()}.pp-cl.tmp"  # `.` and `/` have no name
+    return path.parent / f".{path.name}.{os.getpid()}.pp-cl.tmp{suffix}"  # `.` and `/` have no name
 
 
 def mend(error: OSError) -> str:
@@ -95,24 +111,6 @@ def _remove(temporary):
     """Remove what did not get its final name; what stays is removed by the next start."""
     with suppress(OSError):
         temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path of the same suffix for a library to write to, whose file appears under
-    `path` only when the block ends well.
-
-    Raises UserError naming the file when the library cannot write it.
-    """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.pp-cl.tmp{path.suffix}")
-    try:
-        yield temporary
-        note(temporary, path)
-        _replace(temporary, path)
-    except (OSError, RuntimeError) as error:  # libraries in C++ raise the latter
-        raise _refusal(path, error) from error
-    finally:
-        _remove(temporary)
 
 
 @contextmanager

@@ -64,13 +64,9 @@ def check_finite(arrays: Mapping[str, np.ndarray | Rows]) -> None:
 
 def _finite_pieces(name, array):
     for piece in [array] if isinstance(array, np.ndarray) else array.pieces():
-        _check_piece(name, piece)
+        if piece.dtype.kind == "f" and not np.isfinite(piece).all():
+            raise Diverged(f"{name} holds NaN or Inf")
         yield piece
-
-
-def _check_piece(name, piece):
-    if piece.dtype.kind == "f" and not np.isfinite(piece).all():
-        raise Diverged(f"{name} holds NaN or Inf")
 
 
 # Reading ------------------------------------------------------------------------------------------

@@ -26,9 +26,7 @@ def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) 
     """
     pairs = zip(predictions, truths, strict=True)
     images = [to_8bit(image) for p, t in pairs for image in (p, t, _error(p, t))]
-    table = np.pad(tiles(images, 3), ((HEADER, 0), (0, 0), (0, 0)), constant_values=255)
-    width = _cell(images)[1] + GAP
-    return _captioned(table, [(column * width, 0) for column in range(3)], CAPTIONS)
+    return contact_sheet(images, CAPTIONS * len(predictions), len(CAPTIONS))
 
 
 def contact_sheet(
@@ -38,16 +36,10 @@ def contact_sheet(
     columns = min(columns, len(images))
     headed = [np.pad(i, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255) for i in images]
     height, width = (side + GAP for side in _cell(headed))
-    places = [(i % columns * width, i // columns * height) for i in range(len(images))]
-    return _captioned(tiles(headed, columns), places, captions)
-
-
-def _captioned(table, places, captions):
-    """The picture with captions whose strips begin at the places, (x, y)."""
-    picture = Image.fromarray(table)
+    picture = Image.fromarray(tiles(headed, columns))
     draw = ImageDraw.Draw(picture)
-    for (x, y), caption in zip(places, captions, strict=True):
-        draw.text((x + 3, y + 1), caption, fill=INK)
+    for i, caption in enumerate(captions):
+        draw.text((i % columns * width + 3, i // columns * height + 1), caption, fill=INK)
     return np.array(picture)
 
 

@@ -122,12 +122,12 @@ def _size(path, window):
 def _wanted(path, header, size):
     """The names of R, G, B, or of Y three times, and of A where it is there. Raises UserError."""
     channels = {channel.name: channel for channel in header["channels"]}
-    layers = {name.rpartition(".")[0] for name in channels}
+    layers = {name[: name.rfind(".") + 1] for name in channels}  # with the point behind their name
     found = [
-        (layer, [f"{layer}.{name}" if layer else name for name in colours])
+        (layer, [layer + name for name in colours])
         for layer in sorted(layers)
         for colours in COLOURS
-        if all((f"{layer}.{name}" if layer else name) in channels for name in colours)
+        if all(layer + name in channels for name in colours)
     ]
     whole = [entry for entry in found if entry[0] == ""] or found
     if len(whole) != 1:
@@ -136,8 +136,7 @@ def _wanted(path, header, size):
             f" ({', '.join(sorted(channels))[:80]}); keep one of R, G, B and A, or of Y"
         )
     layer, colours = whole[0]
-    alpha = f"{layer}.A" if layer else "A"
-    names = colours * (3 // len(colours)) + [alpha] * (alpha in channels)
+    names = colours * (3 // len(colours)) + [f"{layer}A"] * (f"{layer}A" in channels)
     if any((channels[name].xSampling, channels[name].ySampling) != (1, 1) for name in names):
         raise UserError(f"{path}: its channels differ in size; save it without subsampling")
     tiles = header.get("tiles")

@@ -1,6 +1,7 @@
 """Writes the curves of a training for TensorBoard, with the package tensorboardX."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from pp_cl.errors import UserError
 BESIDES = ("step", "seconds")  # numbers of a row of the log that are no curves
 
 
-def writer_class() -> type:
+def writer_class() -> Any:
     """What writes for TensorBoard. Raises UserError where tensorboardX is missing."""
     try:
         from tensorboardX import SummaryWriter
@@ -20,32 +21,20 @@ def writer_class() -> type:
     return SummaryWriter
 
 
-class Scalars:
-    """Writes the rows of a log into a folder that TensorBoard reads; the folder is made when the
-    first row comes.
+@contextmanager
+def curves(folder: Path, step: int) -> Iterator[Callable[[int, dict[str, Any] | None], None]]:
+    """What writes the row of a step, if there is one, into a folder that TensorBoard reads.
 
     step: from which on rows will be written, anew where an interrupted training wrote them before.
     Raises UserError where tensorboardX is missing.
     """
+    with writer_class()(str(folder), purge_step=step) as writer:
 
-    def __init__(self, folder: Path, step: int) -> None:
-        make = writer_class()
-        self._make = lambda: make(str(folder), purge_step=step)
-        self._writer: Any = None
+        def write(step: int, row: dict[str, Any] | None) -> None:
+            for name, value in scalars(row or {}):
+                writer.add_scalar(name, value, step)
 
-    def __enter__(self) -> "Scalars":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._writer:
-            self._writer.close()
-
-    def __call__(self, step: int, row: dict[str, Any] | None) -> None:
-        """Write the row of a step, if there is one."""
-        if row:
-            self._writer = self._writer or self._make()
-            for name, value in scalars(row):
-                self._writer.add_scalar(name, value, step)
+        yield write
 
 
 def scalars(row: dict[str, Any]) -> Iterator[tuple[str, float]]:

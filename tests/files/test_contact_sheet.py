@@ -7,7 +7,7 @@ from pp_cl.files.contact_sheet import GAP, HEADER, comparison, contact_sheet
 
 def tile(picture, row, column, height, width):
     """One image of the picture."""
-    y, x = HEADER + row * (height + GAP), column * (width + GAP)
+    y, x = HEADER + row * (HEADER + height + GAP), column * (width + GAP)
     return picture[y : y + height, x : x + width]
 
 
@@ -17,11 +17,8 @@ def test_tiles_stand_in_their_places(rng):
     truths[0, :5] = predictions[0, :5]
     truths[1, :5] = 1 - np.round(predictions[1, :5])
     picture = comparison(list(predictions), list(truths))
-    assert picture.dtype == np.uint8 and picture.shape == (
-        HEADER + 2 * 30 + GAP,
-        3 * 40 + 2 * GAP,
-        3,
-    )
+    shape = 2 * (HEADER + 30) + GAP, 3 * 40 + 2 * GAP, 3
+    assert picture.dtype == np.uint8 and picture.shape == shape
     for row in range(2):
         assert np.abs(tile(picture, row, 0, 30, 40) - predictions[row] * 255).max() <= 0.5 + 1e-4
         assert np.abs(tile(picture, row, 1, 30, 40) - truths[row] * 255).max() <= 0.5 + 1e-4

@@ -9,7 +9,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.errors import UserError
-from pp_cl.files.scalars import Scalars, scalars
+from pp_cl.files.scalars import curves, scalars
 
 
 def test_a_row_gives_a_curve_for_every_number():
@@ -29,7 +29,7 @@ def test_a_row_gives_a_curve_for_every_number():
 def test_without_the_package_one_line_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(UserError, match=r"pip install tensorboardX"):
-        Scalars(tmp_path / "tensorboard", 0)
+        curves(tmp_path / "tensorboard", 0).__enter__()
     monkeypatch.setattr("pp_cl.device.discover.open_device", lambda _: pytest.fail("work"))
     assert main(["train", "demo", "--out", str(tmp_path / "run"), "--tensorboard"]) == 2
     assert not list(tmp_path.iterdir())
