@@ -59,7 +59,7 @@ class RunFolder:
             return None
         try:
             result = json.loads(read_json_text(file, MOST_METRICS))
-            found = {
+            found: dict[str, Any] = {
                 "mean": {name: float(value) for name, value in result["mean"].items()},
                 "step": int(result["step"]),
                 "finished": bool(result["finished"]),
