@@ -13,7 +13,7 @@ from support.checkpoints import load_checkpoint
 from pp_cl.config import Config, assign, load_config, preset, sections, text_of
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
 from pp_cl.files.checkpoint import save_checkpoint
-from pp_cl.files.run_folder import read_row
+from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid
 
@@ -84,7 +84,7 @@ def test_settings_are_themselves_again_from_their_file(tmp_path, pair):
         assert config.train.crop % 4 and "train.crop" in str(error)
 
 
-@given(st.integers(0, 10**9), finite.filter(lambda x: x >= 0), json_values)
+@given(st.integers(0, 10**9), finite.filter(lambda x: 0 <= x < MOST_NUMBER), json_values)
 def test_a_row_of_the_log_is_finite_or_none(step, seconds, value):
     row = {"step": step, "seconds": seconds}
     assert read_row(json.dumps(row)) == row

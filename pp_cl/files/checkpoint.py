@@ -64,9 +64,13 @@ def check_finite(arrays: Mapping[str, np.ndarray | Rows]) -> None:
 
 def _finite_pieces(name, array):
     for piece in [array] if isinstance(array, np.ndarray) else array.pieces():
-        if piece.dtype.kind == "f" and not np.isfinite(piece).all():
-            raise Diverged(f"{name} holds NaN or Inf")
+        _check_piece(name, piece)
         yield piece
+
+
+def _check_piece(name, piece):
+    if piece.dtype.kind == "f" and not np.isfinite(piece).all():
+        raise Diverged(f"{name} holds NaN or Inf")
 
 
 # Reading ------------------------------------------------------------------------------------------

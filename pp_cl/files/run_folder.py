@@ -1,6 +1,5 @@
 """The folder of a run: its file names, config, checkpoint, log and lock."""
 
-import io
 import json
 import math
 import os
@@ -24,6 +23,8 @@ MASKS_PICTURE = "masks.png"
 MOST_OWNER = 1000  # bytes of the line that names the owner
 MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
 MOST_LOG = 2**25  # bytes of a log: 80,000 rows
+MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
+MOST_NUMBER = 1e300  # in a row
 
 
 class RunFolder:
@@ -59,16 +60,26 @@ class RunFolder:
             return None
         try:
             result = json.loads(read_json_text(file, MOST_METRICS))
-            found: dict[str, Any] = {
+            found = {
                 "mean": {name: float(value) for name, value in result["mean"].items()},
-                "step": int(result["step"]),
-                "finished": bool(result["finished"]),
-                "points": int(result["points"]["final"]),
-                "device": str(result["device"]),
+                "step": result["step"],
+                "finished": result["finished"],
+                "points": result["points"]["final"],
+                "device": result["device"],
             }
-            if not all(map(math.isfinite, found["mean"].values())):
-                raise ValueError("a metric is not finite")
-        except Exception as error:  # values of other kinds fail with whatever comes up
+            kinds = {"step": int, "finished": bool, "points": int, "device": str}
+            is_right = all(type(found[key]) is kind for key, kind in kinds.items())
+            if not (is_right and all(map(math.isfinite, found["mean"].values()))):
+                raise ValueError("values of another kind")
+        except (
+            OSError,
+            ValueError,
+            LookupError,
+            TypeError,
+            AttributeError,
+            ArithmeticError,
+            RecursionError,
+        ) as error:
             raise refusal(file, error, "metrics", f"run `pp-cl eval {self}` again") from None
         return found
 
@@ -198,33 +209,35 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
     something else.
     """
     try:
-        row = strict_json(line)
-        json.dumps(row, allow_nan=False)  # it will be written again
-        numbers = [row.get(name, 0) for name in ("step", "seconds", "loss", "psnr")]
-        is_row = type(row["step"]) is int and "seconds" in row and min(numbers[:2]) >= 0
-        is_row = is_row and isinstance(row.get("device", ""), str)
-        is_row = is_row and all(type(n) in (int, float) and math.isfinite(n) for n in numbers)
-    except (ValueError, TypeError, AttributeError, LookupError, OverflowError, RecursionError):
+        row = strict_json(line) if len(line) <= MOST_LINE else None
+        if not isinstance(row, dict) or not _is_kept(row):
+            return None
+    except (ValueError, RecursionError):
         return None
-    return row if is_row else None
+    whole, device = type(row.get("step")) is int, row.get("device", "")
+    numbers = [row.get(name, 0) for name in ("step", "seconds", "loss", "psnr")]
+    is_row = whole and "seconds" in row and isinstance(device, str)
+    is_row = is_row and all(type(number) in (int, float) for number in numbers)
+    return row if is_row and min(numbers[:2]) >= 0 else None
+
+
+def _is_kept(value):
+    """Whether a value of JSON may be written again: no number in it is huge, infinite included."""
+    if isinstance(value, (list, dict)):
+        return all(map(_is_kept, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, (int, float)) or abs(value) < MOST_NUMBER
 
 
 def _rows(path, step=math.inf):
     """The rows of a log up to `step`, or to one that says finished where a step is given. The first
     that is broken, and all after it, are left out with a warning; of a log that may be growing its
-    last line without one. Raises UserError for a log that is too long.
+    last line without one.
     """
-    if not path.is_file():
-        return []
-    if path.stat().st_size > MOST_LOG:
-        raise UserError(
-            f"{path}: is larger than {MOST_LOG} bytes; move it away, and raise train.log_every"
-        )
     rows, last = [], {"step": 0, "seconds": 0}
-    for number, line in enumerate(io.BytesIO(path.read_bytes()), 1):
+    for number, line in enumerate(_lines(path), 1):
         row = read_row(line)
         if row is None or any(row[name] < last[name] for name in last):
-            if line.endswith(b"\n") or step < math.inf:
+            if line.endswith(b"\n") or len(line) > MOST_LINE or step < math.inf:
                 warnings.warn(
                     f"{path}: line {number} is no row of a log; it is left out, as is all after it",
                     stacklevel=2,
@@ -235,3 +248,16 @@ def _rows(path, step=math.inf):
         rows.append(row)
         last = {name: row[name] for name in last}
     return rows
+
+
+def _lines(path):
+    """The lines of a log, in pieces where they are too long. Raises UserError for a log that is too
+    long itself.
+    """
+    if path.is_file():
+        if path.stat().st_size > MOST_LOG:
+            raise UserError(
+                f"{path}: is larger than {MOST_LOG} bytes; move it away, and raise train.log_every"
+            )
+        with path.open("rb") as file:
+            yield from iter(lambda: file.readline(MOST_LINE + 1), b"")

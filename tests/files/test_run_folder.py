@@ -57,6 +57,7 @@ def test_a_finished_row_is_made_again(folder):
         b'{"step": 10, "seconds": 1.0, "psnr": NaN}',
         b'{"step": 10, "seconds": 1e999}',
         b"[" * 100_000,
+        b'{"step": 10, "seconds": 1.0, "rates": ' + b"[" * 900 + b"]" * 900 + b"}",
         b"",
         b"null",
         b'{"step": true, "seconds": 1.0}',
@@ -71,6 +72,7 @@ def test_a_finished_row_is_made_again(folder):
         b'{"step": 10, "seconds": 1.0, "psnr": ' + b"9" * 400 + b"}",
         b'{"step": 10, "seconds": 1.0, "rates": {"sh": [1, -Infinity]}}',
         b'{"step": 10, "seconds": 1.0, "device": [1]}',
+        b'{"step": 10, "seconds": 1.0, "x": "' + b"y" * 2**17 + b'"}',
     ],
 )
 def test_a_damaged_log_is_cut_off_there(folder, line):
