@@ -2,13 +2,14 @@
 
 import errno
 import os
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import pytest
 
 from pp_cl.files.untrusted import (
     MOST_REASON,
     opened_regular,
+    opened_zip,
     read_json_text,
     read_regular,
     refusal,
@@ -34,6 +35,18 @@ def test_json_of_at_most_so_many_values(tmp_path, monkeypatch):
     (tmp_path / "a.json").write_text("[{},[],[],[]]")
     with pytest.raises(ValueError, match="more than 6 values"):
         read_json_text(tmp_path / "a.json", 99)
+
+
+def test_a_zip_of_a_bounded_directory(tmp_path, monkeypatch):
+    """Each entry of which takes more memory than its text."""
+    with ZipFile(tmp_path / "a.zip", "w") as archive:
+        for i in range(9):
+            archive.writestr(str(i), b"")
+    with opened_zip(tmp_path / "a.zip") as archive:
+        assert len(archive.namelist()) == 9
+    monkeypatch.setattr("pp_cl.files.untrusted.MOST_DIRECTORY", 9 * 46)
+    with pytest.raises(ValueError, match="directory is larger"), opened_zip(tmp_path / "a.zip"):
+        pass
 
 
 @pytest.mark.unix

@@ -279,6 +279,15 @@ def test_models_of_later_versions_are_named(binary):
     refused(binary, "SIMPLE_DIVISION", "colmap image_undistorter", splits=("test",))
 
 
+def test_more_entries_or_letters_than_a_model_has(written, monkeypatch):
+    folder, _ = written
+    monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_ENTRIES", 10)
+    refused(folder, "more than 10 entries")
+    if (folder / "sparse/0/images.txt").exists():
+        monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_LINE", 40)
+        refused(folder, "has 40 characters or more")
+
+
 BAD_BYTES = {
     "cut in a camera": ("cameras.bin", lambda b: b[:60]),
     "cut in a name": ("images.bin", lambda b: b[:76]),
@@ -290,8 +299,6 @@ BAD_BYTES = {
     "name": ("images.bin", lambda b: b[:72] + b"\xff" + b[73:]),
     "size": ("cameras.bin", lambda b: b[:16] + struct.pack("<Q", 2**40) + b[24:]),
     "empty": ("cameras.bin", lambda b: b""),
-    "camera twice": ("cameras.bin", lambda b: b[:64] + struct.pack("<I", 1) + b[68:]),
-    "line break in a name": ("images.bin", lambda b: b[:72] + b"\n" + b[73:]),
     "no name": ("images.bin", lambda b: b[:72] + b[82:]),
 }
 

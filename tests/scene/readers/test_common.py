@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.refused import refusing
 from support.same_scene import held_out, views
 from support.transforms_scenes import escape, refused
 
@@ -20,6 +21,7 @@ from pp_cl.scene.readers.common import (
     fail_at,
     folder_images,
     hold_out,
+    read_json,
     read_npy,
     read_npz,
     read_numbers,
@@ -203,9 +205,8 @@ def test_paths_as_windows_writes_them(tmp_path):
 def test_paths_that_cannot_be_used(tmp_path, given):
     (tmp_path / "scene").mkdir()
     write_png(tmp_path / "a.png", np.zeros((2, 2)))
-    with pytest.raises(UserError, match="^file: ") as caught:
+    with pytest.raises(UserError, match="^file: "):
         find_image(tmp_path / "scene", given, FAIL)
-    assert "\n" not in str(caught.value)
 
 
 def test_images_of_a_folder_are_sorted_and_nothing_else_is_one(tmp_path):
@@ -240,6 +241,16 @@ def test_what_numpy_writes(tmp_path, rng):
     assert list(read_npz(tmp_path / "a.npz", "cam_")) == ["cam_1"]
 
 
+def test_json_of_at_most_so_many_bytes(tmp_path, monkeypatch):
+    (tmp_path / "a.json").write_text('{"frames": [1, 2]}')
+    assert read_json(tmp_path / "a.json") == {"frames": [1, 2]}
+    monkeypatch.setattr(common, "MOST_JSON", 17)
+    unreadable(read_json, tmp_path / "a.json")
+    monkeypatch.setattr("pp_cl.files.untrusted.MOST_VALUES", 2)
+    monkeypatch.setattr(common, "MOST_JSON", 18)
+    unreadable(read_json, tmp_path / "a.json")
+
+
 def test_lines_of_numbers(tmp_path):
     (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf1 2.5\r\n\r\n-3e2\r\n")  # as Windows does
     assert read_numbers(tmp_path / "a.txt") == [[1, 2.5], [-300]]
@@ -261,9 +272,8 @@ HEADERS = {
 
 
 def unreadable(read, *given):
-    with pytest.raises(UserError) as caught:
+    with refusing(given[0]):
         read(*given)
-    assert str(given[0]) in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("case", HEADERS)
@@ -283,6 +293,12 @@ def test_what_is_no_array(tmp_path, content):
     (tmp_path / "a.npy").write_bytes(content)
     unreadable(read_npy, tmp_path / "a.npy")
     unreadable(read_npz, tmp_path / "a.npy", "cam")
+
+
+def test_headers_of_up_to_4_gigabytes_are_not_read(tmp_path):
+    with (tmp_path / "a.npy").open("wb") as file:
+        np.lib.format.write_array(file, np.ones(3), version=(2, 0))
+    unreadable(read_npy, tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize(
@@ -306,9 +322,8 @@ def test_a_compressed_file_with_a_changed_byte(tmp_path, rng, method):
         (tmp_path / "a.npz").write_bytes(changed)
         try:
             read_npz(tmp_path / "a.npz", "cam")
-        except UserError as error:
+        except UserError:
             refusals += 1
-            assert "\n" not in str(error)
     assert refusals > len(data) // 2
 
 

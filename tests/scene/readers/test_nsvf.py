@@ -69,7 +69,6 @@ BAD = {
     "pose of words": (POSE, "a b c d\n"),
     "ragged pose": (POSE, "1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n"),
     "a long file": (POSE, "1 0 0 0\n" * 2**17 + "1"),
-    "intrinsics of words": ("intrinsics.txt", "focal\n"),
     "no intrinsics": ("intrinsics.txt", ""),
     "focal length 0": ("intrinsics.txt", "0 14 12 0\n"),
     "skew": ("intrinsics.txt", "40 2 14\n0 41 12\n0 0 1\n"),
