@@ -26,7 +26,6 @@ REFUSED = [
     *((f"{command} none", "none") for command in (*OF_RUNS, SHAPE)),
     *((f"{command} empty", "empty") for command in (*OF_RUNS, SHAPE)),
     *((f"{command} young", "checkpoint.npz") for command in (*OF_RUNS, SHAPE) if command != "view"),
-    *((f"{command} corrupt", "corrupt/checkpoint.npz") for command in ("eval", "info", "render")),
     *((f"{command} run --scene gone", "gone") for command in (*OF_RUNS, SHAPE)),
     ("view full", "no scene in it: 1 image"),
     ("eval run --split val", "val"),
@@ -121,6 +120,13 @@ REFUSED = [
     ("sweep demo --out new --set train.seed=1", "--seeds"),
     ("train demo --out new --masks run", "--masks"),
     ("sweep demo --out new --set points.sh_degree=3", "points.sh_degree"),
+    (f"{TRAIN} --masks nowhere", "nowhere"),
+    (f"{TRAIN} --mask-from colour", "--mask-from"),
+    *((f"{TRAIN} --set scene.mask_tolerance={value}", "mask_tolerance") for value in ("0", "nan")),
+    *(
+        (f"{TRAIN} --set scene.box={box}", "scene.box")
+        for box in ("1,2,3", "0,0,0,1,1,0", "a,0,0,1,1,1")
+    ),
     ("eval run --metrics beauty", "--metrics"),
     ("view run --port 70000", "--port"),
     ("bench unet --blocks triple", "--blocks"),
@@ -146,10 +152,9 @@ REFUSED = [
 def folder(scene, finished, tmp_path, monkeypatch):
     """The folder that one is in: a run, runs that lack something, a mesh, files in the way."""
     monkeypatch.chdir(tmp_path)
-    for name in ("run", "young", "corrupt", "unknown"):
+    for name in ("run", "young", "unknown"):
         shutil.copytree(finished, name)
     Path("young/checkpoint.npz").unlink()
-    Path("corrupt/checkpoint.npz").write_bytes(b"PK\x03\x04 not really")
     Path("unknown/config.json").write_text("{}")
     shutil.copytree(scene, "broken")
     Path("broken/transforms_train.json").write_text('{"frames": [')

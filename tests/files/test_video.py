@@ -104,15 +104,11 @@ def test_webm_keeps_what_is_transparent(tmp_path):
     assert (alpha[:, 52:] < 30).all() and (alpha[:, :48] > 225).all()
 
 
-def test_a_place_that_cannot_be_written_is_one_line(tmp_path):
-    with pytest.raises(UserError, match="film.mp4: cannot be written"):
-        write_video(tmp_path / "missing" / "film.mp4", frames(), 10)
-
-
 @pytest.mark.unix
-@pytest.mark.parametrize("suffix", ["mp4", "gif"])
-def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path, suffix):
-    """A limit on the size of a file stands for it, in a process of its own."""
+def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path):
+    """Of which ffmpeg says nothing; a limit on the size of a file stands for it, in a process of
+    its own.
+    """
     script = (
         "import resource, signal, sys\n"
         "import numpy as np\n"
@@ -127,9 +123,9 @@ def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path, suffix):
         "except UserError as error:\n"
         "    print(error)\n"
     )
-    words = [sys.executable, "-c", script, str(tmp_path / f"film.{suffix}")]
+    words = [sys.executable, "-c", script, str(tmp_path / "film.mp4")]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60)
-    assert f"film.{suffix}: cannot be written" in done.stdout and done.stderr == ""
+    assert "film.mp4: cannot be written" in done.stdout and done.stderr == ""
     assert list(tmp_path.iterdir()) == []
 
 

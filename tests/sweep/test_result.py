@@ -3,7 +3,6 @@
 import pytest
 from support.sweeps import jobs_of, pretend
 
-from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.sweep.result import finished_row
 
@@ -68,10 +67,3 @@ def test_a_lost_log_leaves_the_seconds_unknown(job):
     pretend(job, 21.5)
     RunFolder(job.folder).log.unlink()
     assert finished_row(job)["seconds"] is None
-
-
-def test_other_settings_in_the_folder_are_refused(job, tmp_path):
-    pretend(job, 21.5)
-    (other,) = jobs_of(["demo"], tmp_path / "out", [4], given=[("points.count", "9", "--set")])
-    with pytest.raises(UserError, match="points.count is 1500 there, 9 asked for"):
-        finished_row(other)
