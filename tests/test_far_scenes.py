@@ -102,6 +102,15 @@ def far_run(tmp_path_factory, session_device):
     return load_run(session_device, folder / "run")
 
 
+def glb_points(path):
+    """(N, 3) places in the world of the points of a file."""
+    cloud = trimesh.load(path)
+    [name] = cloud.graph.nodes_geometry
+    place, _ = cloud.graph[name]
+    [read] = cloud.geometry.values()
+    return read.vertices + place[:3, 3]
+
+
 def test_exported_points_keep_their_places_in_the_world(far_run, tmp_path):
     points = coloured_points(far_run)
     positions = far_run.model.positions()[points.rows]
@@ -109,22 +118,14 @@ def test_exported_points_keep_their_places_in_the_world(far_run, tmp_path):
     vertex = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     assert np.array_equal(np.stack([vertex[name] for name in "xyz"], 1), positions)
     write_glb(tmp_path / "a.glb", {"POSITION": points.positions})
-    cloud = trimesh.load(tmp_path / "a.glb")
-    [name] = cloud.graph.nodes_geometry
-    place, _ = cloud.graph[name]
-    [read] = cloud.geometry.values()
-    np.testing.assert_allclose(read.vertices + place[:3, 3], positions, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(glb_points(tmp_path / "a.glb"), positions, rtol=0, atol=1e-6)
 
 
 def test_exported_splats_keep_their_places_in_the_world(far_run, tmp_path):
     up = up_of(far_run.cameras("train"))
     table, origin = splats(far_run, up)
     write_splat_glb(tmp_path / "a.glb", table, origin)
-    cloud = trimesh.load(tmp_path / "a.glb")
-    [name] = cloud.graph.nodes_geometry
-    place, _ = cloud.graph[name]
-    [read] = cloud.geometry.values()
-    away, _ = cKDTree(far_run.model.positions()).query(read.vertices + place[:3, 3])
+    away, _ = cKDTree(far_run.model.positions()).query(glb_points(tmp_path / "a.glb"))
     assert away.max() < 1e-3 * far_run.model.grid.edge < 1e-6 * np.abs(origin).max()
 
 

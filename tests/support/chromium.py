@@ -103,14 +103,6 @@ class Page:
             await asyncio.sleep(pause)
         await self.mouse("mouseReleased", x, y, button=button, clickCount=1)
 
-    async def touch(self, *paths):
-        """Fingers that go along paths, lists of (x, y) of the same length."""
-        for step, places in enumerate(zip(*paths, strict=True)):
-            kind = "touchMove" if step else "touchStart"
-            points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
-            await self.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
-        await self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
-
     async def key(self, key):
         """Press a key."""
         await self.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=key)

@@ -121,15 +121,7 @@ def test_a_photograph_is_shown_in_the_middle_and_without_frustums(view, served):
 def test_a_click_goes_to_a_view(view, served):
     goal = view.page._views[4].camera
     with looking(view, served[1]) as opened:
-        opened.send(
-            "SceneNodeClickMessage",
-            name="/views/4",
-            instance_index=None,
-            ray_origin=[0, 0, 0],
-            ray_direction=[0, 0, 1],
-            screen_pos=[0, 0],
-            modifier=None,
-        )
+        opened.click("/views/4")
         found = opened.receive("SetCameraPositionMessage", lambda m: not m["initial"])
         np.testing.assert_allclose(view.page._space.world(found["position"]), goal.eye, atol=1e-5)
 
@@ -234,11 +226,15 @@ def test_a_run_whose_photographs_are_gone_is_still_shown(served, dev, copied):
         assert "photographs are not there" in view.page._status.content
 
 
-def test_a_watched_training_has_the_same_bits(dev, scene, tmp_path, runs):
+@pytest.fixture
+def training(dev, scene, tmp_path, runs):
+    """A training of 40 steps in the folder run; what it leaves alone is in the folder alone."""
     alone = runs.trained(tmp_path / "alone", scene, train__iterations=40)
     config = load_config(alone / "config.json")
-    folder = RunFolder(tmp_path / "run")
-    training = open_training(dev, folder, config, None)
+    return open_training(dev, RunFolder(tmp_path / "run"), config, None)
+
+
+def test_a_watched_training_has_the_same_bits(training, tmp_path):
     cameras, pictures = ring_cameras(5, 96), []
     with shown_training(training) as (address, on_step), tab(address) as opened:
         page = page_of(on_step)
@@ -255,7 +251,7 @@ def test_a_watched_training_has_the_same_bits(dev, scene, tmp_path, runs):
         training.run(follow)
         shapes = {opened.picture().shape[:2] for _ in range(3)}
     assert pictures == list(range(1, 41)) and max(map(max, shapes)) <= 48
-    assert arrays(folder.path) == arrays(alone)
+    assert arrays(tmp_path / "run") == arrays(tmp_path / "alone")
 
 
 def page_of(on_step) -> ModelPage:
@@ -269,10 +265,7 @@ def arrays(folder):
         return {name: stored[name].tobytes() for name in stored.files if stored[name].ndim}
 
 
-def test_a_page_that_fails_does_not_end_a_training(dev, scene, tmp_path, runs, monkeypatch):
-    finished = runs.trained(tmp_path / "alone", scene, train__iterations=40)
-    config = load_config(finished / "config.json")
-    training = open_training(dev, RunFolder(tmp_path / "run"), config, None)
+def test_a_page_that_fails_does_not_end_a_training(training, monkeypatch):
     monkeypatch.setattr(ModelPage, "draw_next", lambda self: 1 / 0)
     with shown_training(training) as (_, on_step):
         with pytest.warns(UserWarning, match="division"):
@@ -280,10 +273,7 @@ def test_a_page_that_fails_does_not_end_a_training(dev, scene, tmp_path, runs, m
         on_step(2, None)
 
 
-def test_a_training_keeps_two_thirds_of_the_time(dev, scene, tmp_path, runs, monkeypatch):
-    finished = runs.trained(tmp_path / "alone", scene, train__iterations=40)
-    config = load_config(finished / "config.json")
-    training = open_training(dev, RunFolder(tmp_path / "run"), config, None)
+def test_a_training_keeps_two_thirds_of_the_time(training, monkeypatch):
     times = []
 
     def draw_next(self):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.runs import spoken
+from support.refused import failure
 from support.viewing import tab, wait
 
 from pp_cl.scene.load import scene_frames
@@ -111,15 +111,7 @@ def test_one_view_of_each_split_stays(page, opened, folder):
 
 
 def test_a_click_chooses_a_view(page, opened):
-    opened.send(
-        "SceneNodeClickMessage",
-        name="/views/train/r_5.png",
-        instance_index=None,
-        ray_origin=[0, 0, 0],
-        ray_direction=[0, 0, 1],
-        screen_pos=[0, 0],
-        modifier=None,
-    )
+    opened.click("/views/train/r_5.png")
     opened.receive("GuiUpdateMessage", lambda m: m["updates"].get("value") == "train/r_5.png")
 
 
@@ -142,5 +134,4 @@ def test_without_sparse_points_the_hull_is_shown(dev, served, scene):
 
 
 def test_the_run_of_a_scene_is_not_asked_for(folder):
-    status, lines = spoken(["view", folder, "--scene", folder])
-    assert status == 2 and "--scene: only of a run" in lines[-1]
+    assert "--scene: only of a run" in failure("view", folder, "--scene", folder)
