@@ -11,23 +11,10 @@ from textwrap import dedent
 import numpy as np
 import pytest
 from PIL import Image
+from support.refused import failure
 
 from pp_cl.cli import main
 from pp_cl.errors import BuildError
-
-
-def failure(capsys, *words):
-    """The one line on stderr of a command that must end with exit status 2."""
-    capsys.readouterr()
-    assert main([str(w) for w in words]) == 2
-    captured = capsys.readouterr()
-    lines = [line for line in captured.err.splitlines() if line.startswith("pp-cl")]
-    assert (
-        len(lines) == 1
-        and captured.err.rstrip().endswith(lines[0])
-        and "Traceback" not in captured.err
-    )
-    return lines[0]
 
 
 def test_devices_are_listed_and_without_one_it_is_said_what_to_install(
@@ -39,16 +26,16 @@ def test_devices_are_listed_and_without_one_it_is_said_what_to_install(
     assert any(d["problem"] is None and d["name"] for d in json.loads(capsys.readouterr().out))
     monkeypatch.setattr("pp_cl.device.discover.list_devices", lambda **_: [])
     for words in (["train", scene, "--out", tmp_path / "run"], ["devices"]):
-        assert "install" in failure(capsys, *words)
+        assert "install" in failure(*words)
 
 
-def test_a_run_that_lies_in_runs_is_named(tmp_path, capsys, monkeypatch):
+def test_a_run_that_lies_in_runs_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs" / "mine"
     run.mkdir(parents=True)
     (run / "config.json").write_text("{}")
     for command in ("eval", "info", "shape", "compress"):
-        assert "runs/mine?" in failure(capsys, command, "mine")
+        assert "runs/mine?" in failure(command, "mine")
 
 
 def test_compare_writes_the_table_and_the_file(tmp_path, capsys):
@@ -58,26 +45,24 @@ def test_compare_writes_the_table_and_the_file(tmp_path, capsys):
     assert main(["compare", *files, "--json", str(tmp_path / "m.json")]) == 0
     result = json.loads((tmp_path / "m.json").read_text())
     assert f"{result['mean']['psnr']:.4f}" in capsys.readouterr().out
-    assert "none.png" in failure(capsys, "compare", tmp_path / "none.png", files[1])
+    assert "none.png" in failure("compare", tmp_path / "none.png", files[1])
 
 
-def test_a_kernel_that_does_not_build_is_one_line_below_the_log(
-    scene, tmp_path, capsys, monkeypatch
-):
+def test_a_kernel_that_does_not_build_is_one_line_below_the_log(scene, tmp_path, monkeypatch):
     def broken(*_, **__):
         raise BuildError(
             "cl/a.cl does not build on a device with -DA=1", "<kernel>:3:\nno such type\n"
         )
 
     monkeypatch.setattr("pp_cl.session.open_training", broken)
-    line = failure(capsys, "train", scene, "--out", tmp_path / "run", "--downscale", "1")
+    line = failure("train", scene, "--out", tmp_path / "run", "--downscale", "1")
     assert line.startswith(
         "pp-cl: cl/a.cl does not build on a device with -DA=1; update the driver"
     )
 
 
-def test_what_was_typed_breaks_no_line(tmp_path, capsys):
-    line = failure(capsys, "eval", f"{tmp_path}/a\nb\x1b[31m")
+def test_what_was_typed_breaks_no_line(tmp_path):
+    line = failure("eval", f"{tmp_path}/a\nb\x1b[31m")
     assert f"{tmp_path}/a b?[31m/config.json" in line
 
 
@@ -106,14 +91,11 @@ def test_a_further_interrupt_shows_no_traceback(told, then, status):
     assert ("Traceback" in done.stderr) == (status == 1)
 
 
-def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_bugs(
-    monkeypatch, capsys
-):
+def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_bugs(monkeypatch):
     errors = [ImportError("x.so: failed to map segment from shared object"), ImportError("x")]
     monkeypatch.setattr("pp_cl.commands.devices.run", lambda _: (_ for _ in ()).throw(errors[0]))
-    assert main(["devices"]) == 2
-    told = capsys.readouterr().err.splitlines()
-    assert len(told) == 1 and "x.so" in told[0] and "memory" in told[0]
+    told = failure("devices")
+    assert "x.so" in told and "memory" in told
     del errors[0]
     with pytest.raises(ImportError):
         main(["devices"])

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 from support.checkpoints import load_checkpoint
+from support.refused import failure
 from support.runs import arguments, rows
 
-from pp_cl.cli import main
 from pp_cl.training.optim import Optimiser
 
 KEPT = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"
@@ -31,13 +31,12 @@ DIVERGENCES = {
 
 @pytest.mark.parametrize("case", DIVERGENCES)
 def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
-    scene, tmp_path, capsys, monkeypatch, case
+    scene, tmp_path, monkeypatch, case
 ):
     after, what, settings, words = DIVERGENCES[case]
     _poison(monkeypatch, after, what)
     settings = {"train__previews": 3} | settings
-    assert main(arguments(scene, tmp_path / "run", **settings)) == 2
-    line = capsys.readouterr().err.splitlines()[-1]
+    line = failure(*arguments(scene, tmp_path / "run", **settings))
     assert words in line and KEPT in line and str(tmp_path / "run") in line
     header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
     assert header["step"] == 10 and all(np.isfinite(a).all() for a in arrays.values())
@@ -67,20 +66,17 @@ def _poison(monkeypatch, after, what):
     monkeypatch.setattr(Optimiser, "update", poisoned)
 
 
-def test_a_training_that_diverges_at_its_end_is_not_finished(scene, tmp_path, capsys, monkeypatch):
+def test_a_training_that_diverges_at_its_end_is_not_finished(scene, tmp_path, monkeypatch):
     """Averages would hide it."""
     _poison(monkeypatch, 60, "moment")
-    assert main(arguments(scene, tmp_path / "run", train__previews=0)) == 2
-    line = capsys.readouterr().err.splitlines()[-1]
+    line = failure(*arguments(scene, tmp_path / "run", train__previews=0))
     assert "holds NaN or Inf; " in line and "checkpoint.npz of step 50 is kept" in line
     assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 50
     assert not any(row.get("finished") for row in rows(tmp_path / "run"))
 
 
-def test_a_training_that_diverges_before_its_first_checkpoint(scene, tmp_path, capsys, monkeypatch):
+def test_a_training_that_diverges_before_its_first_checkpoint(scene, tmp_path, monkeypatch):
     _poison(monkeypatch, 3, "points")
-    assert main(arguments(scene, tmp_path / "run")) == 2
-    assert "at step 4 (loss, l1, ssim, psnr); nothing was kept: train into" in (
-        capsys.readouterr().err
-    )
+    told = failure(*arguments(scene, tmp_path / "run"))
+    assert "at step 4 (loss, l1, ssim, psnr); nothing was kept: train into" in told
     assert not (tmp_path / "run" / "checkpoint.npz").exists()

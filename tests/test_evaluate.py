@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.models import drawn_alone
+from support.refused import failure
 from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
@@ -97,22 +98,20 @@ def changed_scene(run, tmp_path, split, name):
     return str(tmp_path / "ball")
 
 
-def test_another_scene_is_refused_and_nothing_written(run, tmp_path, capsys):
+def test_another_scene_is_refused_and_nothing_written(run, tmp_path):
     assert main(["eval", str(run)]) == 0
-    capsys.readouterr()
     before = (run / "eval" / "metrics.json").read_bytes()
     other = write_ball_scene(tmp_path / "other", size=60, views=7)
     changed = changed_scene(run, tmp_path, "train", "r_0.png")
     for scene, told in ((other, "other names or cameras"), (changed, "train/r_0.png: other pix")):
         for split in ("test", "train"):
-            assert main(["eval", str(run), "--scene", scene, "--split", split]) == 2
-            [error] = capsys.readouterr().err.splitlines()
+            error = failure("eval", run, "--scene", scene, "--split", split)
             assert "checkpoint.npz: belongs to another scene" in error and told in error
             assert scene in error and "--scene" in error
     assert (run / "eval" / "metrics.json").read_bytes() == before
     last = changed_scene(run, tmp_path / "last", "train", "r_7.png")  # one that test does not read
-    assert main(["eval", str(run), "--scene", last, "--split", "train"]) == 2
-    assert "train/r_7.png: other pixels" in capsys.readouterr().err
+    told = failure("eval", run, "--scene", last, "--split", "train")
+    assert "train/r_7.png: other pixels" in told
 
 
 def test_a_scene_without_training_views_is_measured_with_one_line(run, tmp_path, capsys):

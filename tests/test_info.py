@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.checkpoints import load_checkpoint
+from support.refused import failure
 from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
@@ -39,15 +40,6 @@ def facts(capsys):
         return json.loads(capsys.readouterr().out)
 
     return read
-
-
-def failure(capsys, *words):
-    """The one line on stderr of a command that must end with exit status 2."""
-    capsys.readouterr()
-    assert main(["info", *map(str, words)]) == 2
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1 and not captured.out
-    return captured.err
 
 
 def test_a_run_says_what_its_files_say(scene, finished, facts):
@@ -86,7 +78,7 @@ def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, 
     assert main(["info", str(tmp_path / "young")]) == 0
 
 
-def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts, capsys):
+def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts):
     """info tells what it knows; eval asks for --scene."""
     run, old, new = tmp_path / "run", tmp_path / "ball", tmp_path / "sphere"
     shutil.copytree(scene, old)
@@ -96,8 +88,7 @@ def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts, capsys)
     metrics = json.loads((run / "eval" / "metrics.json").read_text())
     old.rename(new)
     assert facts(run)["grid"] == before["grid"]
-    assert main(["eval", str(run)]) == 2
-    assert f"{old}: the run's scene is not there; say where with --scene" in capsys.readouterr().err
+    assert f"{old}: the run's scene is not there; say where with --scene" in failure("eval", run)
     picture = ("--picture", tmp_path / "points.png")
     assert facts(run, "--scene", new)["grid"] == before["grid"]
     assert facts(run, "--scene", new, *picture)["picture"] == str(tmp_path / "points.png")
@@ -203,7 +194,7 @@ def test_the_demo_is_a_scene_too(facts, monkeypatch):
     assert found["downscale"] == 2 and found["distances"] == pytest.approx([3.4, 3.4])
 
 
-def test_a_broken_evaluation_is_one_line(finished, tmp_path, capsys):
+def test_a_broken_evaluation_is_one_line(finished, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     file = run / "eval" / "metrics.json"
@@ -211,16 +202,15 @@ def test_a_broken_evaluation_is_one_line(finished, tmp_path, capsys):
     means = 3, {"psnr": "high"}, {"psnr": float("nan")}, {"psnr": 10**400}
     for text in ("[]", "{", "[" * 100_000, *(json.dumps(whole | {"mean": m}) for m in means)):
         file.write_text(text)
-        assert "metrics.json: " in failure(capsys, run)
+        assert "metrics.json: " in failure("info", run)
     file.unlink()
     file.mkdir()
-    assert "metrics.json: " in failure(capsys, run)
+    assert "metrics.json: " in failure("info", run)
 
 
 def test_pictures_are_opened_when_asked_for(finished, tmp_path, capsys, monkeypatch):
     opened, path = [], tmp_path / "points.png"
     monkeypatch.setattr("webbrowser.open", lambda uri: opened.append(uri) or True)
-    assert "--picture" in failure(capsys, finished, "--open") and not opened
     assert main(["info", str(finished), "--picture", str(path), "--open"]) == 0
     assert main(["eval", str(finished), "--metrics", "psnr", "--open"]) == 0
     assert opened == [path.as_uri(), (finished / "eval" / "comparison.png").as_uri()]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.refused import failure
 from support.runs import SETTINGS, arguments
 
 import pp_cl
@@ -84,11 +85,10 @@ def test_the_package_and_its_help_need_no_opencl():
 # --------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_has_one_training_at_a_time(scene, tmp_path, capsys):
+def test_a_folder_has_one_training_at_a_time(scene, tmp_path):
     out = tmp_path / "run"
     with RunFolder(out).owned():
-        assert main(arguments(scene, out)) == 2
-        error = capsys.readouterr().err.splitlines()[-1]
+        error = failure(*arguments(scene, out))
         assert f"{out}: process {os.getpid()} on {socket.gethostname()} trains into it" in error
     assert not (out / "config.json").exists(), "nothing was written beside the owner's"
     assert main(arguments(scene, out, train__iterations=2)) == 0

@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from support.checkpoints import load_checkpoint
+from support.refused import failure
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
 from pp_cl import load
@@ -55,7 +56,7 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
 
 @pytest.mark.parametrize("blocks", ["double", "gated"])
 def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
-    scene, tmp_path, monkeypatch, capsys, blocks
+    scene, tmp_path, monkeypatch, blocks
 ):
     whole, run = tmp_path / "whole", tmp_path / "run"
     changes = {"network__blocks": blocks, "train__iterations": 80}
@@ -65,14 +66,11 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     train_and_interrupt(scene, run, 47, monkeypatch, **changes)
     assert main(["train", scene, "--out", str(run)]) == 0  # the settings are the run's
     assert checkpoint(run) == checkpoint(whole)
-    capsys.readouterr()
-    assert main(arguments(scene, run, network__blocks="single")) == 2
-    assert f"network.blocks is {blocks} there, single asked for" in capsys.readouterr().err
+    told = failure(*arguments(scene, run, network__blocks="single"))
+    assert f"network.blocks is {blocks} there, single asked for" in told
 
 
-def test_a_training_begins_with_the_network_of_another_run(
-    scene, finished, tmp_path, monkeypatch, capsys
-):
+def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_path, monkeypatch):
     """Which it needs no more once it has begun."""
     run, whole, other = tmp_path / "run", tmp_path / "whole", tmp_path / "other"
     shutil.copytree(finished, other)
@@ -90,12 +88,10 @@ def test_a_training_begins_with_the_network_of_another_run(
     assert main(["train", "--out", str(run)]) == 0
     assert checkpoint(run) == checkpoint(whole)
 
-    capsys.readouterr()
     words = arguments(scene, tmp_path / "no", network__widths="16,16,32")
-    assert main([*words, "--network", str(other)]) == 2
-    assert "other/config.json: No such file" in capsys.readouterr().err
-    assert main([*words, "--network", str(finished)]) == 2
-    assert "has network.widths=16,16,16, this training 16,16,32" in capsys.readouterr().err
+    assert "other/config.json: No such file" in failure(*words, "--network", other)
+    told = failure(*words, "--network", finished)
+    assert "has network.widths=16,16,16, this training 16,16,32" in told
     assert not (tmp_path / "no").exists()
 
 
@@ -150,7 +146,7 @@ def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path, d
         np.testing.assert_array_equal(array, expected[name])
 
 
-def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatch):
+def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, monkeypatch):
     """No buffer larger than 200 bytes a point, and pruning in place by many pieces."""
     changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}
     assert main(arguments(scene, tmp_path / "free", **changes)) == 0
@@ -160,8 +156,7 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatc
     assert main(arguments(scene, tmp_path / "bounded", **changes)) == 0
     assert checkpoint(tmp_path / "bounded") == checkpoint(tmp_path / "free")
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
-    assert main(arguments(scene, tmp_path / "smaller", **changes)) == 2
-    assert "at once" in capsys.readouterr().err
+    assert "at once" in failure(*arguments(scene, tmp_path / "smaller", **changes))
     assert not (tmp_path / "smaller").exists()
 
 
@@ -176,23 +171,10 @@ def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])
 def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     out = tmp_path / "run"
-    assert (
-        main(
-            arguments(
-                scene,
-                out,
-                raster__footprint=footprint,
-                raster__radius=radius,
-                raster__max_tracked=64,
-                raster__early_stop=0.001,
-                raster__mean_gradient="true",
-                train__iterations=30,
-                train__crop=0,
-                train__final_prune_weight=0,
-            )
-        )
-        == 0
-    )
+    changes = {"raster__footprint": footprint, "raster__radius": radius, "train__iterations": 30}
+    changes |= {"raster__max_tracked": 64, "raster__early_stop": 0.001, "train__crop": 0}
+    changes |= {"raster__mean_gradient": "true", "train__final_prune_weight": 0}
+    assert main(arguments(scene, out, **changes)) == 0
     losses = [r["loss"] for r in rows(out)[:-1]]
     assert losses[-1] < losses[0]
 

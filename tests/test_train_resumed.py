@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.checkpoints import load_checkpoint
+from support.refused import failure
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 from support.scenes import write_ball_scene
 
@@ -29,10 +30,9 @@ def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, cap
     assert main(words) == main([*words, "--iterations", "59"]) == 0
     assert main(["train", "--out", str(finished)]) == 0  # the scene, too
     assert capsys.readouterr().out.count("is finished (60 steps)") == 3
-    assert main(["train", "--out", str(finished / "other")]) == 2
-    assert capsys.readouterr().err.startswith("pp-cl: SCENE: ")
-    assert main([*words, "--points", "1600", "--iterations", "61"]) == 2
-    assert "points.count is 1500 there, 1600 asked for" in capsys.readouterr().err
+    assert failure("train", "--out", finished / "other").startswith("pp-cl: SCENE: ")
+    told = failure(*words, "--points", "1600", "--iterations", "61")
+    assert "points.count is 1500 there, 1600 asked for" in told
 
 
 def measured_psnr(out):
@@ -106,7 +106,7 @@ def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path,
     assert config["scene"]["path"] == str(tmp_path / "moved")
 
 
-def test_a_scene_whose_pixels_have_changed_is_refused(scene, tmp_path, capsys, monkeypatch):
+def test_a_scene_whose_pixels_have_changed_is_refused(scene, tmp_path, monkeypatch):
     folder, out = tmp_path / "ball", tmp_path / "run"
     shutil.copytree(scene, folder)
     train_and_interrupt(str(folder), out, 15, monkeypatch)
@@ -114,16 +114,13 @@ def test_a_scene_whose_pixels_have_changed_is_refused(scene, tmp_path, capsys, m
     pixels = np.array(Image.open(folder / "train" / "r_3.png"))
     pixels[0, 0, 0] ^= 1
     Image.fromarray(pixels).save(folder / "train" / "r_3.png")
-    assert main(arguments(str(folder), out)) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
+    error = failure(*arguments(str(folder), out))
     assert "belongs to another scene" in error and "train/r_3.png: other pixels" in error
     assert checkpoint(out) == before
 
 
 @pytest.mark.parametrize("steps", [25, 5, 60])
-def test_another_scene_is_refused_at_any_state_of_the_run(
-    scene, tmp_path, capsys, monkeypatch, steps
-):
+def test_another_scene_is_refused_at_any_state_of_the_run(scene, tmp_path, monkeypatch, steps):
     """With a checkpoint, before the first, and when the run is finished."""
     out, other = tmp_path / "run", write_ball_scene(tmp_path / "other", views=7)
     if steps == 60:
@@ -131,8 +128,7 @@ def test_another_scene_is_refused_at_any_state_of_the_run(
     else:
         train_and_interrupt(scene, out, steps, monkeypatch)
     before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
-    assert main(arguments(other, out)) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
+    error = failure(*arguments(other, out))
     assert ("belongs to another scene" if steps == 25 else "scene.path is ") in error
     assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
 

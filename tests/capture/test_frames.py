@@ -29,11 +29,16 @@ def shots():
     return np.random.default_rng(0).integers(0, 256, (12, *SIZE[::-1], 3), np.uint8)
 
 
-def test_photographs_of_other_programs(shots, tmp_path):
+@pytest.fixture
+def folder(tmp_path):
+    """An empty folder of photographs."""
+    (tmp_path / "photographs").mkdir()
+    return tmp_path / "photographs"
+
+
+def test_photographs_of_other_programs(shots, folder, tmp_path):
     """16 bits a channel, CMYK, a TIFF whose tags have no room in a JPEG, EXIF that is broken."""
     pytest.importorskip("pillow_heif")
-    folder = tmp_path / "photographs"
-    folder.mkdir()
     for i, image in enumerate(shots):
         Image.fromarray(image).save(folder / f"{i:02d}.png")
     cv2.imwrite(str(folder / "deep.png"), shots[0, ::-1].astype(np.uint16) * 257)
@@ -62,18 +67,17 @@ def test_photographs_of_other_programs(shots, tmp_path):
     assert copy.get_ifd(frames.EXIF)[FOCAL] == pytest.approx(4.2)
 
 
-def test_colours_of_another_profile_become_srgb(tmp_path):
+def test_colours_of_another_profile_become_srgb(folder, tmp_path):
     """Also of photographs that are turned."""
     pytest.importorskip("pillow_heif")
-    (tmp_path / "photographs").mkdir()
     noise = np.random.default_rng(0).integers(-9, 10, (12, 48, 64, 1))
     for i, one in enumerate(noise):
         image = Image.fromarray(([200, 90, 60] + one).astype(np.uint8))
         exif = Image.Exif()
         exif[frames.ORIENTATION] = 6 if i % 2 else 1
-        image.save(tmp_path / f"photographs/{i}.png", icc_profile=display_p3(), exif=exif)
+        image.save(folder / f"{i}.png", icc_profile=display_p3(), exif=exif)
     with pytest.warns(UserWarning, match="colour profile of their own are read as sRGB"):
-        taken = take_images(tmp_path / "photographs", tmp_path / "images")
+        taken = take_images(folder, tmp_path / "images")
     assert len(taken["images"]) == 12
     for one in taken["images"]:
         image = read_rgba(tmp_path / "images" / one["name"])
@@ -82,11 +86,9 @@ def test_colours_of_another_profile_become_srgb(tmp_path):
         assert np.abs(image[..., :3].mean((0, 1)) - in_srgb([200, 90, 60])).max() < 3
 
 
-def test_features_are_not_looked_for_where_alpha_is_0(shots, tmp_path):
+def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
     """A cut-out may still hold the wall behind the object."""
     pytest.importorskip("pycolmap")
-    folder = tmp_path / "photographs"
-    folder.mkdir()
     sharp = np.kron(shots, np.ones((1, 4, 4, 1), np.uint8))
     alpha = np.zeros((*sharp.shape[1:3], 1), np.uint8)
     alpha[60:190, 100:300] = 255
@@ -103,7 +105,7 @@ def test_features_are_not_looked_for_where_alpha_is_0(shots, tmp_path):
             assert len(x) > 50 and x.min() > 99 and x.max() < 301 and y.min() > 59 and y.max() < 191
 
 
-def test_the_focal_length_of_reduced_photographs(shots, tmp_path):
+def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
     """EXIF tells of the sensor as it was before they were cropped to a square and reduced: 5184 by
     3456 pixels, of which 5728 are an inch. COLMAP would begin with 46 / 25.4 * 5728 = 10374 pixels.
     """
@@ -114,8 +116,6 @@ def test_the_focal_length_of_reduced_photographs(shots, tmp_path):
     whole = dict(zip(frames.SENSOR, (64, 64, 30.0, 2), strict=True))
     told = [lens | sensor, lens | whole, lens, lens | sensor | {FOCAL: 0.0}]
     told += [lens | sensor | {frames.SENSOR[3]: 7}, lens | sensor | {frames.FOCAL_35: 50}]
-    folder = tmp_path / "photographs"
-    folder.mkdir()
     for i, image in enumerate(shots):
         exif = Image.Exif()
         exif.get_ifd(frames.EXIF).update(told[i] if i < len(told) else {})

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 from support.benches import KEYS
+from support.refused import failure
 from support.scenes import write_ball_scene
 
 from pp_cl.bench import timing
@@ -79,7 +80,6 @@ def test_a_plot_is_drawn(tmp_path, what):
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
-def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch, capsys):
+def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert main(["bench", "--plot", str(tmp_path / "b.png")]) == 2
-    assert "pip install matplotlib" in capsys.readouterr().err
+    assert "pip install matplotlib" in failure("bench", "--plot", tmp_path / "b.png")

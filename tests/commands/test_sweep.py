@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from support.checkpoints import load_checkpoint
+from support.refused import failure
 from support.scenes import write_ball_scene
 from support.sweeps import jobs_of, pretend, words_of
 
@@ -35,13 +36,6 @@ def nothing_starts(monkeypatch):
     """Dask cannot be imported."""
     monkeypatch.setitem(sys.modules, "pp_cl.sweep.cluster", None)
     monkeypatch.setitem(sys.modules, "distributed", None)
-
-
-def refusal(capsys, words):
-    """The one line on stderr of a command that ends with status 2."""
-    assert main(words) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
 
 
 def test_a_dry_run_says_what_would_be_done(tmp_path, capsys, nothing_starts):
@@ -73,11 +67,11 @@ def test_a_finished_sweep_needs_no_dask(tmp_path, capsys, nothing_starts):
     assert [row["folder"] for row in stored["runs"]] == ["demo/seed-1", "demo/seed-2"]
 
 
-def test_dask_is_missing(tmp_path, capsys, monkeypatch):
+def test_dask_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.delitem(sys.modules, "pp_cl.sweep.cluster", raising=False)
-    line = refusal(capsys, words_of(["demo"], tmp_path / "out"))
-    assert "pip install dask distributed" in line
+    told = failure(*words_of(["demo"], tmp_path / "out"))
+    assert "pip install dask distributed" in told
 
 
 # ---- whole sweeps

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from support.refused import failure
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
@@ -65,7 +66,7 @@ def failing_step(self):
     raise UserError("the loss is not finite at step 1; lower network.rate")
 
 
-def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, capsys, monkeypatch):
+def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch):
     """As a training advises that fails in its first steps; nothing of it shows in the next."""
     scene, out, plain = write_ball_scene(tmp_path / "ball"), tmp_path / "run", tmp_path / "plain"
     with monkeypatch.context() as patch:
@@ -78,9 +79,8 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, capsys, mon
     for name in ("checkpoint.npz", "config.json"):
         assert (out / name).read_bytes() == (plain / name).read_bytes()
     assert not (out / "previews" / "step_000001.png").exists()
-    capsys.readouterr()
-    assert main([*arguments(scene, out, **words), "--preset", "tiny"]) == 2
-    assert "preset is small there" in capsys.readouterr().err
+    told = failure(*arguments(scene, out, **words), "--preset", "tiny")
+    assert "preset is small there" in told
 
 
 def test_a_start_without_a_checkpoint_keeps_what_is_not_said_anew(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import OpenEXR
 import pytest
+from support.refused import refusing
 from support.scenes import write_ball_scene
 
 from pp_cl.errors import UserError
@@ -146,9 +147,8 @@ BAD_IMAGES = {
 def test_images_that_are_refused(tmp_path, case):
     channels, words = BAD_IMAGES[case]
     stored(tmp_path / "a.exr", {name: plane.copy() for name, plane in channels.items()})
-    with pytest.raises(UserError, match=words) as caught:
+    with refusing(tmp_path / "a.exr", words):
         read_rgba(tmp_path / "a.exr")
-    assert str(tmp_path / "a.exr") in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_parts_and_damage(tmp_path, capfd):

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.checkpoints import load_checkpoint
-from support.runs import arguments, spoken
+from support.refused import failure
+from support.runs import arguments
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
@@ -59,12 +60,10 @@ def test_no_edits_leave_no_file(folder):
 )
 def test_a_broken_file_is_one_line_that_names_it(folder, text):
     (folder / "pp_cl.json").write_text(text)
-    status, lines = spoken(["info", folder])
-    assert status == 2 and len(lines) == 1 and "pp_cl.json" in lines[0]
+    assert "pp_cl.json" in failure("info", folder)
 
 
 def test_a_scene_whose_views_are_all_dropped_says_by_what(folder):
     names = [f"train/r_{i}.png" for i in range(8)]
     (folder / "pp_cl.json").write_text(json.dumps({"dropped": names}))
-    status, lines = spoken(["info", folder])
-    assert status == 2 and len(lines) == 1 and "pp_cl.json" in lines[0]
+    assert "pp_cl.json" in failure("info", folder)

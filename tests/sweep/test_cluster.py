@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 from support.checkpoints import load_checkpoint
+from support.refused import refusing
 from support.scenes import write_ball_scene
 from support.sweeps import jobs_of
 
@@ -60,18 +61,15 @@ def test_workers_that_do_not_start_are_one_line(monkeypatch):
         raise RuntimeError("Nanny failed to start.") from OSError(errno.EMFILE, "Too many files")
 
     monkeypatch.setattr(cluster, "LocalCluster", failing)
-    with pytest.raises(UserError) as caught, cluster.local_client(1):
+    with refusing("workers", "Too many files"), cluster.local_client(1):
         pass
-    message = str(caught.value)
-    assert "workers" in message and "Too many files" in message and "\n" not in message
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "what://127.0.0.1:1"])
 def test_nobody_at_the_address(monkeypatch, address):
     monkeypatch.setattr(cluster, "ANSWER", 1)
-    with pytest.raises(UserError) as caught, cluster.client_of(address):
+    with refusing(address), cluster.client_of(address):
         pass
-    assert address in str(caught.value) and "\n" not in str(caught.value)
 
 
 class FakeClient:
@@ -100,9 +98,8 @@ class FakeClient:
 )
 def test_workers_that_a_sweep_cannot_use(monkeypatch, threads, words):
     monkeypatch.setattr(cluster, "Client", lambda *_, **__: FakeClient(threads))
-    with pytest.raises(UserError) as caught, cluster.client_of("tcp://s"):
+    with refusing("--scheduler tcp://s", *words), cluster.client_of("tcp://s"):
         pass
-    assert all(word in str(caught.value) for word in ["--scheduler tcp://s", *words])
 
 
 def future(status, exception=None):

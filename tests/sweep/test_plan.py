@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import pytest
+from support.refused import refusing
 from support.sweeps import jobs_of
 
-from pp_cl.errors import UserError
 from pp_cl.sweep.plan import read_varied
 
 
@@ -16,16 +16,6 @@ def scenes(tmp_path):
     for folder in folders:
         folder.mkdir(parents=True)
     return folders
-
-
-def refused(call, *words):
-    """The call fails with one line that has all the words."""
-    with pytest.raises(UserError) as caught:
-        call()
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in words:
-        assert word in message, message
 
 
 def test_every_combination_is_a_run_of_its_own(tmp_path, scenes):
@@ -64,39 +54,40 @@ def test_nothing_varied_needs_no_folder_of_the_setting(tmp_path, scenes):
         (["points.count"], ["--vary", "section.key=value"]),
         (["points.count="], ["--vary", "section.key=value"]),
         (["points.none=1"], ["--vary", "unknown key", "points.none"]),
-        (["none.count=1"], ["--vary", "unknown key", "none.count"]),
-        (["count=1"], ["--vary", "unknown key", "count"]),
         (["points.count=1,x"], ["--vary", "points.count", "'x'", "whole number"]),
-        (["points.count=1,,2"], ["--vary", "points.count", "''"]),
         (["points.count=5,0"], ["points.count = 0"]),
         (["points.count=1000,1000"], ["two runs", "points.count=1000"]),
         (["network.widths=16,16"], ["--vary", "network.widths", "3 values"]),
-        (["network.widths=16,16,16/"], ["--vary", "network.widths", "3 values"]),
         (["points.count=1", "points.count=2"], ["--vary", "varied already"]),
         (["train.seed=1,2"], ["--vary train.seed", "--seeds"]),
         (["scene.path=a,b"], ["--vary", "scene.path"]),
     ],
 )
 def test_what_cannot_be_varied(tmp_path, texts, words):
-    refused(lambda: jobs_of(["demo"], tmp_path, varied=read_varied(texts), given=[]), *words)
+    with refusing(*words):
+        jobs_of(["demo"], tmp_path, varied=read_varied(texts), given=[])
 
 
 @pytest.mark.parametrize("key", ["train.seed", "scene.path", "points.count"])
 def test_what_tells_runs_apart_cannot_be_set(tmp_path, key):
     given, varied = [(key, "1", "--set")], {"points.count": ["5"]}
-    refused(lambda: jobs_of(["demo"], tmp_path, varied=varied, given=given), "--set", key)
+    with refusing("--set", key):
+        jobs_of(["demo"], tmp_path, varied=varied, given=given)
 
 
 def test_scenes_that_cannot_be_told_apart(tmp_path, scenes):
     for name in ("a", "A", "demo"):
         (tmp_path / "other" / name).mkdir(parents=True)
     for other in (tmp_path / "other" / "a", tmp_path / "other" / "A", f"{scenes[0]}/../a"):
-        refused(lambda other=other: jobs_of([scenes[0], other], tmp_path), "two runs", "scenes")
-    refused(lambda: jobs_of(["demo", tmp_path / "other" / "demo"], tmp_path), "two runs")
+        with refusing("two runs", "scenes"):
+            jobs_of([scenes[0], other], tmp_path)
+    with refusing("two runs"):
+        jobs_of(["demo", tmp_path / "other" / "demo"], tmp_path)
 
 
 def test_a_scene_that_is_not_there(tmp_path):
-    refused(lambda: jobs_of([tmp_path / "none"], tmp_path), str(tmp_path / "none"), "no such")
+    with refusing(tmp_path / "none", "no such"):
+        jobs_of([tmp_path / "none"], tmp_path)
 
 
 def test_each_value_has_a_folder_of_its_own_in_the_sweeps(tmp_path, scenes):
