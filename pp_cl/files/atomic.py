@@ -51,7 +51,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises UserError naming the file when the library cannot write it.
     """
     with _named(_temporary(path, path.suffix), path) as temporary:
-        yield temporary
+        try:
+            yield temporary
+        except RuntimeError as error:  # of libraries in C++
+            raise _refusal(path, error) from error
 
 
 @contextmanager
@@ -63,7 +66,7 @@ def _named(temporary, path, noted=True):
             note(temporary, path)
         _replace(temporary, path)
         _sync_folder(path.parent)
-    except (OSError, RuntimeError) as error:  # libraries in C++ raise the latter
+    except OSError as error:
         raise _refusal(path, error) from error
     finally:
         _remove(temporary)

@@ -77,9 +77,8 @@ class Lpips:
             self._weights[layer.name] = dev.upload(pack_weights(weights[f"kernel{i}"]))
             self._biases[layer.name] = dev.upload(weights[f"bias{i}"])
         self._size = None
-        self._prepared: dict[
-            str, tuple
-        ] = {}  # {layer: (convolution, weights as it reads them, tiles)}
+        # {layer: (convolution, weights as it reads them, tiles)}
+        self._prepared: dict[str, tuple] = {}
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> float:
         """LPIPS of two (H, W, 3) images in [0, 1].

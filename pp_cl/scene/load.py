@@ -217,7 +217,7 @@ def _tell(folder, notes):
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> Listing:
     """The photographs of a split, without their pixels; edited: but for those that the user has
     dropped. Those that cannot be used are left out. Raises UserError where there are none, where
-    too few are left (Notes.check), and for a camera that shows nothing in float32.
+    too few are left (Notes.check), and for cameras in other axes than the format's.
     """
     if path == DEMO:
         return Listing(demo.demo_frames(split), [])
@@ -246,8 +246,8 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     notes.check(len(photographs), LEAST_VIEWS if split == "train" else 1)
     photographs = _masked(folder, reader, photographs, notes)
     photographs = _ignoring(folder, IGNORE_FOLDERS, photographs, split)
-    if in_part := [one.name for one in photographs if one.ignore and not one.ignores_black]:
-        notes.done["pixels are ignored where the masks in ignore are white"] = in_part
+    if ignoring := [one.name for one in photographs if one.ignore and not one.ignores_black]:
+        notes.done["pixels are ignored where the masks in ignore are white"] = ignoring
     return Listing(photographs, notes.lines(len(photographs)))
 
 
@@ -416,7 +416,8 @@ def load_scene(
     most: views to read of each split, spread evenly; None: all. downscale: how many times its
     images are reduced, those of a large scene in part while they are read; None: as they are
     stored. listed: what list_split() gave of some splits, so that their files are not read again.
-    dev: where distortion is removed; the default device is opened for it where none is given.
+    dev: where distortion is removed, and silhouettes are found for training views whose masks are
+    missing; the default device is opened for it where none is given.
     kept: where images that are reduced while they are read are looked for first. Raises UserError
     naming the file, and the key where there is one, for whatever is missing, broken or
     contradictory.

@@ -22,7 +22,7 @@ INWARD, OUTWARD = 0.05, 0.005  # of the image's longer side
 def within_silhouettes(dev: Device, views: Sequence[View], bare: Sequence[View]) -> list[View]:
     """The views without a mask, transparent outside of the hull that the masks of the others leave,
     opaque well inside of it; between, in a rim, they are ignored. With a third of the masks gone
-    this wins 1.2 dB over leaving these views out on DTU's scan 37, and 0.2 dB on ethiopian_head.
+    this wins 0.7 dB over leaving these views out on DTU's scan 37, and 0.1 dB on ethiopian_head.
 
     Raises UserError as build_grid() does, and where the masks contradict each other: then their
     hull says too little of an outline, and on mary_rose these views cost 0.6 dB.

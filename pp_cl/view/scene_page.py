@@ -40,7 +40,8 @@ class ScenePage:
             for split in sorted(scene_splits(folder), key=lambda split: split != "train")
         }
         views = [view for views in self.splits.values() for view in views]
-        self._cameras = cameras = [view.camera for view in views]
+        self._cameras = {view.name: view.camera for view in views}
+        cameras = list(self._cameras.values())
         self._points, colours = sparse_points(folder)
         box, _ = self._box()
         self._space = Space(box.mean(axis=0), float(np.linalg.norm(box[1] - box[0]) / 2))
@@ -101,8 +102,9 @@ class ScenePage:
         if box is not None:
             return box, True
         # of the sparse points near what the cameras look at, else around that
-        middle = looked_at(self._cameras)
-        reach = WIDE * np.median([np.linalg.norm(c.eye - middle) for c in self._cameras])
+        cameras = list(self._cameras.values())
+        middle = looked_at(cameras)
+        reach = WIDE * np.median([np.linalg.norm(c.eye - middle) for c in cameras])
         near = self._points[np.linalg.norm(self._points - middle, axis=1) < 2 * reach]
         if len(near):
             box = np.percentile(near, (2, 98), axis=0)
@@ -194,9 +196,10 @@ class ScenePage:
                 self._add_points(points, np.full((len(points), 3), GREY, np.uint8))
 
     def _read(self, name):
-        """(h, w, 3) uint8 of a view, reduced."""
+        """(h, w, 3) uint8 of a view, reduced, upright as its camera is."""
+        camera = self._cameras[name]
         try:
-            return thumbnail(read_rgba(self._folder / name))
+            return thumbnail(read_rgba(self._folder / name, (camera.width, camera.height)))
         except UserError:
             return UNREADABLE
 

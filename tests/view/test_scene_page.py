@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.refused import failure
 from support.viewing import tab, wait
 
+from pp_cl.files.image import ORIENTATION
 from pp_cl.scene.load import scene_frames
 from pp_cl.view.scene_page import DROPPED, ScenePage, hull_points
 
@@ -59,6 +61,17 @@ def test_cameras_points_and_a_suggested_box_are_shown(page, opened, folder):
     )
     page.fill()
     assert opened.receive("SceneNodeUpdateMessage", lambda m: m["updates"].get("_image_data"))
+
+
+def test_a_photograph_that_exif_turns_is_upright(served, folder):
+    file, turned = folder / "transforms_train.json", Image.Exif()
+    name = scene_frames(folder)[0].name
+    data = json.loads(file.read_text())
+    data["frames"][0] |= {"w": 48, "h": 36}
+    file.write_text(json.dumps(data))
+    turned[ORIENTATION] = 6
+    Image.new("RGBA", (36, 48)).save(folder / name, exif=turned)
+    assert ScenePage(served[0], folder)._read(name).shape == (36, 48, 3)
 
 
 def test_a_box_is_set_dragged_and_removed(page, opened, folder):

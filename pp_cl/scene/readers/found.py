@@ -243,7 +243,7 @@ def folder_named(folder: Path, names: Sequence[str]) -> str | None:
 
 
 def holds_images(folder: Path) -> bool:
-    """Whether there are images in a folder, or in a folder in it that is named as if."""
+    """Whether a folder has images, or a folder for images, in it."""
     inside = (entry.lower().endswith(ENDINGS) for entry in os.listdir(folder))
     return bool(_image_folders(folder)) or any(inside)
 
