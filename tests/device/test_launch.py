@@ -9,7 +9,7 @@ import pytest
 from support.toy_kernels import SOURCE
 
 from pp_cl.device import device as device_module
-from pp_cl.device.kernel import SCALARS, cut, parse_signatures
+from pp_cl.device.kernel import SCALARS, parse_signatures
 from pp_cl.device.launch import channel_ranges, group_items, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
 
@@ -98,24 +98,9 @@ def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqu
     assert seen == [enqueued]
 
 
-@pytest.mark.parametrize("size", [0, (4, 0)])
-def test_a_size_of_zero_launches_nothing(program, rows, size):
-    program.launch("rows", size, **rows)
+def test_a_size_of_zero_launches_nothing(program, rows):
+    program.launch("rows", (4, 0), **rows)
     assert np.isnan(rows["y"].get()).all()
-
-
-@pytest.mark.parametrize(
-    "size, local, parts, along, expected",
-    [
-        ((128,), (64,), 2, 0, [((0,), (64,)), ((64,), (64,))]),
-        ((64,), (64,), 5, 0, [((0,), (64,))]),
-        # 5 groups in 4 parts: two at a time, the last one alone
-        ((8, 20), (8, 4), 4, 1, [((0, 0), (8, 8)), ((0, 8), (8, 8)), ((0, 16), (8, 4))]),
-        ((4, 4, 3), (4, 4, 1), 9, 2, [((0, 0, i), (4, 4, 1)) for i in range(3)]),
-    ],
-)
-def test_a_range_is_cut_between_work_groups(size, local, parts, along, expected):
-    assert list(cut(size, local, parts, along)) == expected
 
 
 @pytest.mark.parametrize(
