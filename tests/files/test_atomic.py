@@ -9,9 +9,9 @@ import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import (
-    check_writable,
     atomic_file,
     atomic_folder,
+    check_writable,
     remove_leftovers,
     write_text,
 )

@@ -46,14 +46,6 @@ def test_an_exception_fails_its_case_alone(dev, error):
     assert rest.passed and rest.case == "b: good"
 
 
-def test_ctrl_c_ends_all_cases(dev):
-    def interrupted(dev, rng):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        next(run_cases(dev, [Case("a: b", interrupted)]))
-
-
 def test_a_case_without_checks_has_checked_nothing():
     assert not run_case(None, case()).passed
 
@@ -64,17 +56,6 @@ def test_variants_that_are_not_offered_are_left_out(dev, monkeypatch):
     assert [row.case for row in run_cases(dev, cases)] == ["None", "direct", "winograd"]
     monkeypatch.setattr(dev, "is_cpu", False)
     assert [row.case for row in run_cases(dev, cases)] == ["None", "direct"]
-
-
-def test_every_case_draws_the_same_numbers_in_any_order(dev):
-    drawn = []
-
-    def draws(dev, rng):
-        drawn.append(rng.random())
-        yield Check(0.0, 1.0)
-
-    list(run_cases(dev, [Case("a: b", draws), Case("a: c", draws)]))
-    assert drawn[0] == drawn[1]
 
 
 GOOD = Row("a: good", 1.25e-7, 1e-6, True, "", 0.5)
@@ -92,15 +73,11 @@ def test_setup_names_what_a_report_needs(dev, monkeypatch):
     assert all(text and "\n" not in text for text in named.values())
 
 
-def test_lines():
+def test_lines_and_json_have_every_row(dev):
     assert HEAD.split() == ["case", "worst", "error", "bound", "pass"]
     assert line(GOOD).split() == ["a:", "good", "1.2e-07", "1e-06", "yes"]
     assert line(NAN).split() == ["a:", "bad", "inf", "1e-06", "NO", "NaN"]
-    assert line(RAISED).splitlines()[1].strip() == "RuntimeError: no"
-    assert line(RAISED).split()[2:5] == ["-", "-", "NO"]
-
-
-def test_json_has_every_row(dev):
+    assert line(RAISED).split() == ["a:", "raised", "-", "-", "NO", "RuntimeError:", "no"]
     stored = json.loads(json.dumps(as_json(dev, [GOOD, NAN, RAISED]), allow_nan=False))
     assert stored["setup"] == setup(dev) and stored["seconds"] == 1.0 and not stored["passed"]
     assert [row["error"] for row in stored["cases"]] == [1.25e-7, None, None]
