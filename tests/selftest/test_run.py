@@ -46,6 +46,20 @@ def test_an_exception_fails_its_case_alone(dev, error):
     assert rest.passed and rest.case == "b: good"
 
 
+def test_ctrl_c_ends_all_cases(dev):
+    def interrupted(dev, rng):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        next(run_cases(dev, [Case("a: b", interrupted)]))
+
+
+def test_every_case_draws_the_same_numbers(dev):
+    checks = [Case(name, lambda dev, rng: [Check(rng.random(), 1.0)]) for name in "ab"]
+    first, second = run_cases(dev, checks)
+    assert first.error == second.error
+
+
 def test_a_case_without_checks_has_checked_nothing():
     assert not run_case(None, case()).passed
 
