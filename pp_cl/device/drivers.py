@@ -96,7 +96,7 @@ def try_drivers(*, again: bool = False) -> Found:
 
 def _key(drivers):
     """What another driver, or another version of one, changes."""
-    about: list[Any] = [cl.VERSION_TEXT]
+    about = [cl.VERSION_TEXT]
     for names in drivers.items():
         file = next(filter(os.path.isfile, reversed(names)), None)
         about.append([*names, file and os.stat(file).st_mtime_ns])

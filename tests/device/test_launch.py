@@ -207,10 +207,9 @@ def test_a_length_that_is_a_formula_is_checked(dev, tmp_path, monkeypatch, chang
 
 
 def test_a_work_group_larger_than_the_device_runs_is_one_line(program, dev, rows):
-    limit = program.kernels["rows"].largest_group
-    assert limit == cl.Kernel(program.built, "rows").get_work_group_info(
-        cl.kernel_work_group_info.WORK_GROUP_SIZE, dev.device
-    )
+    kernel = program.kernels["rows"]
+    limit, what = kernel.largest_group, cl.kernel_work_group_info.WORK_GROUP_SIZE
+    assert limit == kernel.kernel.get_work_group_info(what, dev.device)
     program.launch("rows", 33, local=min(64, limit), **rows)
     with pytest.raises(
         UserError, match=rf"^toy.cl:rows: a work-group of {2 * limit} work-items, but .* {limit} "

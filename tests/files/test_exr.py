@@ -1,14 +1,18 @@
 """OpenEXR files hold the values that went in, and are read as photographs."""
 
+from pathlib import Path
+
 import numpy as np
 import OpenEXR
 import pytest
 from support.refused import refusing
+from support.scenes import write_ball_scene
 
 from pp_cl.errors import UserError
-from pp_cl.files.exr import write_exr
+from pp_cl.files.exr import srgb_to_linear, write_exr
 from pp_cl.files.image import image_size, read_rgba
 from pp_cl.files.picture import Picture
+from pp_cl.scene.load import load_scene
 
 
 @pytest.fixture
@@ -161,3 +165,15 @@ def test_parts_sizes_and_damage(tmp_path, capfd, monkeypatch):
     for read in (read_rgba, image_size):
         with refusing("13x9 pixels"):
             read(tmp_path / "whole.exr")
+
+
+def test_it_may_be_an_image_of_a_scene(tmp_path):
+    file = Path(write_ball_scene(tmp_path, views=4, size=24)) / "train" / "r_0.png"
+    image = read_rgba(file)
+    rgba = image.astype(np.float32) / 255
+    light = np.dstack([srgb_to_linear(rgba[..., :3]) * rgba[..., 3:], rgba[..., 3]])
+    planes = {name: np.ascontiguousarray(light[..., i]) for i, name in enumerate("RGBA")}
+    write_exr(file.with_suffix(".exr"), planes)
+    file.unlink()
+    found = load_scene(tmp_path).splits["train"][0].image
+    assert np.abs(found.astype(int) - image * (image[..., 3:] > 0)).max() <= 1
