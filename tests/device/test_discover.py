@@ -1,6 +1,5 @@
 """Which devices there are, whether they work, and which one is chosen."""
 
-import json
 import os
 import re
 import subprocess
@@ -12,7 +11,7 @@ import pytest
 from support.refused import refusing
 
 from pp_cl.device import discover
-from pp_cl.device.device import describe, kernel_folder
+from pp_cl.device.device import kernel_folder
 from pp_cl.device.discover import list_devices, mend, open_device, separate_devices
 from pp_cl.device.drivers import LEAST_CONSTANT, find_problem
 from pp_cl.training.loss import TAPS
@@ -43,14 +42,6 @@ def test_listed_devices_are_probed(session_device):
     (index,) = (i for i, d, p in found if d == session_device.device and p is None)
     assert len({i for i, _, _ in found}) == len(found)
     assert open_device(index).device == session_device.device
-
-
-def test_description_is_json(session_device):
-    info = json.loads(json.dumps(describe(session_device.device)))
-    assert info["type"] in ("CPU", "GPU", "ACCELERATOR", "OTHER")
-    assert info["compute_units"] >= 1
-    assert 2**27 <= info["max_allocation_bytes"] <= 2**50
-    assert 2**27 <= info["memory_bytes"] <= 2**50
 
 
 def test_a_gpu_that_works_comes_first(listed):

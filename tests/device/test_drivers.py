@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pyopencl as cl
 import pytest
 
@@ -86,6 +87,9 @@ def test_a_driver_that_hangs(vendors):
     assert time.monotonic() - start < 30
     assert {"crash.icd", "hang.icd", "unbuilding"} < set(found)
     assert "20 seconds" in found["hang.icd"]["problem"]
+    left = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
+    library = str(Path(os.environ["OCL_ICD_VENDORS"]).with_name("libhang.so"))
+    assert not [words for words in left if library in " ".join(words)]
     assert [row["index"] for row in found.values() if row["problem"] is None]
 
 
