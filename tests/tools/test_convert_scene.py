@@ -28,14 +28,6 @@ def test_what_is_written_comes_back(tmp_path, name):
     same(folder, given)
 
 
-@pytest.mark.parametrize("name", ["colmap", "llff", "neus"])
-def test_formats_without_splits_ask_for_others(tmp_path, name):
-    many = views(centred=True)
-    with pytest.raises(UserError, match="--hold-out"):
-        convert({"train": many[:6], "test": many[6:]}, tmp_path / "scene", name)
-    assert not (tmp_path / "scene").exists()
-
-
 def longer_lens(given):
     """One view with another focal length, its principal point in the middle."""
     first = given["train"][0]
@@ -43,7 +35,11 @@ def longer_lens(given):
     return given | {"train": [replace(first, stored_camera=camera), *given["train"][1:]]}
 
 
+MANY = views(centred=True)
 REFUSED = {
+    f"{name}, splits": (name, {"train": MANY[:6], "test": MANY[6:]}, "--hold-out")
+    for name in ("colmap", "llff", "neus")
+} | {
     "nsvf, lenses": ("nsvf", held_out(views()), "one camera for all"),
     "nsvf, val alone": ("nsvf", {"val": views(alike=True)}, "no val without test"),
     "nsvf, split": ("nsvf", {"eval": views(alike=True)}, "knows the splits train, val, test"),
