@@ -23,7 +23,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "conv": {"size": [128], "widths": (32, 64, 128)},
     "unet": {"size": [128], "widths": (32, 64, 128)},
     "raster": {"size": [200, 400], "points": [10_000, 250_000]},
-    "train": {"points": [250_000]},
+    "train": {"points": [250_000], "set": [("network.widths", "32,64,128", "bench")]},
 }
 
 
