@@ -173,10 +173,15 @@ def check_target(path: Path) -> None:
 
 
 def check_writable(folder: Path | str) -> None:
-    """Raise UserError where files cannot be made in a folder, or in the one above it that there
-    is.
-    """
-    check_target(Path(folder) / "file")
+    """Raise UserError where a folder, or the one in which it would be made, may not be written."""
+    there = Path(folder).absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(
+            f"{folder}: may not be written (check the permissions of {there}, and that its file"
+            " system is not read-only); choose another --out"
+        )
 
 
 def _sync_folder(folder):
