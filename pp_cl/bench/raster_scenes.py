@@ -118,13 +118,13 @@ class BenchScene:
         n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.weights.shaded.size
         # of a point: place, box, first pair; of a pair: pixel, point and closeness, place or key
         search, pair = 16 + 8 + 4, 4 + 8 + 8
-        rest = (8 + 8 + 4 + 4) * p if blend == "alpha" else 2 * ROW * hw
+        of_hits = p * (8 + 8 + 4 + 8) + ROW * shaded + (1 if blend == "alpha" else 2) * ROW * hw
         # find, scan, scatter, sort
         pairs = n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw
-        weights = p * (8 + 8 + 8 + 8) + 4 * n + 4 * hw
+        weights = p * (8 + 8 + 8 + 4) + 4 * n + 4 * hw
         forward = 8 * p + ROW * shaded + (ROW + 4) * hw
-        backward = p * (4 + 8) + 2 * ROW * shaded + 4 * n + (ROW + 4) * hw + rest
-        return pairs + weights + forward + backward
+        backward = p * (4 + 8) + ROW * shaded + 4 * n + (ROW + 4) * hw
+        return pairs + weights + forward + of_hits + backward
 
 
 class GridScene(BenchScene):
@@ -170,7 +170,8 @@ class GridScene(BenchScene):
 
     def forward(self, blend: str) -> RenderResult:
         """Project, find pairs, weigh, shade and blend, by the renderer."""
-        return self.renderers[blend].forward(self.camera, self.gamma, until="features")
+        renderer = self.renderers[blend]
+        return renderer.forward(self.camera, self.gamma, until="features", training=True)
 
     def backward(self, blend: str, result: RenderResult) -> None:
         """Stage `backward`: gradients of features and opacities."""
@@ -250,11 +251,13 @@ class PulsarScene(BenchScene):
     def backward(self, blend: str, result: RenderResult) -> None:
         """Stages `backward` and `spheres`."""
         with self.dev.stage("backward"):
-            blend_backward(
+            gradients = blend_backward(
                 self.dev,
                 self.buffers[blend],
+                result.points,
                 result.pairs,
                 result.weights,
+                opacity=self.point_opacity,
                 shaded_features=result.shaded_features,
                 features=result.features,
                 grad_features=self.grad,
@@ -264,12 +267,10 @@ class PulsarScene(BenchScene):
                 self.dev,
                 result.points,
                 result.pairs,
-                result.weights,
-                self.buffers[blend],
+                blend,
+                gradients.pair_gradient,
                 opacity=self.point_opacity,
                 gamma=self.gamma,
-                shaded_features=result.shaded_features,
-                grad_features=self.grad,
             )
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
@@ -278,8 +279,8 @@ class PulsarScene(BenchScene):
 
     def moved_bytes(self, blend: str, result: RenderResult) -> int:
         """With the stages `project` and `spheres`."""
-        n, p, hw = self.count, result.pairs.total, self.size**2
-        spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw
+        n, p = self.count, result.pairs.total
+        spheres = p * (4 + 8 + 8) + (16 + 4 + 4 + 16) * n
         return n * (12 + 16 + 8 + 4) + spheres + super().moved_bytes(blend, result)
 
 

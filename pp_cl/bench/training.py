@@ -49,17 +49,17 @@ def bench_step(
                 seconds.clear()  # the first round builds the programs
             for i in range(views):
                 view = trainer.views[len(trainer.views) * i // views]
-                result = renderer.forward(view.camera, GAMMA[1], until="features")
+                result = renderer.forward(view.camera, GAMMA[1], until="features", training=True)
                 if i not in grads:
                     values = np.random.default_rng(i).normal(size=result.features.shape) * 1e-6
                     grads[i] = dev.upload(values, np.float32)
-                *gradients, _ = renderer.backward_features(result, grads[i])
+                gradients = renderer.backward_features(result, grads[i])
                 step += 1
                 with dev.stage("update"):
                     trainer.optimiser.update(
                         step,
                         rates,
-                        *gradients,
+                        gradients,
                         points=result.points,
                         shaded=result.weights.shaded,
                         sh_eps=1e-10,
