@@ -19,11 +19,16 @@ from pp_cl.errors import UserError
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
-from pp_cl.raster.blend import blend_backward, blend_forward, offset_backward, shade_forward
+from pp_cl.raster.blend import BlendGradients, blend_backward, blend_forward, shade_forward
 from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
 from pp_cl.raster.project import ProjectedPoints, project_grid
-from pp_cl.raster.weights import BlendWeights, blend_weights
+from pp_cl.raster.weights import (
+    BlendWeights,
+    blend_weights,
+    list_weights,
+    record_weights,
+)
 from pp_cl.scene.camera import Camera
 from pp_cl.settings import RasterConfig
 
@@ -85,9 +90,9 @@ class Renderer:
         self.dev = dev
         self.model = model
         self.settings = settings
-        # Images and what needs weights by pair take turns in memory, as a training's previews are
-        # larger than its crops. Of each: capacities of the arrays of pairs and of visible points,
-        # which grow with the views.
+        # Images and a training's steps take turns in memory, as its previews are larger than its
+        # crops. Of each: capacities of the arrays of pairs and of visible points, which grow with
+        # the views.
         self._by_pair = False
         self._room, self._shaded_room = [1, 1], [1, 1]
         self.release()
@@ -124,7 +129,7 @@ class Renderer:
                 f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
                 " are rendered; render parts of it"
             )
-        by_pair = training or until != "image"
+        by_pair = training or until == "weights"
         if by_pair != self._by_pair:
             self._by_pair = by_pair
             self.release()
@@ -142,7 +147,7 @@ class Renderer:
                 cloud_offset=cloud.offset,
                 radius=point_radius(self.settings, self.model.grid.edge, self.model.depth_range),
             )
-        pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop)
+        pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop, training)
         result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)
         if until == "weights":
             return result
@@ -164,7 +169,7 @@ class Renderer:
             result.image = net.forward(b.features, training, plan)
         return result
 
-    def _pairs_and_weights(self, points, size, gamma, early_stop):
+    def _pairs_and_weights(self, points, size, gamma, early_stop, training):
         """(Pairs, BlendWeights, RenderResult.tiles). Both stages are enqueued before the number
         of pairs is known, and run again with more room if it was too small.
         """
@@ -183,7 +188,7 @@ class Renderer:
                     gamma=gamma,
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
-                    by_pair=by_pair,
+                    slopes=training,
                 )
             tiles = None
             if self.model.net.is_planned(size):
@@ -194,9 +199,7 @@ class Renderer:
                 return pairs, weights, tiles
             del pairs, weights  # else their arrays would stay beside the larger ones
 
-    def backward(
-        self, result: RenderResult, grad_image: Array, **options: Any
-    ) -> tuple[Array, Array, Array | None, Array]:
+    def backward(self, result: RenderResult, grad_image: Array, **options: Any) -> BlendGradients:
         """What backward_features() returns, from dL/dimage of result.image. The gradients of the
         network's parameters are left in model.net.gradients. options: of backward_features().
         """
@@ -212,42 +215,51 @@ class Renderer:
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
         with_offsets: bool = False,
-    ) -> tuple[Array, Array, Array | None, Array]:
-        """(grad_shaded_features (S, 16), grad_opacity (S,), grad_offset (S, 4), each or longer, of
-        the visible points; pixel_spread (H * W,)) from dL/dfeatures (H, W, 16) of result.features;
-        with alpha compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits
-        with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
-        points are composited by alpha, grad_offset is None.
+    ) -> BlendGradients:
+        """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
+        alpha compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with
+        this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
+        points are composited by alpha, there are none of offsets.
 
-        result: of the last forward(training=True). The gradients of the SH coefficients are
-        grad_shaded_features times the basis functions in the view's direction; the optimiser
+        result: of the last forward(training=True). The gradients of the SH coefficients are those
+        of the shaded features times the basis functions in the view's direction; the optimiser
         multiplies them as it moves each coefficient, and never stores them.
         """
+        moves = with_offsets and (self.settings.blend, self.settings.footprint) == ("alpha", "soft")
         with self.dev.stage("backward"):
-            grad_shaded_features, grad_opacity, pixel_spread = blend_backward(
+            return blend_backward(
                 self.dev,
                 self._buffers,
+                result.points,
                 result.pairs,
                 result.weights,
+                opacity=self.model.cloud.opacity,
                 shaded_features=result.shaded_features,
                 features=result.features,
                 grad_features=grad_features,
                 grad_alpha=grad_alpha,
                 spread_weight=spread_weight,
-                mean=self.settings.mean_gradient,
+                edge=self.model.grid.edge if moves else 0.0,
             )
-            grad_offset, form = None, (self.settings.blend, self.settings.footprint)
-            if with_offsets and form == ("alpha", "soft"):
-                grad_offset = offset_backward(
-                    self.dev,
-                    self._buffers,
-                    result.points,
-                    result.pairs,
-                    result.weights,
-                    opacity=self.model.cloud.opacity,
-                    edge=self.model.grid.edge,
-                )
-            return grad_shaded_features, grad_opacity, grad_offset, pixel_spread
+
+    def record_weights(
+        self,
+        result: RenderResult,
+        max_weight: Array,
+        times_seen: Array,
+        *,
+        least: float = 0.0,
+        gradients: BlendGradients | None = None,
+    ) -> None:
+        """Update what pruning looks at by the last forward(), see raster/weights.py. gradients: of
+        its backward pass, if there was one.
+        """
+        dev, pairs, weights = self.dev, result.pairs, result.weights
+        if gradients:
+            listed = gradients.pair_gradient
+        else:
+            listed = list_weights(dev, self._buffers, pairs, weights)
+        record_weights(dev, pairs, weights, listed, max_weight, times_seen, least)
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of forward()."""

@@ -96,11 +96,6 @@ class RasterConfig:
         0,
         0.5,
     )
-    mean_gradient: bool = setting(
-        False,
-        "divide the gradients of a point's features and opacity, not those of its offset, by the"
-        " number of its pixels, as Pulsar does",
-    )
 
 
 @dataclass

@@ -13,7 +13,6 @@ from pp_cl.device.device import Device
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
 from pp_cl.network.tile_plan import gradient_tiles
-from pp_cl.raster.weights import record_weights
 from pp_cl.render import NETWORK_MULTIPLE, Renderer, RenderResult
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
@@ -115,7 +114,7 @@ class Trainer:
         # the spread is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * self.model.grid.diagonal
         spread_weight = self._rising(train.spread_weight if self._composited else 0.0)
-        grad_features, grad_opacity, grad_offset, pixel_spread = self.renderer.backward(
+        gradients = self.renderer.backward(
             rendered,
             grad_image,
             grad_alpha=grad_alpha,
@@ -123,32 +122,27 @@ class Trainer:
             with_offsets=rates.offset > 0,
         )
         if spread_weight > 0:
-            self.loss.add("spread", pixel_spread, spread_weight, 1 / all_depths)
+            self.loss.add("spread", gradients.pixel_spread, spread_weight, 1 / all_depths)
 
         with self.dev.stage("update"):
             self.optimiser.update(
                 self.step + 1 - self.begun,
                 rates,
-                grad_features,
-                grad_opacity,
-                grad_offset,
+                gradients,
                 points=rendered.points,
                 shaded=rendered.weights.shaded,
                 sh_eps=train.sh_eps / target.size,
             )
         with self.dev.stage("max weights"):
-            record_weights(
-                self.dev,
-                rendered.pairs,
-                rendered.weights,
-                self.state.max_weight,
-                self.state.times_seen,
+            state = self.state
+            self.renderer.record_weights(
+                rendered, state.max_weight, state.times_seen, gradients=gradients
             )
         self.step += 1
         self.check()
         self._terms = self.loss.read(self.step)
         # the renderer may release them now
-        del rendered, grad_features, grad_opacity, grad_offset, pixel_spread
+        del rendered, gradients
         self._after_update(rates)
         return self._terms
 

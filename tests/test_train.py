@@ -173,7 +173,7 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     out = tmp_path / "run"
     changes = {"raster__footprint": footprint, "raster__radius": radius, "train__iterations": 30}
     changes |= {"raster__max_tracked": 64, "raster__early_stop": 0.001, "train__crop": 0}
-    changes |= {"raster__mean_gradient": "true", "train__final_prune_weight": 0}
+    changes |= {"train__final_prune_weight": 0}
     assert main(arguments(scene, out, **changes)) == 0
     losses = [r["loss"] for r in rows(out)[:-1]]
     assert losses[-1] < losses[0]

@@ -20,7 +20,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import multiplications
-from pp_cl.raster.weights import DROPPED
+from pp_cl.raster.weights import listed_hits
 from pp_cl.render import NETWORK_MULTIPLE
 from pp_cl.session import open_training, run_config, stored_state
 from tools.peak import CopyBandwidth, PeakFlops
@@ -41,23 +41,21 @@ def least_bytes(n: int, visible: int, hits: int, front: int, pixels: int, sh: in
     return {
         "project": n * (cloud + WORD) + visible * projected,
         "pairs": visible * projected + hits * 5 * WORD + pixels * WORD,
-        "weights": front * (2 + 2 + 1 + 2 + 2) * WORD + front,
+        "weights": front * (2 + 2 + 1 + 2 + 1) * WORD,
         "shade": visible * (sh + ROW),
         "blend": front * 2 * WORD + visible * ROW + pixels * ROW,
-        "backward": front * (1 + 2 + 2 + 2) * WORD
-        + (2 * visible + pixels) * ROW
+        "backward": front * (2 + 2 + 1 + 2 + 1 + 2 + 2) * WORD
+        + (2 * visible + 2 * pixels) * ROW
         + visible * 5 * WORD,
         "update": visible * (2 * sh + 3 * ROW + 2 * WORD + 5 * moved),
-        "max weights": front * 3 * WORD + visible * 4 * WORD,
+        "max weights": front * 2 * WORD + visible * 4 * WORD,
     }
 
 
 def counts(result) -> dict:
     """The arguments of least_bytes() that a rendered view decides."""
     pairs, weights = result.pairs, result.weights
-    front = pairs.total
-    if weights.has_roles:
-        front = int((weights.pair_role.get()[:front] != DROPPED).sum())
+    front = int(listed_hits(pairs, weights)[0].sum())
     shown = {"visible": weights.shaded.size, "hits": pairs.total, "front": front}
     return shown | {"n": pairs.points, "pixels": pairs.pixels}
 

@@ -6,16 +6,19 @@
 // The background gets the transmittance T behind all hits. An opaque hit lets LEAST_THROUGH pass,
 // so that what lies behind it is known when gradients are computed.
 #include "common.h"
-#include "raster/drops.h"
+
+#ifndef SLOPES
+#define SLOPES 1  // 0: no slopes, which only gradients need
+#endif
 
 #define LEAST_THROUGH 0x1p-24f  // of 1 - alpha, far below what an image shows
 
-// One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
-// their points, by pixel, and marks these points; pixels share points, so some write the same 1.
+// One work-item per pixel: reads its hits, nearest first, writes their weights b with their points,
+// and the slopes s = T d, with which dL/do = s * gain (blend.cl), and marks these points; pixels
+// share points, so some write the same 1.
 //
-// By pair: b, and s = T d, with which dL/do = s * gain (blend.cl). Early stop: a pixel drops the
-// hits behind the depth where T falls below early_stop, as they could weigh no more than T in all;
-// one more entry, without a point, then ends its list.
+// Early stop: a pixel drops the hits behind the depth where T falls below early_stop, as they could
+// weigh no more than T in all; one more entry, without a point, then ends its list.
 kernel void alpha_weights(
     const uint hw,                             // pixels
     const float early_stop,                    // T behind which hits are dropped; 0: none
@@ -23,9 +26,8 @@ kernel void alpha_weights(
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global const float *opacity,               // (N)
-    global float2 *pair_weight,                // (?, 2) P with BY_PAIR, not written where dropped
-    global uchar *pair_role,                   // (?) P with both; with DROPS all DROPPED before
     global ulong *pixel_entry,                 // (P) weight << 32 | point, in the order of the keys
+    global float *pixel_slope,                 // (?) alike, P with SLOPES
     global float *transmittance,               // (HW) of all hits that are not dropped
     global uchar *point_is_shaded)             // (N) 1: has a hit that is not dropped
 {
@@ -35,13 +37,10 @@ kernel void alpha_weights(
     float T = 1.0f;
     uint i = begin;
     for (; i < end && T >= early_stop; i++) {
-        const uint pair = (uint)pair_key[i];
-        const uint2 hit = pair_point_closeness[pair];
+        const uint2 hit = pair_point_closeness[(uint)pair_key[i]];
         const float d = as_float(hit.y), alpha = opacity[hit.x] * d;
-        const bool tracked = !MAX_TRACKED || i - begin < MAX_TRACKED;
-        if (BY_PAIR) pair_weight[pair] = (float2)(T * alpha, tracked ? T * d : 0.0f);
-        if (BY_PAIR && HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
         pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
+        if (SLOPES) pixel_slope[i] = T * d;
         point_is_shaded[hit.x] = 1;
         T *= fmax(1.0f - alpha, LEAST_THROUGH);
     }

@@ -4,10 +4,11 @@
 // F = sum b_i f_i + b_0 BACKGROUND, with G = dL/dF
 // dL/df_i = sum b_i G,  dL/do_i = sum s_i gain_i
 //
-// Both blends share this form. s_i is the second value of pair_weight. The gain of a hit is the
-// change of the loss per unit of weight that moves to it from whatever would show in its place:
+// Both blends share this form; the weights b_i and slopes s_i are those of alpha.cl and softmax.cl.
+// The gain of a hit is the change of the loss per unit of weight that moves to it from whatever would
+// show in its place:
 //
-// Softmax: in its place shows the blend of all hits, so gain_i = G.f_i - G.F; pixel_rest is G.F.
+// Softmax: in its place shows the blend of all hits, so gain_i = G.f_i - G.F.
 //
 // Alpha compositing: in its place shows what lies behind it, composited to R_i, so gain_i = G.f_i -
 // B_i with B_i = G.R_i, and dL/dalpha_i = T_i gain_i. B_i is accumulated back to front, which never
@@ -16,18 +17,17 @@
 // b_i b_j |z_i - z_j| (the distortion loss of Mip-NeRF 360, Eq. 15), adds its derivative with
 // respect to b_i to G.f_i in the same way.
 //
+// A kernel of each blend writes (b, s gain) of the hits by pair, where each point finds its own.
+//
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
 #include "common.h"
 #include "lanes.h"
-#include "raster/pair_role.h"
+#include "raster/offset.h"
 #include "reduce.h"
 
-#ifndef HAS_PAIR_GAIN
-#define HAS_PAIR_GAIN 1  // 0: the gains of a softmax follow from pixel_rest
-#endif
-#ifndef MEAN
-#define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
+#ifndef MOVES
+#define MOVES 0  // 1: gradients of the offsets of soft points that are composited by alpha
 #endif
 
 // The depth of a key, the weight of an entry.
@@ -57,33 +57,51 @@ kernel void blend_forward(
     store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
 }
 
-// One work-item per pixel: writes G.F for the gains of the softmax.
-kernel void softmax_rest(
-    const uint hw,                        // pixels
-    global const float16 *features,       // (H, W, 16) F
-    global const float16 *grad_features,  // (H, W, 16) G
-    global float *pixel_rest)             // (HW)
+// One work-item per pixel: reads its `tracked` nearest hits and their points' features, writes what
+// each adds to the gradients of its point, by softmax.
+kernel __attribute__((vec_type_hint(float16))) void softmax_gradient(
+    const uint hw,                          // pixels
+    const uint tracked,                     // hits of a pixel that get gradients
+    global const uint *pixel_offset,        // (HW+1)
+    global const ulong *pair_key,           // (P) depth << 32 | pair
+    global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
+    global const float *pixel_slope,        // (P)
+    global const uint *point_slot,          // (N) row of a visible point
+    global const float16 *shaded_features,  // (?, 16) of the visible points
+    global const float16 *features,         // (H, W, 16) F
+    global const float16 *grad_features,    // (H, W, 16) G
+    global float2 *pair_gradient)           // (P, 2) b, s gain
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
-    pixel_rest[q] = dot16(grad_features[q], features[q]);
+    const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
+    const float16 G = grad_features[q];
+    const float rest = dot16(G, features[q]);
+    for (uint i = begin; i < begin + min(count, tracked) && (uint)pixel_entry[i] != NONE; i++) {
+        const float own = dot16(G, shaded_features[point_slot[(uint)pixel_entry[i]]]);
+        const float b = upper_float(pixel_entry[i]);
+        pair_gradient[(uint)pair_key[i]] = (float2)(b, pixel_slope[i] * (own - rest));
+    }
 }
 
-// One work-item per pixel: reads its hits, farthest first, and their points' features, writes the
-// gain of each pair that is not dropped, with those of alpha and of the spread, and the spread.
-kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
-    const uint hw,  // pixels
+// One work-item per pixel: reads its hits, farthest first, and their points' features, writes what
+// each of the `tracked` nearest ones adds to the gradients of its point, by alpha compositing, with
+// those of alpha and of the spread; and the spread.
+kernel __attribute__((vec_type_hint(float16))) void alpha_gradient(
+    const uint hw,       // pixels
+    const uint tracked,  // hits of a pixel that get gradients
     const int has_grad_alpha,
     const float spread_weight,              // 0: none, and pixel_spread is not written
     global const uint *pixel_offset,        // (HW+1)
     global const ulong *pair_key,           // (P) depth << 32 | pair
     global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
+    global const float *pixel_slope,        // (P)
     global const float *transmittance,      // (HW)
     global const uint *point_slot,          // (N) row of a visible point
     global const float16 *shaded_features,  // (?, 16) of the visible points
     global const float16 *grad_features,    // (H, W, 16) G
     global const float *grad_alpha,         // (HW) g, not read without has_grad_alpha
-    global float *pair_gain,                // (P)
+    global float2 *pair_gradient,           // (P, 2) b, s gain
     global float *pixel_spread)             // (HW) without its weight
 {
     const uint q = get_global_id(0);
@@ -114,7 +132,8 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
             behind += b * (float2)(1.0f, z);
         }
         const float gain = own + g - B;
-        pair_gain[(uint)pair_key[i]] = gain;
+        if (i - begin < tracked)
+            pair_gradient[(uint)pair_key[i]] = (float2)(b, pixel_slope[i] * gain);
         if (b > 0.0f) {
             T += b;  // in front of this hit
             B += b / T * gain;
@@ -124,39 +143,45 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
 }
 
 // One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes
-// the gradients of its features and, the first one, of its opacity.
+// the gradients of its features and, the first one, of its opacity and offset.
 kernel __attribute__((vec_type_hint(floats))) void blend_backward(
-    const uint s,                           // visible points
-    global const uint *shaded,              // (S) their indices
-    global const float16 *shaded_features,  // (?, 16) a row for each
-    global const uint *point_offset,        // (N+1)
-    global const uint *pair_pixel,          // (P)
-    global const float2 *pair_weight,       // (P, 2)
-    global const uchar *pair_role,          // (?) P with HAS_ROLES
-    global const float *pair_gain,          // (?) P with HAS_PAIR_GAIN
-    global const float *pixel_rest,         // (?) HW without
-    global const float16 *grad_features,    // (H, W, 16) G
-    global float16 *grad_shaded_features,   // (?, 16) a row for each
-    global float *grad_opacity)             // (?) alike
+    const uint s,                              // visible points
+    const float edge,                          // of the grid, world units
+    global const uint *shaded,                 // (S) their indices
+    global const float *camera,                // (20) camera.h
+    global const float *point_radius,          // (N) read with MOVES, as the next two
+    global const float4 *point_camera,         // (N, 4) x, y, z, distance
+    global const float *opacity,               // (N)
+    global const uint *point_offset,           // (N+1)
+    global const uint *pair_pixel,             // (P)
+    global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
+    global const float2 *pair_gradient,        // (P, 2) b, s gain
+    global const float16 *grad_features,       // (H, W, 16) G
+    global float16 *grad_shaded_features,      // (?, 16) a row for each
+    global float *grad_opacity,                // (?) alike
+    global float4 *grad_offset)                // (?, 4) alike, with MOVES
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
+    const Camera cam = camera_load(camera);
+    OffsetGradient moved;
+    if (MOVES) moved = offset_begin(&cam, point_camera[i], point_radius[i]);
     floats dL_df = 0.0f;
     float dL_do = 0.0f;
-    uint tracked = 0;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
-        if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
-        const float2 weight = pair_weight[pair];
+        const float2 of_hit = pair_gradient[pair];
+        if (of_hit.x == 0.0f && of_hit.y == 0.0f) continue;  // mostly dropped
         const uint q = pair_pixel[pair];
-        const float gain = HAS_PAIR_GAIN
-                               ? pair_gain[pair]
-                               : dot16(grad_features[q], shaded_features[g]) - pixel_rest[q];
-        dL_df += weight.x * load_part(grad_features, q);
-        dL_do += weight.y * gain;
-        tracked++;
+        dL_df += of_hit.x * load_part(grad_features, q);
+        dL_do += of_hit.y;
+        if (MOVES && ROW_PART == 0) {
+            const float d = as_float(pair_point_closeness[pair].y);  // 0 at the very rim
+            if (d > 0.0f) offset_add(&moved, &cam, q, d, opacity[i] * of_hit.y / d);
+        }
     }
-    const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
-    store_part(scale * dL_df, grad_shaded_features, g);
-    if (ROW_PART == 0) grad_opacity[g] = scale * dL_do;
+    store_part(dL_df, grad_shaded_features, g);
+    if (ROW_PART != 0) return;
+    grad_opacity[g] = dL_do;
+    if (MOVES) grad_offset[g] = offset_end(&moved, &cam, edge);
 }

@@ -13,8 +13,13 @@
 #include "common.h"
 #include "camera.h"
 #include "lanes.h"
-#include "raster/drops.h"
 
+#ifndef SLOPES
+#define SLOPES 1  // 0: no slopes, which only gradients need
+#endif
+#ifndef DROPS
+#define DROPS 1  // early_stop may be above 0
+#endif
 #define EPS 1e-6f  // depth of the background, as a z (Pulsar's background_normalized_depth)
 
 // What Eq. (1) needs of a batch of LANES hits. Lanes without a hit have opacity and closeness 0,
@@ -44,14 +49,13 @@ ALWAYS_INLINE Hits load_hits(
     return h;
 }
 
-// One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
-// their points, by pixel, and marks these points; pixels share points, so some write the same 1.
+// One work-item per pixel: reads its hits, nearest first, writes their weights b with their points,
+// and the slopes s = b (1/o + z/gamma), finite at o = 0, with which dL/do = s * gain (blend.cl), and
+// marks these points; pixels share points, so some write the same 1.
 //
-// By pair: b, and s = b (1/o + z/gamma), finite at o = 0, with which dL/do = s * gain (blend.cl).
-// Only the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0 and with all
-// behind it, once even an opaque, centred hit (o = d = 1) would have less than the share early_stop
-// of the weight; differs from Pulsar: it looks only when its buffer is flushed. By pixel: the hits
-// that are not dropped, by depth. If any were dropped, one more entry follows, with no point.
+// A hit is dropped, with all behind it, once even an opaque, centred hit (o = d = 1) would have less
+// than the share early_stop of the weight; differs from Pulsar: it looks only when its buffer is
+// flushed. One more entry, without a point, then ends the pixel's list.
 kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const uint hw,  // pixels
     const float gamma,
@@ -61,9 +65,8 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global const float *opacity,               // (N)
-    global float2 *pair_weight,                // (?, 2) P with BY_PAIR
-    global uchar *pair_role,                   // (?) P with both
     global ulong *pixel_entry,                 // (P) weight << 32 | point, in the order of the keys
+    global float *pixel_slope,                 // (?) alike, P with SLOPES
     global uchar *point_is_shaded)             // (N) 1: has a hit that is not dropped
 {
     const uint q = get_global_id(0);
@@ -101,20 +104,11 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
         LANES_INTO(b, h.opacity * share);
         LANES_INTO(slope, share * (1.0f + a));
         for (uint j = 0; j < min(count, stop - first); j++) {
-            const uint i = first + j, pair = (uint)pair_key[i];
-            const bool tracked = !MAX_TRACKED || i - begin < MAX_TRACKED;
-            if (BY_PAIR) pair_weight[pair] = (float2)(b[j], tracked ? slope[j] : 0.0f);
-            if (BY_PAIR && HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
-            const uint point = pair_point_closeness[pair].x;
+            const uint i = first + j, point = pair_point_closeness[(uint)pair_key[i]].x;
             pixel_entry[i] = upsample(as_uint(b[j]), point);
+            if (SLOPES) pixel_slope[i] = slope[j];
             point_is_shaded[point] = 1;
         }
     }
-    if (DROPS) {
-        for (uint i = stop; BY_PAIR && i < end; i++) {
-            pair_weight[(uint)pair_key[i]] = 0.0f;
-            pair_role[(uint)pair_key[i]] = DROPPED;
-        }
-        if (stop < end) pixel_entry[stop] = NONE;
-    }
+    if (stop < end) pixel_entry[stop] = NONE;
 }

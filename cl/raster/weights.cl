@@ -1,7 +1,24 @@
 // What follows for the points from the blend weights of their hits: each one's highest weight, by
 // which it is pruned.
 #include "common.h"
-#include "raster/pair_role.h"
+
+// One work-item per pixel: writes the weights of its `tracked` nearest hits by pair.
+kernel void list_weights(
+    const uint hw,                    // pixels
+    const uint tracked,               // hits of a pixel that count
+    global const uint *pixel_offset,  // (HW+1)
+    global const ulong *pair_key,     // (P) depth << 32 | pair
+    global const ulong *pixel_entry,  // (P) weight << 32 | point; no point: the list ends
+    global float2 *pair_gradient)     // (P, 2) b, 0; not written where dropped or not tracked
+{
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
+    for (uint i = begin; i < begin + min(count, tracked) && (uint)pixel_entry[i] != NONE; i++) {
+        const float b = as_float((uint)(pixel_entry[i] >> 32));
+        pair_gradient[(uint)pair_key[i]] = (float2)(b, 0.0f);
+    }
+}
 
 // One work-item per point with a pair: sums the weights of its pairs, keeps the sum if it is the
 // highest so far, and counts the view if the sum is at least `least`.
@@ -10,8 +27,7 @@ kernel void record_weights(
     const float least,                    // weight of a point that counts as seen
     global const uint *point_offset,      // (N+1)
     global const uchar *point_is_shaded,  // (N) 1: not all of its pairs are dropped
-    global const float2 *pair_weight,     // (P, 2)
-    global const uchar *pair_role,        // (?) P with HAS_ROLES
+    global const float2 *pair_gradient,   // (P, 2) b first, 0 where dropped
     global float *max_weight,             // (N) read and written
     global float *times_seen)             // (N) accumulates
 {
@@ -21,11 +37,8 @@ kernel void record_weights(
     if (begin == end) return;
     float sum = 0.0f;
     if (point_is_shaded[i]) {
-        for (uint pair = begin; pair < end; pair++) {
-            const float weight = pair_weight[pair].x;
-            // no branch, which processors could not foresee
-            sum += HAS_ROLES && pair_role[pair] == DROPPED ? 0.0f : weight;
-        }
+        for (uint pair = begin; pair < end; pair++)
+            sum += pair_gradient[pair].x;
         max_weight[i] = fmax(max_weight[i], sum);
     }
     if (sum >= least) times_seen[i] += 1.0f;

@@ -142,7 +142,8 @@ class GridScene(BenchScene):
 
     def forward(self, blend: str) -> RenderResult:
         """Project, find pairs, weigh, shade and blend, by the renderer."""
-        return self.renderers[blend].forward(self.camera, self.gamma, until="features")
+        renderer = self.renderers[blend]
+        return renderer.forward(self.camera, self.gamma, until="features", training=True)
 
     def backward(self, blend: str, result: RenderResult) -> None:
         """Stage `backward`: gradients of features and opacities."""
@@ -216,11 +217,13 @@ class PulsarScene(BenchScene):
     def backward(self, blend: str, result: RenderResult) -> None:
         """Stages `backward` and `spheres`."""
         with self.dev.stage("backward"):
-            blend_backward(
+            gradients = blend_backward(
                 self.dev,
                 self.buffers[blend],
+                result.points,
                 result.pairs,
                 result.weights,
+                opacity=self.point_opacity,
                 shaded_features=result.shaded_features,
                 features=result.features,
                 grad_features=self.grad,
@@ -230,12 +233,10 @@ class PulsarScene(BenchScene):
                 self.dev,
                 result.points,
                 result.pairs,
-                result.weights,
-                self.buffers[blend],
+                blend,
+                gradients.pair_gradient,
                 opacity=self.point_opacity,
                 gamma=self.gamma,
-                shaded_features=result.shaded_features,
-                grad_features=self.grad,
             )
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:

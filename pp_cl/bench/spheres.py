@@ -11,7 +11,6 @@ from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
 from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints, projection_table
-from pp_cl.raster.weights import BlendWeights
 
 
 def project_spheres(
@@ -61,58 +60,32 @@ def spheres_backward(
     dev: Device,
     points: ProjectedPoints,
     pairs: Pairs,
-    weights: BlendWeights,
-    b: Buffers,
+    blend: str,
+    pair_gradient: Array,
     *,
     opacity: Array,
     gamma: float,
-    shaded_features: Array,
-    grad_features: Array,
-    mean: bool = False,
 ) -> tuple[Array, Array]:
     """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
 
-    points, pairs, weights, opacity (N,), gamma, shaded_features (S, 16): those of the forward pass.
-    b, grad_features (H, W, 16): of blend_backward(), which has run. mean: divide a point's
-    gradients by its number of tracked pixels, as Pulsar does.
+    blend: one of BLENDS. pair_gradient: of blend_backward(). opacity: (N,).
     """
-    n, is_alpha = pairs.points, weights.blend == "alpha"
-    program = dev.program(
-        "bench/spheres",
-        HAS_ROLES=int(weights.has_roles),
-        HAS_PAIR_GAIN=int(is_alpha),
-        MEAN=int(mean),
-    )
-    grad_pair = dev.empty(weights.pair_weight.shape)
+    n = pairs.points
     grad_positions, grad_radius = dev.empty((n, 3)), dev.empty((n,))
-    program.launch(
-        "spheres_backward_pairs",
-        n,
-        n=n,
-        point_slot=weights.point_slot,
-        shaded_features=shaded_features,
-        point_offset=pairs.point_offset,
-        pair_pixel=pairs.pair_pixel,
-        pair_weight=weights.pair_weight,
-        pair_role=weights.pair_role,
-        pair_gain=b.pair_gain,
-        pixel_rest=b.pixel_rest,
-        grad_features=grad_features,
-        pair_point_closeness=pairs.pair_point_closeness,
-        grad_pair=grad_pair,
-    )
-    program.launch(
+    dev.program("bench/spheres").launch(
         "spheres_backward",
         n,
         n=n,
-        gamma=math.inf if is_alpha else gamma,  # alpha depends on the order of the hits alone
+        # alpha depends on the order of the hits alone
+        gamma=math.inf if blend == "alpha" else gamma,
         camera=points.camera_buffer,
         point_radius=points.point_radius,
         point_camera=points.point_camera,
         opacity=opacity,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
-        grad_pair=grad_pair,
+        pair_point_closeness=pairs.pair_point_closeness,
+        pair_gradient=pair_gradient,
         grad_positions=grad_positions,
         grad_radius=grad_radius,
     )

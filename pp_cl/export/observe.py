@@ -10,12 +10,10 @@ from scipy.sparse import csr_array
 from tqdm import tqdm
 
 from pp_cl.files.picture import Picture
-from pp_cl.raster.weights import record_weights
+from pp_cl.raster.weights import listed_hits
 from pp_cl.render import RenderResult
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
-
-NO_POINT = 0xFFFFFFFF  # of a pixel entry: the hits behind it were dropped
 
 
 @dataclass
@@ -34,22 +32,16 @@ class Observation:
         """(N,) float32: each point's blend weights, summed over the pixels."""
         dev, n = self.run.dev, self.run.model.cloud.count
         weights, seen = dev.zeros((n,)), dev.zeros((n,))
-        record_weights(dev, self.view.pairs, self.view.weights, weights, seen)
+        self.run.renderer.record_weights(self.view, weights, seen)
         return weights.get()
 
     def blend_matrix(self) -> csr_array:
         """(HW, N) float32: the blend weight of each point in each pixel y*W + x."""
         pairs = self.view.pairs
-        entry = self.view.weights.pixel_entry.get()[: pairs.total]
-        point = (entry & NO_POINT).astype(np.uint32)
-        weight = (entry >> np.uint64(32)).astype(np.uint32).view(np.float32)
-        offset = pairs.pixel_offset.get().astype(np.int64)
-        # what follows an entry of no point within its pixel was never written
-        ends = np.concatenate([[0], np.cumsum(point == NO_POINT)])
-        valid = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
-        kept = np.concatenate([[0], np.cumsum(valid)])[offset]
+        kept, point, weight = listed_hits(pairs, self.view.weights)
+        offset = np.concatenate([[0], np.cumsum(kept)])[pairs.pixel_offset.get()]
         shape = pairs.pixels, pairs.points
-        matrix = csr_array((weight[valid], point[valid].astype(np.int32), kept), shape=shape)
+        matrix = csr_array((weight, point.astype(np.int32), offset), shape=shape)
         pixels = np.arange(pairs.pixels).reshape(self.view.size)
         return matrix[self.view.cropped(pixels).ravel()]
 

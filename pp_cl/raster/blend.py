@@ -4,6 +4,8 @@ weights of the hits; and the gradients of the blend, gathered by visible point.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from pyopencl.array import Array
 
@@ -13,7 +15,7 @@ from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.points import four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.weights import BlendWeights
+from pp_cl.raster.weights import ALL, BlendWeights
 
 ON_GPU = 4  # lanes there: each work-item reads vectors
 
@@ -51,7 +53,7 @@ def blend_forward(
     dev: Device, pairs: Pairs, weights: BlendWeights, shaded_features: Array, features: Array
 ) -> None:
     """Write features (H, W, 16) from shaded_features, (S, 16) or longer, both float32."""
-    _program(dev, weights).launch(
+    _program(dev).launch(
         "blend_forward",
         pairs.pixels * row_parts(dev, ON_GPU),
         hw=pairs.pixels,
@@ -68,8 +70,7 @@ def blend_backward_table(shaded: int, pixels: int, pairs: int, blend: str) -> Ta
     points and of pairs. blend: one of BLENDS.
     """
     return {
-        "pair_gain": ((pairs if blend == "alpha" else 1,), np.float32),
-        "pixel_rest": ((pixels if blend == "softmax" else 1,), np.float32),
+        "pair_gradient": ((pairs, 2), np.float32),
         "pixel_spread": ((pixels if blend == "alpha" else 1,), np.float32),
         "grad_shaded_features": ((shaded, 16), np.float32),
         "grad_opacity": ((shaded,), np.float32),
@@ -77,84 +78,25 @@ def blend_backward_table(shaded: int, pixels: int, pairs: int, blend: str) -> Ta
     }
 
 
-def blend_backward(
-    dev: Device,
-    b: Buffers,
-    pairs: Pairs,
-    weights: BlendWeights,
-    *,
-    shaded_features: Array,
-    features: Array,
-    grad_features: Array,
-    grad_alpha: Array | None = None,
-    spread_weight: float = 0.0,
-    mean: bool = False,
-) -> tuple[Array, Array, Array]:
-    """(grad_shaded_features (S, 16), grad_opacity (S,), both or longer, pixel_spread (HW,)),
-    float32, valid until the next call: the gradients of the points weights.shaded, while those of
-    all others are 0; and the spread of each pixel, undefined without spread_weight. b.pair_gain
-    (alpha) or b.pixel_rest (softmax) are left for offset_backward() and bench/spheres.py: the
-    gains, and what they follow from (cl/raster/blend.cl).
+@dataclass(frozen=True)
+class BlendGradients:
+    """Of the visible points, a row for each or more, float32, valid until the next backward pass;
+    those of all other points are 0.
 
-    shaded_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
-    grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i
-    b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths (world units) of
-    its hits; no gradient of the depths is formed. mean: a point's gradients are divided by its
-    number of tracked pixels, as Pulsar does. Raises ValueError for grad_alpha or a spread of a
-    softmax, which has no transmittance.
+    shaded_features: (S, 16). opacity: (S,). offset: (S, 4), of soft points composited by alpha, by
+    what the closeness of their hits changes; None if not asked for. pixel_spread: (HW,), undefined
+    without its weight. pair_gradient: (P, 2), by pair the blend weight b and what the hit adds to
+    dL/dopacity, both 0 where it is dropped or not tracked.
     """
-    rows, shaded = len(shaded_features), weights.shaded
-    b.require(blend_backward_table(rows, pairs.pixels, pairs.capacity, weights.blend))
-    program = _program(dev, weights, mean)
-    if weights.blend == "softmax":
-        if grad_alpha is not None or spread_weight > 0:
-            raise ValueError("a softmax has no gradient of alpha and of spread")
-        program.launch(
-            "softmax_rest",
-            pairs.pixels,
-            hw=pairs.pixels,
-            features=features,
-            grad_features=grad_features,
-            pixel_rest=b.pixel_rest,
-        )
-    else:
-        program.launch(
-            "alpha_gain",
-            pairs.pixels,
-            hw=pairs.pixels,
-            has_grad_alpha=int(grad_alpha is not None),
-            spread_weight=spread_weight,
-            pixel_offset=pairs.pixel_offset,
-            pair_key=pairs.pair_key,
-            pixel_entry=weights.pixel_entry,
-            transmittance=weights.transmittance,
-            point_slot=weights.point_slot,
-            shaded_features=shaded_features,
-            grad_features=grad_features,
-            grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
-            pair_gain=b.pair_gain,
-            pixel_spread=b.pixel_spread,
-        )
-    program.launch(
-        "blend_backward",
-        shaded.size * row_parts(dev, ON_GPU),
-        s=shaded.size,
-        shaded=shaded,
-        shaded_features=shaded_features,
-        point_offset=pairs.point_offset,
-        pair_pixel=pairs.pair_pixel,
-        pair_weight=weights.pair_weight,
-        pair_role=weights.pair_role,
-        pair_gain=b.pair_gain,
-        pixel_rest=b.pixel_rest,
-        grad_features=grad_features,
-        grad_shaded_features=b.grad_shaded_features,
-        grad_opacity=b.grad_opacity,
-    )
-    return b.grad_shaded_features, b.grad_opacity, b.pixel_spread
+
+    shaded_features: Array
+    opacity: Array
+    offset: Array | None
+    pixel_spread: Array
+    pair_gradient: Array
 
 
-def offset_backward(
+def blend_backward(
     dev: Device,
     b: Buffers,
     points: ProjectedPoints,
@@ -162,19 +104,66 @@ def offset_backward(
     weights: BlendWeights,
     *,
     opacity: Array,
-    edge: float,
-) -> Array:
-    """grad_offset (S, 4) float32 or longer, valid until the next call, after blend_backward(): of
-    soft points that are composited by alpha, of what the closeness of their hits changes.
+    shaded_features: Array,
+    features: Array,
+    grad_features: Array,
+    grad_alpha: Array | None = None,
+    spread_weight: float = 0.0,
+    edge: float = 0.0,
+) -> BlendGradients:
+    """The gradients of the points weights.shaded, after blend_weights() with slopes.
 
-    opacity: (N,). edge: of the grid that offsets are counted in, world units.
+    opacity: (N,). shaded_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W,
+    16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij
+    b_i b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths (world
+    units) of its hits; no gradient of the depths is formed. edge: of the grid that offsets are
+    counted in, world units; 0: no gradients of offsets. Raises ValueError for grad_alpha or a
+    spread of a softmax, which has no transmittance, and for offsets unless soft points are
+    composited by alpha.
     """
-    dev.program("raster/offset", HAS_ROLES=int(weights.has_roles)).launch(
-        "offset_backward",
-        weights.shaded.size,
-        s=weights.shaded.size,
+    is_alpha, moves = weights.blend == "alpha", edge > 0
+    if not is_alpha and (grad_alpha is not None or spread_weight > 0):
+        raise ValueError("a softmax has no gradient of alpha and of spread")
+    if moves and not (is_alpha and points.footprint == "soft"):
+        raise ValueError("only soft points that are composited by alpha have gradients of offsets")
+    shaded = weights.shaded
+    b.require(
+        blend_backward_table(len(shaded_features), pairs.pixels, pairs.capacity, weights.blend)
+    )
+    if weights.drops or weights.tracked < ALL:
+        dev.fill(b.pair_gradient, 0)
+    of_hits = {
+        "hw": pairs.pixels,
+        "tracked": weights.tracked,
+        "pixel_offset": pairs.pixel_offset,
+        "pair_key": pairs.pair_key,
+        "pixel_entry": weights.pixel_entry,
+        "pixel_slope": weights.pixel_slope,
+        "point_slot": weights.point_slot,
+        "shaded_features": shaded_features,
+        "grad_features": grad_features,
+        "pair_gradient": b.pair_gradient,
+    }
+    program = _program(dev, moves)
+    if is_alpha:
+        program.launch(
+            "alpha_gradient",
+            pairs.pixels,
+            has_grad_alpha=int(grad_alpha is not None),
+            spread_weight=spread_weight,
+            transmittance=weights.transmittance,
+            grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
+            pixel_spread=b.pixel_spread,
+            **of_hits,
+        )
+    else:
+        program.launch("softmax_gradient", pairs.pixels, features=features, **of_hits)
+    program.launch(
+        "blend_backward",
+        shaded.size * row_parts(dev, ON_GPU),
+        s=shaded.size,
         edge=edge,
-        shaded=weights.shaded,
+        shaded=shaded,
         camera=points.camera_buffer,
         point_radius=points.point_radius,
         point_camera=points.point_camera,
@@ -182,19 +171,20 @@ def offset_backward(
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_point_closeness=pairs.pair_point_closeness,
-        pair_weight=weights.pair_weight,
-        pair_role=weights.pair_role,
-        pair_gain=b.pair_gain,
+        pair_gradient=b.pair_gradient,
+        grad_features=grad_features,
+        grad_shaded_features=b.grad_shaded_features,
+        grad_opacity=b.grad_opacity,
         grad_offset=b.grad_offset,
     )
-    return b.grad_offset
-
-
-def _program(dev, weights, mean=False):
-    return dev.program(
-        "raster/blend",
-        LANES=lanes(dev, ON_GPU),
-        HAS_ROLES=int(weights.has_roles),
-        HAS_PAIR_GAIN=int(weights.blend == "alpha"),
-        MEAN=int(mean),
+    return BlendGradients(
+        b.grad_shaded_features,
+        b.grad_opacity,
+        b.grad_offset if moves else None,
+        b.pixel_spread,
+        b.pair_gradient,
     )
+
+
+def _program(dev, moves=False):
+    return dev.program("raster/blend", LANES=lanes(dev, ON_GPU), MOVES=int(moves))

@@ -16,29 +16,29 @@ from pp_cl.device.scan import nonzero
 from pp_cl.raster.pairs import Pairs
 
 BLENDS = ("softmax", "alpha")
-DROPPED = 2  # cl/raster/pair_role.h
+NO_POINT = 0xFFFFFFFF  # of an entry behind which hits were dropped
+ALL = 2**32 - 1  # hits of a pixel that get gradients
 
 
 @dataclass(frozen=True)
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
-    blend: one of BLENDS. has_roles: some pairs may be untracked (no gradient) or dropped (behind
-    the early stop); else pair_role is unread. pair_weight: (P, 2) float32, the blend weight b, and
-    a factor s for the backward pass, dL/dopacity = s * gain (cl/raster/blend.cl); undefined where
-    the pair is dropped. pair_role: (P,) uint8, cl/raster/pair_role.h. Neither is there without
-    by_pair. point_is_shaded: (N,) uint8, 1 for visible points. pixel_entry: (P,) uint64,
-    weight bits << 32 | point, each pixel's hits by depth; where hits are dropped, an entry without
-    a point ends the pixel's list. shaded_list: `shaded`, whose length is still on its way.
+    blend: one of BLENDS. tracked: how many nearest hits of a pixel get gradients. drops: whether
+    there may be hits behind an early stop. pixel_entry: (P,) uint64, weight bits << 32 | point,
+    each pixel's hits by depth; where hits are dropped, an entry without a point ends the pixel's
+    list. pixel_slope: (P,) float32 alike, the factor s of the backward pass, dL/dopacity = s * gain
+    (cl/raster/blend.cl); None without slopes. point_is_shaded: (N,) uint8, 1 for visible
+    points. shaded_list: `shaded`, whose length is still on its way.
     point_slot: (N,) uint32, where a visible point stands in `shaded`, undefined for others.
     transmittance: (HW,) float32 behind all hits, None with the softmax.
     """
 
     blend: str
-    has_roles: bool
-    pair_weight: Array
-    pair_role: Array
+    tracked: int
+    drops: bool
     pixel_entry: Array
+    pixel_slope: Array | None
     point_is_shaded: Array
     shaded_list: Reading[Array]
     point_slot: Array
@@ -52,13 +52,12 @@ class BlendWeights:
         return self.shaded_list.get()
 
 
-def weights_table(n: int, pixels: int, by_pair: int, roles: int) -> Table:
-    """The buffers for n points and a number of pixels, with room for numbers of weights and of
-    roles by pair; those by pixel lie in pairs_table()'s pair_scratch.
+def weights_table(n: int, pixels: int, slopes: int) -> Table:
+    """The buffers for n points and a number of pixels, with room for a number of slopes; the
+    entries lie in pairs_table()'s pair_scratch.
     """
     return {
-        "pair_weight": ((by_pair, 2), np.float32),
-        "pair_role": ((roles,), np.uint8),
+        "pixel_slope": ((slopes,), np.float32),
         "transmittance": ((pixels,), np.float32),
         "point_is_shaded": ((n,), np.uint8),
         "shaded": ((n,), np.uint32),
@@ -77,47 +76,40 @@ def blend_weights(
     gamma: float,
     max_tracked: int = 0,
     early_stop: float = 0.0,
-    by_pair: bool = True,
+    slopes: bool = True,
 ) -> BlendWeights:
     """The weights of all pairs, in the buffers b of find_pairs().
 
     opacity: (N,) float32 in [0, 1]. blend: one of BLENDS. gamma: depth sharpness of the softmax.
     max_tracked: only this many nearest hits of a pixel get gradients (64 in the paper); 0: all.
     early_stop: in [0, 1): a pixel drops all hits behind the depth where no hit can have this share
-    any more (0.001 in the paper); 0: none. by_pair: write what the backward pass and
-    record_weights() read.
+    any more (0.001 in the paper); 0: none. slopes: write what the backward pass reads.
     """
-    has_roles = early_stop > 0 or max_tracked > 0
-    n, pixels, room = pairs.points, pairs.pixels, pairs.capacity if by_pair else 1
-    b.require(weights_table(n, pixels, room, room if has_roles else 1))
-    drops = {"MAX_TRACKED": max_tracked, "DROPS": int(early_stop > 0), "BY_PAIR": int(by_pair)}
+    b.require(weights_table(pairs.points, pairs.pixels, pairs.capacity if slopes else 1))
     dev.fill(b.point_is_shaded, 0)
     if blend == "alpha":
-        _alpha_weights(dev, b, pairs, opacity, early_stop, drops)
+        _alpha_weights(dev, b, pairs, opacity, early_stop, slopes)
     else:
-        _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, drops)
+        _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, slopes)
     shaded_list = nonzero(dev, b.point_is_shaded, b.shaded, b.point_slot)
-    transmittance = b.transmittance if blend == "alpha" else None
     return BlendWeights(
         blend,
-        has_roles,
-        b.pair_weight,
-        b.pair_role,
+        max_tracked or ALL,
+        early_stop > 0,
         b.pair_scratch,
+        b.pixel_slope if slopes else None,
         b.point_is_shaded,
         shaded_list,
         b.point_slot,
-        transmittance,
+        b.transmittance if blend == "alpha" else None,
     )
 
 
-def _alpha_weights(dev, b, pairs, opacity, early_stop, drops):
+def _alpha_weights(dev, b, pairs, opacity, early_stop, slopes):
     """Front to back, weight = transmittance * opacity * closeness; early_stop is the transmittance
     below which the hits behind are dropped.
     """
-    if early_stop > 0:
-        dev.fill(b.pair_role, DROPPED)
-    dev.program("raster/alpha", **drops).launch(
+    dev.program("raster/alpha", SLOPES=int(slopes)).launch(
         "alpha_weights",
         pairs.pixels,
         hw=pairs.pixels,
@@ -126,17 +118,19 @@ def _alpha_weights(dev, b, pairs, opacity, early_stop, drops):
         pair_key=pairs.pair_key,
         pair_point_closeness=pairs.pair_point_closeness,
         opacity=opacity,
-        pair_weight=b.pair_weight,
-        pair_role=b.pair_role,
         pixel_entry=b.pair_scratch,
+        pixel_slope=b.pixel_slope,
         transmittance=b.transmittance,
         point_is_shaded=b.point_is_shaded,
     )
 
 
-def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, drops):
+def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, slopes):
     """Eq. (1) of the supplemental; early_stop is Pulsar's percent_allowed_difference."""
-    dev.program("raster/softmax", LANES=lanes(dev), **drops).launch(
+    program = dev.program(
+        "raster/softmax", LANES=lanes(dev), SLOPES=int(slopes), DROPS=int(early_stop > 0)
+    )
+    program.launch(
         "softmax_weights",
         pairs.pixels,
         hw=pairs.pixels,
@@ -147,34 +141,66 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, d
         pair_key=pairs.pair_key,
         pair_point_closeness=pairs.pair_point_closeness,
         opacity=opacity,
-        pair_weight=b.pair_weight,
-        pair_role=b.pair_role,
         pixel_entry=b.pair_scratch,
+        pixel_slope=b.pixel_slope,
         point_is_shaded=b.point_is_shaded,
     )
+
+
+def listed_hits(pairs: Pairs, weights: BlendWeights) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """On the host, of each hit in the order of pairs.pair_key: (P,) bool, whether it is not
+    dropped, and of those that are not uint32 point and float32 weight.
+    """
+    offset = pairs.pixel_offset.get().astype(np.int64)
+    entry = weights.pixel_entry.get()[: pairs.total]
+    point = (entry & np.uint64(NO_POINT)).astype(np.uint32)
+    # what follows an entry of no point within its pixel was never written
+    ends = np.concatenate([[0], np.cumsum(point == NO_POINT)])
+    kept = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
+    return kept, point[kept], (entry[kept] >> np.uint64(32)).astype(np.uint32).view(np.float32)
+
+
+def list_weights(dev: Device, b: Buffers, pairs: Pairs, weights: BlendWeights) -> Array:
+    """(P, 2) float32, valid until the next call: the blend weight of each pair, and 0; both 0 where
+    the pair is dropped or not tracked.
+    """
+    b.require({"pair_gradient": ((pairs.capacity, 2), np.float32)})
+    dev.fill(b.pair_gradient, 0)
+    dev.program("raster/weights").launch(
+        "list_weights",
+        pairs.pixels,
+        hw=pairs.pixels,
+        tracked=weights.tracked,
+        pixel_offset=pairs.pixel_offset,
+        pair_key=pairs.pair_key,
+        pixel_entry=weights.pixel_entry,
+        pair_gradient=b.pair_gradient,
+    )
+    return b.pair_gradient
 
 
 def record_weights(
     dev: Device,
     pairs: Pairs,
     weights: BlendWeights,
+    pair_gradient: Array,
     max_weight: Array,
     times_seen: Array,
     least: float = 0.0,
 ) -> None:
     """Update what pruning looks at, both (N,) float32: max_weight, the highest sum over an image's
     pixels of a point's blend weights so far, and times_seen, how many images had a hit of the
-    point, dropped or not, and such a sum of at least `least`.
+    point, dropped or not, and such a sum of at least `least`. pair_gradient: of blend_backward() or
+    list_weights().
     """
-    dev.program("raster/weights", HAS_ROLES=int(weights.has_roles)).launch(
+    dev.program("raster/weights").launch(
         "record_weights",
         pairs.points,
         n=pairs.points,
         least=least,
         point_offset=pairs.point_offset,
         point_is_shaded=weights.point_is_shaded,
-        pair_weight=weights.pair_weight,
-        pair_role=weights.pair_role,
+        pair_gradient=pair_gradient,
         max_weight=max_weight,
         times_seen=times_seen,
     )

@@ -246,12 +246,10 @@ def gradients(
     grad_features: np.ndarray,
     *,
     max_tracked: int = 0,
-    mean: bool = False,
     spread_weight: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the max_tracked nearest hits (0:
-    all). mean: over a point's tracked hits, not their sum. spread_weight: of the pixels' spread,
-    which is added to the loss; of alpha() alone.
+    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the tracked() hits. spread_weight:
+    of the pixels' spread, which is added to the loss; of alpha() alone.
     """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
@@ -261,10 +259,13 @@ def gradients(
         slope = _alpha_slope(blend_, own, G.sum(axis=1), ranks) * geometry_["closeness"]
     else:
         slope = blend_["by_opacity"] * (own - (G * features(blend_, f)).sum(axis=1))
-    tracked = blend_["hit"] & (ranks < max_tracked) if max_tracked else blend_["hit"]
-    scale = 1 / np.maximum(tracked.sum(axis=1), 1) if mean else np.ones(len(f))
-    weight, slope = np.where(tracked, blend_["weight"], 0), np.where(tracked, slope, 0)
-    return scale[:, None] * (weight @ G), scale * slope.sum(axis=1)
+    used = tracked(geometry_, blend_, max_tracked)
+    return np.where(used, blend_["weight"], 0) @ G, np.where(used, slope, 0).sum(axis=1)
+
+
+def tracked(geometry_: Arrays, blend_: Arrays, max_tracked: int) -> np.ndarray:
+    """(N, HW) bool: the max_tracked nearest hits of each pixel that are used, 0: all."""
+    return blend_["hit"] & (order(geometry_) < max_tracked) if max_tracked else blend_["hit"]
 
 
 def _alpha_slope(blend_, own, background, ranks):

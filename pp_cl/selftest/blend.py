@@ -10,7 +10,7 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.raster.project import FOOTPRINTS
-from pp_cl.raster.weights import BLENDS, DROPPED
+from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.case import (
@@ -67,10 +67,10 @@ def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Ite
 
 
 def _backward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    for gamma, mean, tracked in ((0.1, False, 0), (0.01, False, 3), (0.01, True, 0)):
-        options: dict[str, Any] = {"mean": mean, "max_tracked": tracked, "rule": rule}
+    for gamma, tracked in ((0.1, 0), (0.01, 3)):
+        options: dict[str, Any] = {"max_tracked": tracked, "rule": rule}
         blended = Blended(dev, rng, kind=kind, gamma=gamma, **options)
-        gradients, expected = blended.gradients(), blended.reference_gradients(tracked, mean)
+        gradients, expected = blended.gradients(), blended.reference_gradients(tracked)
         yield relative(gradients["features"], expected[0], GRADIENT)
         yield relative(gradients["opacity"], expected[1], OPACITY[rule])
         unseen = ~blended.geometry["hit"].any(axis=1)
@@ -97,7 +97,7 @@ def _early_stop(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Ch
         options: dict[str, Any] = {"gamma": 0.02, "radius": 0.4, "rule": rule, "early_stop": stop}
         blended = Blended(dev, rng, 500, **options)
         hit, kept = blended.geometry["hit"], blended.blend["hit"]
-        yield exact(hit & (blended.role == DROPPED), hit & ~kept)
+        yield exact(blended.dropped, hit & ~kept)
         yield exact(blended.scene.weights.shaded.get(), np.flatnonzero(kept.any(axis=1)))
         yield from _check_blended(blended)
 
@@ -151,7 +151,7 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0)):  # the last: of the least size
         scene = PairedPoints(dev, camera, positions, radius)
         scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
-        gradients = scene.offset_gradients(grad, edge)
+        gradients = scene.gradients(grad, edge=edge)["offset"]
         exact_geometry = scene.geometry()
         used = dense.alpha(exact_geometry, opacity, stop)["hit"]
 
@@ -295,22 +295,16 @@ def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]
 
 def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Of hits of all weights, of those before an early stop, and of the tracked ones."""
-    for n, tracked, stop, mean in (
-        (257, 0, 0.0, False),
-        (257, 0, 0.05, False),
-        (257, 3, 0.0, False),
-        (33, 0, 0.0, True),
-        (31, 0, 0.0, False),
-    ):
-        options: dict[str, Any] = {"max_tracked": tracked, "early_stop": stop, "mean": mean}
+    for n, tracked, stop in ((257, 0, 0), (257, 0, 0.05), (257, 3, 0), (33, 0, 0), (31, 0, 0)):
+        options: dict[str, Any] = {"max_tracked": tracked, "early_stop": stop}
         blended = Blended(dev, rng, n, rule="alpha", **options)
         blended.grad[:] = 0
-        expected = blended.reference_gradients(tracked, mean, spread_weight=3.0)[1]
+        expected = blended.reference_gradients(tracked, spread_weight=3.0)[1]
         gradients = blended.gradients(spread_weight=3.0)
         yield relative(gradients["opacity"], expected, GRADIENT)
         yield exact(gradients["features"], np.zeros((n, 16)))
         spread = dense.spread(blended.geometry, blended.blend)
-        yield relative(blended.scene.pixel_spread.get(), spread, GRADIENT)
+        yield relative(blended.scene.backward.pixel_spread.get(), spread, GRADIENT)
 
 
 def _opaque(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

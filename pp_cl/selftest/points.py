@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
 from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
-from pp_cl.raster.blend import blend_backward, blend_forward, offset_backward
-from pp_cl.raster.weights import DROPPED, blend_weights
+from pp_cl.raster.blend import BlendGradients, blend_backward, blend_forward
+from pp_cl.raster.weights import blend_weights, listed_hits
 from pp_cl.reference import dense
 from pp_cl.scene.camera import Camera, look_at
 
@@ -45,6 +45,8 @@ class PairedPoints:
 
     positions: (N, 3). radius: one number or (N,), world units. depth_range: (near, far).
     """
+
+    backward: BlendGradients  # of the last gradients()
 
     def __init__(
         self,
@@ -115,12 +117,11 @@ class PairedPoints:
         gamma: float,
         point_features: np.ndarray,
         *,
-        mean: bool = False,
         rule: str = "softmax",
         **drops: Any,
     ) -> np.ndarray:
         """(H, W, 16) blended features. rule: of BLENDS. drops: max_tracked and early_stop."""
-        self.gamma, self.mean, self.opacity = gamma, mean, self.dev.upload(opacity, np.float32)
+        self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
         self.weights = blend_weights(
             self.dev,
             self.buffers,
@@ -141,37 +142,50 @@ class PairedPoints:
 
     def weight(self) -> np.ndarray:
         """(N, HW) the blend weights, 0 where a hit was dropped."""
-        weights = self.weights.pair_weight.get()[:, 0]
-        return self.dense(np.where(self.roles() == DROPPED, 0, weights))
+        kept, _, weights = listed_hits(self.pairs, self.weights)
+        by_pair = np.zeros(self.pairs.total, np.float32)
+        by_pair[self._listed()[kept]] = weights
+        return self.dense(by_pair)
 
-    def roles(self) -> np.ndarray:
-        """(P,) numpy: cl/raster/pair_role.h of each pair."""
-        roles = self.weights.pair_role.get()
-        return roles if self.weights.has_roles else np.zeros(len(self.pairs.pair_pixel), np.uint8)
+    def dropped(self) -> np.ndarray:
+        """(N, HW) bool: the hits behind an early stop."""
+        kept, _, _ = listed_hits(self.pairs, self.weights)
+        by_pair = np.empty(self.pairs.total, bool)
+        by_pair[self._listed()] = ~kept
+        return self.dense(by_pair, False)
+
+    def _listed(self):
+        """(P,) the pairs in the order of the keys."""
+        return self.pairs.pair_key.get()[: self.pairs.total] & np.uint64(0xFFFFFFFF)
 
     def gradients(
         self,
         grad_features: np.ndarray,
         grad_alpha: np.ndarray | None = None,
         spread_weight: float = 0.0,
+        edge: float = 0.0,
     ) -> Gradients:
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
-        sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend().
+        sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend(); on a grid of
+        an edge also "offset", (N, 4).
         """
         alphas = None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32)
-        features, opacity, self.pixel_spread = blend_backward(
+        found = self.backward = blend_backward(
             self.dev,
             self.buffers,
+            self.projected,
             self.pairs,
             self.weights,
+            opacity=self.opacity,
             shaded_features=self.shaded_features,
             features=self.features,
             grad_features=self._uploaded(grad_features),
             grad_alpha=alphas,
             spread_weight=spread_weight,
-            mean=self.mean,
+            edge=edge,
         )
-        return {"features": self._of_points(features), "opacity": self._of_points(opacity)}
+        rows = {"features": found.shaded_features, "opacity": found.opacity, "offset": found.offset}
+        return {name: self._of_points(array) for name, array in rows.items() if array is not None}
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
@@ -180,29 +194,12 @@ class PairedPoints:
             self.dev,
             self.projected,
             self.pairs,
-            self.weights,
-            self.buffers,
+            self.weights.blend,
+            self.backward.pair_gradient,
             opacity=self.opacity,
             gamma=self.gamma,
-            shaded_features=self.shaded_features,
-            grad_features=self._uploaded(grad_features),
-            mean=self.mean,
         )
         return gradients | {"positions": positions.get(), "radius": radius.get()}
-
-    def offset_gradients(self, grad_features: np.ndarray, edge: float) -> np.ndarray:
-        """(N, 4) of the same, on a grid of this edge; of soft points composited by alpha."""
-        self.gradients(grad_features)
-        rows = offset_backward(
-            self.dev,
-            self.buffers,
-            self.projected,
-            self.pairs,
-            self.weights,
-            opacity=self.opacity,
-            edge=edge,
-        )
-        return self._of_points(rows)
 
     def _of_points(self, rows):
         """(N, ...): those of the visible points, 0 for all others."""
@@ -275,14 +272,14 @@ class Blended:
         stop = blend.get("early_stop", 0.0)
         self.blend = dense.blend_by_rule(rule, self.geometry, self.opacity, gamma, stop)
         self.weight = self.scene.weight()
-        self.role = self.scene.dense(self.scene.roles())
+        self.dropped = self.scene.dropped()
 
     def gradients(self, spread_weight: float = 0.0) -> Gradients:
         """The kernels' gradients of sum(features * grad) and the spread times its weight."""
         return self.scene.gradients(self.grad, spread_weight=spread_weight)
 
     def reference_gradients(
-        self, max_tracked: int = 0, mean: bool = False, spread_weight: float = 0.0
+        self, max_tracked: int = 0, spread_weight: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """The same in float64: (features, opacity)."""
         return dense.gradients(
@@ -291,6 +288,5 @@ class Blended:
             self.point_features,
             self.grad,
             max_tracked=max_tracked,
-            mean=mean,
             spread_weight=spread_weight,
         )

@@ -14,7 +14,7 @@ from pp_cl.raster.blend import shade_forward
 from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.raster.project import FOOTPRINTS, project_grid
-from pp_cl.raster.weights import BLENDS, DROPPED, record_weights
+from pp_cl.raster.weights import BLENDS, list_weights, record_weights
 from pp_cl.reference import dense
 from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
@@ -191,11 +191,11 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         )
         scene = blended.scene
         alpha, depth, median = _depths(dev, scene)
-        weight = np.where(blended.role == DROPPED, 0, scene.weight()).astype(np.float64)
+        weight = scene.weight().astype(np.float64)
         z = dense.surface_depth(scene.camera, blended.geometry, blended.radius, kind)
         total = weight.sum(axis=0)
         hit = total > 0
-        stopped = (blended.geometry["hit"] & (blended.role == DROPPED)).any(axis=0)
+        stopped = blended.dropped.any(axis=0)
         yield each(alpha, np.where(stopped, 1, np.minimum(total, 1)), SUMMED, floor=1e-2)
         yield exact(np.isinf(depth), ~hit)
         mean = (weight * z).sum(axis=0)[hit] / total[hit]
@@ -221,7 +221,7 @@ def _medians(blended, weight, z):
     """Two (HW,) between which the medians lie: where shares just below and above one half are
     reached. weight, z: (N, HW).
     """
-    hits, bounds = blended.geometry["hit"] & (blended.role != DROPPED), np.zeros((2, len(weight.T)))
+    hits, bounds = blended.geometry["hit"] & ~blended.dropped, np.zeros((2, len(weight.T)))
     for q in np.flatnonzero(weight.any(axis=0)):
         order = np.argsort(blended.geometry["depth"][:, q], kind="stable")
         listed = order[hits[order, q]]
@@ -237,18 +237,26 @@ def _depths(dev, scene):
 
 
 def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The highest weight of each point, and how often it was seen."""
+    """The highest weight of each point, and how often it was seen, by the tracked hits; the same
+    from the weights that the backward pass leaves.
+    """
     options: dict[str, Any] = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
     before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
     highest, scene = before.copy(), blended.scene
-    record_weights(dev, scene.pairs, scene.weights, highest, seen)
+    listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
+    record_weights(dev, scene.pairs, scene.weights, listed, highest, seen)
     yield exact(seen.get() - np.arange(500), blended.geometry["hit"].any(axis=1))
-    weight = blended.blend["weight"].sum(axis=1)
-    least = float(np.sort(weight)[-100:-98].mean())  # 99 points have more
+    tracked = dense.tracked(blended.geometry, blended.blend, 2)
+    weight = np.where(tracked, blended.blend["weight"], 0).sum(axis=1)
+    least = float(np.sort(weight)[-30:-28].mean())  # 29 points have more
     dev.fill(seen, 0)
-    record_weights(dev, scene.pairs, scene.weights, highest, seen, least)
+    record_weights(dev, scene.pairs, scene.weights, listed, highest, seen, least)
     yield exact(seen.get(), weight > least)
+    weights = listed.get()[: scene.pairs.total, 0]
+    blended.gradients()
+    left = scene.backward.pair_gradient.get()[: scene.pairs.total, 0]
+    yield exact(left, weights)
     yield relative(highest.get(), np.maximum(before.get(), weight), PLACED)
 
 

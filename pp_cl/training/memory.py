@@ -25,10 +25,10 @@ MIB, GIB = 2**20, 2**30
 
 # Bytes on the device beside what a point learns: of each point in a view (its projection, its
 # place in the lists of pairs and of visible points), of its neighbours, of a pair in an image and
-# in a step (with weight, role and gradient), of a visible point's features in either, and of a
+# in a step (with slope and gradient), of a visible point's features in either, and of a
 # step's pixel (target, loss and features with their gradients).
 VIEW_POINT, NEIGHBOURS = 45, 25
-PAIR, TRAINED_PAIR = 28, 41
+PAIR, TRAINED_PAIR = 28, 40
 FEATURES, TRAINED_FEATURES = 64, 148
 TRAINED_PIXEL = 400
 GROWN = 1.25  # arrays of pairs have this much more room than is needed

@@ -16,6 +16,7 @@ from pp_cl.device.buffers import DeviceRows
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 from pp_cl.model import Model
+from pp_cl.raster.blend import BlendGradients
 from pp_cl.raster.points import MOST_OFFSET, PointCloud, four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.training.schedule import Rates
@@ -46,19 +47,16 @@ class Optimiser:
         self,
         step: int,
         rates: Rates,
-        grad_shaded_features: Array,
-        grad_opacity: Array,
-        grad_offset: Array | None,
+        gradients: BlendGradients,
         *,
         points: ProjectedPoints,
         shaded: Array,
         sh_eps: float,
     ) -> None:
-        """One step by the gradients of the visible points' features (S, 16), opacities (S,) and
-        offsets (S, 4), each or longer, and by those of the network, which lie in
-        model.net.gradients.
+        """One step by the gradients of the visible points, and by those of the network, which lie
+        in model.net.gradients.
 
-        step: from 1. grad_offset: None where offsets stay. points: as projected into the rendered
+        step: from 1. points: as projected into the rendered
         view. shaded: (S) uint32, the visible ones. sh_eps: eps of the SH coefficients.
         """
         net = self.model.net
@@ -66,9 +64,9 @@ class Optimiser:
             self.dev,
             step,
             rates,
-            grad_shaded_features,
-            grad_opacity,
-            grad_offset,
+            gradients.shaded_features,
+            gradients.opacity,
+            gradients.offset,
             points=points,
             shaded=shaded,
             cloud=self.model.cloud,
@@ -219,11 +217,12 @@ def rmsprop_update(
     state: PointState,
     sh_eps: float,
 ) -> None:
-    """One step of what the visible points learn, in place. The gradient of a SH coefficient is the
-    product of its harmonic in the direction from the eye to the point and the gradient of the
-    point's feature; it is never formed.
+    """One step of what the visible points learn, in place, by the gradients of their features (S,
+    16), opacities (S,) and offsets (S, 4), each or longer; None: offsets stay. The gradient of a SH
+    coefficient is the product of its harmonic in the direction from the eye to the point and the
+    gradient of the point's feature; it is never formed.
 
-    step: from 1 on. The gradients, points, shaded and sh_eps: as Optimiser.update() takes them.
+    step: from 1 on. points, shaded and sh_eps: as Optimiser.update() takes them.
     """
     degree = max((d for d in range(stored_degree(cloud.sh) + 1) if rates.sh[d] > 0), default=0)
     root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(cloud.sh)

@@ -9,7 +9,6 @@ from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.errors import Diverged
 from pp_cl.model import Model
-from pp_cl.raster.weights import record_weights
 from pp_cl.render import Renderer
 from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
@@ -70,7 +69,7 @@ def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Co
     max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
     for view in views:
         drawn = renderer.forward(view.camera, GAMMA[1], until="weights")
-        record_weights(dev, drawn.pairs, drawn.weights, max_weight, seen, train.final_prune_weight)
+        renderer.record_weights(drawn, max_weight, seen, least=train.final_prune_weight)
         del drawn  # else its arrays would stay beside the larger ones of the next view
     least = 2 if len(views) >= MANY_VIEWS else 1
     return final_points_to_keep(dev, max_weight, seen, cloud.opacity, train, least)

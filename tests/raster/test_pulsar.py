@@ -80,14 +80,25 @@ class Case:
     def _padded(self, values):
         return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 16 - values.shape[-1])])
 
-    def compare(self, prefix, keys, which):
-        """These gradients of the spheres `which` are the fixture's."""
+    def compare(self, prefix, keys, which, pixels=1):
+        """These gradients of the spheres `which`, divided by numbers of `pixels`, are the
+        fixture's.
+        """
         gradients = self.scene.sphere_gradients(self._padded(self["in_grad_image"]))
+        gradients = {key: (values.T / pixels).T for key, values in gradients.items()}
         gradients["features"] = gradients["features"][:, : len(self.shift)]
         gradients["positions"] = gradients["positions"] * MIRROR
         for key in keys:
             expected = self[f"{prefix}_{key}"][which]
             assert relative_error(gradients[key][which], expected) < 1e-3, key
+
+    def tracked_pixels(self, most):
+        """(N,) in how many pixels a sphere is among the `most` nearest ones."""
+        pairs = self.scene.pairs
+        starts = pairs.pixel_offset.get().astype(np.int64)
+        rank = np.arange(pairs.total) - np.repeat(starts[:-1], np.diff(starts))
+        pair = pairs.pair_key.get()[: pairs.total][rank < most] & np.uint64(0xFFFFFFFF)
+        return np.bincount(self.scene.pair_points()[pair], minlength=len(self.radius))
 
     def solid(self):
         """(N,) bool: at least one pixel in radius; for smaller spheres Pulsar's position gradients
@@ -142,9 +153,11 @@ def test_gradient_sums(dev, data, name):
 
 @pytest.mark.parametrize("max_tracked,prefix", [(64, "exact_grad"), (5, "exact_k5_grad")])
 def test_gradient_means(dev, data, name, max_tracked, prefix):
-    case = Case(dev, data, name, mean=True, max_tracked=max_tracked)
+    """Pulsar divides the gradients of a sphere by the number of pixels that track it."""
+    case = Case(dev, data, name, max_tracked=max_tracked)
+    pixels = np.maximum(case.tracked_pixels(max_tracked), 1)
     compared = case.all_but(DAMPED) & (case.all_but(TIED) | (max_tracked == 64))
-    case.compare(prefix, ("features", "opacity"), compared)
+    case.compare(prefix, ("features", "opacity"), compared, pixels)
     compared &= case.solid() & case.boxed()
     assert compared.sum() > 5
-    case.compare(prefix, ("positions", "radius"), compared)
+    case.compare(prefix, ("positions", "radius"), compared, pixels)
