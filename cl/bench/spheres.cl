@@ -12,6 +12,7 @@ kernel void spheres_backward(
     global const float *point_radius,          // (N)
     global const float4 *point_camera,         // (N, 4) x, y, z, t
     global const float *opacity,               // (N)
+    global const uchar *point_is_shaded,       // (N) 0: has no gradients
     global const uint *point_offset,           // (N+1)
     global const uint *pair_pixel,             // (P)
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
@@ -21,6 +22,11 @@ kernel void spheres_backward(
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
+    if (!point_is_shaded[i]) {
+        vstore3((float3)(0.0f), i, grad_positions);
+        grad_radius[i] = 0.0f;
+        return;
+    }
     const Camera cam = camera_load(camera);
     const float3 centre = point_camera[i].xyz;
     const float t = point_camera[i].w, radius = point_radius[i];

@@ -70,7 +70,7 @@ kernel __attribute__((vec_type_hint(float16))) void softmax_gradient(
     global const float16 *shaded_features,  // (?, 16) of the visible points
     global const float16 *features,         // (H, W, 16) F
     global const float16 *grad_features,    // (H, W, 16) G
-    global float2 *pair_gradient)           // (P, 2) b, s gain
+    global float2 *pair_gradient)           // (P, 2) b, s gain; cleared before
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
@@ -101,7 +101,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gradient(
     global const float16 *shaded_features,  // (?, 16) of the visible points
     global const float16 *grad_features,    // (H, W, 16) G
     global const float *grad_alpha,         // (HW) g, not read without has_grad_alpha
-    global float2 *pair_gradient,           // (P, 2) b, s gain
+    global float2 *pair_gradient,           // (P, 2) b, s gain; cleared before
     global float *pixel_spread)             // (HW) without its weight
 {
     const uint q = get_global_id(0);

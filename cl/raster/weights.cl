@@ -2,6 +2,20 @@
 // which it is pruned.
 #include "common.h"
 
+// One work-item per visible point: clears its pairs, of which the pixels then write those that they
+// do not drop.
+kernel void clear_pairs(
+    const uint s,                     // visible points
+    global const uint *shaded,        // (S) their indices
+    global const uint *point_offset,  // (N+1)
+    global float2 *pair_gradient)     // (P, 2)
+{
+    const uint g = get_global_id(0);
+    if (g >= s) return;
+    for (uint pair = point_offset[shaded[g]]; pair < point_offset[shaded[g] + 1]; pair++)
+        pair_gradient[pair] = 0.0f;
+}
+
 // One work-item per pixel: writes the weights of its `tracked` nearest hits by pair.
 kernel void list_weights(
     const uint hw,                    // pixels
@@ -9,7 +23,7 @@ kernel void list_weights(
     global const uint *pixel_offset,  // (HW+1)
     global const ulong *pair_key,     // (P) depth << 32 | pair
     global const ulong *pixel_entry,  // (P) weight << 32 | point; no point: the list ends
-    global float2 *pair_gradient)     // (P, 2) b, 0; not written where dropped or not tracked
+    global float2 *pair_gradient)     // (P, 2) b, 0; cleared before
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
@@ -27,7 +41,7 @@ kernel void record_weights(
     const float least,                    // weight of a point that counts as seen
     global const uint *point_offset,      // (N+1)
     global const uchar *point_is_shaded,  // (N) 1: not all of its pairs are dropped
-    global const float2 *pair_gradient,   // (P, 2) b first, 0 where dropped
+    global const float2 *pair_gradient,   // (P, 2) b first; read of visible points
     global float *max_weight,             // (N) read and written
     global float *times_seen)             // (N) accumulates
 {

@@ -233,7 +233,7 @@ class PulsarScene(BenchScene):
                 self.dev,
                 result.points,
                 result.pairs,
-                blend,
+                result.weights,
                 gradients.pair_gradient,
                 opacity=self.point_opacity,
                 gamma=self.gamma,

@@ -11,6 +11,7 @@ from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
 from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints, projection_table
+from pp_cl.raster.weights import BlendWeights
 
 
 def project_spheres(
@@ -60,7 +61,7 @@ def spheres_backward(
     dev: Device,
     points: ProjectedPoints,
     pairs: Pairs,
-    blend: str,
+    weights: BlendWeights,
     pair_gradient: Array,
     *,
     opacity: Array,
@@ -68,7 +69,7 @@ def spheres_backward(
 ) -> tuple[Array, Array]:
     """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
 
-    blend: one of BLENDS. pair_gradient: of blend_backward(). opacity: (N,).
+    pair_gradient: of blend_backward(). opacity: (N,).
     """
     n = pairs.points
     grad_positions, grad_radius = dev.empty((n, 3)), dev.empty((n,))
@@ -77,11 +78,12 @@ def spheres_backward(
         n,
         n=n,
         # alpha depends on the order of the hits alone
-        gamma=math.inf if blend == "alpha" else gamma,
+        gamma=math.inf if weights.blend == "alpha" else gamma,
         camera=points.camera_buffer,
         point_radius=points.point_radius,
         point_camera=points.point_camera,
         opacity=opacity,
+        point_is_shaded=weights.point_is_shaded,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_point_closeness=pairs.pair_point_closeness,

@@ -15,7 +15,7 @@ from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.points import four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.weights import ALL, BlendWeights
+from pp_cl.raster.weights import BlendWeights, clear_pairs
 
 ON_GPU = 4  # lanes there: each work-item reads vectors
 
@@ -85,8 +85,8 @@ class BlendGradients:
 
     shaded_features: (S, 16). opacity: (S,). offset: (S, 4), of soft points composited by alpha, by
     what the closeness of their hits changes; None if not asked for. pixel_spread: (HW,), undefined
-    without its weight. pair_gradient: (P, 2), by pair the blend weight b and what the hit adds to
-    dL/dopacity, both 0 where it is dropped or not tracked.
+    without its weight. pair_gradient: (P, 2), by pair of a visible point the blend weight b and
+    what the hit adds to dL/dopacity, both 0 where it is dropped or not tracked.
     """
 
     shaded_features: Array
@@ -130,8 +130,7 @@ def blend_backward(
     b.require(
         blend_backward_table(len(shaded_features), pairs.pixels, pairs.capacity, weights.blend)
     )
-    if weights.drops or weights.tracked < ALL:
-        dev.fill(b.pair_gradient, 0)
+    clear_pairs(dev, pairs, weights, b.pair_gradient)
     of_hits = {
         "hw": pairs.pixels,
         "tracked": weights.tracked,

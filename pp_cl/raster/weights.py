@@ -24,19 +24,18 @@ ALL = 2**32 - 1  # hits of a pixel that get gradients
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
-    blend: one of BLENDS. tracked: how many nearest hits of a pixel get gradients. drops: whether
-    there may be hits behind an early stop. pixel_entry: (P,) uint64, weight bits << 32 | point,
-    each pixel's hits by depth; where hits are dropped, an entry without a point ends the pixel's
-    list. pixel_slope: (P,) float32 alike, the factor s of the backward pass, dL/dopacity = s * gain
-    (cl/raster/blend.cl); None without slopes. point_is_shaded: (N,) uint8, 1 for visible
-    points. shaded_list: `shaded`, whose length is still on its way.
+    blend: one of BLENDS. tracked: how many nearest hits of a pixel get gradients. pixel_entry: (P,)
+    uint64, weight bits << 32 | point, each pixel's hits by depth; where hits are dropped, an entry
+    without a point ends the pixel's list. pixel_slope: (P,) float32 alike, the factor s of the
+    backward pass, dL/dopacity = s * gain (cl/raster/blend.cl); None without slopes.
+    point_is_shaded: (N,) uint8, 1 for visible points. shaded_list: `shaded`, whose length is still
+    on its way.
     point_slot: (N,) uint32, where a visible point stands in `shaded`, undefined for others.
     transmittance: (HW,) float32 behind all hits, None with the softmax.
     """
 
     blend: str
     tracked: int
-    drops: bool
     pixel_entry: Array
     pixel_slope: Array | None
     point_is_shaded: Array
@@ -95,7 +94,6 @@ def blend_weights(
     return BlendWeights(
         blend,
         max_tracked or ALL,
-        early_stop > 0,
         b.pair_scratch,
         b.pixel_slope if slopes else None,
         b.point_is_shaded,
@@ -160,12 +158,25 @@ def listed_hits(pairs: Pairs, weights: BlendWeights) -> tuple[np.ndarray, np.nda
     return kept, point[kept], (entry[kept] >> np.uint64(32)).astype(np.uint32).view(np.float32)
 
 
+def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
+    """Set (P, 2) float32 to 0 at the pairs of visible points."""
+    shaded = weights.shaded
+    dev.program("raster/weights").launch(
+        "clear_pairs",
+        shaded.size,
+        s=shaded.size,
+        shaded=shaded,
+        point_offset=pairs.point_offset,
+        pair_gradient=pair_gradient,
+    )
+
+
 def list_weights(dev: Device, b: Buffers, pairs: Pairs, weights: BlendWeights) -> Array:
-    """(P, 2) float32, valid until the next call: the blend weight of each pair, and 0; both 0 where
-    the pair is dropped or not tracked.
+    """(P, 2) float32, valid until the next call: the blend weight of each pair of a visible point,
+    and 0; both 0 where the pair is dropped or not tracked.
     """
     b.require({"pair_gradient": ((pairs.capacity, 2), np.float32)})
-    dev.fill(b.pair_gradient, 0)
+    clear_pairs(dev, pairs, weights, b.pair_gradient)
     dev.program("raster/weights").launch(
         "list_weights",
         pairs.pixels,

@@ -194,7 +194,7 @@ class PairedPoints:
             self.dev,
             self.projected,
             self.pairs,
-            self.weights.blend,
+            self.weights,
             self.backward.pair_gradient,
             opacity=self.opacity,
             gamma=self.gamma,

@@ -253,10 +253,11 @@ def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]
     dev.fill(seen, 0)
     record_weights(dev, scene.pairs, scene.weights, listed, highest, seen, least)
     yield exact(seen.get(), weight > least)
-    weights = listed.get()[: scene.pairs.total, 0]
+    is_shaded = np.isin(scene.pair_points(), scene.weights.shaded.get())
+    weights = listed.get()[: scene.pairs.total, 0][is_shaded]
     blended.gradients()
     left = scene.backward.pair_gradient.get()[: scene.pairs.total, 0]
-    yield exact(left, weights)
+    yield exact(left[is_shaded], weights)
     yield relative(highest.get(), np.maximum(before.get(), weight), PLACED)
 
 
