@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 from support.models import GRID, make_model
-from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
 import pp_cl.network.unet
+from pp_cl.bench.unet import plain_parameters
 from pp_cl.errors import UserError
 from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle_raster

@@ -29,7 +29,6 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 from unittest.mock import patch
 
-from pp_cl.bench.timing import CopyBandwidth, PeakFlops
 from pp_cl.cli import main as pp_cl
 from pp_cl.device.device import (
     INTEL_PLATFORM,
@@ -93,8 +92,8 @@ def recorded() -> Iterator[dict[Build, set[str]]]:
 
 
 def record() -> dict[Build, set[str]]:
-    """What is built and launched on a GPU: by the selftest, the two blends, the paper's network and
-    the measured peaks. Raises RuntimeError where something fails.
+    """What is built and launched on a GPU: by the selftest, the two blends and the paper's network.
+    Raises RuntimeError where something fails.
     """
     with (
         patch.dict(os.environ, {"PP_FORM": "gpu"}),
@@ -103,8 +102,6 @@ def record() -> dict[Build, set[str]]:
     ):
         dev = open_device()
         failed = [row.case for row in run_cases(dev, CASES) if not row.passed]
-        PeakFlops(dev)
-        CopyBandwidth(dev).run()
         write_scene({"train": demo_views(dev, "train", 4, 16)}, f"{folder}/scene")
         for preset in ("tiny", "paper"):
             words = ["--points", "500", "--iterations", "2", "--preset", preset]

@@ -14,7 +14,7 @@ import statistics
 import sys
 from pathlib import Path
 
-from pp_cl.bench.timing import CopyBandwidth, PeakFlops, interleave
+from pp_cl.bench.timing import interleave
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -23,6 +23,7 @@ from pp_cl.network.layers import multiplications
 from pp_cl.raster.weights import listed_hits
 from pp_cl.render import NETWORK_MULTIPLE
 from pp_cl.session import open_training, run_config, stored_state
+from tools.peak import CopyBandwidth, PeakFlops
 
 UNTIMED, TIMED = 4, 15  # steps; the first ones build kernels and grow buffers
 WORD, ROW = 4, 64  # bytes of a number, and of a point's or pixel's 16 features

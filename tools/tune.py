@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.bench.conv import RandomConv
+from pp_cl.bench.conv import Layer, UploadedLayer
 from pp_cl.bench.timing import interleave
 from pp_cl.config import preset
 from pp_cl.device.device import Device
@@ -79,17 +79,17 @@ CANDIDATES: dict[str, Any] = {
 }
 
 
-def network_convolutions(dev: Device, side: int = SIDE) -> list[RandomConv]:
+def network_convolutions(dev: Device) -> list[UploadedLayer]:
     """The 3x3 convolutions of the preset tiny's network, on random data."""
-    network = preset("tiny").network
+    network, rng = preset("tiny").network, np.random.default_rng(0)
     return [
-        RandomConv(dev, 3, side >> layer.level, layer.sources, co=layer.channels)
-        for layer in convolutions(unet_layers(network.widths, blocks=network.blocks))
-        if layer.kernel_size == 3
+        UploadedLayer(dev, Layer.random(rng, (SIDE >> at.level,) * 2, at.sources, at.channels))
+        for at in convolutions(unet_layers(network.widths, blocks=network.blocks))
+        if at.kernel_size == 3
     ]
 
 
-def tuned(dev: Device, convs: Sequence[RandomConv]) -> Blocking:
+def tuned(dev: Device, convs: Sequence[UploadedLayer]) -> Blocking:
     """The shipped row of a device with the fastest of CANDIDATES, whose times are printed."""
     blocking = blocking_of(dev)
     for variant, directions, candidates in CANDIDATES[device_class(dev)]:

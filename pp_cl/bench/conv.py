@@ -1,7 +1,6 @@
 """`pp-cl bench conv`: time against error of the variants of every convolution of the network.
 
-Errors are against float64 (reference/network.py): of outputs and input gradients at SAMPLES pixels,
-of weights' gradients at SAMPLE_CHANNELS x SAMPLE_CHANNELS channels and every tap.
+Errors are against float64 (reference/network.py), of an image of at most CHECK_SIDE pixels a side.
 """
 
 import math
@@ -11,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pp_cl.bench.timing import PeakFlops, errors, variant_rows
+from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_class
 from pp_cl.layers.conv_direct import (
@@ -23,14 +22,18 @@ from pp_cl.layers.conv_direct import (
     pack_weights,
     sum_parts,
     table_of_sums,
-    unpack_weights,
 )
 from pp_cl.layers.tiles import Tiles, all_tiles
 from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
 
-SAMPLES = 256  # pixels: some of every place in the tiles of any variant
-SAMPLE_CHANNELS = 16
+CHECK_SIDE = 33  # several tiles of any variant, and parts of some; float64 takes a second
+# what of Layer.expected a direction computes
+RESULTS = {
+    Direction.FORWARD: slice(0, 1),
+    Direction.BACKWARD_WEIGHTS: slice(1, 2),
+    Direction.BACKWARD_INPUT: slice(3, None),
+}
 
 
 class Layer:
@@ -106,7 +109,9 @@ class Layer:
 
 
 class UploadedLayer:
-    """The arrays of a Layer on the device, and those that its convolution fills."""
+    """The arrays of a Layer on the device, and those that its convolution fills. variants: names of
+    those that are offered to the device and can run it.
+    """
 
     def __init__(self, dev: Device, layer: Layer):
         self.dev, self.relu = dev, layer.relu
@@ -116,6 +121,19 @@ class UploadedLayer:
         self.out = dev.empty(self.grad_out.shape)
         self.grad_parts = [dev.empty(part.shape) for part in layer.parts]
         self.grad_weight, self.grad_bias = dev.empty(self.weight.shape), dev.empty(self.bias.shape)
+        co, k = layer.weight.shape[0], layer.weight.shape[2]
+        sources = [part.shape[2] for part in layer.parts]
+        self.variants = [v for v in OFFERED[device_class(dev)] if can_run(v, k, *sources, co)]
+
+    def runner(self, variant: str, direction: Direction, blocking: Blocking) -> Callable:
+        """A function that computes a direction by a variant and waits for it."""
+        tiles = all_tiles(self.dev, *self.grad_out.shape[:2])
+
+        def run():
+            self.compute(VARIANTS[variant], blocking, direction, tiles)
+            self.dev.finish()
+
+        return run
 
     def compute(
         self,
@@ -160,52 +178,16 @@ class UploadedLayer:
         return self.dev.scratch("bench: weights and parts of their gradients", n)[:n].reshape(shape)
 
 
-class RandomConv:
-    """A K x K convolution of one or two sources to `co` channels at side x side pixels, with ReLU,
-    on random data. variants: names of those that are offered to the device and can run it.
-    """
-
-    def __init__(self, dev: Device, k: int, side: int, sources: tuple[int, ...], co: int):
-        rng = np.random.default_rng(0)
-        self.layer = Layer.random(rng, (side, side), sources, co, k)
-        self.uploaded = UploadedLayer(dev, self.layer)
-        self.tiles = all_tiles(dev, side, side)
-        self.pixels = tuple(rng.integers(0, side, (2, SAMPLES)))
-        self.channels = [np.sort(rng.permutation(n)[:SAMPLE_CHANNELS]) for n in (co, sum(sources))]
-        self.variants = [
-            name for name in OFFERED[device_class(dev)] if can_run(name, k, *sources, co)
-        ]
-
-    def runner(self, variant: str, direction: Direction, blocking: Blocking) -> Callable:
-        """A function that computes a direction by a variant, as the network does, and waits for
-        it.
-        """
-
-        def run():
-            self.uploaded.compute(VARIANTS[variant], blocking, direction, self.tiles)
-            self.uploaded.dev.finish()
-
-        return run
-
-    def result(
-        self, variant: str, direction: Direction, blocking: Blocking
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(computed, float64) values of the sample."""
-        self.runner(variant, direction, blocking)()
-        layer, uploaded, at = self.layer, self.uploaded, self.pixels
-        if direction == Direction.FORWARD:
-            expected = reference.convolution_at(layer.x, layer.weight, layer.bias, at)
-            return uploaded.out.get()[at], np.maximum(expected, 0)
-        if direction == Direction.BACKWARD_INPUT:
-            flipped = reference.flipped(layer.weight)
-            expected = reference.convolution_at(layer.grad_out, flipped, 0.0, at)
-            actual = np.concatenate([grad.get()[at] for grad in uploaded.grad_parts], 1)
-            return actual, expected * (layer.x[at] > 0)
-        co, ci = self.channels
-        actual = unpack_weights(uploaded.grad_weight.get(), len(layer.weight))[np.ix_(co, ci)]
-        return actual, reference.convolution_backward_weights(
-            layer.x[..., ci], layer.grad_out[..., co], layer.weight.shape[2]
-        )
+def layer_errors(
+    layer: Layer, computed: list[np.ndarray], direction: Direction
+) -> tuple[float, float]:
+    """errors() of what Layer.computed() returned, of one direction."""
+    own = RESULTS[direction]
+    actual, expected = (
+        np.concatenate([array.ravel() for array in arrays[own]])
+        for arrays in (computed, layer.expected)
+    )
+    return errors(actual, expected)
 
 
 def bench_conv(
@@ -219,22 +201,24 @@ def bench_conv(
 
     blocks: as UNet takes them.
     """
-    peak, seen, blocking = PeakFlops(dev), set(), blocking_of(dev)
+    rng, seen, blocking = np.random.default_rng(0), set(), blocking_of(dev)
     for layer in convolutions(unet_layers(widths, blocks=blocks)):
-        side = size >> layer.level
-        key = (layer.kernel_size, side, layer.sources, layer.channels)
+        side, k = size >> layer.level, layer.kernel_size
+        key = (k, side, layer.sources, layer.channels)
         if key in seen:
             continue
         seen.add(key)
-        conv = RandomConv(dev, layer.kernel_size, side, layer.sources, co=layer.channels)
-        shape = [side, side, sum(layer.sources), layer.channels, layer.kernel_size]
+        timed, checked = (
+            Layer.random(rng, (n, n), layer.sources, layer.channels, k)
+            for n in (side, min(side, CHECK_SIDE))
+        )
+        uploaded = UploadedLayer(dev, timed)
+        found = {v: checked.computed(dev, VARIANTS[v], blocking) for v in uploaded.variants}
+        shape = [side, side, sum(layer.sources), layer.channels, k]
         for direction in Direction:
-            runs = {v: conv.runner(v, direction, blocking) for v in conv.variants}
-            found = {v: errors(*conv.result(v, direction, blocking)) for v in conv.variants}
             yield from variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction.value},
-                runs,
-                found,
+                {v: uploaded.runner(v, direction, blocking) for v in uploaded.variants},
+                {v: layer_errors(checked, results, direction) for v, results in found.items()},
                 flops=2 * layer.multiplications(size, size),
-                peak=peak,
             )

@@ -26,13 +26,12 @@ from pp_cl.settings import RasterConfig
 SAMPLES = 64  # pixels compared with float64
 ROUNDING = 4 * np.finfo(np.float32).eps  # of the distance from a ray, in shares of the range
 CHANNELS = 16
-ROW = 4 * CHANNELS  # bytes of the features of a point or a pixel
 # every coefficient of degrees 1 and 2; random ones would take minutes for 4 million points
 HIGHER_SH = 0.1
 
 
 class BenchScene:
-    """What the scenes share: float64 features of pixels, and the bytes that the stages move.
+    """What the scenes share: float64 features of pixels.
 
     A scene has forward(blend) and backward(blend, result of the last forward), which rasterise it
     in stages (Device.stage), and exact_features(points), (S, 16) in float64.
@@ -55,18 +54,21 @@ class BenchScene:
     forward: Callable[[str], RenderResult]
     exact_features: Callable[[np.ndarray], np.ndarray]
 
-    def error(self, blend: str, features: np.ndarray) -> float:
-        """Largest difference of features (H, W, 16) from float64, over their range, at SAMPLES
-        pixels that the object covers.
+    def error(self, blend: str, result: RenderResult) -> float:
+        """Largest difference of the features from float64, at SAMPLES pixels that the object
+        covers, over the range of the features of the shaded points and of the background, 1.
 
         Pixels where float32's rounding may decide over a hit are left out.
         """
-        rng, largest = np.random.default_rng(1), 0.0
-        for pixel in rng.permutation(self.covered_pixels)[:SAMPLES]:
+        features, largest = result.features.get(), 0.0
+        covered = np.flatnonzero(np.diff(result.pairs.pixel_offset.get().astype(np.int64)))
+        rows = result.shaded_features.get()[: result.weights.shaded.size]
+        span = np.maximum(rows.max(axis=0), 1) - np.minimum(rows.min(axis=0), 1)
+        for pixel in np.random.default_rng(1).permutation(covered)[:SAMPLES]:
             row, column = divmod(int(pixel), self.size)
             expected = self.exact_pixel(blend, column, row)
             if expected is not None:
-                difference = np.abs(features[row, column] - expected) / self.feature_range
+                difference = np.abs(features[row, column] - expected) / span
                 largest = max(largest, float(difference.max()))
         return largest
 
@@ -95,36 +97,6 @@ class BenchScene:
     @cached_property
     def _camera_space(self):
         return dense.camera_space(self.camera, self.positions).T
-
-    @cached_property
-    def covered_pixels(self) -> np.ndarray:
-        """Indices of the pixels with hits. Rasterises the scene."""
-        return np.flatnonzero(
-            np.diff(self.forward("softmax").pairs.pixel_offset.get().astype(np.int64))
-        )
-
-    @cached_property
-    def feature_range(self) -> np.ndarray:
-        """(16,) largest minus smallest feature of the shaded points and of the background, 1.
-
-        Rasterises the scene.
-        """
-        result = self.forward("softmax")
-        rows = result.shaded_features.get()[: result.weights.shaded.size]
-        return np.maximum(rows.max(axis=0), 1) - np.minimum(rows.min(axis=0), 1)
-
-    def moved_bytes(self, blend: str, result: RenderResult) -> int:
-        """Bytes that the stages must read and write: every value used by each kernel, once."""
-        n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.weights.shaded.size
-        # of a point: place, box, first pair; of a pair: pixel, point and closeness, place or key
-        search, pair = 16 + 8 + 4, 4 + 8 + 8
-        of_hits = p * (8 + 8 + 4 + 8) + ROW * shaded + (1 if blend == "alpha" else 2) * ROW * hw
-        # find, scan, scatter, sort
-        pairs = n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw
-        weights = p * (8 + 8 + 8 + 4) + 4 * n + 4 * hw
-        forward = 8 * p + ROW * shaded + (ROW + 4) * hw
-        backward = p * (4 + 8) + ROW * shaded + 4 * n + (ROW + 4) * hw
-        return pairs + weights + forward + of_hits + backward
 
 
 class GridScene(BenchScene):
@@ -182,12 +154,6 @@ class GridScene(BenchScene):
         coefficients = np.full((len(points), 9, CHANNELS), HIGHER_SH)
         coefficients[:, 0] = self.sh_0[points, 0]
         return dense.shade(self.positions[points], self.camera.eye, coefficients)
-
-    def moved_bytes(self, blend: str, result: RenderResult) -> int:
-        """With the stages `project` and `shade`."""
-        shade = result.weights.shaded.size * (4 + 16 + 9 * ROW + ROW)
-        project = self.count * (4 + 16 + 8 + 4)
-        return project + shade + super().moved_bytes(blend, result)
 
 
 class PulsarScene(BenchScene):
@@ -276,12 +242,6 @@ class PulsarScene(BenchScene):
     def exact_features(self, points: np.ndarray) -> np.ndarray:
         """(S, 16) float64 features of some points."""
         return self.point_features[points].astype(np.float64)
-
-    def moved_bytes(self, blend: str, result: RenderResult) -> int:
-        """With the stages `project` and `spheres`."""
-        n, p = self.count, result.pairs.total
-        spheres = p * (4 + 8 + 8) + (16 + 4 + 4 + 16) * n
-        return n * (12 + 16 + 8 + 4) + spheres + super().moved_bytes(blend, result)
 
 
 SCENES = {scene.name: scene for scene in (GridScene, PulsarScene)}

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.bench.timing import PeakFlops, errors, variant_rows
+from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, OFFERED, device_class
 from pp_cl.layers.conv_direct import unpack_weights
@@ -34,7 +34,7 @@ def bench_unet(
     The errors of train are those of the gradient (input's, or a weight's or bias's) where they are
     largest. blocks: as UNet takes them.
     """
-    peak, rng = PeakFlops(dev), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
     grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
     names = (AUTO, *OFFERED[device_class(dev)])
@@ -58,7 +58,6 @@ def bench_unet(
             {name: network_runner(nets[name], device_x, grad) for name in names},
             {name: found[name][direction] for name in names},
             flops=factor * flops,
-            peak=peak,
         )
 
 

@@ -23,7 +23,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "conv": {"size": [128], "widths": (32, 64, 128)},
     "unet": {"size": [128], "widths": (32, 64, 128)},
     "raster": {"size": [200, 400], "points": [10_000, 250_000]},
-    "train": {"points": [250_000]},
+    "train": {"points": [250_000], "set": [("network.widths", "32,64,128", "bench")]},
 }
 
 
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="all",
         choices=OPTIONS,
         help="all (default): each of the others at small sizes; conv: every layer of the network;"
-        " unet: all of it; raster: points; train: a step without the network",
+        " unet: all of it; raster: points; train: the last steps of a training",
     )
     add(
         "--size",
@@ -86,6 +86,7 @@ def run(options: argparse.Namespace) -> None:
     measured, for options that make no sense and files that cannot be written.
     """
     from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
+    from pp_cl.bench.timing import HEAD, line
     from pp_cl.device.discover import open_device
 
     foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
@@ -98,13 +99,11 @@ def run(options: argparse.Namespace) -> None:
         (name, BENCHES[name](name, argparse.Namespace(**own))) for name, own in given.items()
     ]
     dev, rows = open_device(options.device), []
-    print(f"{dev.name} [{dev.info['platform']}]")
+    print(f"{dev.name} [{dev.info['platform']}]\n{HEAD}")
     for name, measure in benches:
-        head, line, found = measure(dev)
-        print(head)
-        for row in found:
+        for row in measure(dev):
             rows.append({"bench": name} | row)
-            print(line(row), flush=True)
+            print(line(rows[-1]), flush=True)
     result = {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
     shared.write_json_option(options.json, result)
     if figure:
@@ -113,23 +112,22 @@ def run(options: argparse.Namespace) -> None:
         save_figure(figure, options.plot)
 
 
-# ---- each bench: its options are checked; the function of a device that it returns gives the head
-# of the table, what makes a line of a row, and the rows as they are measured
+# ---- each bench: its options are checked; the function of a device that it returns yields the rows
+# as they are measured
 
 
 def _network(name, options):
     from pp_cl.bench.conv import bench_conv
-    from pp_cl.bench.timing import HEAD, line
     from pp_cl.bench.unet import bench_unet
 
     size = _one(options, "size") if options.size else 256
     widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
     bench = bench_conv if name == "conv" else bench_unet
-    return lambda dev: (HEAD, line, bench(dev, size, widths, blocks=blocks))
+    return lambda dev: bench(dev, size, widths, blocks=blocks)
 
 
 def _raster(_, options):
-    from pp_cl.bench.raster import BLENDS, HEAD, bench_raster, line
+    from pp_cl.bench.raster import BLENDS, bench_raster
     from pp_cl.bench.raster_scenes import SCENES
 
     scene = options.scene or "grid"
@@ -138,22 +136,17 @@ def _raster(_, options):
     points = options.points or [10_000, 63_000, 250_000, 1_000_000, 4_000_000]
     sizes, blends = options.size or [200, 400, 800], options.blend or BLENDS
     gamma = options.gamma or 0.01  # the last one of a training, the sharpest
-    return lambda dev: (
-        HEAD,
-        line,
-        bench_raster(dev, scene, points, sizes, blends=blends, gamma=gamma),
-    )
+    return lambda dev: bench_raster(dev, scene, points, sizes, blends=blends, gamma=gamma)
 
 
 def _train(_, options):
-    from pp_cl.bench.raster import HEAD, line
     from pp_cl.bench.training import bench_step
     from pp_cl.config import configure
 
     config = configure(preset("paper"), options.scene or "demo", options.set)
     if options.points:
         assign(config, "points.count", _one(options, "points"), "--points")
-    return lambda dev: (HEAD, line, bench_step(dev, config))
+    return lambda dev: bench_step(dev, config)
 
 
 BENCHES = {"conv": _network, "unet": _network, "raster": _raster, "train": _train}

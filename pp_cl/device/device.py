@@ -79,7 +79,7 @@ def kernel_folder() -> Path:
 
 def describe(device: cl.Device) -> dict[str, Any]:
     """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units",
-    "memory_bytes", "max_allocation_bytes", "cache_bytes" (of the last cache) in a dictionary.
+    "memory_bytes", "max_allocation_bytes" in a dictionary.
     """
     return {
         "name": device.name.strip(),
@@ -90,7 +90,6 @@ def describe(device: cl.Device) -> dict[str, Any]:
         "compute_units": device.max_compute_units,
         "memory_bytes": _memory_bytes(device),
         "max_allocation_bytes": _max_allocation_bytes(device),
-        "cache_bytes": device.global_mem_cache_size,
     }
 
 
@@ -168,12 +167,8 @@ class Device:
         self.has_watchdog = not self.is_cpu and has_watchdog(device)
         self.debug = _debug_level()
         self.context = cl.Context([device])
-        profiling = cl.command_queue_properties.PROFILING_ENABLE
-        self.queue = (
-            cl.CommandQueue(self.context, properties=profiling)
-            if self.debug
-            else cl.CommandQueue(self.context)
-        )
+        profiling: Any = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
+        self.queue = cl.CommandQueue(self.context, properties=profiling)
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
         self.bytes = self.peak_bytes = 0
         self._sent: deque[Any] = deque()  # events of send()
@@ -283,7 +278,8 @@ class Device:
         """
         self._sent.append(self._upload(array, values, is_blocking=False))
         # an event that is dropped waits for the end of its transfer
-        while len(self._sent) > 1 and _is_complete(self._sent[0]):
+        complete = cl.command_execution_status.COMPLETE
+        while len(self._sent) > 1 and self._sent[0].command_execution_status == complete:
             self._sent.popleft()
 
     def _upload(self, array, values, *, is_blocking):
@@ -465,7 +461,6 @@ class Program:
         defines: dict[str, Any],
     ):
         self.device = device
-        self.name = name
         signatures = parse_signatures(source, f"cl/{name}.cl")
         try:
             with quiet_compiler():
@@ -474,7 +469,6 @@ class Program:
             raise BuildError(
                 f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}", str(error)
             ) from error
-        self.built = built
         self.kernels = {
             k: Kernel(getattr(built, k), device.device, p, defines=defines, label=f"{name}.cl:{k}")
             for k, p in signatures.items()
@@ -522,7 +516,3 @@ class Program:
                 self.device.queue.flush()
             if self.device.debug:
                 self.device.observe(kernel, event, arguments)
-
-
-def _is_complete(event):
-    return event.command_execution_status == cl.command_execution_status.COMPLETE

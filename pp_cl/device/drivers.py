@@ -38,7 +38,7 @@ LEAST_CONSTANT = 64  # bytes of constant memory, which the kernels' tables take
 PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
 
 Found = dict[str, Any]  # what try_drivers() returns
-_tried: Found = {}  # by this process, or read from the file; by _key()
+_tried: dict[str, Found] = {}  # {_key() of the drivers: what this process knows of them}
 
 
 def runtime_library() -> Path | None:
@@ -80,45 +80,45 @@ def in_conda() -> bool:
 
 def try_drivers(*, again: bool = False) -> Found:
     """{driver: [[platform, device, version, problem or None]], or why it is left out}. What was
-    found is kept in the user's cache, and found anew where it is not known yet, where nothing
-    works, or if it is asked for `again`.
+    found is kept in the user's cache, and found anew where these drivers are not known yet, where
+    none works, or if it is asked for `again`.
     """
     drivers = find_drivers()
-    keys = {name: _key(name, library) for name, library in drivers.items()}
-    if not _tried:
-        _tried.update(_read())
-    found = {name: _tried[key] for name, key in keys.items() if key in _tried and not again}
-    if not any(row[3] is None for rows in found.values() if type(rows) is list for row in rows):
-        found = {}
-    if unknown := {name: drivers[name] for name in drivers if name not in found}:
-        found |= _probe(unknown)
-        _tried.clear()
-        _tried.update({keys[name]: rows for name, rows in found.items()})
+    key = _key(drivers)
+    found = {} if again else _tried.get(key) or _read(key)
+    if not found:
+        found = _probe(drivers)
         with suppress(UserError):  # without a cache they are tried at each start
-            write_json(make_cache_folder() / "drivers.json", _tried)
-    return {name: found[name] for name in drivers}
+            write_json(make_cache_folder() / "drivers.json", [key, found])
+    _tried[key] = found
+    return found
 
 
-def _key(name, library):
-    """What another version of a driver changes."""
-    file = next((f for f in (library, name) if os.path.isfile(f)), None)
-    about = os.stat(file) if file else None
-    return json.dumps([name, library, about and about.st_mtime_ns, cl.VERSION_TEXT])
+def _key(drivers):
+    """What another driver, or another version of one, changes."""
+    about = [cl.VERSION_TEXT]
+    for names in drivers.items():
+        file = next(filter(os.path.isfile, reversed(names)), None)
+        about.append([*names, file and os.stat(file).st_mtime_ns])
+    return json.dumps(about)
 
 
-def _read():
-    """What was found before; {} without the file, or if it is damaged."""
+def _read(key):
+    """What was found of these drivers before; {} if none worked, without the file, or if it is
+    damaged.
+    """
     try:
-        tried = json.loads(read_regular(cache_folder() / "drivers.json", MOST_BYTES))
-        rows = [row for rows in tried.values() if type(rows) is list for row in rows]
-        return tried if all(len(row) == 4 for row in rows) else {}
+        known, found = json.loads(read_regular(cache_folder() / "drivers.json", MOST_BYTES))
+        rows = [row for rows in found.values() if type(rows) is list for row in rows]
+        works = [problem is None for _, _, _, problem in rows]
+        return found if known == key and any(works) else {}
     except (OSError, ValueError, TypeError, AttributeError):
         return {}
 
 
 def load(tried: Found) -> list[cl.Platform]:
     """The platforms of the drivers that neither crash nor hang."""
-    return _platforms({n: lib for n, lib in find_drivers().items() if type(tried[n]) is list})
+    return _platforms({n: lib for n, lib in find_drivers().items() if type(tried.get(n)) is list})
 
 
 def _platforms(drivers):
@@ -190,7 +190,10 @@ def _probe(drivers):
     for name, child in children.items():
         try:
             said, _ = child.communicate(timeout=max(0.1, end - time.monotonic()))
-            found[name] = _rows(said) if child.returncode == 0 else _ending(child.returncode)
+            if child.returncode == 0:  # after whatever the driver has printed
+                found[name] = json.loads(said.splitlines()[-1])
+            else:
+                found[name] = _ending(child.returncode)
         except subprocess.TimeoutExpired:
             child.kill()
             found[name] = f"does not answer within {SECONDS} seconds"
@@ -205,11 +208,6 @@ def _start(name, library):
     )
     silent = {"stdin": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, **silent)
-
-
-def _rows(said):
-    """What report() said, after whatever the driver has printed."""
-    return json.loads(said.splitlines()[-1])
 
 
 def _ending(status):

@@ -43,8 +43,6 @@ def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarr
     says. Raises Unusable naming a file that is missing, truncated, no image, larger than
     MOST_PIXELS, or of another kind of numbers.
     """
-    if _is_exr(path):
-        return read_exr_rgba(path)
     with _opened(path) as image:
         if size is not None and size == image.size[::-1] != image.size:
             ImageOps.exif_transpose(image, in_place=True)
@@ -99,8 +97,6 @@ def read_mask(path: Path | str) -> np.ndarray:
     a cut-out, else its gray, of which colour that JPEG or a camera's program left in noise and rims
     is no part. Raises UserError as read_rgba does, and for one with areas of colour.
     """
-    if _is_exr(path):
-        return _mask_of(path, Image.fromarray(read_exr_rgba(path)))
     with _opened(path) as image:
         return _mask_of(path, in_srgb(path, image))
 
@@ -155,6 +151,9 @@ def _opened(path, checked=True):
     """The image file, opened; what goes wrong with it inside the block becomes a UserError.
     checked: by the checksums of a PNG, at which its decoder does not look.
     """
+    if _is_exr(path):
+        yield Image.fromarray(read_exr_rgba(path))
+        return
     try:
         with opened_regular(path) as file:
             if checked and file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:

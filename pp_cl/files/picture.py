@@ -49,19 +49,15 @@ class Picture:
         straight = (self.colour - (1 - alpha)) / np.maximum(alpha, 1 / 255)
         return np.concatenate([np.clip(straight, 0, 1), alpha], axis=2)
 
-    def premultiplied_linear(self) -> np.ndarray:
-        """(H, W, 4) float32: linear light multiplied by alpha, and alpha, as OpenEXR keeps them."""
-        rgba = self.rgba()
-        linear = srgb_to_linear(rgba[..., :3]) * rgba[..., 3:]
-        return np.concatenate([linear, rgba[..., 3:]], axis=2)
-
     def channels(self) -> dict[str, np.ndarray]:
-        """{channel: (H, W) float32} for OpenEXR: R, G, B, A; Z, the median depth, and mean.Z, both
-        infinite where nothing is; feature.00 to feature.15 where the picture has them.
+        """{channel: (H, W) float32} for OpenEXR: R, G, B, in linear light and multiplied by alpha,
+        A; Z, the median depth, and mean.Z, both infinite where nothing is; feature.00 to feature.15
+        where the picture has them.
         """
-        colour = self.premultiplied_linear()
-        channels = {name: colour[..., i] for i, name in enumerate("RGBA")}
-        channels |= {"Z": self.median_depth, "mean.Z": self.depth}
+        rgba = self.rgba()
+        light = srgb_to_linear(rgba[..., :3]) * rgba[..., 3:]
+        channels = {name: light[..., i] for i, name in enumerate("RGB")}
+        channels |= {"A": rgba[..., 3], "Z": self.median_depth, "mean.Z": self.depth}
         if self.features is not None:
             count = self.features.shape[2]
             channels |= {f"feature.{i:02d}": self.features[..., i] for i in range(count)}

@@ -4,7 +4,6 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 
 def convolution(x: np.ndarray, weight: np.ndarray, bias: np.ndarray | float = 0.0) -> np.ndarray:
@@ -15,16 +14,6 @@ def convolution(x: np.ndarray, weight: np.ndarray, bias: np.ndarray | float = 0.
     for ky, kx, seen in _taps(x, weight.shape[2]):
         out += seen @ weight[:, :, ky, kx].T.astype(np.float64, order="C")
     return out.reshape(*x.shape[:2], -1) + bias
-
-
-def convolution_at(
-    x: np.ndarray, weight: np.ndarray, bias: np.ndarray | float, pixels: tuple
-) -> np.ndarray:
-    """(P, CO): the same at some pixels = (rows (P,), columns (P,))."""
-    k = weight.shape[2]
-    windows = sliding_window_view(np.pad(x, _padding(k)), (k, k), (0, 1))[pixels]  # (P, CI, K, K)
-    matrix = weight.reshape(len(weight), -1).astype(np.float64).T
-    return windows.reshape(len(windows), -1).astype(np.float64) @ matrix + bias
 
 
 def flipped(weight: np.ndarray) -> np.ndarray:

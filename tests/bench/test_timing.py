@@ -1,15 +1,15 @@
-"""Runs take turns, errors are what they say, and the peaks do what they are credited with."""
+"""Runs take turns, errors are what they say, rows become lines and a picture."""
 
 import numpy as np
 import pytest
 
 from pp_cl.bench import timing
-from pp_cl.bench.timing import CopyBandwidth, PeakFlops, errors, interleave
+from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
+from pp_cl.bench.timing import errors, interleave
 
-pytestmark = [pytest.mark.usefixtures("quick"), pytest.mark.kernels]  # of cl/bench/peak.cl
 
-
-def test_runs_take_turns():
+def test_runs_take_turns(monkeypatch):
+    monkeypatch.setattr(timing, "SECONDS", 0.0)
     calls = []
     times = interleave({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, rounds=3)
     assert "".join(calls) == "ab" * 4  # the first round is not measured
@@ -24,29 +24,30 @@ def test_errors_are_what_they_say_and_hide_no_nan():
         errors([np.nan], [1.0])
 
 
-def test_flops_are_those_of_a_loop_with_the_same_result(dev):
-    peak = PeakFlops(dev)
-    chains, operations = -1.5 + np.arange(peak.chains, dtype=np.float64), 0
-    for _ in range(peak.rounds):
-        chains = chains * 0.99 + 0.25
-        operations += 2 * chains.size
-    peak.run(-1.5, 0.99, 0.25)
-    out = peak.out.get()
-    np.testing.assert_allclose(out, chains.sum(), rtol=3e-6)
-    assert peak.flops == operations * out.size
-    assert len(out) >= dev.info["compute_units"]
+def network_row(variant, direction, ms, error):
+    row = {"bench": "unet", "variant": variant, "direction": direction, "ms": ms}
+    return row | {"rel_l2": error, "max_err": 1.0}
 
 
-def test_a_run_is_long_enough_to_be_timed(dev, monkeypatch):
-    monkeypatch.setattr(timing, "PEAK_SECONDS", 0.02)
-    monkeypatch.setattr(PeakFlops, "_seconds", lambda self: 0.006 * self.rounds / 64)
-    assert PeakFlops(dev).rounds == 64 * 4
+ROWS = [
+    network_row("direct", "forward", 9.0, 1e-6),
+    network_row("direct", "forward", 2.0, 0.0),
+    network_row("winograd", "train", 3.0, 1e-5),
+    {"bench": "raster", "blend": "alpha", "ms": 8.0, "max_err": 1e-7},
+    {"bench": "train", "blend": "alpha", "ms": 8.0},  # has no error
+]
 
 
-def test_the_copy_copies_all_that_it_counts(dev, monkeypatch, rng):
-    monkeypatch.setattr(timing, "COPY_BYTES", 64 * 257)
-    copy = CopyBandwidth(dev)
-    assert copy.bytes == 2 * 64 * 257
-    copy.source.set(rng.normal(size=(257, 16)).astype(np.float32))
-    copy.run()
-    np.testing.assert_array_equal(copy.target.get(), copy.source.get())
+def test_time_against_error(tmp_path):
+    file = tmp_path / "a.svg"
+    figure = figure_of(str(file))
+    plot_time_and_error(figure, ROWS)
+    (axes,) = figure.axes
+    assert {line.get_label(): line.get_xydata().tolist() for line in axes.lines} == {
+        "unet direct, forward": [[9.0, 1e-6], [2.0, 1e-9]],
+        "unet winograd, train": [[3.0, 1e-5]],
+        "raster, alpha": [[8.0, 1e-7]],
+    }
+    assert len({line.get_color() for line in axes.lines}) == 3
+    save_figure(figure, str(file))
+    assert "<svg" in file.read_text()

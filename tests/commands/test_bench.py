@@ -4,7 +4,6 @@ import json
 import sys
 
 import pytest
-from support.benches import KEYS
 from support.refused import failure
 from support.scenes import write_ball_scene
 
@@ -12,72 +11,52 @@ from pp_cl.bench import timing
 from pp_cl.cli import main
 from pp_cl.commands import bench as command
 
-SMALL = {
-    "conv": ("--size", "8", "--widths", "16,16,16"),
-    "raster": ("--points", "60,500", "--size", "12,20"),
-}
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    """Short runs, and few of them."""
-    monkeypatch.setattr(timing, "COPY_BYTES", 2**16)
-    monkeypatch.setattr(timing, "PEAK_SECONDS", 0.0)
-    monkeypatch.setattr(timing, "SECONDS", 0.0)
-    monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)
-
 
 def bench(tmp_path, *words):
-    """What the bench wrote with --json."""
+    """The rows that the bench wrote with --json."""
     file = tmp_path / "b.json"
     assert main(["bench", *words, "--json", str(file)]) == 0
-    return json.loads(file.read_text())
-
-
-def test_the_network_prints_and_writes_its_rows(tmp_path, capsys):
-    result = bench(tmp_path, "conv", *SMALL["conv"])
-    assert result["device"] and all(row.keys() >= KEYS for row in result["rows"])
-    printed = capsys.readouterr().out
-    rows = [row for row in result["rows"] if row["layer"] == "enc0.a"]
-    assert printed.count("enc0.a") == len(rows) > 3 and "GFLOP/s" in printed
-
-
-def test_the_rasteriser_prints_and_writes_its_rows(tmp_path, capsys):
-    result = bench(tmp_path, "raster", *SMALL["raster"])
-    assert result["device"] and len(result["rows"]) == 8
-    assert capsys.readouterr().out.count("grid ") == 8
-
-
-def test_train_prints_and_writes_its_row(tmp_path, capsys):
-    scene = write_ball_scene(tmp_path / "ball", size=40)
-    words = ["--scene", scene, "--points", "1500", "--set", "raster.early_stop=0.001"]
-    result = bench(tmp_path, "train", *words)
-    (row,), printed = result["rows"], capsys.readouterr().out
-    assert result["device"] and f"ball {row['points']:>11}" in printed
-    assert all(name in printed for name in row["stages_ms"])
+    result = json.loads(file.read_text())
+    assert result["device"]
+    return result["rows"]
 
 
 def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
     small = {
         "conv": {"size": [8], "widths": (16, 16, 16)},
         "unet": {"size": [8], "widths": (16, 16, 16)},
-        "raster": {"size": [16], "points": [100]},
-        "train": {"points": [1000]},
+        "raster": {"size": [12, 20], "points": [60, 500]},
+        "train": {"points": [1000], "set": [("network.widths", "16,16,16", "--set")]},
     }
     assert small.keys() == command.SMALL.keys()
     monkeypatch.setattr(command, "SMALL", small)
+    monkeypatch.setattr(timing, "SECONDS", 0.0)
+    monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)
     plot = tmp_path / "b.png"
-    rows = bench(tmp_path, "--plot", str(plot))["rows"]
+    rows = bench(tmp_path, "--plot", str(plot))
     assert list(dict.fromkeys(row["bench"] for row in rows)) == list(small)
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert capsys.readouterr().out.count("\n") == 1 + 4 + len(rows)
+    _, head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["bench", "of", "variant", "ms", "rel.", "L2", "max"]
+    assert [line.split()[0] for line in lines] == [row["bench"] for row in rows]
+    first = rows[0]
+    assert lines[0].split()[1:5] == ["enc0.a", "8x8x16x16x3", "forward", first["variant"]]
+    assert f"{first['rel_l2']:.1e}" in lines[0] and "GFLOP/s" in lines[0]
+    assert sum("grid" in line and "weights" in line for line in lines) == 8
 
 
-@pytest.mark.parametrize("what", SMALL)
-def test_a_plot_is_drawn(tmp_path, what):
-    file = tmp_path / "b.png"
-    assert main(["bench", what, *SMALL[what], "--plot", str(file)]) == 0
-    assert file.read_bytes().startswith(b"\x89PNG")
+def test_a_step_on_a_small_scene(tmp_path, capsys):
+    scene = write_ball_scene(tmp_path / "ball", size=40)
+    words = ["--points", "1500", "--set", "raster.early_stop=0.001"]
+    words += ["--set", "network.widths=16,16,16"]
+    (row,) = bench(tmp_path, "train", "--scene", scene, *words)
+    assert 1500 <= row["points"] < 1600 and row["size"] == 40
+    stages = ["target", "project", "pairs", "weights", "shade", "blend", "network", "loss"]
+    stages += ["network backward", "backward", "update", "max weights"]
+    assert list(row["stages_ms"]) == stages
+    assert row["ms"] == pytest.approx(sum(row["stages_ms"].values()))
+    assert row["peak_device_bytes"] > 1500 * 4 * 145
+    assert f"ball {row['points']} points, 40 pixels" in capsys.readouterr().out
 
 
 def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch):

@@ -8,7 +8,6 @@ import pytest
 from pp_cl.cli import main
 from pp_cl.device import device as device_module
 from pp_cl.selftest import run
-from pp_cl.selftest.case import Case
 
 NAMES = ("device: scan", "training: split opacities", "training: moving average")
 
@@ -45,14 +44,3 @@ def test_a_perturbed_kernel_is_status_1_and_named(few, dev, tmp_path, monkeypatc
     assert out.splitlines()[-1].endswith("2 pass")
     stored = json.loads((tmp_path / "a.json").read_text())
     assert [row["passed"] for row in stored["cases"]] == [True, False, True]
-
-
-def test_a_case_that_raises_is_a_line(few, monkeypatch, capsys):
-    def raises(dev, rng):
-        raise RuntimeError("no\nway")
-
-    monkeypatch.setattr(run, "CASES", [Case("a: b", raises), *run.CASES])
-    assert main(["selftest"]) == 1
-    out, err = capsys.readouterr()
-    assert "    RuntimeError: no way" in out.splitlines() and out.count(" yes") == 3
-    assert err == "pp-cl: selftest: 1 failed: a: b\n"

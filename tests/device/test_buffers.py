@@ -25,35 +25,17 @@ TABLE = {"place": ((5, 4), np.float32), "box": ((5, 4), np.uint16)}
 
 
 def test_arrays_are_what_the_table_declares(dev):
-    before = dev.bytes
-    buffers = Buffers(dev)
-    buffers.require(TABLE)
-    assert (buffers.place.shape, buffers.place.dtype) == ((5, 4), np.float32)
-    assert (buffers.box.shape, buffers.box.dtype) == ((5, 4), np.uint16)
-    assert dev.bytes - before == table_bytes(TABLE) == 5 * 4 * 6
-
-
-def test_only_what_changed_is_allocated_anew(dev):
-    buffers = Buffers(dev)
+    """Allocated anew only where they change, and released before that."""
+    before, buffers = dev.bytes, Buffers(dev)
     buffers.require(TABLE)
     place, box = buffers.place, buffers.box
+    assert (place.shape, place.dtype, box.shape, box.dtype) == ((5, 4), "f4", (5, 4), "u2")
+    assert dev.bytes - before == table_bytes(TABLE) == 5 * 4 * 6
+    del box
+    dev.reset_peak()
     buffers.require(TABLE | {"box": ((6, 4), np.uint16)})
-    assert buffers.place is place
-    assert buffers.box is not box
-    assert buffers.box.shape == (6, 4)
-
-
-def test_the_old_array_is_released_before_the_new_one_is_allocated(dev):
-    buffers = Buffers(dev)
-    buffers.require({"large": ((1000,), np.float32)})
-    dev.peak_bytes = dev.bytes
-    buffers.require({"large": ((1001,), np.float32)})
-    assert dev.peak_bytes == dev.bytes
-
-
-def test_a_name_that_was_not_required(dev):
-    with pytest.raises(AttributeError, match="'absent'"):
-        Buffers(dev).absent  # noqa: B018
+    assert buffers.place is place and buffers.box.shape == (6, 4)
+    assert dev.peak_bytes == dev.bytes == before + 5 * 4 * 4 + 6 * 4 * 2
 
 
 def test_packed_arrays(dev, rng):
@@ -72,13 +54,6 @@ def test_packed_arrays(dev, rng):
     del arrays, array
     packed.send(rows[:2], values[:2])
     assert before < dev.bytes < used
-
-
-def test_a_kernel_reads_a_packed_array(dev):
-    rows = [((5,), np.float32), ((3,), np.float32)]
-    first, second = PackedArrays(dev).send(rows, [np.arange(5, dtype="f4"), np.float32([7, -2, 3])])
-    dev.copy(first[:3], second)
-    assert first.get().tolist() == [7, -2, 3, 3, 4] and second.get().tolist() == [7, -2, 3]
 
 
 def test_a_reading_is_what_the_kernels_before_it_left(dev, rng):
@@ -120,9 +95,6 @@ def test_what_is_sent_may_be_dropped_at_once(dev, rng):
     dev.finish()
     dev.send(array, expected)
     assert len(dev._sent) <= 2
-    for wrong in (expected.T, expected.astype(np.float32)):
-        with pytest.raises(ValueError, match="write: "):
-            dev.send(array, wrong)
 
 
 @pytest.mark.parametrize("shape", [(), (16,), (3, 16), (7,)])

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pyopencl as cl
 import pytest
 
@@ -86,6 +87,9 @@ def test_a_driver_that_hangs(vendors):
     assert time.monotonic() - start < 30
     assert {"crash.icd", "hang.icd", "unbuilding"} < set(found)
     assert "20 seconds" in found["hang.icd"]["problem"]
+    left = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
+    library = str(Path(os.environ["OCL_ICD_VENDORS"]).with_name("libhang.so"))
+    assert not [words for words in left if library in " ".join(words)]
     assert [row["index"] for row in found.values() if row["problem"] is None]
 
 
@@ -104,24 +108,33 @@ def test_intels_runtime_is_found_beside_pp_cl(tmp_path, monkeypatch):
     assert "unbuilding" not in listed()
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{", '{"a": 1}', '{"a": [[]]}'])
-def test_a_damaged_file_of_what_was_found_is_made_anew(
-    session_device, tmp_path, monkeypatch, content
+def test_what_was_found_is_kept_and_found_anew_where_its_file_is_damaged(
+    session_device, tmp_path, monkeypatch
 ):
-    monkeypatch.setenv("PP_CACHE", str(tmp_path))
-    monkeypatch.setattr(drivers, "_tried", {})
-    (tmp_path / "drivers.json").write_text(content)
-    rows = {tuple(row[:3]): row[3] for found in drivers.try_drivers().values() for row in found}
-    assert rows[drivers.identity(session_device.device)] is None
-    assert json.loads((tmp_path / "drivers.json").read_text()) == drivers._tried
+    """Or where it cannot be written, or nothing worked."""
+    shown, probed = drivers.try_drivers(again=True), []
+    monkeypatch.setattr(drivers, "_probe", lambda _: probed.append(0) or shown)
 
+    def tried(cache):
+        monkeypatch.setenv("PP_CACHE", str(cache))
+        drivers._tried.clear()
+        found, count = drivers.try_drivers(), len(probed)
+        rows = {tuple(row[:3]): row[3] for rows in found.values() for row in rows}
+        assert rows[drivers.identity(session_device.device)] is None
+        return count
 
-def test_a_cache_that_cannot_be_written_is_done_without(session_device, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("PP_CACHE", str(tmp_path / "file" / "cache"))
-    monkeypatch.setattr(drivers, "_tried", {})
-    rows = [tuple(row[:3]) for found in drivers.try_drivers().values() for row in found]
-    assert drivers.identity(session_device.device) in rows
+    assert tried(tmp_path) == tried(tmp_path) == 1
+    file = tmp_path / "drivers.json"
+    key, found = json.loads(file.read_text())
+    broken = {name: [[*row[:3], "broken"] for row in rows] for name, rows in found.items()}
+    contents = [[], {"a": 1}, [key, 1], [key, {"a": [[]]}], [key, broken], ["other", found]]
+    for n, content in enumerate(contents, 2):
+        file.write_text(json.dumps(content))
+        assert tried(tmp_path) == n
+    file.write_text("{")
+    assert tried(tmp_path) == tried(tmp_path) == 8
+    file.write_text("")
+    assert tried(file / "cache") == 9
 
 
 @pytest.mark.parametrize("result", ["wrong", "error"])

@@ -34,12 +34,9 @@ def limit(machine, most, used, cached):
     (machine / "group/memory.stat").write_text(f"anon 5\ninactive_file {cached}\n")
 
 
-def test_what_is_free_and_what_the_process_holds(machine):
+def test_a_container_has_less(machine):
     assert host.resident_bytes() == 40 * 4096
     assert host.available_bytes() == 1000 * MIB + 40 * 4096
-
-
-def test_a_container_has_less(machine):
     limit(machine, 500 * MIB, 300 * MIB, 30 * MIB)
     assert host.available_bytes() == 230 * MIB + 40 * 4096
     limit(machine, 5000 * MIB, 300 * MIB, 0)

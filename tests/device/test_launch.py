@@ -9,7 +9,7 @@ import pytest
 from support.toy_kernels import SOURCE
 
 from pp_cl.device import device as device_module
-from pp_cl.device.kernel import SCALARS, cut, parse_signatures
+from pp_cl.device.kernel import SCALARS, parse_signatures
 from pp_cl.device.launch import channel_ranges, group_items, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
 
@@ -45,7 +45,7 @@ def rows(dev, rng):
 
 
 def test_a_launch_computes(program, dev, rows):
-    """Of a launch, a letter stands for one size only within it; numpy's numbers are taken."""
+    """A letter stands for one size only within a launch; numpy's numbers are taken."""
     program.launch("rows", (np.uint32(33),), local=(8,), **rows | {"n": np.int64(33)})
     expected = 2 * rows["x"].get().sum(1) + np.arange(33) % 3
     np.testing.assert_allclose(rows["y"].get()[:, 0], expected, rtol=1e-6)
@@ -98,24 +98,9 @@ def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqu
     assert seen == [enqueued]
 
 
-@pytest.mark.parametrize("size", [0, (4, 0)])
-def test_a_size_of_zero_launches_nothing(program, rows, size):
-    program.launch("rows", size, **rows)
+def test_a_size_of_zero_launches_nothing(program, rows):
+    program.launch("rows", (4, 0), **rows)
     assert np.isnan(rows["y"].get()).all()
-
-
-@pytest.mark.parametrize(
-    "size, local, parts, along, expected",
-    [
-        ((128,), (64,), 2, 0, [((0,), (64,)), ((64,), (64,))]),
-        ((64,), (64,), 5, 0, [((0,), (64,))]),
-        # 5 groups in 4 parts: two at a time, the last one alone
-        ((8, 20), (8, 4), 4, 1, [((0, 0), (8, 8)), ((0, 8), (8, 8)), ((0, 16), (8, 4))]),
-        ((4, 4, 3), (4, 4, 1), 9, 2, [((0, 0, i), (4, 4, 1)) for i in range(3)]),
-    ],
-)
-def test_a_range_is_cut_between_work_groups(size, local, parts, along, expected):
-    assert list(cut(size, local, parts, along)) == expected
 
 
 @pytest.mark.parametrize(
@@ -160,65 +145,41 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
     )
 
 
-def without(arguments, name):
-    """The arguments but one."""
-    return {k: v for k, v in arguments.items() if k != name}
+INT, UINT = np.zeros(3, np.int32), np.zeros(3, np.uint32)
+# (arguments that are other ones, None: left out; error; message)
+REFUSED = [
+    ({"scale": None}, TypeError, r"missing \['scale'\], unknown \[\]"),
+    ({"z": 1}, TypeError, r"missing \[\], unknown \['z'\]"),
+    ({"k": INT}, TypeError, "k is an array of int32, expected .*uint32"),
+    ({"x": 1.0}, TypeError, "x is a float, expected a device array"),
+    ({"n": UINT}, TypeError, "n = .*is no uint32"),
+    ({"n": 33.0}, TypeError, "n = 33.0 is no uint32"),
+    ({"n": -1}, TypeError, "n = -1 is no uint32"),
+    ({"y": np.zeros(33, "f4")}, ValueError, r"y has shape \(33,\), expected rank 2"),
+    ({"k": UINT.repeat(2)}, ValueError, r"k has shape \(6,\), expected \('3',\)"),
+    ({"n": 32}, ValueError, r"x has shape \(33, 4\), expected .* with N = 32"),
+    ({"y": np.zeros((32, 1), "f4")}, ValueError, "y has shape .* with N = 33"),
+]
 
 
-REFUSED = {
-    "missing": (lambda d, a: without(a, "scale"), TypeError, r"missing \['scale'\], unknown \[\]"),
-    "unknown": (lambda d, a: {**a, "z": 1}, TypeError, r"missing \[\], unknown \['z'\]"),
-    "dtype": (
-        lambda d, a: {**a, "k": d.zeros((3,), np.int32)},
-        TypeError,
-        "k is an array of int32, expected .*uint32",
-    ),
-    "number for a buffer": (
-        lambda d, a: {**a, "x": 1.0},
-        TypeError,
-        "x is a float, expected a device array",
-    ),
-    "buffer for a number": (lambda d, a: {**a, "n": a["k"]}, TypeError, "n = .*is no uint32"),
-    "fraction for an integer": (lambda d, a: {**a, "n": 33.0}, TypeError, "n = 33.0 is no uint32"),
-    "negative for unsigned": (lambda d, a: {**a, "n": -1}, TypeError, "n = -1 is no uint32"),
-    "rank": (
-        lambda d, a: {**a, "y": d.zeros((33,))},
-        ValueError,
-        r"y has shape \(33,\), expected rank 2",
-    ),
-    "fixed size": (
-        lambda d, a: {**a, "k": d.zeros((4,), np.uint32)},
-        ValueError,
-        r"k has shape \(4,\), expected \('3',\)",
-    ),
-    "letter against scalar": (
-        lambda d, a: {**a, "n": 32},
-        ValueError,
-        r"x has shape \(33, 4\), expected .* with N = 32",
-    ),
-    "letter against letter": (
-        lambda d, a: {**a, "y": d.zeros((32, 1))},
-        ValueError,
-        "y has shape .* with N = 33",
-    ),
-    "transposed": (
-        lambda d, a: {**a, "x": d.zeros((4, 33)).T},
-        ValueError,
-        "x has shape .*not contiguous",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_refused_before_the_enqueue(program, dev, rows, case):
-    change, error, message = REFUSED[case]
+@pytest.mark.parametrize("change, error, message", REFUSED)
+def test_refused_before_the_enqueue(program, dev, rows, change, error, message):
     program.launch("rows", 33, **rows)  # a good launch before must not hide a bad one
     dev.fill(rows["y"], -1)
     enqueued = []
     program.kernels["rows"].kernel = lambda *args, **_: enqueued.append(args)
+    ((name, value),) = change.items()
+    rows[name] = dev.upload(value) if isinstance(value, np.ndarray) else value
+    if value is None:
+        del rows[name]
     with pytest.raises(error, match=f"^toy.cl:rows: {message}"):
-        program.launch("rows", 33, **change(dev, rows))
+        program.launch("rows", 33, **rows)
     assert enqueued == []
+
+
+def test_what_is_not_contiguous_is_refused(program, dev, rows):
+    with pytest.raises(ValueError, match="x has shape .*not contiguous"):
+        program.launch("rows", 33, **rows | {"x": dev.zeros((4, 33)).T})
 
 
 FORMULAS = {"offsets": (34,), "halves": (3, 8), "both": (11,), "first": (5,), "second": (7,)}
@@ -246,10 +207,9 @@ def test_a_length_that_is_a_formula_is_checked(dev, tmp_path, monkeypatch, chang
 
 
 def test_a_work_group_larger_than_the_device_runs_is_one_line(program, dev, rows):
-    limit = program.kernels["rows"].largest_group
-    assert limit == cl.Kernel(program.built, "rows").get_work_group_info(
-        cl.kernel_work_group_info.WORK_GROUP_SIZE, dev.device
-    )
+    kernel = program.kernels["rows"]
+    limit, what = kernel.largest_group, cl.kernel_work_group_info.WORK_GROUP_SIZE
+    assert limit == kernel.kernel.get_work_group_info(what, dev.device)
     program.launch("rows", 33, local=min(64, limit), **rows)
     with pytest.raises(
         UserError, match=rf"^toy.cl:rows: a work-group of {2 * limit} work-items, but .* {limit} "
@@ -314,19 +274,15 @@ def test_file_builds_alone_and_its_signatures_agree_with_the_driver(dev, stem):
         ], name
 
 
-@pytest.mark.parametrize(
-    ("limit", "groups"),
-    [
-        (64, [(64,), (16, 4), (16, 4, 1)]),
-        (7, [(4,), (2, 2), (2, 2, 1)]),
-        (1, [(1,), (1, 1), (1, 1, 1)]),
-    ],
-)
-def test_a_default_work_group_fits_the_device(program, monkeypatch, limit, groups):
+LIMITED = {64: [(64,), (16, 4), (16, 4, 1)], 7: [(4,), (2, 2), (2, 2, 1)], 1: [(1,), (1, 1)]}
+
+
+@pytest.mark.parametrize("limit", LIMITED)
+def test_a_default_work_group_fits_the_device(program, monkeypatch, limit):
     kernel = program.kernels["rows"]
     monkeypatch.setattr(kernel, "largest_group", limit)
     monkeypatch.setattr(kernel, "_ranges", {})
-    for group in groups:
+    for group in LIMITED[limit]:
         rounded, local = kernel.ranges(tuple(5 for _ in group), None)
         assert local == group
         assert rounded == tuple(-(-5 // side) * side for side in group)

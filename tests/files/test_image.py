@@ -9,6 +9,7 @@ import pytest
 import tifffile
 from PIL import Image, ImageCms
 from support.profile import display_p3, in_srgb
+from support.refused import refusing
 
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size, read_mask, read_rgba, to_8bit, write_png
@@ -119,16 +120,6 @@ def test_colours_of_other_spaces_become_srgb(tmp_path):
     assert (read_rgba(tmp_path / "broken.png")[..., :3] == (200, 90, 60)).all()
 
 
-def test_sixteen_bits_of_a_damaged_header_are_no_image(tmp_path, rgba):
-    Image.fromarray(rgba).save(tmp_path / "rgba.png")
-    content = bytearray((tmp_path / "rgba.png").read_bytes())
-    content[24] = 16  # bits a channel; the header chunk ends with its CRC
-    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
-    (tmp_path / "rgba.png").write_bytes(content)
-    with pytest.raises(UserError, match=r"rgba\.png: cannot be read"):
-        read_rgba(tmp_path / "rgba.png")
-
-
 def test_a_checksum_that_is_wrong_is_refused(tmp_path):
     """Of smooth pixels, where a changed bit leaves the compressed stream readable."""
     y, x = np.mgrid[:64, :64]
@@ -159,33 +150,27 @@ def test_a_broken_animation_is_read_without_a_word(tmp_path, rgba, recwarn):
 
 @pytest.mark.unix
 @pytest.mark.parametrize("read", (read_rgba, image_size))
-@pytest.mark.parametrize("name", ("a.png", "a.exr"))
-def test_a_pipe_is_not_waited_for(tmp_path, read, name):
-    os.mkfifo(tmp_path / name)
-    with pytest.raises(UserError, match=f"{name}: "):
-        read(tmp_path / name)
-
-
-@pytest.mark.parametrize("read", (read_rgba, image_size))
 def test_not_an_image(tmp_path, read):
+    """A pipe is not waited for."""
     (tmp_path / "text.png").write_text("not an image")
     (tmp_path / "empty.png").touch()
+    for name in ("pipe.png", "pipe.exr"):
+        os.mkfifo(tmp_path / name)
     Image.new("RGB", (5, 7)).save(tmp_path / "a.gif")
-    with pytest.raises(UserError, match=r"a\.gif: is no PNG, JPEG, WEBP, .*; convert it"):
+    with refusing(tmp_path / "a.gif", "is no PNG, JPEG, WEBP, ", "; convert it"):
         read(tmp_path / "a.gif")
-    for path in (tmp_path, *(tmp_path / f"{name}.png" for name in ("text", "empty", "none"))):
-        with pytest.raises(UserError) as caught:
+    for path in (*sorted(tmp_path.iterdir()), tmp_path, tmp_path / "none.png"):
+        with refusing(path):
             read(path)
-        assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize("shape", ((5, 7), (5, 7, 3), (5, 7, 4)))
 def test_written_image_comes_back(tmp_path, rng, shape):
     image = rng.random(shape)
     write_png(tmp_path / "float.png", image)
-    write_png(tmp_path / "bytes.png", to_8bit(image))
     stored = np.array(Image.open(tmp_path / "float.png"))
-    assert stored.shape == shape and np.abs(stored / 255 - image).max() <= 0.5 / 255 + 1e-12
+    assert np.array_equal(stored, to_8bit(image))
+    write_png(tmp_path / "bytes.png", stored)
     assert np.array_equal(stored, np.array(Image.open(tmp_path / "bytes.png")))
 
 

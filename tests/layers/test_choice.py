@@ -4,8 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pp_cl.bench.conv import RandomConv
-from pp_cl.bench.timing import errors
+from pp_cl.bench.conv import Layer, layer_errors
 from pp_cl.layers.choice import (
     CPUS,
     GPU,
@@ -80,9 +79,10 @@ def test_tiles_are_multiplied_in_whole_groups():
     [((16,), 16, 97, 3), ((64, 64), 32, 31, 3), ((512,), 32, 9, 3), ((48,), 3, 64, 1)],
 )
 @pytest.mark.parametrize("direction", Direction)
-def test_stated_errors_bound_what_is_measured(dev, direction, sources, co, side, k):
-    conv = RandomConv(dev, k, side, sources, co=co)
+def test_stated_errors_bound_what_is_measured(dev, rng, direction, sources, co, side, k):
+    layer = Layer.random(rng, (side, side), sources, co, k)
     for name in VARIANTS:
         if can_run(name, k, *sources, co):
-            error = errors(*conv.result(name, direction, blocking_of(dev)))[0]
+            computed = layer.computed(dev, VARIANTS[name], blocking_of(dev))
+            error = layer_errors(layer, computed, direction)[0]
             assert error <= ERRORS[name][k][[*Direction].index(direction)], name

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from support.comparisons import relative_error
-from support.networks import plain_parameters
 
+from pp_cl.bench.unet import plain_parameters
 from pp_cl.network.layers import (
     array_shapes,
     convolutions,
@@ -48,7 +48,10 @@ def test_forward_and_backward(dev, rng, widths, variant, blocks):
     active = {name: values > 0 for name, values in outputs.items()}
     expected = network_gradients(net.layers, parameters, outputs, active, grad_image=grad_y)
     assert relative_error(y, outputs["image"]) < 3e-6
-    gradients = plain_parameters(net, net.gradients) | {"x": grad_x}
+    gradients = plain_parameters(net, net.gradients)
+    for name, array in net.gradients.items():  # the padding is 0
+        assert np.count_nonzero(array.get()) == np.count_nonzero(gradients[name])
+    gradients |= {"x": grad_x}
     assert gradients.keys() == expected.keys()
     for name, gradient in gradients.items():
         assert relative_error(gradient, expected[name]) < 1e-5, name

@@ -54,6 +54,12 @@ def test_ctrl_c_ends_all_cases(dev):
         next(run_cases(dev, [Case("a: b", interrupted)]))
 
 
+def test_every_case_draws_the_same_numbers(dev):
+    checks = [Case(name, lambda dev, rng: [Check(rng.random(), 1.0)]) for name in "ab"]
+    first, second = run_cases(dev, checks)
+    assert first.error == second.error
+
+
 def test_a_case_without_checks_has_checked_nothing():
     assert not run_case(None, case()).passed
 
@@ -66,17 +72,6 @@ def test_variants_that_are_not_offered_are_left_out(dev, monkeypatch):
     assert [row.case for row in run_cases(dev, cases)] == ["None", "direct"]
 
 
-def test_every_case_draws_the_same_numbers_in_any_order(dev):
-    drawn = []
-
-    def draws(dev, rng):
-        drawn.append(rng.random())
-        yield Check(0.0, 1.0)
-
-    list(run_cases(dev, [Case("a: b", draws), Case("a: c", draws)]))
-    assert drawn[0] == drawn[1]
-
-
 GOOD = Row("a: good", 1.25e-7, 1e-6, True, "", 0.5)
 NAN = Row("a: bad", np.inf, 1e-6, False, "NaN", 0.25)
 RAISED = Row("a: raised", None, None, False, "RuntimeError: no", 0.25)
@@ -85,24 +80,16 @@ RAISED = Row("a: raised", None, None, False, "RuntimeError: no", 0.25)
 def test_setup_names_what_a_report_needs(dev, monkeypatch):
     monkeypatch.setenv("PYOPENCL_BUILD_OPTIONS", "-cl-opt-disable")
     named = setup(dev)
-    assert dev.name in named["device"] and dev.info["driver"] == named["driver"]
-    assert named["platform"] == dev.info["platform"] and named["OpenCL"] == dev.info["version"]
-    assert named["build options"].startswith("-cl-std=CL1.2")
     assert named["build options"].endswith(" -cl-opt-disable")
     assert all(text and "\n" not in text for text in named.values())
 
 
-def test_lines():
+def test_lines_and_json_have_every_row(dev):
     assert HEAD.split() == ["case", "worst", "error", "bound", "pass"]
     assert line(GOOD).split() == ["a:", "good", "1.2e-07", "1e-06", "yes"]
     assert line(NAN).split() == ["a:", "bad", "inf", "1e-06", "NO", "NaN"]
-    assert line(RAISED).splitlines()[1].strip() == "RuntimeError: no"
-    assert line(RAISED).split()[2:5] == ["-", "-", "NO"]
-
-
-def test_json_has_every_row(dev):
+    assert line(RAISED).split() == ["a:", "raised", "-", "-", "NO", "RuntimeError:", "no"]
     stored = json.loads(json.dumps(as_json(dev, [GOOD, NAN, RAISED]), allow_nan=False))
-    assert stored["setup"] == setup(dev) and stored["seconds"] == 1.0 and not stored["passed"]
+    assert stored["setup"] == setup(dev) and stored["seconds"] == 1.0
     assert [row["error"] for row in stored["cases"]] == [1.25e-7, None, None]
     assert stored["cases"][2] == vars(RAISED)
-    assert as_json(dev, [GOOD])["passed"]

@@ -6,6 +6,7 @@ import re
 import signal
 import sys
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import psutil
 import pytest
@@ -72,32 +73,18 @@ def test_nobody_at_the_address(monkeypatch, address):
         pass
 
 
-class FakeClient:
-    """A client of a cluster whose workers have these numbers of threads."""
-
-    def __init__(self, threads):
-        self.threads = threads
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def wait_for_workers(self, count, timeout):
-        if len(self.threads) < count:
-            raise TimeoutError
-
-    def nthreads(self):
-        return {f"tcp://w{i}": n for i, n in enumerate(self.threads)}
-
-
 @pytest.mark.parametrize(
-    "threads, words",
-    [([1, 4], ["several runs", "--nthreads 1"]), ([], ["no Dask scheduler with workers"])],
+    "threads, waited, words",
+    [
+        ({"w0": 1, "w1": 4}, None, ["several runs", "--nthreads 1"]),
+        ({}, TimeoutError, ["no Dask scheduler with workers"]),
+    ],
 )
-def test_workers_that_a_sweep_cannot_use(monkeypatch, threads, words):
-    monkeypatch.setattr(cluster, "Client", lambda *_, **__: FakeClient(threads))
+def test_workers_that_a_sweep_cannot_use(monkeypatch, threads, waited, words):
+    client = MagicMock()
+    client.__enter__.return_value = client
+    client.nthreads.return_value, client.wait_for_workers.side_effect = threads, waited
+    monkeypatch.setattr(cluster, "Client", lambda *_, **__: client)
     with refusing("--scheduler tcp://s", *words), cluster.client_of("tcp://s"):
         pass
 

@@ -9,39 +9,23 @@ from support.scenes import write_ball_scene
 
 from pp_cl.errors import UserError
 from pp_cl.scene.load import load_scene, scene_format
-from tools.convert_scene import FORMATS, convert, dealt, main
+from tools.convert_scene import FORMATS, convert, main
 
 READER = {"nerf_synthetic": "transforms", "nerfstudio": "transforms"}
 PLACE = {"co3d": "object/sequence"}  # of the scene in what is written
 
 
-def test_there_is_a_writer_for_each_reader():
-    assert FORMATS == ["co3d", "colmap", "llff", "nerf_synthetic", "nerfstudio", "neus", "nsvf"]
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_what_is_written_comes_back(tmp_path, name):
-    given = held_out(views(centred=name == "llff", alike=name in ("llff", "nsvf")))
+    """With its splits where a format has them."""
+    many = views(centred=name == "llff", alike=name in ("llff", "nsvf"))
+    given = {"test": many[:4], "train": many[4:9], "val": many[9:]}
+    if name in ("colmap", "llff", "neus"):
+        given = held_out(many)
     convert(given, tmp_path / "scene", name)
     folder = tmp_path / "scene" / PLACE.get(name, ".")
     assert scene_format(str(folder)) == READER.get(name, name)
     same(folder, given)
-
-
-@pytest.mark.parametrize("name", ["co3d", "nerf_synthetic", "nerfstudio", "nsvf"])
-def test_formats_with_splits_keep_them(tmp_path, name):
-    many = views(alike=True)
-    given = {"test": many[:4], "train": many[4:9], "val": many[9:]}
-    convert(given, tmp_path / "scene", name)
-    same(tmp_path / "scene" / PLACE.get(name, "."), given)
-
-
-@pytest.mark.parametrize("name", ["colmap", "llff", "neus"])
-def test_formats_without_splits_ask_for_others(tmp_path, name):
-    many = views(centred=True)
-    with pytest.raises(UserError, match="--hold-out"):
-        convert({"train": many[:6], "test": many[6:]}, tmp_path / "scene", name)
-    assert not (tmp_path / "scene").exists()
 
 
 def longer_lens(given):
@@ -51,7 +35,11 @@ def longer_lens(given):
     return given | {"train": [replace(first, stored_camera=camera), *given["train"][1:]]}
 
 
+MANY = views(centred=True)
 REFUSED = {
+    f"{name}, splits": (name, {"train": MANY[:6], "test": MANY[6:]}, "--hold-out")
+    for name in ("colmap", "llff", "neus")
+} | {
     "nsvf, lenses": ("nsvf", held_out(views()), "one camera for all"),
     "nsvf, val alone": ("nsvf", {"val": views(alike=True)}, "no val without test"),
     "nsvf, split": ("nsvf", {"eval": views(alike=True)}, "knows the splits train, val, test"),
@@ -66,13 +54,6 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path, case):
     with pytest.raises(UserError, match=words):
         convert(given, tmp_path / "scene", name)
     assert not list(tmp_path.iterdir())
-
-
-def test_the_views_are_dealt_anew():
-    many = views(count=17)
-    found = dealt({"train": many[:9], "test": many[9:]})
-    assert [view.name for view in found["test"]] == ["9.png", "0.png", "8.png"]
-    assert len(found["train"]) == 14
 
 
 def test_the_command(tmp_path, capsys):

@@ -1,8 +1,6 @@
 """tools/memory_peaks.py: its trainings make sense, and its rows are what plan and devices say."""
 
-import importlib.util
 import json
-from pathlib import Path
 
 import pytest
 from support.scenes import write_ball_scene
@@ -10,13 +8,9 @@ from support.scenes import write_ball_scene
 from pp_cl.config import assign, preset, validate
 from pp_cl.device.device import Device
 from pp_cl.scene.load import load_scene
+from tools import memory_peaks as TOOL
 from tools.results import MEMORY
 
-SPEC = importlib.util.spec_from_file_location(
-    "memory_peaks", Path(__file__).parents[2] / "tools" / "memory_peaks.py"
-)
-TOOL = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(TOOL)
 SETTINGS = {"points.count": 400, "network.widths": (16, 16, 16), "train.iterations": 4}
 
 

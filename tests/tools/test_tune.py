@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from pp_cl.bench.conv import RandomConv
-from pp_cl.bench.timing import errors
-from pp_cl.layers.choice import blocking_of
+from pp_cl.bench.conv import Layer, UploadedLayer, layer_errors
+from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, device_class
 from tools import tune as TOOL
 
 
 @pytest.mark.usefixtures("cpu_form")
-def test_the_fastest_candidates_make_the_row(dev, monkeypatch, capsys):
+def test_the_fastest_candidates_make_the_row(dev, rng, monkeypatch, capsys):
     """As if fewer accumulators, and four tiles of one group together, were faster."""
     tried = []
 
@@ -26,9 +25,9 @@ def test_the_fastest_candidates_make_the_row(dev, monkeypatch, capsys):
             for name, run in runs.items()
         }
 
-    monkeypatch.setattr(RandomConv, "runner", runner)
+    monkeypatch.setattr(UploadedLayer, "runner", runner)
     monkeypatch.setattr(TOOL, "interleave", interleave)
-    found = TOOL.tuned(dev, [RandomConv(dev, 3, 8, (16,), co=16)])
+    found = TOOL.tuned(dev, [UploadedLayer(dev, Layer.random(rng, (8, 8), (16,), 16))])
     assert found.winograd == (64, 4) and found.accumulators == 4
     assert found.direct == TOOL.CANDIDATES["CPU"][2][2][0]["direct"]
     assert {direction for _, direction, _ in tried} == {*TOOL.IMAGES, *TOOL.WEIGHTS}
@@ -38,14 +37,14 @@ def test_the_fastest_candidates_make_the_row(dev, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_every_candidate_is_right(dev):
+def test_every_candidate_is_right(dev, rng):
     """On a layer whose groups of channels come in pairs, and on one of three groups."""
-    for variants in TOOL.CANDIDATES.values():
-        for variant, directions, candidates in variants:
-            for co in (32, 48):
-                conv = RandomConv(dev, 3, 12, (32,), co=co)
-                for fields in candidates:
+    for co in (32, 48):
+        layer = Layer.random(rng, (12, 12), (32,), co)
+        for variants in TOOL.CANDIDATES.values():
+            for variant, directions, candidates in variants:
+                for fields in candidates if variant in OFFERED[device_class(dev)] else ():
+                    blocking = replace(blocking_of(dev), **fields)
+                    computed = layer.computed(dev, VARIANTS[variant], blocking)
                     for direction in directions:
-                        blocking = replace(blocking_of(dev), **fields)
-                        if variant in conv.variants:
-                            assert errors(*conv.result(variant, direction, blocking))[0] < 1e-5
+                        assert layer_errors(layer, computed, direction)[0] < 1e-5

@@ -5,8 +5,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from support.browser import WEBGL
-from support.chromium import chromium, find_chromium
+from support.browser import find_chromium, new_page
 from support.viewing import drawing
 
 from pp_cl.files.run_folder import RunFolder
@@ -49,7 +48,7 @@ def test_a_browser_shows_the_model_and_asks_nobody_else(served, dev, trained):
         return (around < 60).all() and np.ptp(middle) < 40 and middle.min() > 60
 
     async def scenario():
-        async with chromium(*WEBGL) as browser, browser.page() as page:
+        async with new_page() as page:
             await page.open(address)
             await seen(page, is_colour)
             await page.key("2")
@@ -58,7 +57,7 @@ def test_a_browser_shows_the_model_and_asks_nobody_else(served, dev, trained):
             await seen(page, is_colour)
             [tab] = view.page._tabs.values()
             eye = tab.camera.eye
-            await page.drag(MIDDLE, [(9, 4)] * 10, pause=0.02)
+            await page.drag(MIDDLE, [(9, 4)] * 10)
             await seen(page, lambda _: (tab.camera.eye != eye).any())
             assert np.isclose(np.linalg.norm(tab.camera.eye), np.linalg.norm(eye), rtol=0.05)
             hosts = {urlsplit(a).netloc for a in page.asked if a.startswith(("http", "ws"))}

@@ -1,11 +1,5 @@
 // Peak rates of a device, against which the speed of kernels is measured: multiply-adds in
 // registers, and bytes copied.
-#include "common.h"
-
-#ifndef CHAINS
-// independent sums of 16 lanes: enough to hide an FMA's latency, few enough for the registers
-#define CHAINS 6
-#endif
 
 // One work-item per row of out: does `rounds` times `CHAINS` multiply-adds x = x * factor + term in
 // registers, and writes the sum of the chains. They begin at first, first + 1, ... so that no two
