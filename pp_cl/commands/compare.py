@@ -13,7 +13,7 @@ Without TRUTH: how well a run's points fill the surface of a mesh, before and af
 nearest vertex; these vertices are compared with the points. Of a mesh alone: their number, on a
 grid with --edge."""
 METRICS = ("psnr", "ssim")
-SAMPLES = 1024**3
+SAMPLES = 1024**3  # as pp_cl.metrics.shape has it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

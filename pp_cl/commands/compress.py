@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
     if not whole.header["finished"]:
         raise UserError(f"{whole.folder}: its training is not finished; finish it first")
     which, views, error = validation_views(whole)
-    original = Original.of(whole)
+    original = Original(whole)
     search = Search(original, views, options.max_loss, error)
     if options.verbose:
         print(f"{which}: {search.psnr:.2f} dB, may lose {search.most_loss:g}", flush=True)

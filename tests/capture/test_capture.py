@@ -16,7 +16,7 @@ from PIL import Image, ImageFilter
 from support.runs import spoken
 
 from pp_cl.capture import STAGES, poses
-from pp_cl.capture.features import opened, quiet, verification
+from pp_cl.capture.features import quiet, verification
 from pp_cl.capture.frames import take_images
 from pp_cl.cli import main
 from pp_cl.device.discover import open_device
@@ -151,7 +151,7 @@ def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
     """That of larger photographs, which EXIF may keep: with it, few images have a place."""
     work = captured / "capture"
     database = Path(shutil.copy(work / "database.db", tmp_path))
-    with quiet(database), opened(database) as db:
+    with quiet(database), colmap.Database.open(database) as db:
         for one in db.read_all_cameras():
             params = [WRONG * cameras(SIZE)[0].fx, SIZE / 2, SIZE / 2, 0]
             one.params, one.has_prior_focal_length = params, True
@@ -171,14 +171,14 @@ def test_wrong_matches_do_not_pull_at_the_cameras():
     model = colmap.synthesize_dataset(
         colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=400)
     )
-    true = [one.camera for one in poses.photographs(model, "")]
+    true = [one.camera for one in poses.photographs(model)]
     rng = np.random.default_rng(0)
     for image in model.images.values():
         for one in image.points2D:
             if one.has_point3D():
                 one.xy = one.xy + rng.normal(0, 4 if one.point3D_id % 20 == 0 else 0.2, 2)
     poses.refine(model)
-    found = align([one.camera for one in poses.photographs(model, "")], true)
+    found = align([one.camera for one in poses.photographs(model)], true)
     assert found.position < 0.001 and found.degrees < 0.02
 
 

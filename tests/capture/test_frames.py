@@ -10,7 +10,7 @@ from PIL import Image, TiffImagePlugin
 from support.profile import display_p3, in_srgb
 
 from pp_cl.capture import frames
-from pp_cl.capture.features import find_features, opened
+from pp_cl.capture.features import find_features
 from pp_cl.capture.frames import take_images
 from pp_cl.capture.stages import Capture
 from pp_cl.errors import UserError
@@ -88,7 +88,7 @@ def test_colours_of_another_profile_become_srgb(folder, tmp_path):
 
 def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
     """A cut-out may still hold the wall behind the object."""
-    pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap")
     sharp = np.kron(shots, np.ones((1, 4, 4, 1), np.uint8))
     alpha = np.zeros((*sharp.shape[1:3], 1), np.uint8)
     alpha[60:190, 100:300] = 255
@@ -99,7 +99,7 @@ def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
     capture.work.mkdir(parents=True)
     write_json(capture.work / "frames.json", take_images(folder, capture.frames))
     capture._features()
-    with opened(capture.database) as db:
+    with pycolmap.Database.open(capture.database) as db:
         for image in db.read_all_images():
             x, y = db.read_keypoints(image.image_id)[:, :2].T
             assert len(x) > 50 and x.min() > 99 and x.max() < 301 and y.min() > 59 and y.max() < 191
@@ -110,7 +110,7 @@ def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
     3456 pixels, of which 5728 are an inch. COLMAP would begin with 46 / 25.4 * 5728 = 10374 pixels.
     """
     pytest.importorskip("pillow_heif")
-    pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap")
     sensor = dict(zip(frames.SENSOR, (5184, 3456, 5728.0, 2), strict=True))
     lens = {FOCAL: 46.0}
     whole = dict(zip(frames.SENSOR, (64, 64, 30.0, 2), strict=True))
@@ -125,14 +125,14 @@ def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
     assert [one["focal"] for one in taken] == [pytest.approx(focal)] + [None] * (len(shots) - 1)
     database = tmp_path / "database.db"
     find_features(database, tmp_path / "images", taken[:1])
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         (camera,) = db.read_all_cameras()
     assert camera.params == pytest.approx([focal, 32, 32, 0])
 
 
 def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
     """As matches and poses depend on the numbers; the second takes longest."""
-    pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap")
     taken = [{"name": f"{i}.png", "lens": "", "size": (600, 600), "focal": None} for i in range(9)]
     for i, one in enumerate(taken):
         values = rng.integers(0, 256, (75, 75), np.uint8) if i == 1 else np.full((75, 75), 100 + i)
@@ -140,7 +140,7 @@ def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
         Image.fromarray(pixels).save(tmp_path / one["name"])
     found = find_features(tmp_path / "database.db", tmp_path, taken)
     assert list(found) == [one["name"] for one in taken] and found["1.png"] > 100
-    with opened(tmp_path / "database.db") as db:
+    with pycolmap.Database.open(tmp_path / "database.db") as db:
         assert db.num_frames() == db.num_images() == 9
 
 

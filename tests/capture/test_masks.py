@@ -72,9 +72,8 @@ class Capture:
 
     def write(self, **options):
         """The line of write_masks."""
-        masks = self.folder / "masks"
         return write_masks(
-            self.folder, masks, self.photographs, self.box, self.points, self.seen, **options
+            self.folder, self.photographs, self.box, self.points, self.seen, **options
         )[0]
 
     def agreement(self):
@@ -85,7 +84,7 @@ class Capture:
 
     def file(self, number):
         """The mask of a photograph."""
-        return mask_file(self.folder / "masks", self.photographs[number].name)
+        return mask_file(self.folder, self.photographs[number].name)
 
 
 @pytest.fixture(autouse=True)
@@ -456,9 +455,9 @@ def test_the_picture_shows_outlines(capture, tmp_path):
     """In a colour that the photographs lack, the named ones first."""
     capture.write(given=given_masks(capture, tmp_path / "given"))
     first = [capture.photographs[7].name]
-    sheet = picture(capture.folder, capture.folder / "masks", capture.photographs, first)
+    sheet = picture(capture.folder, capture.photographs, first)
     assert (sheet == OUTLINE).all(2).sum() > 12 * SIZE
-    alone = picture(capture.folder, capture.folder / "masks", capture.photographs[7:8])
+    alone = picture(capture.folder, capture.photographs[7:8])
     height, width = alone.shape[:2]
     assert (sheet[:height, :width] == alone).all()
 

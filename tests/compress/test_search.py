@@ -42,7 +42,7 @@ def test_a_loss_without_bound_leaves_the_least(original, views):
 
 
 def test_a_compressed_run_has_16_bits_already(original, views):
-    small = Original.of(original.reduced(1.0, half=True))
+    small = Original(original.reduced(1.0, half=True))
     trials = list(Search(small, views, 0.0).trials())
     assert all(trial.half and trial.keep < 1 for trial in trials)
     assert small.reduced_arrays(1.0, half=True)["points.sh0"].dtype == np.float16

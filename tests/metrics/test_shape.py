@@ -119,9 +119,6 @@ def test_what_cannot_be_sampled(dev):
         sample_surface(dev, flat, grid, 10)
     with pytest.raises(UserError, match="in the world of the scene"):
         sample_surface(dev, Mesh(SQUARE.vertices * 1e6, SQUARE.faces), grid, 10)
-    for samples in (0, 2**30 + 1):
-        with pytest.raises(ValueError, match="samples"):
-            sample_surface(dev, SQUARE, grid, samples)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "off", "glb"])
