@@ -55,7 +55,8 @@ def find_features(
             if focal := of_camera[0]["focal"]:
                 width, height = of_camera[0]["size"]
                 options.camera_params = f"{focal},{width / 2},{height / 2},0"
-            # in this order, as matches and poses depend on the numbers that images have
+            # numbers them by name; later COLMAP would, as their features happen to be found, and
+            # matches and poses depend on the numbers
             names = [one["name"] for one in of_camera]
             colmap.import_images(database, images, colmap.CameraMode.SINGLE, names, options)
         options = colmap.ImageReaderOptions(camera_model=LENS)

@@ -150,6 +150,8 @@ def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
     assert list(found) == [one["name"] for one in taken] and found["1.png"] > 100
     with pycolmap.Database.open(tmp_path / "database.db") as db:
         assert db.num_frames() == db.num_images() == 9 and db.num_cameras() == 2
+        ids = [db.read_image_with_name(one["name"]).image_id for one in taken]
+    assert ids == list(range(1, 10))
 
 
 def test_names_that_colmap_can_list(shots, tmp_path):
