@@ -22,7 +22,7 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_mask, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements, listing
-from pp_cl.scene.masks import MaskRule, cut_out, named_mask
+from pp_cl.scene.masks import MaskRule, cut_out, named_mask, of_size
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink
 
@@ -108,17 +108,16 @@ def _found(scene, photograph, given, sources, fitted, words):
     """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
     if it has not.
     """
-    if given is None and words is None and photograph.name.lower().endswith(OPAQUE):
-        return "none", None
-    image = read_rgba(scene / photograph.name)
+    file, size = scene / photograph.name, (photograph.camera.width, photograph.camera.height)
     if given is not None:
-        name = Path(photograph.name).name
-        mask = named_mask(given, sources.get(name, name), name)
-        return "given", fitted(photograph.name, MaskRule().apply(image, mask)[..., 3])
+        mask = named_mask(given, sources.get(file.name, file.name), file.name)
+        return "given", fitted(photograph.name, of_size(read_mask(mask), size, mask))
     if words is not None:
-        return "by the program", _of_program(words, scene / photograph.name, image.shape[:2])
-    if (image[..., 3] < 255).any():
-        return "of their alpha", image[..., 3]
+        return "by the program", _of_program(words, file, size[::-1])
+    if not photograph.name.lower().endswith(OPAQUE):
+        alpha = read_rgba(file)[..., 3]
+        if (alpha < 255).any():
+            return "of their alpha", alpha
     return "none", None
 
 
