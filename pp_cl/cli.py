@@ -30,7 +30,6 @@ COMMANDS = (
     "view",
     "export",
     "compare",
-    "shape",
     "compress",
     "bench",
     "selftest",

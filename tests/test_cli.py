@@ -34,7 +34,7 @@ def test_a_run_that_lies_in_runs_is_named(tmp_path, monkeypatch):
     run = tmp_path / "runs" / "mine"
     run.mkdir(parents=True)
     (run / "config.json").write_text("{}")
-    for command in ("eval", "info", "shape", "compress"):
+    for command in ("eval", "info", "compare", "compress"):
         assert "runs/mine?" in failure(command, "mine")
 
 

@@ -65,7 +65,6 @@ keys = st.sampled_from(KEYS) | damage.words
 ENDING = {
     "render": ["--seconds", "0.1", "--fps", "10"],
     "train": set_words(train__iterations=1),
-    "shape": ["--samples", "100"],
     "sweep": ["--dry-run"],
     "bench": ["--points", "100", "--size", "16"],
     **{name: ["--no-such"] for name in ("view", "selftest", "compress")},
@@ -454,7 +453,8 @@ def test_a_command_line(world, data):
         if name in ("train", "sweep", "capture"):
             words = [world.scene(), "--out", folder / "out"]
         elif name == "compare":
-            words = [world.scene() / "train"] * 2
+            images = [world.scene() / "train"] * 2
+            words = one(draw, images, [*words, "--samples", "100"])
         elif name in ("devices", "bench", "selftest"):
             words = ["raster"] if name == "bench" else []
         if rarely(draw, 5):

@@ -11,7 +11,7 @@ from support.runs import arguments, spoken
 from support.sweeps import jobs_of, pretend, words_of
 
 from pp_cl.cli import main
-from pp_cl.export.formats import FORMATS
+from pp_cl.export import FORMATS
 
 FILM = ["render", "run", "--seconds", "0.2", "--fps", "10"]
 OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
@@ -30,7 +30,7 @@ COMMANDS = {
     **{f"export {name}": (["export", "run", "--format", name], ()) for name in FORMATS},
     **{
         f"export {name} elsewhere": (["export", "run", "--format", name, "--out", f"a{end}"], named)
-        for name, (_, ends) in FORMATS.items()
+        for name, (_, ends, _) in FORMATS.items()
         for end in (ends or ("",))[:1]
         for named in ((f"a{end}",) if end else (),)
     },

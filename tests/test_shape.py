@@ -10,7 +10,7 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.commands.shape_facts import mesh_shape, run_shape
+from pp_cl.commands.compare_mesh import mesh_shape, run_shape
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
@@ -82,11 +82,11 @@ def test_another_scene_is_noticed(dev, mesh, trained, tmp_path):
 def test_the_command_prints_and_writes_the_row(mesh, trained, tmp_path, capsys):
     file = tmp_path / "ball.ply"
     trimesh.Trimesh(mesh.vertices, mesh.faces).export(file)
-    words = ["shape", str(trained), "--mesh", str(file), "--samples", "20000"]
+    words = ["compare", str(trained), "--mesh", str(file), "--samples", "20000"]
     assert main([*words, "--json", str(tmp_path / "row.json")]) == 0
     facts = json.loads((tmp_path / "row.json").read_text())
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[-3:]] == ["training", "before", "after"]
     assert lines[-1].split()[1:3] == [str(facts["after"]["points"]), f"{facts['after']['iou']:.4f}"]
-    assert main(["shape", str(file), "--edge", "0.2", "--samples", "1000"]) == 0
+    assert main(["compare", str(file), "--edge", "0.2", "--samples", "1000"]) == 0
     assert "voxel size 0.2" in capsys.readouterr().out

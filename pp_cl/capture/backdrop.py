@@ -135,8 +135,9 @@ def _places_behind(one, background):
         (np.arange(columns) + 0.5) * camera.width / columns,
         (np.arange(rows) + 0.5) * camera.height / rows,
     )
-    ahead = one.directions(x, y)
-    return camera.eye + ahead @ camera.pose[:, :3].T / between(x, y)[..., None]
+    ahead = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)
+    along = np.stack(ahead, axis=-1) @ camera.pose[:, :3].T
+    return camera.eye + along / between(x, y)[..., None]
 
 
 def evidence(

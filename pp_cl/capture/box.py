@@ -34,10 +34,6 @@ class World(NamedTuple):
     shift: np.ndarray
     box: np.ndarray
 
-    def points(self, points: np.ndarray) -> np.ndarray:
-        """(N, 3) points there."""
-        return self.scale * points @ self.rotation.T + self.shift
-
 
 def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     """The world whose z axis is up, whose origin is the middle of the object, and where its box

@@ -25,16 +25,6 @@ LOOPS = 50  # frames that are compared with each other wherever they are in the 
 
 
 @contextmanager
-def opened(database: Path) -> Iterator[Any]:
-    """pycolmap's database, closed at the end."""
-    db = needed("pycolmap").Database.open(database)
-    try:
-        yield db
-    finally:
-        db.close()
-
-
-@contextmanager
 def quiet(work: Path) -> Iterator[Any]:
     """pycolmap without its log. What it says of a disk that cannot be written is a UserError."""
     colmap = needed("pycolmap")
@@ -58,82 +48,42 @@ def find_features(
     taken: what take_images() says of the images; those of equal lens and size have one camera.
     masks: NAME.png of each image, black where no features are wanted. Returns {name: features}.
     """
-    with quiet(database) as colmap, opened(database) as db:
-        bar = tqdm(total=len(taken), desc="features", unit="image", leave=False, disable=None)
-        by_camera = sorted(taken, key=_camera)
-        for _, of_camera in groupby(by_camera, _camera):
-            group = list(of_camera)
-            names, camera = [one["name"] for one in group], None
-            known = {image.name: image for image in db.read_all_images()}
-            for name in names:
-                camera = known[name].camera_id if name in known else camera
-            missing = [name for name in names if not _has_features(db, known.get(name))]
-            bar.update(len(names) - len(missing))
-            while missing:
-                if camera is None:
-                    some = missing[:1]  # makes the camera
-                else:
-                    some = missing[:AT_ONCE]
-                    _number(colmap, db, some, camera)
-                missing = missing[len(some) :]
-                colmap.extract_features(
-                    database,
-                    images,
-                    some,
-                    colmap.CameraMode.SINGLE,
-                    _reading(colmap, camera, masks, group[0]),
-                    _extraction(colmap),
-                )
-                camera = db.read_image_with_name(some[0]).camera_id
-                bar.update(len(some))
-        bar.close()
-        return {
-            image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()
-        }
-
-
-def _number(colmap, db, names, camera):
-    """Give images their numbers in this order; COLMAP would, as their features happen to be found,
-    and matches and poses depend on them.
-    """
-    rig = db.read_rig_with_sensor(colmap.sensor_t(colmap.SensorType.CAMERA, camera)).rig_id
-    with colmap.DatabaseTransaction(db):
-        for name in names:
-            if not db.exists_image(name):
-                image, frame = colmap.Image(name=name, camera_id=camera), colmap.Frame()
-                image.image_id = db.write_image(image)
-                frame.rig_id = rig
-                frame.add_data_id(image.data_id)
-                db.write_frame(frame)
+    with quiet(database) as colmap, colmap.Database.open(database) as db:
+        for _, alike in groupby(sorted(taken, key=_camera), _camera):
+            of_camera = list(alike)
+            options = colmap.ImageReaderOptions(camera_model=LENS)
+            if focal := of_camera[0]["focal"]:
+                width, height = of_camera[0]["size"]
+                options.camera_params = f"{focal},{width / 2},{height / 2},0"
+            # numbers them by name; later COLMAP would, as their features happen to be found, and
+            # matches and poses depend on the numbers
+            names = [one["name"] for one in of_camera]
+            colmap.import_images(database, images, colmap.CameraMode.SINGLE, names, options)
+        options = colmap.ImageReaderOptions(camera_model=LENS)
+        if masks is not None:
+            options.mask_path = masks
+        extraction = colmap.FeatureExtractionOptions(
+            max_image_size=LARGEST, use_gpu=False, num_threads=cores()
+        )
+        extraction.sift.max_num_features = FEATURES
+        found = db.read_all_images()
+        for some in _in_parts([image.name for image in found], AT_ONCE, "features", "image"):
+            colmap.extract_features(
+                database, images, some, colmap.CameraMode.AUTO, options, extraction
+            )
+        return {image.name: db.num_keypoints_for_image(image.image_id) for image in found}
 
 
 def _camera(one):
     return one["lens"], tuple(one["size"])
 
 
-def _has_features(db, image):
-    return image is not None and db.exists_descriptors(image.image_id)
-
-
-def _reading(colmap, camera, masks, one):
-    """How images like one are read. camera: the id of theirs, None for a new one."""
-    options = colmap.ImageReaderOptions(camera_model=LENS)
-    if camera is not None:
-        options.existing_camera_id = camera
-    elif one["focal"]:
-        width, height = one["size"]
-        options.camera_params = f"{one['focal']},{width / 2},{height / 2},0"
-    if masks is not None:
-        options.mask_path = masks
-    return options
-
-
-def _extraction(colmap):
-    options = colmap.FeatureExtractionOptions(
-        max_image_size=LARGEST, use_gpu=False, num_threads=cores()
-    )
-    options.sift.max_num_features = FEATURES
-    return options
+def _in_parts(items, count, what, unit):
+    """Lists of so many of the items, under a progress bar. COLMAP leaves out what is done."""
+    with tqdm(total=len(items), desc=what, unit=unit, leave=False, disable=None) as bar:
+        for first in range(0, len(items), count):
+            yield (some := items[first : first + count])
+            bar.update(len(some))
 
 
 def cores() -> int:
@@ -145,40 +95,28 @@ def match(database: Path, is_film: bool) -> int:
     """Match the features of pairs of images, where that is not done yet, and keep the pairs whose
     matches fit one motion of the camera. Returns their number.
     """
-    with quiet(database) as colmap, opened(database) as db:
-        images = sorted(db.read_all_images(), key=lambda image: image.name)
-        ids = {image.name: image.image_id for image in images}
-        pairs = pairs_of([image.name for image in images], is_film)
-        missing = [pair for pair in pairs if not db.exists_matches(*(ids[name] for name in pair))]
-        bar = tqdm(total=len(pairs), desc="matches", unit="pair", leave=False, disable=None)
-        bar.update(len(pairs) - len(missing))
+    with quiet(database) as colmap, colmap.Database.open(database) as db:
+        pairs = pairs_of(sorted(image.name for image in db.read_all_images()), is_film)
         matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=cores())
         with tempfile.TemporaryDirectory(prefix="pp-cl-") as folder:
             listed = Path(folder) / "pairs.txt"
-            while missing:
-                some, missing = missing[:PAIRS_AT_ONCE], missing[PAIRS_AT_ONCE:]
+            options = colmap.ImportedPairingOptions(match_list_path=listed)
+            for some in _in_parts(pairs, PAIRS_AT_ONCE, "matches", "pair"):
                 listed.write_text("".join(f"{a} {b}\n" for a, b in some), "utf-8")
-                colmap.match_image_pairs(
-                    database,
-                    matching,
-                    colmap.ImportedPairingOptions(match_list_path=listed),
-                    verification(colmap),
-                )
-                bar.update(len(some))
-        bar.close()
+                colmap.match_image_pairs(database, matching, options, verification(colmap))
         return db.num_verified_image_pairs()
 
 
 def forget_matches(database: Path) -> None:
     """Remove all matches, so that match() begins anew."""
-    with quiet(database), opened(database) as db:
+    with quiet(database) as colmap, colmap.Database.open(database) as db:
         db.clear_matches()
         db.clear_two_view_geometries()
 
 
 def forget_focal_lengths(database: Path) -> bool:
     """Where EXIF told any, begin with COLMAP's guess, check the pairs anew, and return True."""
-    with quiet(database) as colmap, opened(database) as db:
+    with quiet(database) as colmap, colmap.Database.open(database) as db:
         factor = colmap.ImageReaderOptions().default_focal_length_factor
         told = [camera for camera in db.read_all_cameras() if camera.has_prior_focal_length]
         for one in told:

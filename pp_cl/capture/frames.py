@@ -218,11 +218,10 @@ def _frames(film, images):
     # in groups, since ffmpeg sums no more than a hundred
     some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
     wanted = "+".join(f"({one})" for one in some)
-    _, frames = _decoded(film, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
-    frames = zip(chosen, frames, strict=False)
-    for number, frame in tqdm(
-        frames, "frames", len(chosen), unit="image", leave=False, disable=None
-    ):
+    frames = _decoded(film, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
+    next(frames)  # what is said of the film
+    bar = tqdm(chosen, "frames", unit="image", leave=False, disable=None)
+    for number, frame in zip(bar, frames, strict=False):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
         with atomic_file(images / name) as file:
             image.save(file, "JPEG", **QUALITY)
@@ -232,7 +231,8 @@ def _frames(film, images):
 
 def _sharpest(film):
     """(the number of the sharpest frame of each of FRAMES intervals, whether the film is HDR)."""
-    meta, frames = _decoded(film, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
+    frames = _decoded(film, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
+    meta = next(frames)
     # an estimate, for the bar alone: what browsers record states no length
     total = round(meta["duration"] * meta["fps"]) or None
     bar = tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
@@ -245,8 +245,8 @@ def _sharpest(film):
     return [max(numbers, key=sharpness.__getitem__) for _, numbers in intervals], is_hdr
 
 
-def _decoded(film: Path, filters: str, pixels: str, channels: int) -> tuple[dict, Iterator]:
-    """(what ffmpeg says of the film, its frames after the filters, (H, W, channels) uint8)."""
+def _decoded(film: Path, filters: str, pixels: str, channels: int) -> Iterator[Any]:
+    """What ffmpeg says of the film, then its frames after the filters, (H, W, channels) uint8."""
     # which tells of a film that is shown turned, as phones make them
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     reading = needed("imageio_ffmpeg").read_frames(
@@ -256,30 +256,18 @@ def _decoded(film: Path, filters: str, pixels: str, channels: int) -> tuple[dict
         input_params=LOCAL,
         output_params=["-vf", filters, *EACH_ONCE],
     )
-
-    def refused(error):
+    try:
+        yield (meta := next(reading))
+        for content in reading:
+            yield np.frombuffer(content, np.uint8).reshape(*meta["size"][::-1], channels)
+    except (OSError, RuntimeError, ValueError, IndexError, KeyError, StopIteration) as error:
         # ffmpeg's last line that says what is wrong, without its banner
         lines = [line for line in str(error).splitlines() if "rror" in line or "nvalid" in line]
         said = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
-        return UserError(
+        raise UserError(
             f"{film}: cannot be read as a video ({shown(said, 100)}); give an MP4, MOV or WebM,"
             " or a folder of photographs"
-        )
-
-    try:
-        meta = next(reading)
-        shape = (*meta["size"][::-1], channels)
-    except (OSError, RuntimeError, ValueError, IndexError, KeyError, StopIteration) as error:
-        raise refused(error) from None
-
-    def frames():
-        try:
-            for content in reading:
-                yield np.frombuffer(content, np.uint8).reshape(shape)
-        except (OSError, RuntimeError) as error:
-            raise refused(error) from None
-
-    return meta, frames()
+        ) from None
 
 
 # What is left out ---------------------------------------------------------------------------------

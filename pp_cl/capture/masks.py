@@ -22,7 +22,7 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_mask, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements, listing
-from pp_cl.scene.masks import MaskRule, cut_out, named_mask
+from pp_cl.scene.masks import MaskRule, cut_out, named_mask, of_size
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink
 
@@ -37,14 +37,13 @@ CHECKED_SIDE = 200  # pixels of the masks that are compared
 SECONDS = 600  # that a program may take for a mask
 
 
-def mask_file(folder: Path, name: str) -> Path:
+def mask_file(scene: Path, name: str) -> Path:
     """Where write_masks() writes the mask of a photograph."""
-    return folder / f"{Path(name).stem}.png"
+    return scene / "masks" / f"{Path(name).stem}.png"
 
 
 def write_masks(
     scene: Path,
-    folder: Path,
     photographs: Sequence[Photograph],
     box: np.ndarray,
     points: np.ndarray,
@@ -70,12 +69,11 @@ def write_masks(
     fails, a box in which nothing is seen.
     """
     words = None if command is None else program_words(command)
-    folder.mkdir(parents=True, exist_ok=True)
-    left = _without_mask(folder, photographs)
+    (scene / "masks").mkdir(exist_ok=True)
+    left = _without_mask(scene, photographs)
     how = {"kept": len(photographs) - len(left)}
-    shown = [i for i, one in enumerate(photographs) if place_of(one, box)] or range(
-        len(photographs)
-    )
+    shown = [i for i, one in enumerate(photographs) if place_of(one, box)]
+    shown = shown or list(range(len(photographs)))  # which window() refuses
     beside = {one.name for one in photographs} - {photographs[i].name for i in shown}
     for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
         source, mask = _found(scene, one, given, sources or {}, fitted, words)
@@ -83,44 +81,43 @@ def write_masks(
             source = "empty, as the object is outside"
             mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
         if mask is not None:
-            write_png(mask_file(folder, one.name), mask)
+            write_png(mask_file(scene, one.name), mask)
             how[source] = how.get(source, 0) + 1
-    if _without_mask(folder, photographs):
+    if _without_mask(scene, photographs):
         inside = ((points > box[0]) & (points < box[1])).all(1)
         in_view, seen = [photographs[i] for i in shown], [seen[i] for i in shown]
         bar = tqdm(in_view, "reading images", unit="image", leave=False, disable=None)
-        windows = [_window(scene, folder, one, box) for one in bar]
+        windows = [_window(scene, one, box) for one in bar]
         of_object = [points[some[inside[some]]] for some in seen]
-        how |= _uniform(scene, folder, in_view, windows, box, of_object)
-        if _without_mask(folder, in_view):
-            how |= _cut(scene, folder, in_view, windows, box, points, inside, seen, turns)
+        how |= _uniform(scene, in_view, windows, box, of_object)
+        if _without_mask(scene, in_view):
+            how |= _cut(scene, in_view, windows, box, points, inside, seen, turns)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
-    wrong = _contradicting(scene, folder, photographs, box)
+    wrong = _contradicting(scene, photographs, box)
     if wrong:
         shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
         counts += f"; {len(wrong)} contradict the others: {listing(shares)}"
     return counts, list(wrong)
 
 
-def _without_mask(folder, photographs):
-    return [one for one in photographs if not mask_file(folder, one.name).is_file()]
+def _without_mask(scene, photographs):
+    return [one for one in photographs if not mask_file(scene, one.name).is_file()]
 
 
 def _found(scene, photograph, given, sources, fitted, words):
     """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
     if it has not.
     """
-    if given is None and words is None and photograph.name.lower().endswith(OPAQUE):
-        return "none", None
-    image = read_rgba(scene / photograph.name)
+    file, size = scene / photograph.name, (photograph.camera.width, photograph.camera.height)
     if given is not None:
-        name = Path(photograph.name).name
-        mask = named_mask(given, sources.get(name, name), name)
-        return "given", fitted(photograph.name, MaskRule().apply(image, mask)[..., 3])
+        mask = named_mask(given, sources.get(file.name, file.name), file.name)
+        return "given", fitted(photograph.name, of_size(read_mask(mask), size, mask))
     if words is not None:
-        return "by the program", _of_program(words, scene / photograph.name, image.shape[:2])
-    if (image[..., 3] < 255).any():
-        return "of their alpha", image[..., 3]
+        return "by the program", _of_program(words, file, size[::-1])
+    if not photograph.name.lower().endswith(OPAQUE):
+        alpha = read_rgba(file)[..., 3]
+        if (alpha < 255).any():
+            return "of their alpha", alpha
     return "none", None
 
 
@@ -160,15 +157,15 @@ def program_words(command: str) -> list[str]:
     return words
 
 
-def _window(scene, folder, photograph, box):
+def _window(scene, photograph, box):
     """The Window of a photograph, with its mask if that is written."""
     found = window(read_rgba(scene / photograph.name)[..., :3], photograph, box)
-    if mask_file(folder, photograph.name).is_file():
-        found.mask = found.reduced(read_mask(mask_file(folder, photograph.name))) > 127
+    if mask_file(scene, photograph.name).is_file():
+        found.mask = found.reduced(read_mask(mask_file(scene, photograph.name))) > 127
     return found
 
 
-def _uniform(scene, folder, photographs, windows, box, points):
+def _uniform(scene, photographs, windows, box, points):
     """Write the masks of photographs before a uniform background, where nearly all of those without
     a mask are. points: (M, 3) of the object that each shows. Returns {what: how many}.
     """
@@ -190,7 +187,7 @@ def _uniform(scene, folder, photographs, windows, box, points):
             x0, y0, x1, y1 = one.place
             closed = cv2.resize(spots[i].astype(np.uint8), (x1 - x0, y1 - y0)) > 0
             mask[y0:y1, x0:x1][closed] = 255
-        write_png(mask_file(folder, name), mask)
+        write_png(mask_file(scene, name), mask)
         one.mask = one.reduced(mask) > 127
     return {"before a uniform background": sum(windows[i].mask is not None for i in found)}
 
@@ -212,7 +209,7 @@ def _spots(windows, numbers, box):
 
 
 def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
-    """(H, W) uint8 mask of a photograph (H, W, 4), None where its border shows more than one
+    """(H, W) uint8 mask of a photograph (H, W, 3 or 4), None where its border shows more than one
     colour. with_holes: as cut_out() takes it.
     """
     height, width = image.shape[:2]
@@ -243,9 +240,7 @@ def _before_uniform(window, points, with_holes):
     """(H, W) bool: the mask of a window whose background is uniform, and from which all points
     (M, 3) of the object stand out; else None.
     """
-    opaque = np.full((*window.image.shape[:2], 1), 255, np.uint8)
-    image = np.concatenate([window.image, opaque], axis=2)
-    mask = uniform_mask(image, window.name, with_holes)
+    mask = uniform_mask(window.image, window.name, with_holes)
     if mask is None:
         return None
     mask = mask > 127
@@ -254,19 +249,19 @@ def _before_uniform(window, points, with_holes):
     return mask if held >= ON_MASK else None
 
 
-def _cut(scene, folder, photographs, windows, box, points, inside, seen, turns):
+def _cut(scene, photographs, windows, box, points, inside, seen, turns):
     """Cut out what has no mask, and write it. Returns {what: how many}."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
     cut_out_all(windows, box, points, inside, seen, turns)
     for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
         name = photographs[i].name
         mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
-        write_png(mask_file(folder, name), mask)
+        write_png(mask_file(scene, name), mask)
     return {"cut out": len(left)}
 
 
 def picture(
-    scene: Path, folder: Path, photographs: Sequence[Photograph], first: Sequence[str] = ()
+    scene: Path, photographs: Sequence[Photograph], first: Sequence[str] = ()
 ) -> np.ndarray:
     """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks drawn
     over them. first: names of those that come first; the others are spread evenly.
@@ -276,7 +271,7 @@ def picture(
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
     for one in chosen:
-        photograph, mask = read_rgba(scene / one.name), read_mask(mask_file(folder, one.name))
+        photograph, mask = read_rgba(scene / one.name), read_mask(mask_file(scene, one.name))
         factor = fitting_downscale(mask.shape, SHOWN_SIZE)
         image = shrink(photograph, factor)[..., :3]
         held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
@@ -286,11 +281,11 @@ def picture(
     return contact_sheet(images, [Path(one.name).name for one in chosen])
 
 
-def _contradicting(scene, folder, photographs, box):
+def _contradicting(scene, photographs, box):
     """{name: share of the object that its mask alone rejects} of those that contradict others."""
     views = []
     for one in photographs:
-        mask = read_mask(mask_file(folder, one.name))
+        mask = read_mask(mask_file(scene, one.name))
         factor = fitting_downscale(mask.shape, CHECKED_SIDE)
         image = shrink(np.dstack([mask] * 4), factor)
         views.append(View(one.name, one.camera.downscaled(factor), image))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.capture.features import cores, forget_focal_lengths, opened, quiet
+from pp_cl.capture.features import cores, forget_focal_lengths, quiet
 from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
@@ -115,7 +115,7 @@ def refine(model: Any) -> None:
 def _reasons(database, taken, placed):
     """{image: why it has no place}."""
     best = _most_matches(database)
-    with opened(database) as db:
+    with needed("pycolmap").Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(i) for name, i in ids.items()}
     usual = np.median([one["sharpness"] for one in taken])
@@ -138,7 +138,7 @@ def _reasons(database, taken, placed):
 
 def _most_matches(database):
     """{image's id: its matches with the image with which it has most}."""
-    with opened(database) as db:
+    with needed("pycolmap").Database.open(database) as db:
         best = {image.image_id: 0 for image in db.read_all_images()}
         for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
             for one in needed("pycolmap").pair_id_to_image_pair(pair):
@@ -146,9 +146,9 @@ def _most_matches(database):
     return best
 
 
-def photographs(model: Any, folder: str) -> list[Photograph]:
+def photographs(model: Any) -> list[Photograph]:
     """The images of pycolmap's model that have a place, in the order of their names, as a scene
-    lists them that has them in its folder `folder`.
+    lists them that has them in its folder `images`.
     """
     found = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
@@ -158,7 +158,7 @@ def photographs(model: Any, folder: str) -> list[Photograph]:
         focal, cx, cy, k1 = lens.params  # of features.LENS
         world = image.cam_from_world().inverse().matrix()
         camera = Camera(np.array(world), focal, focal, cx, cy, lens.width, lens.height)
-        found.append(Photograph(f"{folder}/{image.name}", camera, distortion=Distortion(k1)))
+        found.append(Photograph(f"images/{image.name}", camera, distortion=Distortion(k1)))
     return found
 
 

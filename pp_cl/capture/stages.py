@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -94,10 +95,8 @@ class Capture:
             changed = self._take_options(begin)
             anew = {begin, *(OPTIONS[name][0] for name in changed)}
             anew |= {"masks"} if replace_masks else set()
-            stages, first = list(STAGES), 0
-            while first < len(stages) and not self._is_due(stages[first], anew):
-                first += 1
-            done, left = stages[:first], stages[first:]
+            done = list(takewhile(lambda one: one not in anew and self._is_done(one), STAGES))
+            left = list(STAGES)[len(done) :]
             mended = self._mended() if "masks" in left else []
             if mended and "images" in left and not replace_masks:
                 raise UserError(
@@ -112,7 +111,7 @@ class Capture:
             for path in mended if replace_masks else ():
                 path.unlink()
             for stage in reversed(left):
-                if stage != stages[first] or stage in anew or stage not in RESUMED:
+                if stage != left[0] or stage in anew or stage not in RESUMED:
                     if stage == "matches" and self.database.exists():
                         features.forget_matches(self.database)
                     remove_ours(files[stage])
@@ -130,8 +129,8 @@ class Capture:
                 write_json(self._file(stage), found)
                 self.tell(f"{stage}: {found['line']} ({time.monotonic() - start:.0f} s)")
 
-    def _is_due(self, stage, anew):
-        return stage in anew or not self._file(stage).is_file()
+    def _is_done(self, stage):
+        return self._file(stage).is_file()
 
     def _new(self):
         """What photographs have come since they were taken, in words."""
@@ -169,7 +168,7 @@ class Capture:
             )
         self.options = before | self.given
         changed = [name for name in OPTIONS if self.options[name] != before[name]]
-        if "source" in changed and begin != "frames" and self._file("frames").is_file():
+        if "source" in changed and begin != "frames" and self._is_done("frames"):
             raise UserError(
                 f"{self.scene}: was made from {before['source']}; choose another --out, or begin"
                 " again with --from frames"
@@ -189,8 +188,8 @@ class Capture:
 
     def _mended(self):
         """The masks of the images that the user has made or changed, which are kept."""
-        taken = self._found("frames")["images"] if self._file("frames").is_file() else []
-        named = [masks.mask_file(self.scene / "masks", one["name"]) for one in taken]
+        taken = self._found("frames")["images"] if self._is_done("frames") else []
+        named = [masks.mask_file(self.scene, one["name"]) for one in taken]
         there = [path for path in named if path.is_file()]
         return sorted(set(there) - set(ours(there)))
 
@@ -276,22 +275,24 @@ class Capture:
 
     def _images(self):
         model = needed("pycolmap").Reconstruction(self.model)
-        taken = poses.photographs(model, "images")
+        taken = poses.photographs(model)
         made = pinhole.write_images(self._dev, self.frames, self.images, taken)
         kept = f", {len(taken) - made} of them before" if made < len(taken) else ""
         return {"line": f"{len(taken)} without distortion{kept}"}
 
     def _box(self):
         model = needed("pycolmap").Reconstruction(self.model)
-        cameras = [one.camera for one in poses.photographs(model, "images")]
+        cameras = [one.camera for one in poses.photographs(model)]
         world = box.find_world(cameras, poses.points(model)[0])
         corners = self.options["box"]
         chosen = world.box if corners is None else np.sort(np.reshape(corners, (2, 3)), axis=0)
         size = " x ".join(f"{side:.2f}" for side in np.ptp(chosen, axis=0))
         _move(model, world.scale, world.rotation, world.shift)
+        eyes = [one.camera.eye for one in poses.photographs(model)]
+        distance = np.median(np.linalg.norm(eyes, axis=1))
         self._show("box", _seen_from_outside(model, chosen))
         return {
-            "line": f"{size}, the cameras {_distance(cameras, world):.2f} from its middle",
+            "line": f"{size}, the cameras {distance:.2f} from its middle",
             "scale": float(world.scale),
             "rotation": world.rotation.tolist(),
             "shift": world.shift.tolist(),
@@ -301,9 +302,8 @@ class Capture:
     def _masks(self):
         model, corners = self._world()
         given, dropped = self.options["masks"], read_edits(self.scene).dropped
-        taken = {one.name: one for one in poses.photographs(model, "images")}
+        taken = {one.name: one for one in poses.photographs(model)}
         photographs = [replace(one, distortion=Distortion()) for one in taken.values()]
-        folder = self.scene / "masks"
         points, seen = poses.points(model, FOLLOWED)
         kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
         files = self._found("frames")["images"] if self.source.is_dir() else []
@@ -315,7 +315,6 @@ class Capture:
         def write(chosen):
             return masks.write_masks(
                 self.scene,
-                folder,
                 [photographs[i] for i in chosen],
                 corners,
                 points,
@@ -330,16 +329,16 @@ class Capture:
         line, wrong = write(kept)
         if dropped:  # they have had no say in the others
             write(range(len(photographs)))
-        self._show("masks", masks.picture(self.scene, folder, photographs, wrong))
+        self._show("masks", masks.picture(self.scene, photographs, wrong))
         return {"line": line}
 
     def _scene(self):
         model, corners = self._world()
-        found = poses.photographs(model, "images")
+        found = poses.photographs(model)
         places = [
             {
                 "file_path": one.name,
-                "mask_path": masks.mask_file(Path("masks"), one.name).as_posix(),
+                "mask_path": masks.mask_file(Path(), one.name).as_posix(),
                 **frame_keys(one.camera),
             }
             for one in found
@@ -384,7 +383,7 @@ def _move(model, scale, rotation, shift):
 
 def _seen_from_outside(model, box):
     """The picture of a model's points and cameras, and a box (2, 3), from two sides."""
-    cameras = [one.camera for one in poses.photographs(model, "images")]
+    cameras = [one.camera for one in poses.photographs(model)]
     colours = np.array([point.color for point in model.points3D.values()])
     return overview(cameras, box, poses.points(model)[0], colours, SHOWN_WIDTH)
 
@@ -392,8 +391,3 @@ def _seen_from_outside(model, box):
 def _left_out(lines: Sequence[str], what: str) -> str:
     """`; 3 left out: A, B and 1 more`, empty without lines."""
     return f"; {len(lines)} {what}: {listing(lines)}" if lines else ""
-
-
-def _distance(cameras, world):
-    eyes = world.points(np.stack([camera.eye for camera in cameras]))
-    return float(np.median(np.linalg.norm(eyes, axis=1)))

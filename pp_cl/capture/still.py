@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import coo_matrix
 
-from pp_cl.capture.features import opened, quiet, verification
+from pp_cl.capture.features import quiet, verification
 
 SAMPLED = 30  # matches of a pair
 LEAST_MATCHES = 15  # of a pair, of which at least a half stand still
@@ -27,7 +27,7 @@ def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
     goes on. is_turntable: the object is known to turn.
     """
     is_turntable = is_turntable or begun.exists()
-    with quiet(database) as colmap, opened(database) as db:
+    with quiet(database) as colmap, colmap.Database.open(database) as db:
         images = db.read_all_images()
         sizes = {i.camera_id: i for i in db.read_all_cameras()}
         index = {image.image_id: k for k, image in enumerate(images)}

@@ -9,6 +9,7 @@ from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
 from pp_cl.scene.bounds import corners_of
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.hull import project
 from pp_cl.scene.views import Photograph
 
 cv2 = needed("cv2")
@@ -33,16 +34,8 @@ class Window:
 
     def pixels(self, positions: np.ndarray) -> np.ndarray:
         """(N, 2) x and y of world positions (N, 3); NaN behind the camera."""
-        c = self.camera
-        right, down, depth = c.pose[:, :3].T @ (positions - c.eye).T
-        depth = np.where(depth > 0, depth, np.nan)
-        return np.stack([c.fx * right / depth + c.cx, c.fy * down / depth + c.cy], axis=1)
-
-    def directions(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """(..., 3) along the camera's axes, of depth 1, of pixels x and y."""
-        c = self.camera
-        x, y = (x - c.cx) / c.fx, (y - c.cy) / c.fy
-        return np.stack([x, y, np.ones_like(x)], axis=-1)
+        x, y, depth = project(self.camera, positions)
+        return np.where(depth > 0, [x, y], np.nan).T
 
     def pixels_in(self, other: "Window") -> np.ndarray:
         """(H, W, 2) float32 x and y of this one's pixels in another window that lies at the same
@@ -82,10 +75,9 @@ def place_of(photograph: Photograph, box: np.ndarray) -> tuple[int, int, int, in
     """(x0, y0, x1, y1) around the projected box (2, 3) in a photograph; None where it is
     outside.
     """
-    camera, nothing = photograph.camera, np.empty(0)
-    whole = Window(photograph.name, nothing, camera, (0, 0, 0, 0))
-    x, y = whole.pixels(corners_of(box)).T
-    if np.isnan(x).any():  # the box is around the camera
+    camera = photograph.camera
+    x, y, depth = project(camera, corners_of(box))
+    if depth.min() <= 0:  # the box is around the camera
         x, y = np.array([0, camera.width]), np.array([0, camera.height])
     if x.max() < 1 or y.max() < 1 or x.min() > camera.width - 1 or y.min() > camera.height - 1:
         return None

@@ -1,27 +1,101 @@
-"""`pp-cl compare`: PSNR, SSIM and LPIPS of images against the ground truth."""
+"""`pp-cl compare`: images against the ground truth, or a run's points against a mesh."""
 
 import argparse
+from pathlib import Path
 
 from pp_cl.commands import options as shared
+from pp_cl.errors import UserError
 
-HELP = "measure one image, or a folder of images, against the truth"
+HELP = "measure images against the truth, or a run's points against a mesh"
+EPILOG = """With TRUTH: --metrics of one image, or of each image of a folder.
+Without TRUTH: how well a run's points fill the surface of a mesh, before and after training (Table
+4 of the supplemental). The mesh is sampled evenly by its area, and each sample goes to the grid's
+nearest vertex; these vertices are compared with the points. Of a mesh alone: their number, on a
+grid with --edge."""
+METRICS = ("psnr", "ssim")
+SAMPLES = 1024**3  # as pp_cl.metrics.shape has it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("prediction", metavar="PRED", help="image, or folder of images")
-    parser.add_argument("truth", metavar="TRUTH", help="the same of what it should be")
+    add = parser.add_argument
+    add(
+        "subject",
+        metavar="PRED|RUN|MESH",
+        help="image, or folder of images; folder of a run, or a file with a triangle mesh",
+    )
+    add("truth", nargs="?", metavar="TRUTH", help="of PRED: the same of what it should be")
     shared.add_metrics(parser)
+    parser.set_defaults(metrics=None)
+    add(
+        "--mesh",
+        metavar="FILE",
+        help="of a run: the object's mesh in the scene's world; the demo has its own",
+    )
+    add(
+        "--edge",
+        type=shared.number(1e-30, 1e30),
+        metavar="E",
+        help="of a mesh: voxel size of the grid in its units (default: 2^27 cells)",
+    )
+    add("--samples", type=shared.integer(1, SAMPLES), metavar="N", help="on the mesh (1024^3)")
+    shared.add_run_scene(parser)
     shared.add_json(parser)
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure, print the means."""
+    """Measure, print. Raises UserError for options that do not fit the subject."""
+    if options.truth is None:
+        shared.refuse(options, ("metrics",), "only of images, with TRUTH")
+        facts = _shape(options)
+        shared.tell(options.json, facts, _rows(facts))
+    else:
+        shared.refuse(options, ("mesh", "edge", "samples", "scene"), "only without TRUTH")
+        result = _images(options)
+        lines = [f"{name:6s} {value:.4f}" for name, value in result["mean"].items()]
+        shared.tell(options.json, result, lines)
+
+
+def _images(options):
     from pp_cl.device.discover import open_device
     from pp_cl.metrics.compare import compare
 
-    dev = open_device(options.device) if "lpips" in options.metrics else None
-    result = compare(options.prediction, options.truth, options.metrics, dev)
-    lines = [f"{name:6s} {value:.4f}" for name, value in result["mean"].items()]
-    shared.tell(options.json, result, lines)
+    metrics = options.metrics or METRICS
+    dev = open_device(options.device) if "lpips" in metrics else None
+    return compare(options.subject, options.truth, metrics, dev)
+
+
+def _shape(options):
+    from pp_cl.commands.compare_mesh import mesh_shape, run_shape
+    from pp_cl.config import nearby_run
+    from pp_cl.device.discover import open_device
+    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.metrics.shape import read_mesh
+
+    path, samples = Path(options.subject), options.samples or SAMPLES
+    if not path.exists():
+        near = nearby_run(path)
+        raise UserError(f"{path}: no such file or folder; {near or 'name a run or a mesh'}")
+    if path.is_dir():
+        shared.refuse(options, ("edge",), "only of a mesh")
+        mesh, dev = read_mesh(options.mesh) if options.mesh else None, open_device(options.device)
+        return run_shape(dev, RunFolder(path), mesh, samples, scene=options.scene)
+    shared.refuse(options, ("mesh", "scene"), "only of a run")
+    mesh, dev = read_mesh(path), open_device(options.device)
+    return mesh_shape(dev, mesh, options.edge, samples)
+
+
+def _rows(facts):
+    grid = facts["grid"]
+    lines = [
+        f"grid      {'x'.join(map(str, grid['dims']))}, voxel size {grid['edge']:.6g}",
+        f"surface   {facts['surface']} vertices, by {facts['samples']} samples",
+    ]
+    if "before" in facts:
+        lines.append("training      points       IoU    recall precision")
+        for when in ("before", "after"):
+            row = facts[when]
+            values = "  ".join(f"{row[name]:8.4f}" for name in ("iou", "recall", "precision"))
+            lines.append(f"{when:8s}  {row['points']:10d}  {values}")
+    return lines

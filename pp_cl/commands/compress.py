@@ -39,8 +39,8 @@ def run(options: argparse.Namespace) -> None:
     """Search, write the compressed run, print what it saves and loses."""
     from tqdm import tqdm
 
-    from pp_cl.compress.reduction import REPORT, Original, nbytes
-    from pp_cl.compress.search import Search, validation_views
+    from pp_cl.compress.reduction import REPORT, Original
+    from pp_cl.compress.search import search, validation_views
     from pp_cl.device.discover import open_device
     from pp_cl.files.atomic import check_new_folder
     from pp_cl.run import load_run
@@ -51,32 +51,32 @@ def run(options: argparse.Namespace) -> None:
     if not whole.header["finished"]:
         raise UserError(f"{whole.folder}: its training is not finished; finish it first")
     which, views, error = validation_views(whole)
-    original = Original.of(whole)
-    search = Search(original, views, options.max_loss, error)
+    original = Original(whole)
+    steps, trials = search(original, views, options.max_loss, error), []
+    before = found = next(steps)
     if options.verbose:
-        print(f"{which}: {search.psnr:.2f} dB, may lose {search.most_loss:g}", flush=True)
-    trials = []
-    for trial in tqdm(search.trials(), "searching", unit="trial", leave=False, disable=None):
+        print(f"{which}: {before.psnr:.2f} dB, may lose {options.max_loss:g}", flush=True)
+    for trial in tqdm(steps, "searching", unit="trial", leave=False, disable=None):
         trials.append(trial)
+        found = trial if trial.taken else found
         if options.verbose:
             state = "taken" if trial.taken else "loses too much"
             tqdm.write(f"{trial}: {trial.psnr:.3f} dB, {trial.nbytes / 2**20:.1f} MiB, {state}")
-    found, before = search.found, nbytes(whole)
     report = {
         "of": str(whole.folder),
         "most_loss": options.max_loss,
         "views": which,
-        "psnr": search.psnr,
+        "psnr": before.psnr,
         "loss": found.loss,
-        "bytes": [before, found.nbytes],
-        "points": [whole.model.cloud.count, found.points],
+        "bytes": [before.nbytes, found.nbytes],
+        "points": [before.points, found.points],
         "device": whole.dev.name,
         "trials": [vars(trial) for trial in trials],
     }
     original.write(found.keep, found.half, out, report)
     print(
-        f"{before / 2**20:.1f} to {found.nbytes / 2**20:.1f} MiB"
-        f" ({before / found.nbytes:.1f} times less), {whole.model.cloud.count} to {found.points}"
+        f"{before.nbytes / 2**20:.1f} to {found.nbytes / 2**20:.1f} MiB"
+        f" ({before.nbytes / found.nbytes:.1f} times less), {before.points} to {found.points}"
         f" points, {found.loss:.3f} dB lost on {which}"
     )
     print(f"wrote {out} and {out / REPORT}; pp-cl eval {out} measures its test views")

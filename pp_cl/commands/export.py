@@ -5,19 +5,16 @@ from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
+from pp_cl.export import FORMATS
 
 HELP = "write a run in a format that other programs open"
-EPILOG = """formats:
-  splat      the .ply of 3D Gaussian splatting, for SuperSplat, Blender and all other viewers
-  splat-glb  the same as glTF (KHR_gaussian_splatting)
-  ply        all points with colour, opacity and everything learned
-  glb        the coloured points
-  mesh       the surface with coloured vertices, .ply or .glb by --out
-  html       one page that a browser draws without network or installation
-  gallery    a folder of such pages, one a run, with an index and stills
-  scene      renderings of the train and test views as a NeRF-synthetic folder
-docs/export.md says more."""
-FORMATS = ("splat", "splat-glb", "ply", "glb", "mesh", "html", "gallery", "scene")
+EPILOG = "\n".join(
+    (
+        "formats:",
+        *(f"  {name:9}  {what}" for name, (_, _, what) in FORMATS.items()),
+        "docs/export.md says more.",
+    )
+)
 OF_POINTS = ("ply", "glb")
 
 

@@ -28,17 +28,14 @@ REPORT = "compress.json"
 
 @dataclass(frozen=True)
 class Original:
-    """A trained run that reduced ones are made of. weights: (N,) float32, how much each point
-    contributes; see point_weights().
-    """
+    """A trained run that reduced ones are made of."""
 
     run: Run
-    weights: np.ndarray
 
-    @classmethod
-    def of(cls, run: Run) -> Original:
-        """A run, seen from its training cameras."""
-        return cls(run, point_weights(run, run.cameras("train")))
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """(N,) float32: point_weights() of its training cameras."""
+        return point_weights(self.run, self.run.cameras("train"))
 
     @cached_property
     def arrays(self) -> dict[str, np.ndarray]:

@@ -37,50 +37,37 @@ class Trial:
         return f"{self.keep:.0%} of the points, {16 if self.half else 32} bits"
 
 
-class Search:
-    """Finds a reduction that loses at most `most_loss` dB over the validation views.
+def search(
+    original: Original, views: list[View], most_loss: float, error: float = 0.0
+) -> Iterator[Trial]:
+    """What is tried for a reduction that loses at most `most_loss` dB over the validation views:
+    the original itself, coefficients of 16 bits, then shares of the points, halving the interval of
+    those that may do. The last that is taken is the smallest.
 
-    error: mean square by which the views, where they are the original's own renderings, are wrong.
-    psnr: of the original. found: the last reduction that was taken.
+    error: mean square by which the views, where they are the original's own renderings, are wrong;
+    it and the errors of what reduces them add up.
     """
 
-    def __init__(self, original: Original, views: list[View], most_loss: float, error: float = 0.0):
-        self.original, self.views, self.most_loss, self.error = original, views, most_loss, error
-        run = original.run
-        half = run.model.cloud.sh[0].dtype == np.float16  # it is a compressed run
-        self.psnr = self._measured(run)
-        count = run.model.cloud.count
-        self.found = Trial(1.0, half, self.psnr, 0.0, nbytes(run), count, taken=True)
+    def tried(run, keep, half, most_loss):
+        psnr = -10 * float(np.log10(10 ** (-measured_psnr(run, views) / 10) + error))
+        loss, count = (0.0 if run is original.run else whole.psnr - psnr), run.model.cloud.count
+        return Trial(keep, half, psnr, loss, nbytes(run), count, taken=loss <= most_loss)
 
-    def _measured(self, run):
-        """PSNR against the photographs: errors of renderings and of what reduces them add up."""
-        return -10 * float(np.log10(10 ** (-measured_psnr(run, self.views) / 10) + self.error))
-
-    def trials(self) -> Iterator[Trial]:
-        """What is tried, in turn: coefficients of 16 bits, then shares of the points, halving the
-        interval of those that may do.
-        """
-        if not self.found.half:
-            yield self._tried(1.0, True, OF_HALF * self.most_loss)
-        fails, fits = LEAST_KEPT - 1, 100
-        while fits - fails > 1:
-            percent = (fits + fails) // 2
-            trial = self._tried(percent / 100, self.found.half, self.most_loss)
-            fails, fits = (fails, percent) if trial.taken else (percent, fits)
-            yield trial
-
-    def _tried(self, keep, half, most_loss):
-        run = self.original.reduced(keep, half)
-        psnr = self._measured(run)
-        loss, count = self.psnr - psnr, run.model.cloud.count
-        trial = Trial(keep, half, psnr, loss, nbytes(run), count, taken=loss <= most_loss)
-        if trial.taken:
-            self.found = trial
-        return trial
+    half = original.run.model.cloud.sh[0].dtype == np.float16  # it is a compressed run
+    yield (whole := tried(original.run, 1.0, half, most_loss))
+    if not half:
+        yield (trial := tried(original.reduced(1.0, True), 1.0, True, OF_HALF * most_loss))
+        half = trial.taken
+    fails, fits = LEAST_KEPT - 1, 100
+    while fits - fails > 1:
+        percent = (fits + fails) // 2
+        keep = percent / 100
+        yield (trial := tried(original.reduced(keep, half), keep, half, most_loss))
+        fails, fits = (fails, percent) if trial.taken else (percent, fits)
 
 
 def validation_views(run: Run) -> tuple[str, list[View], float]:
-    """(which they are, views, their error as Search has it) to measure a loss on, at most
+    """(which they are, views, their error as search() takes it) to measure a loss on, at most
     MOST_VIEWS: those of the split val, where the scene has none every eighth of the training views;
     where the scene is missing, the run's renderings of these. Never those of a test. Raises
     UserError where the scene is broken.

@@ -1,1 +1,34 @@
 """Exports a run to other programs: films, point clouds, meshes, a web page, rendered views."""
+
+# {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder;
+# what it is)}
+FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
+    "splat": (
+        "splat.ply",
+        (".ply",),
+        "the .ply of 3D Gaussian splatting, for SuperSplat, Blender and all other viewers",
+    ),
+    "splat-glb": ("splat.glb", (".glb",), "the same as glTF (KHR_gaussian_splatting)"),
+    "ply": ("cloud.ply", (".ply",), "all points with colour, opacity and everything learned"),
+    "glb": ("cloud.glb", (".glb",), "the coloured points"),
+    "mesh": (
+        "mesh.ply",
+        (".ply", ".glb"),
+        "the surface with coloured vertices, .ply or .glb by --out",
+    ),
+    "html": (
+        "view.html",
+        (".html",),
+        "one page that a browser draws without network or installation",
+    ),
+    "gallery": (
+        "gallery",
+        (),
+        "a folder of such pages, one a run, with an index and stills",
+    ),
+    "scene": (
+        "scene",
+        (),
+        "renderings of the train and test views as a NeRF-synthetic folder",
+    ),
+}

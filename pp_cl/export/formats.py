@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 from pp_cl.errors import UserError
+from pp_cl.export import FORMATS
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.page import page_text, write_gallery
@@ -20,18 +21,6 @@ from pp_cl.run import Run, image_files
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.scene.views import View
 
-# {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder)}
-FORMATS = {
-    "splat": ("splat.ply", (".ply",)),
-    "splat-glb": ("splat.glb", (".glb",)),
-    "ply": ("cloud.ply", (".ply",)),
-    "glb": ("cloud.glb", (".glb",)),
-    "mesh": ("mesh.ply", (".ply", ".glb")),
-    "html": ("view.html", (".html",)),
-    "gallery": ("gallery", ()),
-    "scene": ("scene", ()),
-}
-
 
 def check_target(name: str, folder: Path, out: Path | None) -> Path:
     """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says.
@@ -39,7 +28,7 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
     Raises UserError unless it can be written there, and no other file is lost that `out` does not
     name.
     """
-    default, suffixes = FORMATS[name]
+    default, suffixes, _ = FORMATS[name]
     path = folder / "export" / default if out is None else out
     if suffixes and path.suffix.lower() not in suffixes:
         raise UserError(f"--out {path}: name a file that ends in {' or '.join(suffixes)}")

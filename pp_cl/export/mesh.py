@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import plyfile
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from tqdm import tqdm
@@ -20,8 +19,8 @@ from pp_cl.export.points import (
     in_world,
     place_and_colour,
     table_of,
+    write_elements,
 )
-from pp_cl.files.atomic import atomic_file
 from pp_cl.run import Run
 
 NEIGHBOURS = 4  # points that colour a vertex
@@ -78,7 +77,5 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
         return
     faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
     faces["vertex_indices"] = mesh.faces
-    parts = {"vertex": table_of(place_and_colour(mesh.vertices, mesh.colours)), "face": faces}
-    elements = [plyfile.PlyElement.describe(part, name) for name, part in parts.items()]
-    with atomic_file(path) as file:
-        plyfile.PlyData(elements, byte_order="<").write(file)
+    vertices = table_of(place_and_colour(mesh.vertices, mesh.colours))
+    write_elements(path, {"vertex": vertices, "face": faces})

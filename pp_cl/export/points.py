@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,9 +93,7 @@ def _colours(picture: Picture, camera: Camera, positions):
 
 
 def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> None:
-    """Write a binary little-endian PLY file of points and of what `cloud` learned of them. Raises
-    UserError as atomic_file does.
-    """
+    """Write points and what `cloud` learned of them, as write_elements() does."""
     columns = place_and_colour(points.positions, points.colours)
     columns |= {"point_opacity": points.opacity, "weight": points.weight}
     for block, array in zip(cloud.blocks, cloud.sh, strict=True):
@@ -103,10 +102,18 @@ def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> No
             order = block.first + k - block.degree**2  # within its degree
             named = {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
             columns |= named
-    element = plyfile.PlyElement.describe(table_of(columns), "vertex")
-    data = plyfile.PlyData([element], byte_order="<", comments=list(COMMENTS))
+    write_elements(path, {"vertex": table_of(columns)}, COMMENTS)
+
+
+def write_elements(
+    path: Path | str, elements: dict[str, np.ndarray], comments: Sequence[str] = ()
+) -> None:
+    """Write a binary little-endian PLY file of {name: records}. Raises UserError as atomic_file
+    does.
+    """
+    described = [plyfile.PlyElement.describe(rows, name) for name, rows in elements.items()]
     with atomic_file(path) as file:
-        data.write(file)
+        plyfile.PlyData(described, byte_order="<", comments=list(comments)).write(file)
 
 
 def place_and_colour(positions: np.ndarray, colours: np.ndarray) -> dict[str, np.ndarray]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import plyfile
 from scipy.spatial.transform import Rotation
 
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.harmonics import COUNT, basis, fit_harmonics
 from pp_cl.export.page import check_drawable
-from pp_cl.export.points import in_world, table_of
-from pp_cl.files.atomic import atomic_file
+from pp_cl.export.points import in_world, table_of, write_elements
 from pp_cl.files.image import to_8bit
 from pp_cl.run import Run
 from pp_cl.scene.camera_path import up_of
@@ -98,11 +96,8 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     columns["opacity"] = np.log(table["opacity"] / (1 - table["opacity"]))
     columns |= dict.fromkeys(("scale_0", "scale_1", "scale_2"), np.log(table["deviation"]))
     columns |= {"rot_0": nothing + 1} | dict.fromkeys(("rot_1", "rot_2", "rot_3"), nothing)
-    element = plyfile.PlyElement.describe(table_of(columns), "vertex")
-    with atomic_file(path) as file:
-        # brush turns a model by this comment; others take y for the vertical axis anyway
-        comments = ["Vertical axis: y"]
-        plyfile.PlyData([element], byte_order="<", comments=comments).write(file)
+    # brush turns a model by this comment; others take y for the vertical axis anyway
+    write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
 
 
 def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> None:

@@ -4,8 +4,8 @@ renderer.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -23,34 +23,6 @@ from pp_cl.metrics.lpips_weights import load_weights
 BLOCKS = (2, 2, 3, 3, 3)
 LEAST_SIZE = 16  # pixels: four poolings leave one
 
-Size = tuple[int, int]  # (height, width)
-
-
-@dataclass(frozen=True)
-class VggConv:
-    """A 3x3 convolution with ReLU of VGG16. name: of its output."""
-
-    name: str
-    block: int
-    ci: int
-    co: int
-
-
-def size_of(size: Size, block: int) -> Size:
-    """(height, width) of a block's features for an image of `size`."""
-    return size[0] >> block, size[1] >> block
-
-
-def vgg_layers(widths: tuple[int, ...]) -> list[VggConv]:
-    """The convolutions in the order of the forward pass. widths: channels of the blocks."""
-    layers: list[VggConv] = []
-    ci = 3
-    for block, (convolutions, co) in enumerate(zip(BLOCKS, widths, strict=True)):
-        for _ in range(convolutions):
-            layers.append(VggConv(f"conv{len(layers)}", block, ci, co))
-            ci = co
-    return layers
-
 
 def lpips_program(dev: Device) -> Program:
     """The Program of cl/metrics/lpips.cl in the device's form."""
@@ -67,18 +39,17 @@ class Lpips:
 
     def __init__(self, dev: Device, weights: dict[str, np.ndarray] | None = None):
         weights = load_weights() if weights is None else weights
-        self.dev = dev
-        self.blocking = blocking_of(dev)
-        self.program = lpips_program(dev)
-        self.heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
-        self.layers = vgg_layers(tuple(head.size for head in self.heads))
-        self._weights, self._biases = {}, {}
-        for i, layer in enumerate(self.layers):
-            self._weights[layer.name] = dev.upload(pack_weights(weights[f"kernel{i}"]))
-            self._biases[layer.name] = dev.upload(weights[f"bias{i}"])
-        self._size = None
-        # {layer: (convolution, weights as it reads them, tiles)}
-        self._prepared: dict[str, tuple] = {}
+        self.dev, self.program = dev, lpips_program(dev)
+        self._heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
+        # of each block, [(channels in, out, weights, biases)]
+        self._layers: list[list[tuple]] = [[] for _ in BLOCKS]
+        for i, block in enumerate(np.repeat(range(len(BLOCKS)), BLOCKS)):
+            kernel, bias = weights[f"kernel{i}"], dev.upload(weights[f"bias{i}"])
+            co, ci = kernel.shape[:2]
+            self._layers[block].append((ci, co, dev.upload(pack_weights(kernel)), bias))
+        self._size: tuple[int, int] | None = None
+        # of each block, [(convolution, weights as it reads them, biases)]; and its tiles
+        self._blocks: list[tuple[list[tuple], Any]] = []
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> float:
         """LPIPS of two (H, W, 3) images in [0, 1].
@@ -94,7 +65,7 @@ class Lpips:
                 f"{width}x{height} pixels, LPIPS needs {LEAST_SIZE}x{LEAST_SIZE}: "
                 "take larger images or leave lpips out of --metrics"
             )
-        self._prepare((height, width))
+        self._prepare(height, width)
         # Both images go through a block before either goes on, so that the features of one block
         # only are held.
         features = [
@@ -112,16 +83,16 @@ class Lpips:
         h, w, _ = image.shape
         x = self._place(next(turns), image.shape)
         self.program.launch("lpips_input", h * w, n=h * w, image=image, x=x)
-        for block, convolutions in enumerate(BLOCKS):
+        for block, (convolutions, tiles) in enumerate(self._blocks):
             if block:
-                pooled = self._place(next(turns), (*size_of(x.shape[:2], 1), x.shape[2]))
+                height, width, channels = x.shape
+                pooled = self._place(next(turns), (height // 2, width // 2, channels))
                 maxpool2_forward(self.dev, x, pooled)
                 x = pooled
-            layers = [layer for layer in self.layers if layer.block == block]
-            for i, layer in enumerate(layers):
-                place = name if i == convolutions - 1 else next(turns)
-                out = self._place(place, (*x.shape[:2], layer.co))
-                self._convolve(layer, x, out)
+            for i, (convolution, weights, bias) in enumerate(convolutions, 1):
+                place = name if i == len(convolutions) else next(turns)
+                out = self._place(place, (*x.shape[:2], bias.size))
+                convolution.forward((x,), weights, bias, out, relu=True, tiles=tiles)
                 x = out
             yield x
 
@@ -146,25 +117,21 @@ class Lpips:
             c=channels,
             a=a.reshape(n, channels),
             b=b.reshape(n, channels),
-            head=self.heads[block],
+            head=self._heads[block],
             distance=distance.reshape(-1),
         )
         return distance
 
-    def _prepare(self, size):
+    def _prepare(self, height, width):
         """Variants, weights as they read them, and tiles for images of this size."""
-        if size == self._size:
+        if (height, width) == self._size:
             return
-        self._size, self._prepared = None, {}
-        tiles = [all_tiles(self.dev, *size_of(size, block)) for block in range(len(BLOCKS))]
-        for layer in self.layers:
-            of_block = size_of(size, layer.block)
-            shape = ConvShape(Direction.FORWARD, 3, (layer.ci,), layer.co, of_block)
-            conv = choose(self.dev, shape)(self.dev, self.blocking, shape)
-            weights = conv.laid_out(self._weights[layer.name])
-            self._prepared[layer.name] = conv, weights, tiles[layer.block]
-        self._size = size
-
-    def _convolve(self, layer, x, out):
-        conv, weights, tiles = self._prepared[layer.name]
-        conv.forward((x,), weights, self._biases[layer.name], out, relu=True, tiles=tiles)
+        self._size, self._blocks = None, []
+        for block, layers in enumerate(self._layers):
+            size, convolutions = (height >> block, width >> block), []
+            for ci, co, weights, bias in layers:
+                shape = ConvShape(Direction.FORWARD, 3, (ci,), co, size)
+                convolution = choose(self.dev, shape)(self.dev, blocking_of(self.dev), shape)
+                convolutions.append((convolution, convolution.laid_out(weights), bias))
+            self._blocks.append((convolutions, all_tiles(self.dev, *size)))
+        self._size = height, width

@@ -115,13 +115,11 @@ def sample_surface(
     *,
     advance: Callable[[int], object] = lambda samples: None,
 ) -> Surface:
-    """The Surface of a mesh for a grid, by samples spread evenly over the mesh's area.
+    """The Surface of a mesh for a grid, by 1 to SAMPLES samples spread evenly over the mesh's area.
 
     advance(samples) is called with the number of new samples from time to time. Raises UserError
-    for a mesh without area or too large for the grid, ValueError for other than 1 to 2^30 samples.
+    for a mesh without area or too large for the grid.
     """
-    if not 1 <= samples <= SAMPLES:
-        raise ValueError(f"{samples} samples; they must be 1 to {SAMPLES}")
     around = _grid_around(mesh, grid)
     area_end, corners = _triangles(mesh, around)
     nx, ny, nz = around.dims

@@ -16,7 +16,7 @@ from PIL import Image, ImageFilter
 from support.runs import spoken
 
 from pp_cl.capture import STAGES, poses
-from pp_cl.capture.features import opened, quiet, verification
+from pp_cl.capture.features import quiet, verification
 from pp_cl.capture.frames import take_images
 from pp_cl.cli import main
 from pp_cl.device.discover import open_device
@@ -117,12 +117,8 @@ def test_nothing_in_the_scene_is_distorted(captured):
     one = splits[0][0]
     assert not any(view.distortion for split in splits for view in split)
     model = colmap.Reconstruction(captured / "sparse" / "0")
-    assert {str(camera.model) for camera in model.cameras.values()} == {"CameraModelId.PINHOLE"}
     focal, _, cx, cy = model.camera(1).params
     assert (focal, cx, cy) == pytest.approx((one.camera.fx, one.camera.cx, one.camera.cy))
-    model.update_point_3d_errors()
-    error = found(captured, "poses")["error"]
-    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=0.01)
     bent = colmap.Reconstruction(captured / "capture" / "model")
     k1 = bent.camera(1).params[3]
     assert abs(k1) > 1e-5
@@ -151,7 +147,7 @@ def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
     """That of larger photographs, which EXIF may keep: with it, few images have a place."""
     work = captured / "capture"
     database = Path(shutil.copy(work / "database.db", tmp_path))
-    with quiet(database), opened(database) as db:
+    with quiet(database), colmap.Database.open(database) as db:
         for one in db.read_all_cameras():
             params = [WRONG * cameras(SIZE)[0].fx, SIZE / 2, SIZE / 2, 0]
             one.params, one.has_prior_focal_length = params, True
@@ -171,14 +167,14 @@ def test_wrong_matches_do_not_pull_at_the_cameras():
     model = colmap.synthesize_dataset(
         colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=400)
     )
-    true = [one.camera for one in poses.photographs(model, "")]
+    true = [one.camera for one in poses.photographs(model)]
     rng = np.random.default_rng(0)
     for image in model.images.values():
         for one in image.points2D:
             if one.has_point3D():
                 one.xy = one.xy + rng.normal(0, 4 if one.point3D_id % 20 == 0 else 0.2, 2)
     poses.refine(model)
-    found = align([one.camera for one in poses.photographs(model, "")], true)
+    found = align([one.camera for one in poses.photographs(model)], true)
     assert found.position < 0.001 and found.degrees < 0.02
 
 
@@ -279,41 +275,6 @@ def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
     assert told in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_photographs_as_they_come(shot, tmp_path):
-    """Turned ones with EXIF, HEIC, another size, one cut off: the others find their places."""
-    heif = pytest.importorskip("pillow_heif")
-    heif.register_heif_opener()
-    mixed = tmp_path / "mixed"
-    mixed.mkdir()
-    for k, file in enumerate(sorted(shot[0].iterdir())):
-        image, to = Image.open(file), mixed / file.name
-        if k % 4 == 0:
-            exif = Image.Exif()
-            exif[0x0112] = 6  # turned to the right when it is shown
-            image.rotate(90, expand=True).save(to.with_suffix(".jpg"), quality=95, exif=exif)
-        elif k % 4 == 1:
-            image.save(to.with_suffix(".heic"), quality=95)
-        elif k % 4 == 2:
-            image.resize((240, 240), Image.Resampling.LANCZOS).save(to)
-        else:
-            shutil.copy(file, to)
-    (mixed / "cut off.jpg").write_bytes(next(mixed.glob("*.jpg")).read_bytes()[:9000])
-    shutil.copy(mixed / "004.jpg", mixed / "again.jpg")
-    scene = tmp_path / "scene"
-    status, _ = capture(mixed, scene, "--from", "frames")  # no masks: it ends there
-    assert status in (0, 2)
-    left_out = {one["source"]: one["reason"] for one in found(scene, "frames")["left_out"]}
-    assert set(left_out) >= {"cut off.jpg"} and found(scene, "poses")["placed"] >= 11
-    sizes = {tuple(one["size"]) for one in found(scene, "frames")["images"]}
-    assert sizes == {(SIZE, SIZE), (240, 240)}
-
-
-def blurred(files, folder):
-    for file in files:
-        Image.open(file).filter(ImageFilter.GaussianBlur(25)).save(folder / file.name)
-
-
 def strangers(files, folder):
     """Photographs of different things."""
     for k, file in enumerate(files):
@@ -332,7 +293,7 @@ def nothing(files, folder):
     (folder / "notes.txt").write_text("none")
 
 
-@pytest.mark.parametrize("make", [blurred, strangers, three, nothing])
+@pytest.mark.parametrize("make", [strangers, three, nothing])
 def test_photographs_of_no_use(shot, tmp_path, make):
     folder, scene = tmp_path / "folder", tmp_path / "scene"
     folder.mkdir()
@@ -353,8 +314,8 @@ def test_films(shot, tmp_path):
     assert len(chosen) > 100 and all(number % 2 for number in chosen)
     black = [to_8bit(np.zeros((64, 96, 3)))] * 30
     write_video(tmp_path / "black.mp4", black, 24)
-    for name in ("black.mp4", "missing.mp4"):
-        refused(tmp_path / name, tmp_path / "other", named=name)
+    refused(tmp_path / "black.mp4", tmp_path / "other", named="shows nothing sharp")
+    refused(tmp_path / "missing.mp4", tmp_path / "other", named="missing.mp4")
 
 
 @pytest.mark.unix

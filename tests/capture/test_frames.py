@@ -10,7 +10,7 @@ from PIL import Image, TiffImagePlugin
 from support.profile import display_p3, in_srgb
 
 from pp_cl.capture import frames
-from pp_cl.capture.features import find_features, opened
+from pp_cl.capture.features import find_features
 from pp_cl.capture.frames import take_images
 from pp_cl.capture.stages import Capture
 from pp_cl.errors import UserError
@@ -37,8 +37,10 @@ def folder(tmp_path):
 
 
 def test_photographs_of_other_programs(shots, folder, tmp_path):
-    """16 bits a channel, CMYK, a TIFF whose tags have no room in a JPEG, EXIF that is broken."""
-    pytest.importorskip("pillow_heif")
+    """16 bits a channel, CMYK, a TIFF whose tags have no room in a JPEG, EXIF that is broken; the
+    rest of one, and what is there twice, are left out.
+    """
+    heif = pytest.importorskip("pillow_heif")
     for i, image in enumerate(shots):
         Image.fromarray(image).save(folder / f"{i:02d}.png")
     cv2.imwrite(str(folder / "deep.png"), shots[0, ::-1].astype(np.uint16) * 257)
@@ -48,17 +50,22 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
     Image.fromarray(shots[2, ::-1]).save(folder / "layers.tif", tiffinfo=tags)
     for i, name in enumerate(("a.avif", "b.bmp", "c.jfif"), 4):
         Image.fromarray(shots[i, ::-1]).save(folder / name)
+    heif.from_pillow(Image.fromarray(shots[7, ::-1])).save(folder / "d.heic")
     exif = Image.Exif()
     exif[frames.ORIENTATION] = 6
     exif.get_ifd(frames.EXIF).update({FOCAL: 4.2, MAKER_NOTE: b"x" * 60_000})
     Image.fromarray(shots[3, ::-1]).save(folder / "turned.jpg", exif=exif)
     content = (folder / "turned.jpg").read_bytes()
     (folder / "broken.jpg").write_bytes(content[:30] + b"\xff" * 40 + content[70:])
+    (folder / "cut off.jpg").write_bytes(content[: len(content) - 3000])
+    Image.fromarray(shots[11]).save(folder / "11b.png")
     taken = take_images(folder, tmp_path / "images")
     made = {one["source"]: one for one in taken["images"]}
     assert {"deep.png", "print.jpg", "layers.tif", "turned.jpg"} <= set(made)
-    assert {"a.avif", "b.bmp", "c.jfif"} <= set(made)
-    assert {one["source"] for one in taken["left_out"]} <= {"broken.jpg"}
+    assert {"a.avif", "b.bmp", "c.jfif", "d.heic"} <= set(made)
+    left_out = {one["source"]: one["reason"] for one in taken["left_out"]}
+    assert left_out.keys() - {"broken.jpg"} == {"cut off.jpg", "11b.png"}
+    assert left_out["11b.png"] == "shows the same as 11.png"
     for one in made.values():
         size = read_rgba(tmp_path / "images" / one["name"]).shape[1::-1]
         assert size == tuple(one["size"]) == (SIZE if one["source"] != "turned.jpg" else SIZE[::-1])
@@ -88,7 +95,7 @@ def test_colours_of_another_profile_become_srgb(folder, tmp_path):
 
 def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
     """A cut-out may still hold the wall behind the object."""
-    pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap")
     sharp = np.kron(shots, np.ones((1, 4, 4, 1), np.uint8))
     alpha = np.zeros((*sharp.shape[1:3], 1), np.uint8)
     alpha[60:190, 100:300] = 255
@@ -99,7 +106,7 @@ def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
     capture.work.mkdir(parents=True)
     write_json(capture.work / "frames.json", take_images(folder, capture.frames))
     capture._features()
-    with opened(capture.database) as db:
+    with pycolmap.Database.open(capture.database) as db:
         for image in db.read_all_images():
             x, y = db.read_keypoints(image.image_id)[:, :2].T
             assert len(x) > 50 and x.min() > 99 and x.max() < 301 and y.min() > 59 and y.max() < 191
@@ -110,7 +117,7 @@ def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
     3456 pixels, of which 5728 are an inch. COLMAP would begin with 46 / 25.4 * 5728 = 10374 pixels.
     """
     pytest.importorskip("pillow_heif")
-    pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap")
     sensor = dict(zip(frames.SENSOR, (5184, 3456, 5728.0, 2), strict=True))
     lens = {FOCAL: 46.0}
     whole = dict(zip(frames.SENSOR, (64, 64, 30.0, 2), strict=True))
@@ -125,23 +132,26 @@ def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
     assert [one["focal"] for one in taken] == [pytest.approx(focal)] + [None] * (len(shots) - 1)
     database = tmp_path / "database.db"
     find_features(database, tmp_path / "images", taken[:1])
-    with opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         (camera,) = db.read_all_cameras()
     assert camera.params == pytest.approx([focal, 32, 32, 0])
 
 
 def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
     """As matches and poses depend on the numbers; the second takes longest."""
-    pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap")
     taken = [{"name": f"{i}.png", "lens": "", "size": (600, 600), "focal": None} for i in range(9)]
+    taken[0]["size"] = 304, 600
     for i, one in enumerate(taken):
         values = rng.integers(0, 256, (75, 75), np.uint8) if i == 1 else np.full((75, 75), 100 + i)
         pixels = np.kron(values, np.ones((8, 8))).astype(np.uint8)
-        Image.fromarray(pixels).save(tmp_path / one["name"])
+        Image.fromarray(pixels[:, : one["size"][0]]).save(tmp_path / one["name"])
     found = find_features(tmp_path / "database.db", tmp_path, taken)
     assert list(found) == [one["name"] for one in taken] and found["1.png"] > 100
-    with opened(tmp_path / "database.db") as db:
-        assert db.num_frames() == db.num_images() == 9
+    with pycolmap.Database.open(tmp_path / "database.db") as db:
+        assert db.num_frames() == db.num_images() == 9 and db.num_cameras() == 2
+        ids = [db.read_image_with_name(one["name"]).image_id for one in taken]
+    assert ids == list(range(1, 10))
 
 
 def test_names_that_colmap_can_list(shots, tmp_path):

@@ -8,7 +8,7 @@ from support.runs import train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.export.formats import FORMATS
+from pp_cl.export import FORMATS
 
 
 @pytest.fixture(scope="module")

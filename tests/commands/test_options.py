@@ -85,7 +85,7 @@ def test_an_empty_value_is_refused(words, capsys):
         ("bench conv --json", {"what": "conv", "json": "-"}),
         ("bench conv --json out", {"what": "conv", "json": "out"}),
         ("sweep --out S --json out demo", {"scenes": ["demo"], "json": "out"}),
-        ("compare --metrics A B", {"prediction": "A", "truth": "B", "metrics": options.METRICS}),
+        ("compare --metrics A B", {"subject": "A", "truth": "B", "metrics": options.METRICS}),
         ("eval --json --metrics RUN", {"metrics": options.METRICS, "json": "-"}),
         ("eval --metrics RUN", {"run_folder": "RUN", "metrics": options.METRICS}),
         ("eval RUN --metrics psnr", {"run_folder": "RUN", "metrics": ("psnr",)}),

@@ -14,7 +14,7 @@ from pp_cl.run import Run
 
 TRAIN = "train BALL --out new"
 OF_RUNS = ("eval", "render", "view", "export --format ply", "compress", "info --picture a.png")
-SHAPE = "shape --mesh ball.ply"
+SHAPE = "compare --mesh ball.ply"
 REFUSED = [
     ("", "command"),
     ("trian", "did you mean train?"),
@@ -37,8 +37,8 @@ REFUSED = [
     ("info broken", "transforms_train.json"),
     ("render run --path nowhere", "nowhere"),
     ("render run --path nowhere.json", "nowhere.json"),
-    ("shape run --mesh none.ply", "none.ply"),
-    ("shape run", "--mesh"),
+    ("compare run --mesh none.ply", "none.ply"),
+    ("compare run", "--mesh"),
     ("bench train --scene none", "none"),
     # where nothing can be written
     ("compare a.png a.png --json /no/such/a.json", "--json"),
@@ -82,8 +82,10 @@ REFUSED = [
     ("info run --preset tiny", "--preset"),
     ("info run --open", "--picture"),
     ("info BALL --scene BALL", "--scene"),
-    ("shape run --edge 1", "--edge"),
-    ("shape ball.ply --mesh ball.ply", "--mesh"),
+    ("compare run --edge 1", "--edge"),
+    ("compare run run --edge 1", "--edge"),
+    ("compare ball.ply --mesh ball.ply", "--mesh"),
+    ("compare ball.ply --metrics psnr", "--metrics"),
     ("sweep demo --out new --json --dry-run", "--json"),
     ("sweep demo --out new --workers 2 --scheduler tcp://a", "--workers"),
     ("sweep demo --out new --vary points.count=1,2 --set points.count=3", "points.count"),
@@ -134,8 +136,8 @@ REFUSED = [
     ("bench raster --blend alpha,beta", "--blend"),
     ("bench raster --scene moon", "--scene"),
     ("bench train --points 10,20", "--points"),
-    ("shape run --samples 0", "--samples"),
-    ("shape ball.ply --edge nan", "--edge"),
+    ("compare run --samples 0", "--samples"),
+    ("compare ball.ply --edge nan", "--edge"),
     ("compress run --max-loss much", "--max-loss"),
     ("export run", "--format"),
     ("export run --format obj", "obj"),

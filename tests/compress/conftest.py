@@ -16,4 +16,4 @@ def ball_run(runs, tmp_path_factory):
 
 @pytest.fixture
 def original(dev, ball_run):
-    return Original.of(load_run(dev, ball_run))
+    return Original(load_run(dev, ball_run))

@@ -5,7 +5,8 @@ import shutil
 import numpy as np
 import pytest
 
-from pp_cl.export.formats import FORMATS, check_target, export, renderings
+from pp_cl.export import FORMATS
+from pp_cl.export.formats import check_target, export, renderings
 from pp_cl.files.image import to_8bit
 from pp_cl.run import load_run
 from pp_cl.scene.load import load_scene

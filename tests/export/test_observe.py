@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.models import drawn_alone
 
-from pp_cl.export.observe import directions, observe
+from pp_cl.export.observe import observe
 from pp_cl.run import load_run
 
 
@@ -51,12 +51,6 @@ def test_it_blends_what_the_rasteriser_blends(run):
     blended = matrix @ points + (1 - matrix.sum(1))[:, None]  # the background's features are 1
     features = run.render(camera, features=True).features.reshape(-1, 16)
     assert blended == pytest.approx(features, abs=1e-4)
-
-
-def test_directions_are_unit_vectors_from_the_eye(run, rng):
-    camera, ahead = run.cameras("test")[0], rng.normal(size=(20, 3))
-    found = directions(camera.eye + ahead, camera)
-    assert found * np.linalg.norm(ahead, axis=1)[:, None] == pytest.approx(ahead)
 
 
 def test_views_are_observed_one_at_a_time(run, monkeypatch):

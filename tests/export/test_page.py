@@ -195,14 +195,17 @@ CONTROLS = """
     return { seen, address };"""
 
 
+def in_address(found, name):
+    """(3,) that the address says."""
+    words = re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")
+    return np.array([float(word) for word in words])
+
+
 def test_mouse_and_keys_move_the_camera(page):
     found = ask(page, CONTROLS)
     assert len(set(found["seen"])) == 4 and found["seen"][0] == found["seen"][4]
     header = kept(page)[0]
-    eye, target = (
-        np.array([float(x) for x in re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")])
-        for name in ("eye", "target")
-    )
+    eye, target = (in_address(found, name) for name in ("eye", "target"))
     centre, first = (np.array(header[name]) for name in ("centre", "eye"))
     assert target == pytest.approx(centre, abs=1e-5)
     distances = [np.linalg.norm(at - centre) for at in (eye, first)]
@@ -231,10 +234,7 @@ PINCH = """
 def test_fingers_move_the_camera(page):
     found = ask(page, PINCH)
     assert len(set(found["seen"])) == 3 and found["seen"][0] == found["seen"][3]
-    eye, target = (
-        np.array([float(x) for x in re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")])
-        for name in ("eye", "target")
-    )
+    eye, target = (in_address(found, name) for name in ("eye", "target"))
     header = kept(page)[0]
     first = np.linalg.norm(np.subtract(header["eye"], header["centre"]))
     assert np.linalg.norm(eye - target) == pytest.approx(first / 2, rel=1e-4)

@@ -3,10 +3,9 @@
 import numpy as np
 import plyfile
 import pytest
-import trimesh
 
 from pp_cl.errors import UserError
-from pp_cl.export.gltf import gltf_colours, write_glb
+from pp_cl.export.gltf import gltf_colours
 from pp_cl.export.observe import observe
 from pp_cl.export.points import coloured_points, write_ply
 from pp_cl.files.image import to_8bit
@@ -75,22 +74,6 @@ def test_the_ply_reads_back_by_plyfile(run, written):
     comments = " ".join(data.comments)
     for name in ("red, green, blue:", "weight:", "point_opacity:", "feature_C_D_K:"):
         assert name in comments
-
-
-def test_the_ply_reads_back_by_trimesh(written):
-    path, points = written
-    cloud = trimesh.load(path)
-    assert np.array_equal(np.float32(cloud.vertices), points.positions)
-    assert np.array_equal(cloud.colors[:, :3], points.colours)
-
-
-def test_the_glb_reads_back_by_trimesh(points, tmp_path):
-    colours = gltf_colours(points.colours)
-    write_glb(tmp_path / "a.glb", {"POSITION": points.positions, "COLOR_0": colours})
-    (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
-    assert isinstance(cloud, trimesh.PointCloud)
-    assert np.array_equal(np.float32(cloud.vertices), points.positions)
-    assert np.array_equal(cloud.colors, gltf_colours(points.colours))
 
 
 def test_colours_are_in_linear_light():

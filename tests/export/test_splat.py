@@ -88,6 +88,7 @@ def glb(path):
         dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
         assert view["byteOffset"] % 4 == 0
+        assert accessor["normalized"] == (dtype == "u1")
         found = np.frombuffer(
             body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], dtype
         )

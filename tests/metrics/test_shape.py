@@ -1,4 +1,4 @@
-"""The vertices nearest to a mesh: against exact counts, and sample by sample against float64."""
+"""The vertices nearest to a mesh, sample by sample against float64."""
 
 import os
 
@@ -62,25 +62,6 @@ def test_every_sample_marks_its_nearest_vertex(dev, rng, samples):
     assert surface.count == members(surface).sum()
 
 
-def test_a_sphere_has_the_vertices_whose_cubes_it_cuts(dev):
-    """The cube around a vertex is cut where its nearest corner is inside and its farthest
-    outside.
-    """
-    edge, n = 0.1, 23
-    ball = trimesh.creation.icosphere(subdivisions=6)
-    grid = Grid((-1.097, -1.1, -1.103), edge, (n, n, n))
-    axes = [origin + edge * np.arange(n) for origin in grid.origin]
-    near = [np.maximum(np.abs(axis) - edge / 2, 0) ** 2 for axis in axes]
-    far = [(np.abs(axis) + edge / 2) ** 2 for axis in axes]
-    near, far = (d[2][:, None, None] + d[1][None, :, None] + d[0] for d in (near, far))
-    exact = ((near <= 1) & (far >= 1)).ravel()
-    surface = sample_surface(dev, Mesh(ball.vertices, ball.faces), grid, 2**22)
-    assert surface.grid == grid
-    assert abs(surface.count / exact.sum() - 1) < 5e-3
-    found = overlap(surface, grid, np.flatnonzero(exact))
-    assert found.recall > 0.998 and found.precision > 0.995
-
-
 def test_launches_add_up(dev, monkeypatch):
     told = []
     one = sample_surface(dev, SQUARE, Grid((0.0, 0, 0), 0.03, (2, 2, 2)), 5000)
@@ -119,9 +100,6 @@ def test_what_cannot_be_sampled(dev):
         sample_surface(dev, flat, grid, 10)
     with pytest.raises(UserError, match="in the world of the scene"):
         sample_surface(dev, Mesh(SQUARE.vertices * 1e6, SQUARE.faces), grid, 10)
-    for samples in (0, 2**30 + 1):
-        with pytest.raises(ValueError, match="samples"):
-            sample_surface(dev, SQUARE, grid, samples)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "off", "glb"])
