@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
@@ -15,7 +15,7 @@ from pp_cl.scene.agreement import explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, reach_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid, smallest_edge
-from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
+from pp_cl.scene.views import MASK_THRESHOLD, View, border
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
 CELL_CAP = 2**27
@@ -94,27 +94,27 @@ class Carver:
         self.program = dev.program("scene/hull")
         self.cameras = [view.stored_camera for view in views]
         self.least = min(LEAST_SEEING, len(views)) if any(v.has_mask for v in views) else 1
-        words = [-(-c.width // 32) for c in self.cameras]
-        starts = np.cumsum([0, *(c.height * w for c, w in zip(self.cameras, words, strict=True))])
-        self.masks = dev.empty((int(starts[-1]),), np.uint32)
-        table = [
-            (c.width, c.height, w, start)
-            for c, w, start in zip(self.cameras, words, starts[:-1], strict=True)
-        ]
-        for view, (width, height, row_words, start) in zip(views, table, strict=True):
+        table, start = [], 0
+        for camera in self.cameras:
+            words = -(-camera.width // 32)
+            table.append((camera.width, camera.height, words, start))
+            start += words * camera.height
+        self.masks = dev.empty((start,), np.uint32)
+        for view, (width, height, words, first) in zip(views, table, strict=True):
             self.program.launch(
                 "pack_mask",
-                (row_words, height),
+                (words, height),
                 width=width,
                 height=height,
-                words=row_words,
-                first=start,
+                words=words,
+                first=first,
                 threshold=MASK_THRESHOLD,
                 alpha=dev.upload(view.hull_alpha),
                 masks=self.masks,
             )
         self.view_masks = dev.upload(table, np.uint32)
-        self.view_is_whole = dev.upload([_is_whole(view) for view in views], np.uint32)
+        is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
+        self.view_is_whole = dev.upload(is_whole, np.uint32)
 
     def carve(self, grid: Grid, forgiven: int = 0) -> Carving:
         """The vertices of a grid that enough images see and no more masks than `forgiven` reject,
@@ -171,12 +171,6 @@ class Carver:
         )
         origin = np.asarray(carving.grid.origin) + carving.grid.edge * low
         return Grid(tuple(float(x) for x in origin), carving.grid.edge, (nx, ny, nz)), ids.get()
-
-
-def _is_whole(view):
-    """Whether the mask touches no border of its image."""
-    mask = view.hull_alpha > MASK_THRESHOLD
-    return not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
 def build_grid(
@@ -282,19 +276,15 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
     one grid edge. A range stated by the dataset is kept, but widened to the ball itself, since
     points outside of it would be missing.
     """
-    stated = [view.depth_range for view in views if view.depth_range]
-    grid = hull.grid
+    stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
     half = grid.edge * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
     offsets = np.stack([view.camera.eye for view in views]) - grid.centre
     from_centre = np.linalg.norm(offsets, axis=1)
     from_box = np.linalg.norm(np.maximum(np.abs(offsets) - half, 0), axis=1)
     radius = (1 if stated else DEPTH_MARGIN) * np.linalg.norm(half)
     near = max(from_centre.min() - radius, from_box.min() / 2, grid.edge)
-    far = from_centre.max() + radius
-    return (
-        float(min([near, *(view_near for view_near, _ in stated)])),
-        float(max([far, *(view_far for _, view_far in stated)])),
-    )
+    ranges = np.array([(near, from_centre.max() + radius), *stated])
+    return float(ranges[:, 0].min()), float(ranges[:, 1].max())
 
 
 def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
@@ -311,24 +301,11 @@ def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
     closed.
     """
     gap = math.ceil(spacing_pixels(grid, [camera])) + 1
-    x, y, depth = project(camera, grid.positions(ids))
-    columns, rows = np.floor(x) + gap, np.floor(y) + gap
-    marked = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
-    inside = (depth > 0) & (columns >= 0) & (columns < marked.shape[1])
-    inside &= (rows >= 0) & (rows < marked.shape[0])
-    marked[rows[inside].astype(int), columns[inside].astype(int)] = True
+    wide = camera.crop(-gap, -gap, camera.width + 2 * gap, camera.height + 2 * gap)
+    column, row, is_shown = wide.pixels(grid.positions(ids))
+    marked = np.zeros((wide.height, wide.width), bool)
+    marked[row[is_shown], column[is_shown]] = True
     return closing(marked, disk(gap))[gap:-gap, gap:-gap]
-
-
-def project(camera: Camera, positions: np.ndarray) -> np.ndarray:
-    """(3, N) float64: x and y in pixels and the depth of (N, 3) world positions; those that are not
-    in front of the camera are in its centre.
-    """
-    right, down, depth = camera.pose[:, :3].T @ (positions - camera.eye).T
-    ahead = np.where(depth > 0, depth, np.inf)
-    return np.stack(
-        [camera.fx * right / ahead + camera.cx, camera.fy * down / ahead + camera.cy, depth]
-    )
 
 
 class Agreement(NamedTuple):
@@ -350,11 +327,9 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
     box: as build_grid() takes it. Raises UserError as build_grid() does.
     """
     kept = list(views)
-    left_out: dict[str, Any] = {}
-    if (
-        not any(one.has_mask for one in kept)
-        or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2
-    ):
+    left_out: dict[str, float] = {}
+    is_masked = any(one.has_mask for one in kept)
+    if not is_masked or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
         return Agreement(kept, left_out, 0)
     most = len(kept) // FORGIVING
     while len(left_out) < most:
@@ -376,8 +351,7 @@ def _shares_beside(dev, views, box, forgiven):
     hull = build_grid(dev, views, min(COMPARED_POINTS, CELL_CAP), box, forgiven)
     shares = []
     for view in views:
-        size = view.stored_camera.width, view.stored_camera.height
-        small = replace(view, downscale=fitting_downscale(size, COMPARED_SIZE))
+        small = view.near_size(COMPARED_SIZE)
         camera, k = small.camera, small.downscale
         mask = view.image[: camera.height * k : k, : camera.width * k : k, 3] > 127
         covered = dilation(silhouette(hull.grid, hull.ids, camera), disk(1))

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl.errors import listing
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.views import Photograph, View
 
 STRAIGHT = Distortion()  # of a lens without distortion
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
-POSE, LENS, SIZE, RANGE = 12, 4, 2, 2  # numbers of a kept view; it may have no depth range
+POSE, LENS, RANGE = 12, 6, 2  # numbers of a kept view; it may have no depth range
 MOST_SIDE, MOST_NUMBER = 2**24, 1e30  # what float32 holds as whole numbers, and as products
 
 
@@ -50,28 +51,27 @@ def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None
 
 
 def kept_views(views: Any) -> list[Photograph]:
-    """The training views that identity() has kept. Raises ValueError for what it never makes."""
+    """The training views that identity() has kept. Raises ValueError or TypeError for what it never
+    makes.
+    """
     if not isinstance(views, list) or not views:
         raise ValueError("no list of views")
-    return [_unpacked(view) for view in views]
+    return [_unpacked(*view) for view in views]
 
 
-def _unpacked(view):
-    if not isinstance(view, list) or [type(part) for part in view] != [str, str]:
-        raise ValueError("a view without name or camera")
-    numbers = np.frombuffer(base64.b64decode(view[1], validate=True), "<f8")
-    if len(numbers) - (POSE + LENS + SIZE) not in (0, RANGE):
-        raise ValueError(f"a camera of {len(numbers)} numbers")
-    pose, (fx, fy, cx, cy, width, height, *near_far) = numbers[:POSE], numbers[POSE:].tolist()
-    pose = pose.reshape(3, 4).astype(np.float64)
-    turn = pose[:, :3]
-    sides = all(side.is_integer() and 1 <= side <= MOST_SIDE for side in (width, height))
-    if not (np.abs(numbers) < MOST_NUMBER).all() or min(fx, fy) <= 0 or not sides:
+def _unpacked(name, packed):
+    numbers = np.frombuffer(base64.b64decode(packed, validate=True), "<f8")
+    if type(name) is not str or len(numbers) - (POSE + LENS) not in (0, RANGE):
+        raise ValueError(f"a view without name, or with a camera of {len(numbers)} numbers")
+    fx, fy, cx, cy, width, height, *near_far = numbers[POSE:].tolist()
+    pose = numbers[:POSE].reshape(3, 4).astype(np.float64)
+    is_whole = all(side.is_integer() and 1 <= side <= MOST_SIDE for side in (width, height))
+    if not (np.abs(numbers) < MOST_NUMBER).all() or min(fx, fy) <= 0 or not is_whole:
         raise ValueError("a camera that shows nothing")
-    if not np.allclose(turn.T @ turn, np.eye(3), rtol=0, atol=1e-4):
+    if not np.allclose(pose[:, :3].T @ pose[:, :3], np.eye(3), rtol=0, atol=1e-4):
         raise ValueError("a camera whose axes are not orthonormal")
     camera = Camera(pose, fx, fy, cx, cy, int(width), int(height))
-    return Photograph(view[0], camera, tuple(near_far) or None)
+    return Photograph(name, camera, tuple(near_far) or None)
 
 
 def fingerprint(views: Sequence[View | Photograph]) -> str:
@@ -97,5 +97,4 @@ def difference(
         return "its training views have other names or cameras"
     known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]
-    more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-    return f"{changed[0]}{more}: other pixels, or another mask" if changed else ""
+    return f"{listing(changed)}: other pixels, or another mask" if changed else ""

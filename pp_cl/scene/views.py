@@ -140,6 +140,11 @@ class View:
         check_downscale(self.name, self.file_camera, asked)
         return replace(self, downscale=downscale)
 
+    def near_size(self, side: int) -> "View":
+        """The same photograph reduced to about `side` pixels, as fitting_downscale() has it."""
+        size = self.stored_camera.width, self.stored_camera.height
+        return replace(self, downscale=fitting_downscale(size, side))
+
     def crop_camera(
         self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
     ) -> Camera:
@@ -251,6 +256,11 @@ def _sums(values, shape):
     return np.add.reduceat(
         values, np.arange(0, values.shape[1], values.shape[1] // columns), axis=1
     )
+
+
+def border(image: np.ndarray) -> np.ndarray:
+    """(N, ...) the pixels of the outermost rows and columns of an image (H, W, ...)."""
+    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
 
 
 def evenly(items: Sequence[Item], most: int | None) -> list[Item]:

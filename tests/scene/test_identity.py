@@ -69,7 +69,7 @@ def test_other_pixels_are_named(folder, channel):
     assert difference(header, views, views[:1]) == ""
     repaint(folder / "train/r_5.png", channel)
     views = views_of(folder)
-    assert difference(header, views, views).startswith("train/r_1.png and 1 more: other pixels")
+    assert difference(header, views, views).startswith("train/r_1.png, train/r_5.png: other pixels")
 
 
 def test_masks_of_their_own_belong_to_the_pixels(folder, tmp_path):

@@ -135,8 +135,8 @@ def scale(matrix):
 
 
 BAD = {
-    "missing": (lambda a: a.pop("world_mat_2"), "10 world_mat_i"),
-    "one more": (lambda a: a.update(world_mat_11=np.eye(4)), "12 world_mat_i"),
+    "missing": (lambda a: a.pop("world_mat_2"), "10 cameras"),
+    "one more": (lambda a: a.update(world_mat_11=np.eye(4)), "12 cameras"),
     "numbered from 1": (lambda a: a.update(world_mat_11=a.pop("world_mat_2")), "world_mat_2"),
     "mirrored": (world(lambda m: m @ np.diag([-1, 1, 1, 1])), "world_mat_2"),
     "negated": (world(np.negative), "world_mat_2"),
