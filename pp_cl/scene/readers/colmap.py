@@ -79,7 +79,7 @@ class Lens(NamedTuple):
     model: str
     width: int
     height: int
-    parameters: tuple[float, ...]
+    parameters: Sequence[float]
 
 
 class Image(NamedTuple):
@@ -182,12 +182,24 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
     is_binary = suffix == ".bin"
     lenses, images, names = {}, [], set()
     file = folder / f"cameras{suffix}"
-    for identity, lens in _bounded(file, _binary_cameras if is_binary else _text_cameras):
+    for where, (identity, lens) in _bounded(file, _binary_cameras if is_binary else _text_cameras):
+        model, width, height, parameters = lens
+        if model not in MODELS:
+            raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
+        if not 1 <= min(width, height) <= max(width, height) < MOST_PIXELS:
+            raise UserError(f"{where}: {width}x{height} pixels is no size; copy the file again")
         if identity in lenses:
             raise UserError(f"{file}: camera {identity} stands there twice; remove one")
+        if len(parameters) != MODELS[model] or not _are_numbers(parameters):
+            text = f"{MODELS[model]} parameters, finite and not huge; copy the file again"
+            lens = Unusable(f"{where}: {model} has {text}", BROKEN_CAMERA)
         lenses[identity] = lens
     file = folder / f"images{suffix}"
-    for image in _bounded(file, _binary_images if is_binary else _text_images):
+    for where, image in _bounded(file, _binary_images if is_binary else _text_images):
+        # the name goes into messages of one line
+        has_controls = any(unicodedata.category(letter) == "Cc" for letter in image.name)
+        if has_controls or not 1 <= len(image.name) <= MOST_NAME:
+            raise UserError(f"{where}: {image.name[:80]!r} is no name of an image; rename it")
         if image.camera not in lenses:
             raise UserError(
                 f"{file}: {image.name}: its camera {image.camera} is not in cameras{suffix}; copy"
@@ -219,30 +231,6 @@ def _bounded(file, read):
         if count == MOST_ENTRIES:
             raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
         yield entry
-
-
-def _lens(where, model, size, parameters):
-    """The Lens; what is wrong with its parameters, an Unusable. Raises UserError beginning with
-    `where`.
-    """
-    if not all(1 <= side < MOST_PIXELS for side in size):
-        raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file again")
-    if len(parameters) != MODELS[model] or not _are_numbers(parameters):
-        return Unusable(
-            f"{where}: {model} has {MODELS[model]} parameters, finite and not huge; copy the file"
-            " again",
-            BROKEN_CAMERA,
-        )
-    return Lens(model, *size, tuple(parameters))
-
-
-def _image(where, name, camera, pose):
-    """The Image. Raises UserError beginning with `where`."""
-    # the name goes into messages of one line
-    has_controls = any(unicodedata.category(letter) == "Cc" for letter in name)
-    if has_controls or not 1 <= len(name) <= MOST_NAME:
-        raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
-    return Image(name, camera, pose)
 
 
 def _are_numbers(values):
@@ -280,37 +268,35 @@ def _rows(file, lines, form, parse):
 
 
 def _text_cameras(file):
-    """Each (id, Lens)."""
+    """Each (place in words, (id, Lens))."""
 
     def parse(line):
         identity, model, width, height, *parameters = line.split()
-        return int(identity), model, (int(width), int(height)), [float(p) for p in parameters]
+        return int(identity), Lens(model, int(width), int(height), [float(p) for p in parameters])
 
-    form = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
-    for where, (identity, model, size, parameters) in _rows(file, _lines(file), form, parse):
-        if model not in MODELS:
-            raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
-        yield identity, _lens(where, model, size, parameters)
+    return _rows(file, _lines(file), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", parse)
 
 
 def _text_images(file):
-    """Each Image; it has two lines, of which the second, its 2D points, may be empty."""
+    """Each (place in words, Image); it has two lines, of which the second, its 2D points, may be
+    empty.
+    """
 
     def parse(line):
         words = line.split(maxsplit=9)
-        return words[9], int(words[8]), [float(word) for word in words[1:8]]
+        return Image(words[9], int(words[8]), [float(word) for word in words[1:8]])
 
     lines, form = _lines(file), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    for where, (name, camera, pose) in _rows(file, lines, form, parse):
+    for where, image in _rows(file, lines, form, parse):
         number, line = next(lines, (0, ""))
         points = line.split()
         # else an image without its line of points would hide the next one
         if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
             raise UserError(
-                f"{file}: line {number}: must be the 2D points of {name[:80]!r}, X Y POINT3D_ID"
-                " each; give every image a second line, empty if it has none"
+                f"{file}: line {number}: must be the 2D points of {image.name[:80]!r}, X Y"
+                " POINT3D_ID each; give every image a second line, empty if it has none"
             )
-        yield _image(where, name, camera, pose)
+        yield where, image
 
 
 def _text_points(file):
@@ -348,22 +334,22 @@ def _take(opened, form):
 
 
 def _binary_cameras(file):
-    """Each (id, Lens)."""
+    """Each (place in words, (id, Lens))."""
     names = list(MODELS)
 
     def take(opened):
         identity, number, width, height = _take(opened, "IiQQ")
-        where = f"{file}: camera {identity}"
         if not 0 <= number < len(names):
-            raise UserError(f"{where}: {number} {UNKNOWN}")
+            raise ValueError(f"camera {identity}: {number} {UNKNOWN}")
         parameters = _take(opened, "d" * MODELS[names[number]])
-        return identity, _lens(where, names[number], (width, height), parameters)
+        lens = Lens(names[number], width, height, parameters)
+        return f"{file}: camera {identity}", (identity, lens)
 
     return _entries(file, take)
 
 
 def _binary_images(file):
-    """Each Image."""
+    """Each (place in words, Image)."""
 
     def take(opened):
         identity, *pose, camera = _take(opened, "IdddddddI")
@@ -374,7 +360,7 @@ def _binary_images(file):
         opened.seek(at + len(name) + 1)
         (points,) = _take(opened, "Q")
         opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
-        return _image(f"{file}: image {identity}", name.decode(), camera, pose)
+        return f"{file}: image {identity}", Image(name.decode(), camera, pose)
 
     return _entries(file, take)
 
