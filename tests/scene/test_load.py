@@ -22,6 +22,9 @@ def test_missing_folder_format_and_split(tmp_path):
     write_png(scene / "a.png", np.zeros((8, 8, 3)))
     refused(scene, scene, "no scene in it: 'a.png', 'images', but no file", "pp-cl capture")
     write_scene(scene)
+    (scene / "transforms_train.json").rename(scene / "cameras.json")
+    refused(scene, "'cameras.json' has frames; is it a transforms.json?")
+    (scene / "cameras.json").rename(scene / "transforms_train.json")
     refused(scene / "transforms_train.json", "is a file", scene)
     (scene / "a.mov").touch()
     refused(scene / "a.mov", "is a file", f"pp-cl capture {scene / 'a.mov'} --out SCENE")
@@ -38,13 +41,6 @@ def test_a_split_without_photographs(tmp_path):
     file.write_text(file.read_text().replace("train_filenames", "names"))
     assert len(load_scene(tmp_path, ("test",)).splits["test"]) == 1
     refused(tmp_path, tmp_path, "split train has no photographs")
-
-
-def test_truncated_image(tmp_path):
-    write_scene(tmp_path)
-    file = tmp_path / "train_1.png"
-    file.write_bytes(file.read_bytes()[:-200])
-    refused(tmp_path, file, "truncated", "copy")
 
 
 def test_some_views_of_a_split_are_read_and_no_others(tmp_path):

@@ -80,16 +80,6 @@ def test_projection_follows_pytorch3d(tmp_path, rng, size, kind):
     assert photograph.mask is None and (camera.width, camera.height) == size
 
 
-def test_sizes_may_differ_from_frame_to_frame(tmp_path):
-    given = {"train": views(size=(30, 22))[:4] + views(size=(21, 35))[4:8], "test": views()[8:]}
-    co3d.write(tmp_path, given, 1)
-    read = read_split(tmp_path / "object" / "sequence", "train", Notes())
-    for photograph, view in zip(read, given["train"], strict=True):
-        for name in ("fx", "fy", "cx", "cy", "width", "height"):
-            expected = getattr(view.stored_camera, name)
-            assert getattr(photograph.camera, name) == pytest.approx(expected, abs=1e-9)
-
-
 def test_set_lists_of_version_1(tmp_path):
     """Known frames are for training, unseen ones for testing, whatever the other word."""
     many = views()
