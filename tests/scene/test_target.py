@@ -36,6 +36,9 @@ def test_wholly_outside_is_white(dev, x0, y0):
     assert (target.crop(view, (x0, y0, 8, 8))[0].get() == 1).all()
     inside = target.crop(view, (4, 4, 8, 8))[0].get()
     assert (np.abs(inside - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
+    partly = target.crop(view, (-2, -3, 8, 8), (1, 1))[0].get()  # a block counts what is inside
+    assert (partly[:2] == 1).all() and (partly[:, :1] == 1).all()
+    assert (np.abs(partly[2:, 1:] - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
 
 
 def test_transparent_is_exactly_white_whatever_its_colour(dev, rng):

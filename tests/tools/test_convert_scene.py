@@ -52,6 +52,9 @@ def longer_lens(given):
 
 
 REFUSED = {
+    "co3d, train alone": ("co3d", {"train": views()}, "--hold-out"),
+    "co3d, no test": ("co3d", {"train": views(), "val": views()}, "--hold-out"),
+    "co3d, split": ("co3d", dict.fromkeys(("train", "test", "eval"), views()), "--hold-out"),
     "nsvf, lenses": ("nsvf", held_out(views()), "one camera for all"),
     "nsvf, val alone": ("nsvf", {"val": views(alike=True)}, "no val without test"),
     "nsvf, split": ("nsvf", {"eval": views(alike=True)}, "knows the splits train, val, test"),

@@ -129,21 +129,6 @@ def test_a_linked_sequence(sequence):
     assert [len(read_split(sequence, split, Notes())) for split in ("train", "test")] == [9, 2]
 
 
-@pytest.mark.parametrize(
-    ("names", "version"),
-    [
-        (("train",), 2),
-        (("train", "val"), 2),
-        (("train", "test", "eval"), 2),
-        (("train", "test", "val"), 1),
-    ],
-)
-def test_splits_that_the_lists_cannot_tell_are_not_written(tmp_path, names, version):
-    with pytest.raises(UserError, match="--hold-out"):
-        co3d.write(tmp_path, dict.fromkeys(names, views()[:1]), version)
-    assert not list(tmp_path.iterdir())
-
-
 # --------------------------------------------------------------------------------------------------
 
 

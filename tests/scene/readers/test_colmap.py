@@ -89,6 +89,11 @@ def test_a_projection_by_hand(tmp_path):
             (40, 42),
             Distortion(0.2, -0.1, k3=0.3, k4=-0.4, fisheye=True),
         ),
+        (
+            "FULL_OPENCV 30 22 40 42 15 11 1 2 3 4 5 6 7 8",
+            (40, 42),
+            Distortion(k1=1, k2=2, p1=3, p2=4, k3=5, k4=6, k5=7, k6=8),
+        ),
     ],
 )
 def test_models(text, line, focal, distortion):
@@ -208,19 +213,6 @@ def test_bad_text(text, case):
         refused(text, text / "sparse" / "0", word, splits=("train", "test"))
 
 
-def test_other_models_are_named_with_the_command_that_converts_them(text):
-    edit(text, "cameras.txt", replaced(1, "FOV"))
-    edit(text, "cameras.txt", second(lambda w: [*w, "0.1"]))
-    refused(text, "FOV", "colmap image_undistorter", f"--image_path {text / 'images'}")
-
-
-def test_the_rational_model_of_opencv(text):
-    edit(text, "cameras.txt", replaced(1, "FULL_OPENCV"))
-    edit(text, "cameras.txt", second(lambda w: [*w, *"12345678"]))
-    [lens] = {one.distortion for one in read_split(text, "train", Notes()) if one.distortion}
-    assert lens == Distortion(k1=1, k2=2, p1=3, p2=4, k3=5, k4=6, k5=7, k6=8)
-
-
 def test_of_several_models_the_largest_is_read(written):
     """As COLMAP leaves sparse/0 with two images where the rest is in sparse/1."""
     folder, _ = written
@@ -247,7 +239,8 @@ def test_models_of_later_versions_are_named(binary):
     file = binary / "sparse" / "0" / "cameras.bin"
     data = file.read_bytes()
     file.write_bytes(data[:12] + struct.pack("<i", 12) + data[16:])
-    refused(binary, "SIMPLE_DIVISION", "colmap image_undistorter", splits=("test",))
+    command = f"colmap image_undistorter --image_path {binary / 'images'}"
+    refused(binary, "SIMPLE_DIVISION", command, splits=("test",))
 
 
 def test_more_entries_or_letters_than_a_model_has(written, monkeypatch):

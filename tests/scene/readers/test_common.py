@@ -52,10 +52,6 @@ def scene(request, tmp_path):
     return folder, folder / images, masks and folder / masks
 
 
-def test_an_unknown_split_is_told_with_those_there_are(scene):
-    refused(scene[0], "no split eval", "test, train", splits=("eval",))
-
-
 def test_links_of_the_user_are_followed(scene):
     """Of one image, and of whole folders, as large data lies on another disk."""
     folder, *places = scene
@@ -151,19 +147,12 @@ def test_every_eighth_is_held_out():
     assert sorted(hold_out(range(18), "test") + hold_out(range(18), "train")) == list(range(18))
 
 
-def test_the_first_ending_that_exists(tmp_path):
-    write_png(tmp_path / "a.png", np.zeros((2, 2)))
-    assert find_image(tmp_path, "a", FAIL, ("", ".jpg", ".png")) == "a.png"
-    assert find_image(tmp_path, "./b/../a.png", FAIL) == "a.png"
-    with pytest.raises(UserError, match="'b', with or without the ending"):
-        find_image(tmp_path, "b", FAIL, ("", ".jpg"))
-
-
 @pytest.mark.parametrize(
     "given, there",
     [
         ("/home/ada/mug/images/a.png", "images/a.png"),
         (r"C:\Users\ada\mug\images\a.png", "images/a.png"),
+        (r".\images\a.png", "images/a.png"),
         ("images/a.jpg", "images/a.png"),
         ("images/A.PNG", "images/a.png"),
         ("images/a.png.png", "images/a.png"),
@@ -191,7 +180,10 @@ def test_which_image_a_name_means(tmp_path, given, there):
 def test_alpha_goes_before_and_two_that_differ_in_case_are_none(tmp_path):
     for name in ("a.jpg", "a.png", "bC.jpg", "Bc.jpg"):
         (tmp_path / name).write_bytes(b"")
-    assert find_image(tmp_path, "a", FAIL) == "a.png"
+    assert find_image(tmp_path, "a", FAIL) == find_image(tmp_path, "./b/../a.png", FAIL) == "a.png"
+    assert find_image(tmp_path, "a", FAIL, ("", ".jpg", ".png")) == "a.jpg", "first as it says"
+    with pytest.raises(UserError, match="'b', with or without the ending"):
+        find_image(tmp_path, "b", FAIL, ("", ".jpg"))
     with pytest.raises(Unusable):
         find_image(tmp_path, "bc.jpg", FAIL)
 
@@ -208,8 +200,6 @@ def test_places_in_a_list_of_which_some_are_gone():
 def test_paths_as_windows_writes_them(tmp_path):
     """Also as the name of a file, where a zip of Windows was unpacked elsewhere."""
     (tmp_path / "images").mkdir()
-    write_png(tmp_path / "images" / "a.png", np.zeros((2, 2)))
-    assert find_image(tmp_path, r".\images\a.png", FAIL) == "images/a.png"
     write_png(tmp_path / r"images\b.png", np.zeros((2, 2)))
     assert find_image(tmp_path, r"images\b.png", FAIL) == r"images\b.png"
     with pytest.raises(UserError, match="leaves the scene's folder"):
@@ -306,20 +296,13 @@ def test_headers_that_lie(tmp_path, case):
         read_npz(tmp_path / "a.npz", "cam")
 
 
-@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\0", b"\x93NUMPY\x09\0" + bytes(100)])
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\0", b"\x93NUMPY\x02\0" + bytes(100)])
 def test_what_is_no_array(tmp_path, content):
     (tmp_path / "a.npy").write_bytes(content)
     with refusing(tmp_path / "a.npy"):
         read_npy(tmp_path / "a.npy")
     with refusing(tmp_path / "a.npy"):
         read_npz(tmp_path / "a.npy", "cam")
-
-
-def test_headers_of_up_to_4_gigabytes_are_not_read(tmp_path):
-    with (tmp_path / "a.npy").open("wb") as file:
-        np.lib.format.write_array(file, np.ones(3), version=(2, 0))
-    with refusing(tmp_path / "a.npy"):
-        read_npy(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize(
