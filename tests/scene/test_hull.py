@@ -212,13 +212,6 @@ def test_impossible_counts(dev, points):
         build_grid(dev, ball_views(), points)
 
 
-def test_a_view_without_mask_is_named(dev):
-    views = ball_views()
-    views[3].image[..., 3] = 255
-    with pytest.raises(UserError, match=r"^train/r_3\.png: .*give it a mask"):
-        build_grid(dev, views, 100)
-
-
 def test_lego_has_the_published_shape(dev, data):
     """Its grid of 4.04 million points has 194x345x232 vertices (PlenopticPoints supplemental, Table
     4).

@@ -1,6 +1,5 @@
 """Photographs that are reduced while they are read: numbers, choice, what a training sees."""
 
-import hashlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from support.scenes import write_ball_scene
 from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.identity import difference, fingerprint, identity
+from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import load_scene, open_scene, scene_frames
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import KEPT_BYTES, kept_bytes, shrink, shrink_factor
@@ -92,10 +91,8 @@ def test_a_large_scene_is_kept_reduced_and_stays_itself(dev, scene, monkeypatch)
         assert same(view.camera, before.camera)  # exact, since 2 is a power of two
         assert same(view.file_camera, before.stored_camera)
         assert before.file_camera is before.stored_camera
-        assert view.digest == hashlib.sha256(pixels.tobytes()).hexdigest()[:16]
-    assert identity(views, views) == identity(whole, whole)
-    assert fingerprint(views) == fingerprint(scene_frames(scene))
     header = identity(whole, whole)
+    assert identity(views, views) == header
     assert difference(header, scene_frames(scene), views) == ""
     moved = views[0].moved((1, 2, 3))
     assert same(moved.file_camera, whole[0].moved((1, 2, 3)).stored_camera)
