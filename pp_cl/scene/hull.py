@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from pyopencl.array import Array
 from skimage.morphology import closing, dilation, disk
 
 from pp_cl.device.device import Device
@@ -48,39 +47,7 @@ class Hull:
 
     grid: Grid
     ids: np.ndarray
-    capped: bool
-
-
-@dataclass(frozen=True)
-class Carving:
-    """The vertices of a grid that lie inside the hull.
-
-    bits: (rows, words) uint32 on the device, a set of vertices. extents: (rows, 3) uint32, count,
-    first and last of each row of the grid (cl/scene/hull.cl:row_extents).
-    """
-
-    grid: Grid
-    bits: Array
-    extents: np.ndarray
-
-    @property
-    def count(self) -> int:
-        """Number of vertices inside."""
-        return int(self.extents[:, 0].sum(dtype=np.int64))
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """((3,), (3,)): smallest and largest vertex coordinates (i, j, k) inside."""
-        rows = np.flatnonzero(self.extents[:, 0])
-        j, k = rows % self.grid.dims[1], rows // self.grid.dims[1]
-        _, first, last = self.extents[rows].T.astype(np.int64)
-        return np.array([first.min(), j.min(), k.min()]), np.array([last.max(), j.max(), k.max()])
-
-    def box(self) -> np.ndarray:
-        """(2, 3) box around the vertices inside, grown by one edge: the next carving searches
-        there.
-        """
-        low, high = self.bounds()
-        return np.asarray(self.grid.origin) + self.grid.edge * np.stack([low - 1, high + 1])
+    capped: bool = False
 
 
 class Carver:
@@ -116,61 +83,34 @@ class Carver:
         is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
         self.view_is_whole = dev.upload(is_whole, np.uint32)
 
-    def carve(self, grid: Grid, forgiven: int = 0) -> Carving:
-        """The vertices of a grid that enough images see and no more masks than `forgiven` reject,
-        or the same share of those that see one.
+    def carve(self, grid: Grid, forgiven: int = 0) -> np.ndarray:
+        """(nz, ny, nx) bool: the vertices of a grid that enough images see and no more masks than
+        `forgiven` reject, or the same share of those that see one.
         """
         nx, ny, nz = grid.dims
         rows, words = ny * nz, -(-nx // 32)
-        projections = self.dev.upload(
-            [grid.projection(camera) for camera in self.cameras], np.float32
-        )
+        projections = [grid.projection(camera) for camera in self.cameras]
         bits = self.dev.empty((rows, words), np.uint32)
-        extents = self.dev.empty((rows, 3), np.uint32)
         self.program.launch(
             "carve",
             (words, rows),
             multiply_adds=VERTEX_WORK * 32 * words * rows * len(self.cameras),
             along=1,
-            nx=nx,
             ny=ny,
             rows=rows,
             words=words,
             views=len(self.cameras),
             least=self.least,
             forgiven=forgiven,
-            projections=projections,
+            projections=self.dev.upload(projections, np.float32),
             view_masks=self.view_masks,
             view_is_whole=self.view_is_whole,
             masks=self.masks,
             bits=bits,
         )
-        self.program.launch("row_extents", rows, rows=rows, words=words, bits=bits, extents=extents)
-        return Carving(grid, bits, extents.get())
-
-    def points(self, carving: Carving) -> tuple[Grid, np.ndarray]:
-        """(Grid, (N,) uint32 ascending ids): the smallest grid around the vertices inside, and
-        their ids there.
-        """
-        low, high = carving.bounds()
-        nx, ny, nz = (int(n) for n in high - low + 1)
-        counts = carving.extents[:, 0]
-        rows = len(counts)
-        j, k = np.arange(rows) % carving.grid.dims[1], np.arange(rows) // carving.grid.dims[1]
-        bases = nx * (j - low[1] + ny * (k - low[2])) - low[0]  # wraps below 0; the ids do not
-        ids = self.dev.empty((carving.count,), np.uint32)
-        self.program.launch(
-            "expand_rows",
-            rows,
-            rows=rows,
-            words=carving.bits.shape[1],
-            bits=carving.bits,
-            ids=ids,
-            row_starts=self.dev.upload(np.cumsum(counts) - counts, np.uint32),
-            row_bases=self.dev.upload(bases.astype(np.uint32)),
-        )
-        origin = np.asarray(carving.grid.origin) + carving.grid.edge * low
-        return Grid(tuple(float(x) for x in origin), carving.grid.edge, (nx, ny, nz)), ids.get()
+        found = self.dev.download(bits).view(np.uint8)
+        inside = np.unpackbits(found, axis=1, count=nx, bitorder="little")
+        return inside.view(bool).reshape(nz, ny, nx)
 
 
 def build_grid(
@@ -213,9 +153,7 @@ def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     carver = Carver(dev, _farthest_point_order(near, grid.centre - corner))
-    bits = carver.carve(grid.moved(-corner), forgiven).bits.get()
-    inside = np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")[:, : grid.dims[0]]
-    return np.flatnonzero(inside)
+    return np.flatnonzero(carver.carve(grid.moved(-corner), forgiven))
 
 
 def _box(views, given, forgiven):
@@ -247,25 +185,39 @@ def _search(dev, views, points, box, forgiven, limit):
     carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
 
     def carve(edge):
-        return carver.carve(Grid.centred_in(box, edge).rounded(), forgiven)
+        grid = Grid.centred_in(box, edge).rounded()
+        return _tight(grid, carver.carve(grid, forgiven))
 
     best = last = carve(smallest_edge(box, min(COARSE_CELLS, CELL_CAP)))
-    capped, rounds = False, 0
-    if not last.count:
+    capped, rounds, count = False, 0, len(last.ids)
+    if not count:
         raise UserError(explain_empty_hull(views, box))
-    while rounds < ROUNDS and not points <= last.count <= TOLERANCE * points:
-        box = last.box() if last.count else box
+    while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
+        if count:  # the next carving searches an edge around
+            box = last.grid.box + last.grid.edge * np.array([[-1], [1]])
         if limit is not None:
             box = np.stack([np.maximum(box[0], limit[0]), np.minimum(box[1], limit[1])])
-        wanted = last.grid.edge * (max(last.count, 0.5) / (AIM * points)) ** (1 / 3)
+        wanted = last.grid.edge * (max(count, 0.5) / (AIM * points)) ** (1 / 3)
         edge = max(wanted, smallest_edge(box, CELL_CAP))
         capped = edge > wanted
         if capped and edge > 0.99 * last.grid.edge:
             break  # the box shrinks no more
         last = carve(edge)
-        rounds += 1
-        best = min(best, last, key=lambda c: (c.count < points, abs(c.count - points)))
-    return Hull(*carver.points(best), capped and best.count < points)
+        count, rounds = len(last.ids), rounds + 1
+        best = min(best, last, key=lambda h: (len(h.ids) < points, abs(len(h.ids) - points)))
+    return replace(best, capped=capped and len(best.ids) < points)
+
+
+def _tight(grid, inside):
+    """The Hull of the vertices inside, (nz, ny, nx) bool, on the grid itself if there are none."""
+    if not inside.any():
+        return Hull(grid, np.empty(0, np.uint32))
+    used = [np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 1), (0, 2), (1, 2))]
+    low = np.array([places[0] for places in used])
+    part = inside[tuple(slice(places[0], places[-1] + 1) for places in reversed(used))]
+    origin = np.asarray(grid.origin) + grid.edge * low
+    tight = Grid(tuple(float(x) for x in origin), grid.edge, part.shape[::-1])
+    return Hull(tight, np.flatnonzero(part).astype(np.uint32))
 
 
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
