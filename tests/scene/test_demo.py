@@ -124,9 +124,3 @@ def test_the_scene_shows_the_whole_mesh(dev):
     inside = distance(lattice) < 0
     kept = np.isin(np.arange(len(lattice)), hull.ids)
     assert inside.sum() > 2000 and kept[inside].all()
-
-
-def test_views_spread_evenly_are_some_of_all(dev):
-    few, every = demo_views(dev, "test", 4, 16), demo_views(dev, "test", size=16)
-    assert [view.name for view in few] == [f"test/r_{i}.png" for i in (0, 4, 8, 12)]
-    np.testing.assert_array_equal(few[1].image, every[4].image)

@@ -14,7 +14,7 @@ from pp_cl.scene import hull
 from pp_cl.scene.bounds import bounding_box
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import Carver, build_grid, depth_range, spacing_pixels
+from pp_cl.scene.hull import Carver, build_grid, depth_range
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.views import MASK_THRESHOLD, View
 
@@ -181,21 +181,6 @@ def test_depth_range_of_close_cameras(dev, distance):
     distances = np.linalg.norm(positions_of(found) - camera.eye, axis=1)
     assert near > 0 and far > distances.max()
     assert near < distances.min() if distance > 1 else near == found.grid.edge
-
-
-@pytest.mark.large
-def test_spacing_is_what_two_projected_neighbours_are_apart(dev):
-    views = ball_views()
-    found = build_grid(dev, views, 2000)
-    camera = views[0].camera
-    centre = found.grid.origin + found.grid.edge * (np.array(found.grid.dims) - 1) / 2
-    towards = camera.pose[:, :3].T @ (centre - camera.eye)
-    along = towards + [found.grid.edge, 0, 0]
-    expected = camera.fx * (along[0] / along[2] - towards[0] / towards[2])
-    assert spacing_pixels(found.grid, [views[0].camera]) == pytest.approx(expected, rel=1e-3)
-    assert spacing_pixels(found.grid, [views[0].reduced(4).camera]) == pytest.approx(
-        expected / 4, rel=1e-3
-    )
 
 
 @pytest.mark.large
