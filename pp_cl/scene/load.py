@@ -8,7 +8,7 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -103,16 +103,6 @@ class Scene:
     splits: dict[str, list[View]]
     notes: Sequence[str] = ()
 
-    def reduced(self, downscale: int) -> "Scene":
-        """The same scene, its images reduced `downscale` times. Raises UserError as View.reduced
-        does.
-        """
-        splits = {
-            split: [view.reduced(downscale) for view in views]
-            for split, views in self.splits.items()
-        }
-        return replace(self, splits=splits)
-
 
 def open_scene(
     dev: Device,
@@ -130,7 +120,7 @@ def open_scene(
     path, downscale, masks = config.scene.path, config.scene.downscale, mask_rule(config)
     if path == DEMO:
         rendered = {split: demo.demo_views(dev, split, most) for split in splits}
-        return Scene(DEMO, None, rendered).reduced(downscale)
+        return Scene(DEMO, None, _reduced(rendered, downscale))
     scene = load_scene(
         path, splits, most, masks, downscale=downscale, listed=listed, dev=dev, kept=kept
     )
@@ -282,15 +272,17 @@ def _ignoring(folder, places, photographs, split):
     """The photographs, with the masks of what says nothing that lie in one of the places in a
     folder. Raises UserError where a place has none for any training photograph.
     """
-    with suppress(UserError) if split != "train" else nullcontext():
+    try:
         found = find_masks(folder, [one.name for one in photographs], places) or {}
-        return [
-            replace(one, ignore=str(folder.absolute() / found[one.name]), ignores_black=False)
-            if one.name in found
-            else one
-            for one in photographs
-        ]
-    return photographs
+    except UserError:
+        if split == "train":
+            raise
+        return photographs
+    files = {name: str(folder.absolute() / mask) for name, mask in found.items()}
+    return [
+        replace(one, ignore=files[one.name], ignores_black=False) if one.name in files else one
+        for one in photographs
+    ]
 
 
 def _checked(folder, photograph):
@@ -456,8 +448,12 @@ def load_scene(
         views[split] = usable
         lines += [f"{split}: {line}" for line in notes.lines(len(usable))]
     _tell(folder, lines)
-    scene = Scene(folder.resolve().name, folder, views, lines)
-    return scene.reduced(downscale // factor) if downscale else scene
+    views = _reduced(views, downscale // factor) if downscale else views
+    return Scene(folder.resolve().name, folder, views, lines)
+
+
+def _reduced(splits, downscale):
+    return {split: [view.reduced(downscale) for view in views] for split, views in splits.items()}
 
 
 def reading(
