@@ -22,8 +22,7 @@ from tqdm import tqdm
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
-from pp_cl.errors import listing as listing_of
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, listing, quoted
 from pp_cl.files.image import has_alpha, read_mask, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
@@ -371,7 +370,7 @@ def _found_instead(folder):
         with suppress(UserError):
             if isinstance(data := read_json(file), dict) and "frames" in data:
                 return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
-    found = listing_of([quoted(entry.name, 40) for entry in inside]) or "nothing"
+    found = listing([quoted(entry.name, 40) for entry in inside]) or "nothing"
     return (
         f": {found}, but no file of cameras that is known, such as transforms.json or sparse/0;"
         " `pp-cl capture` makes one of photographs"
@@ -403,9 +402,9 @@ def load_scene(
     folder, listed, lines = Path(path), listed or {}, []
     chosen = {}
     for split in splits:
-        listing = listed.get(split) or list_split(folder, split)
-        chosen[split] = evenly(listing.photographs, most)
-        lines += [f"{split}: {line}" for line in listing.notes]
+        frames, notes = listed.get(split) or list_split(folder, split)
+        chosen[split] = evenly(frames, most)
+        lines += [f"{split}: {line}" for line in notes]
         if masks.ignore:
             if not os.path.isdir(masks.ignore):
                 raise UserError(f"{masks.ignore}: no such folder; --ignore takes one of masks")
@@ -426,7 +425,7 @@ def load_scene(
         named_mask(Path(masks.folder), photographs[0].name)
     left = iter(zip(photographs, found, strict=True))
     for split, some in chosen.items():
-        notes, is_whole = Notes(), split == "train" and most is None
+        told, is_whole = Notes(), split == "train" and most is None
         bare: list[View] = []
 
         def used(pair, bare=bare):
@@ -437,16 +436,16 @@ def load_scene(
             return _lacks_mask(folder, photograph.name, masks)
 
         pairs = [next(left) for _ in some]
-        usable = list(notes.usable(pairs, used, lambda pair: pair[0].name))
-        notes.check(len(usable), LEAST_VIEWS if is_whole else 1)
+        usable = list(told.usable(pairs, used, lambda pair: pair[0].name))
+        told.check(len(usable), LEAST_VIEWS if is_whole else 1)
         if is_whole and bare:
             with suppress(UserError):  # else they stay left out
                 usable += within_silhouettes(dev or open_device(), usable, bare)
-                notes.done[OF_OTHERS] = notes.left_out.pop(NO_MASK)
+                told.done[OF_OTHERS] = told.left_out.pop(NO_MASK)
                 order = {one.name: i for i, one in enumerate(some)}
                 usable.sort(key=lambda view: order[view.name])
         views[split] = usable
-        lines += [f"{split}: {line}" for line in notes.lines(len(usable))]
+        lines += [f"{split}: {line}" for line in told.lines(len(usable))]
     _tell(folder, lines)
     views = _reduced(views, downscale // factor) if downscale else views
     return Scene(folder.resolve().name, folder, views, lines)

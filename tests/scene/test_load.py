@@ -1,4 +1,4 @@
-"""Loading scenes: what is missing or contradictory is one line; two real scenes."""
+"""Loading scenes: what is missing or contradictory is one line; a real one carves its hull in test_hull.py."""
 
 import numpy as np
 import pytest
@@ -94,31 +94,6 @@ def test_lenses_that_float32_cannot_hold(tmp_path, key, value, told):
     refused(tmp_path, tmp_path / "train_1.png", told, "correct")
     with pytest.raises(UserError, match=told):
         scene_frames(str(tmp_path))
-
-
-# --------------------------------------------------------------------------------------------------
-
-
-def test_lego(data):
-    """The view's mask lies where the model's extent says."""
-    scene = load_scene(data / "nerf_synthetic/lego", ("test",))
-    views = scene.splits["test"]
-    assert len(views) == 25 and views[1].name == "test/r_8.png"
-    for view in views:
-        assert view.depth_range is None
-        assert view.camera.fx == pytest.approx(1111.111, abs=1e-3) and view.image.shape == (
-            800,
-            800,
-            4,
-        )
-        assert np.linalg.norm(view.camera.eye) == pytest.approx(4.031, abs=1e-2)
-        assert alpha_at(view, [0, 0, 0.3]) == 255
-
-
-def alpha_at(view, point):
-    """Alpha of the pixel that shows a world point."""
-    column, row, _ = view.camera.project(point).astype(int)
-    return view.image[row, column, 3]
 
 
 def test_a_folder_that_may_not_be_read(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.load import open_scene, scene_frames
+from pp_cl.scene.load import load_scene, open_scene, scene_frames
 from pp_cl.scene.views import KEPT_BYTES, kept_bytes, shrink, shrink_factor
 
 PHONE = (4000, 3000)
@@ -91,6 +91,13 @@ def test_a_large_scene_is_kept_reduced_and_stays_itself(dev, scene, monkeypatch)
     assert difference(header, scene_frames(scene), views) == ""
     moved = views[0].moved((1, 2, 3))
     assert same(moved.file_camera, whole[0].moved((1, 2, 3)).stored_camera)
+
+
+def test_pixels_stay_as_stored_where_nothing_is_reduced(dev, scene, monkeypatch):
+    large(monkeypatch, most=1)
+    for view in (opened(dev, scene, 1)[0], load_scene(scene).splits["train"][0]):
+        np.testing.assert_array_equal(view.image, read_rgba(f"{scene}/{view.name}"))
+        assert view.shrunk == 1
 
 
 def test_too_far_is_refused_before_a_photograph_is_read(dev, scene, monkeypatch):
