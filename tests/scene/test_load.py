@@ -1,4 +1,4 @@
-"""Loading scenes: what is missing or contradictory is one line; a real one carves its hull in test_hull.py."""
+"""Loading scenes: what is missing or contradictory is one line."""
 
 import numpy as np
 import pytest
