@@ -1,6 +1,5 @@
 """Cameras that look at no one place, and are right, are not told that their axes are wrong."""
 
-
 import numpy as np
 import pytest
 
