@@ -1,9 +1,10 @@
 """The exceptions that a user sees as one line, and the quoting of text from files in that line."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 MOST_LINE = 1000  # characters of a message: two long paths and a reason
+NAMES_SHOWN = 3  # of many, in a message
 
 
 def one_line(text: object, most: int = MOST_LINE) -> str:
@@ -21,16 +22,16 @@ class UserError(Exception):
     line.
     """
 
-    def __init__(self, message: str) -> None:
+    def __init__(self, message: object) -> None:
         super().__init__(one_line(message))
 
 
 class Unusable(UserError):
-    """What makes one view of a scene unusable, while the others may do without it. why: in a few
-    words, the same for all views of a kind.
+    """What makes one view of a scene unusable, while the others may do without it. message: as of a
+    UserError, or that error itself. why: in a few words, the same for all views of a kind.
     """
 
-    def __init__(self, message: str, why: str) -> None:
+    def __init__(self, message: object, why: str) -> None:
         super().__init__(message)
         self.why = why
 
@@ -75,6 +76,12 @@ def quoted(value: object, most: int = 100) -> str:
         return shown(repr(value), most)
     except (RecursionError, ValueError):  # nested deeply, or a number of thousands of digits
         return f"a {type(value).__name__}"
+
+
+def listing(names: Sequence[str]) -> str:
+    """A few of the names, and how many more there are."""
+    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    return ", ".join(names[:NAMES_SHOWN]) + more
 
 
 def suggestion(word: str, words: Iterable[str]) -> str:

@@ -31,11 +31,11 @@ kernel void pack_mask(
 // One work-item per word of 32 vertices along x: projects them into the views, one view after the
 // other until all are rejected too often, writes the set of those that at least `least` images see
 // and that no more masks reject than `forgiven` of all views, or the same share of those that see
-// it. A vertex outside of an image is not seen by it; where the mask ends within the image, the
+// it; those of the last word that are beyond the row say nothing. A vertex outside of an image is
+// not seen by it; where the mask ends within the image, the
 // object does, and that rejects the vertex.
 kernel void carve(
-    const uint nx,
-    const uint ny,
+    const uint ny,     // grid vertices
     const uint rows,   // grid rows: ny * nz
     const uint words,  // words per grid row
     const uint views,
@@ -50,7 +50,6 @@ kernel void carve(
     const uint word = get_global_id(0), row = get_global_id(1);
     if (word >= words || row >= rows) return;
     const float4 first = (float4)(32.0f * word, row % ny, row / ny, 1.0f);
-    const uint count = min(nx - 32 * word, 32u);
     uint tally[32];  // views that see the vertex, and from bit 16 on those that reject it
     for (uint b = 0; b < 32; b++)
         tally[b] = 0;
@@ -78,46 +77,5 @@ kernel void carve(
         const uint seen = tally[b] & 0xffff, rejected = tally[b] >> 16;
         kept |= (uint)(seen >= least && views * rejected <= forgiven * seen) << b;
     }
-    bits[row * words + word] = kept & (0xffffffff >> (32 - count));
-}
-
-// One work-item per grid row: reads its words, writes how many vertices are set, the first and the
-// last.
-kernel void row_extents(
-    const uint rows,
-    const uint words,
-    global const uint *bits,  // (rows, words)
-    global uint *extents)     // (rows, 3) count, first, last; first > last in an empty row
-{
-    const uint row = get_global_id(0);
-    if (row >= rows) return;
-    uint count = 0, first = NONE, last = 0;
-    for (uint word = 0; word < words; word++) {
-        const uint set = bits[row * words + word];
-        if (set) {
-            count += popcount(set);
-            first = min(first, 32 * word + 31 - clz(set & -set));
-            last = 32 * word + 31 - clz(set);
-        }
-    }
-    extents[3 * row] = count;
-    extents[3 * row + 1] = first;
-    extents[3 * row + 2] = last;
-}
-
-// One work-item per grid row: reads its words, writes the ids of its vertices in ascending order.
-kernel void expand_rows(
-    const uint rows,
-    const uint words,
-    global const uint *bits,        // (rows, words)
-    global const uint *row_starts,  // (rows) vertices in the rows before
-    global const uint *row_bases,   // (rows) id of the row's vertex 0
-    global uint *ids)               // (N)
-{
-    const uint row = get_global_id(0);
-    if (row >= rows) return;
-    uint next = row_starts[row];
-    for (uint word = 0; word < words; word++)
-        for (uint set = bits[row * words + word]; set; set &= set - 1)
-            ids[next++] = row_bases[row] + 32 * word + 31 - clz(set & -set);
+    bits[row * words + word] = kept;
 }

@@ -18,10 +18,10 @@ from tqdm import tqdm
 from pp_cl.capture.cut import FORGIVEN, cut_out_all, forgiving_hull, gap_of, silhouette, whole_mask
 from pp_cl.capture.packages import needed
 from pp_cl.capture.window import dilated, place_of, window
-from pp_cl.errors import UserError, shown
+from pp_cl.errors import UserError, listing, shown
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_mask, read_rgba, write_png
-from pp_cl.scene.agreement import disagreements, listing
+from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.masks import MaskRule, cut_out, named_mask, of_size
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink

@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 from pp_cl.capture import STAGES, box, features, frames, masks, pinhole, poses, still
 from pp_cl.capture.packages import isolated, needed
 from pp_cl.device.discover import open_device
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, listing
 from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_rgba, write_png
@@ -29,7 +29,6 @@ from pp_cl.files.manifest import (
     ours,
     remove_ours,
 )
-from pp_cl.scene.agreement import listing
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS

@@ -9,7 +9,6 @@ from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
 from pp_cl.scene.bounds import corners_of
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.hull import project
 from pp_cl.scene.views import Photograph
 
 cv2 = needed("cv2")
@@ -34,7 +33,8 @@ class Window:
 
     def pixels(self, positions: np.ndarray) -> np.ndarray:
         """(N, 2) x and y of world positions (N, 3); NaN behind the camera."""
-        x, y, depth = project(self.camera, positions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y, depth = self.camera.project(positions)
         return np.where(depth > 0, [x, y], np.nan).T
 
     def pixels_in(self, other: "Window") -> np.ndarray:
@@ -76,7 +76,8 @@ def place_of(photograph: Photograph, box: np.ndarray) -> tuple[int, int, int, in
     outside.
     """
     camera = photograph.camera
-    x, y, depth = project(camera, corners_of(box))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y, depth = camera.project(corners_of(box))
     if depth.min() <= 0:  # the box is around the camera
         x, y = np.array([0, camera.width]), np.array([0, camera.height])
     if x.max() < 1 or y.max() < 1 or x.min() > camera.width - 1 or y.min() > camera.height - 1:

@@ -1,10 +1,12 @@
 """Finds masks that contradict those of the other views, and words the warning."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from pp_cl.errors import listing
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.views import MASK_THRESHOLD, View
 
@@ -13,7 +15,6 @@ from pp_cl.scene.views import MASK_THRESHOLD, View
 # views reach 0.03 with all 100 of them, and 0.15 with 20; a mask shifted by 15 % of the image 0.35.
 LEAST_SHARE, TIMES_MEDIAN, TIMES_EVEN = 0.05, 4.0, 4.0
 PROBED_CELLS = 32**3  # positions at which the masks are looked up
-NAMES_SHOWN = 3  # views named in a message
 AGREEING = 0.75  # of the other views that see a place, whose masks hold it
 
 
@@ -77,35 +78,16 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
 
 def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray, np.ndarray]:
     """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its vertices fall onto
-    each view's mask, and which into its image beside the mask).
+    each view's mask, and which into its image beside the mask), neither where it is ignored.
     """
     grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
-    k, j, i = np.indices(grid.dims[::-1]).reshape(3, -1)
-    vertices = np.stack([i, j, k, np.ones_like(i)])
-    votes = [_votes_of(view, grid.projection(view.stored_camera) @ vertices) for view in views]
-    return grid, *np.stack(votes, axis=1)
-
-
-def _votes_of(view, projected):
-    """(2, N) bool: which positions fall onto the mask, and which into the image beside it; none
-    where it is ignored.
-
-    projected: (3, N), as Grid.projection gives them.
-    """
-    u, v, depth = projected
-    height, width = view.image.shape[:2]
-    ahead = depth > 0
-    x, y = (np.floor(np.divide(a, depth, where=ahead, out=np.full_like(a, -1))) for a in (u, v))
-    inside = ahead & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    place = np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)
-    on = view.image[..., 3][place] > MASK_THRESHOLD
-    if view.ignored is not None:
-        inside &= ~view.ignored[place]
-    return np.stack([inside & on, inside & ~on])
-
-
-def listing(names: Sequence[str]) -> str:
-    """A few of the names, and how many more there are."""
-    return ", ".join(names[:NAMES_SHOWN]) + (
-        f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    )
+    vertices = grid.positions(np.arange(math.prod(grid.dims)))
+    on_mask, beside = [], []
+    for view in views:
+        column, row, is_shown = view.stored_camera.pixels(vertices)
+        is_on = view.image[row, column, 3] > MASK_THRESHOLD
+        if view.ignored is not None:
+            is_shown &= ~view.ignored[row, column]
+        on_mask.append(is_shown & is_on)
+        beside.append(is_shown & ~is_on)
+    return grid, np.stack(on_mask), np.stack(beside)

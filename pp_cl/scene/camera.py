@@ -59,6 +59,16 @@ class Camera:
         x, y, z = np.moveaxis((positions - self.eye) @ self.pose[:, :3], -1, 0)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy, z])
 
+    def pixels(self, positions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of (N, 3) world positions, (N,) each: column and row of the pixel that shows one, and
+        whether one does; where none does both are 0.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y, depth = self.project(positions)
+        is_shown = (depth > 0) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        column, row = (np.where(is_shown, place, 0).astype(int) for place in (x, y))
+        return column, row, is_shown
+
     def rays(self) -> np.ndarray:
         """(H, W, 3) through the pixels' centres, along the world's axes, of depth 1."""
         y, x = np.mgrid[: self.height, : self.width] + 0.5

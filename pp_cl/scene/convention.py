@@ -9,6 +9,7 @@ import numpy as np
 
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import looked_at
+from pp_cl.scene.readers.frame import GL_FROM_CV
 
 STATED = "stated"
 FLIPPED, INVERSE = "opencv", "world-to-camera"
@@ -27,7 +28,6 @@ SPREAD = 0.2  # of the distance to what they look at, by which eyes differ aroun
 # the length of the mean of the axes: of cameras that go 90 degrees around an object on an arc. Of
 # those that look the same way from a wall, 0.97 and more, the place all look at is of no use.
 ONE_WAY = 0.9
-GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_as(camera: Camera, axes: str) -> Camera:

@@ -39,7 +39,13 @@ def demo_frames(split: str, size: int = SIZE) -> list[Photograph]:
     """A split's views, without their images. Raises UserError for a split that there is not."""
     if split not in SPLITS:
         raise UserError(f"--split {split}: demo has {', '.join(SPLITS)}")
-    cameras = _spread_cameras(size) if split == "train" else _circling_cameras(size)
+    if split == "train":  # on a spiral whose steps have equal areas of the sphere
+        heights = np.linspace(0.95, -0.15, TRAIN_VIEWS)
+        angles = [(i * math.pi * (3 - math.sqrt(5)), math.asin(h)) for i, h in enumerate(heights)]
+    else:  # around the object, rising and sinking twice, from 5 to 45 degrees
+        turns = (np.arange(TEST_VIEWS) + 0.5) / TEST_VIEWS * 2 * math.pi
+        angles = [(turn, math.radians(25 + 20 * math.sin(2 * turn))) for turn in turns]
+    cameras = [_camera(*angle, size) for angle in angles]
     return [Photograph(f"{split}/r_{i}.png", camera) for i, camera in enumerate(cameras)]
 
 
@@ -89,20 +95,6 @@ def distances(dev: Device, grid: Grid) -> np.ndarray:
         distances=out,
     )
     return out.get().reshape(grid.dims[::-1])
-
-
-def _spread_cameras(size):
-    """Cameras on a spiral whose steps have equal areas of the sphere."""
-    heights = np.linspace(0.95, -0.15, TRAIN_VIEWS)
-    return [
-        _camera(i * math.pi * (3 - math.sqrt(5)), math.asin(h), size) for i, h in enumerate(heights)
-    ]
-
-
-def _circling_cameras(size):
-    """Cameras around the object that rise and sink twice, from 5 to 45 degrees."""
-    turns = (np.arange(TEST_VIEWS) + 0.5) / TEST_VIEWS * 2 * math.pi
-    return [_camera(turn, math.radians(25 + 20 * math.sin(2 * turn)), size) for turn in turns]
 
 
 def _camera(azimuth, elevation, size):

@@ -29,39 +29,30 @@ class Edits(NamedTuple):
 def read_edits(folder: Path) -> Edits:
     """The edits of a scene. Raises UserError naming the file and the key that is wrong."""
     file = folder / FILE
-    return checked_edits(read_json(file), file) if file.exists() else Edits()
-
-
-def checked_edits(found: object, file: Path) -> Edits:
-    """The Edits that a JSON object {"box": ..., "dropped": ..., "axes": ...} holds. Raises
-    UserError naming the file and the key that is wrong.
-    """
+    if not file.exists():
+        return Edits()
+    found = read_json(file)
     if not isinstance(found, dict) or not found.keys() <= set(Edits._fields):
         keys = " and ".join(f'"{key}"' for key in Edits._fields)
         raise fail_at(file)(f"must be a JSON object with no other keys than {keys}; correct it")
     if (axes := found.get("axes")) is not None and axes not in AXES:
         raise fail_at(file, "axes")(f"is {quoted(axes, 40)}; must be one of {', '.join(AXES)}")
-    corners, dropped = found.get("box"), found.get("dropped", [])
+    dropped = found.get("dropped", [])
     if not isinstance(dropped, list) or not all(type(name) is str for name in dropped):
         raise fail_at(file, "dropped")("must be a list of names of photographs; correct it")
-    return Edits(
-        None if corners is None else checked_box(corners, fail_at(file, "box")),
-        frozenset(dropped),
-        axes,
-    )
+    corners = found.get("box")
+    box = None if corners is None else checked_box(corners, fail_at(file, "box"))
+    return Edits(box, frozenset(dropped), axes)
 
 
 def write_edits(folder: Path, edits: Edits) -> None:
     """Write the edits into a scene's folder; none at all remove the file. Raises UserError where
     that cannot be done.
     """
-    file, kept = folder / FILE, {}
-    if edits.box is not None:
-        kept["box"] = edits.box.tolist()
-    if edits.dropped:
-        kept["dropped"] = sorted(edits.dropped)
-    if edits.axes:
-        kept["axes"] = edits.axes
+    file = folder / FILE
+    box = None if edits.box is None else edits.box.tolist()
+    kept = {"box": box, "dropped": sorted(edits.dropped), "axes": edits.axes}
+    kept = {key: value for key, value in kept.items() if value}
     if kept:
         write_json(file, kept)
         return

@@ -70,13 +70,10 @@ class Grid:
         if 8 * math.prod(self.dims) > MOST_VERTICES:
             raise ValueError(f"a grid of {self.dims} vertices cannot be refined")
         nx, ny, _ = self.dims
-        ids = np.asarray(ids, np.int64)
-        i, j, k = ids % nx, ids // nx % ny, ids // (nx * ny)
+        i, j, k = self.coordinates(ids).T
         corners = [
             2 * i + a + 2 * nx * (2 * j + b + 2 * ny * (2 * k + c))
-            for c in (0, 1)
-            for b in (0, 1)
-            for a in (0, 1)
+            for c, b, a in product((0, 1), repeat=3)
         ]
         found = np.concatenate(corners)
         order = np.argsort(found)
@@ -118,10 +115,13 @@ class Grid:
 
     def positions(self, ids: ArrayLike) -> np.ndarray:
         """(N, 3) float64 world positions of the vertices with ids (N,), i + nx*(j + ny*k)."""
+        return np.asarray(self.origin) + self.edge * self.coordinates(ids)
+
+    def coordinates(self, ids: ArrayLike) -> np.ndarray:
+        """(N, 3) int64 (i, j, k) of the vertices with ids (N,)."""
         nx, ny, _ = self.dims
         ids = np.asarray(ids, np.int64)
-        ijk = np.stack([ids % nx, ids // nx % ny, ids // (nx * ny)], -1)
-        return np.asarray(self.origin) + self.edge * ijk
+        return np.stack([ids % nx, ids // nx % ny, ids // (nx * ny)], -1)
 
     def in_large_parts(self, ids: np.ndarray, least: int) -> np.ndarray:
         """(N,) bool: which of the vertices with ids (N,), ascending, are in a connected part
@@ -129,9 +129,7 @@ class Grid:
         the memory of the vertices, not of the box around them.
         """
         nx, ny, nz = self.dims
-        ids = np.asarray(ids, np.int64)
-        place = np.stack([ids % nx, ids // nx % ny, ids // (nx * ny)], -1)
-        edges = []
+        ids, place, edges = np.asarray(ids, np.int64), self.coordinates(ids), []
         for step in HALF_OF_NEIGHBOURS:
             there = place + step
             inside = np.flatnonzero(((there >= 0) & (there < (nx, ny, nz))).all(1))

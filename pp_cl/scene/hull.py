@@ -3,10 +3,9 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pyopencl.array import Array
 from skimage.morphology import closing, dilation, disk
 
 from pp_cl.device.device import Device
@@ -15,7 +14,7 @@ from pp_cl.scene.agreement import explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, reach_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid, smallest_edge
-from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
+from pp_cl.scene.views import MASK_THRESHOLD, View, border
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
 CELL_CAP = 2**27
@@ -48,39 +47,7 @@ class Hull:
 
     grid: Grid
     ids: np.ndarray
-    capped: bool
-
-
-@dataclass(frozen=True)
-class Carving:
-    """The vertices of a grid that lie inside the hull.
-
-    bits: (rows, words) uint32 on the device, a set of vertices. extents: (rows, 3) uint32, count,
-    first and last of each row of the grid (cl/scene/hull.cl:row_extents).
-    """
-
-    grid: Grid
-    bits: Array
-    extents: np.ndarray
-
-    @property
-    def count(self) -> int:
-        """Number of vertices inside."""
-        return int(self.extents[:, 0].sum(dtype=np.int64))
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """((3,), (3,)): smallest and largest vertex coordinates (i, j, k) inside."""
-        rows = np.flatnonzero(self.extents[:, 0])
-        j, k = rows % self.grid.dims[1], rows // self.grid.dims[1]
-        _, first, last = self.extents[rows].T.astype(np.int64)
-        return np.array([first.min(), j.min(), k.min()]), np.array([last.max(), j.max(), k.max()])
-
-    def box(self) -> np.ndarray:
-        """(2, 3) box around the vertices inside, grown by one edge: the next carving searches
-        there.
-        """
-        low, high = self.bounds()
-        return np.asarray(self.grid.origin) + self.grid.edge * np.stack([low - 1, high + 1])
+    capped: bool = False
 
 
 class Carver:
@@ -94,89 +61,56 @@ class Carver:
         self.program = dev.program("scene/hull")
         self.cameras = [view.stored_camera for view in views]
         self.least = min(LEAST_SEEING, len(views)) if any(v.has_mask for v in views) else 1
-        words = [-(-c.width // 32) for c in self.cameras]
-        starts = np.cumsum([0, *(c.height * w for c, w in zip(self.cameras, words, strict=True))])
-        self.masks = dev.empty((int(starts[-1]),), np.uint32)
-        table = [
-            (c.width, c.height, w, start)
-            for c, w, start in zip(self.cameras, words, starts[:-1], strict=True)
-        ]
-        for view, (width, height, row_words, start) in zip(views, table, strict=True):
+        table, start = [], 0
+        for camera in self.cameras:
+            words = -(-camera.width // 32)
+            table.append((camera.width, camera.height, words, start))
+            start += words * camera.height
+        self.masks = dev.empty((start,), np.uint32)
+        for view, (width, height, words, first) in zip(views, table, strict=True):
             self.program.launch(
                 "pack_mask",
-                (row_words, height),
+                (words, height),
                 width=width,
                 height=height,
-                words=row_words,
-                first=start,
+                words=words,
+                first=first,
                 threshold=MASK_THRESHOLD,
                 alpha=dev.upload(view.hull_alpha),
                 masks=self.masks,
             )
         self.view_masks = dev.upload(table, np.uint32)
-        self.view_is_whole = dev.upload([_is_whole(view) for view in views], np.uint32)
+        is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
+        self.view_is_whole = dev.upload(is_whole, np.uint32)
 
-    def carve(self, grid: Grid, forgiven: int = 0) -> Carving:
-        """The vertices of a grid that enough images see and no more masks than `forgiven` reject,
-        or the same share of those that see one.
+    def carve(self, grid: Grid, forgiven: int = 0) -> np.ndarray:
+        """(nz, ny, nx) bool: the vertices of a grid that enough images see and no more masks than
+        `forgiven` reject, or the same share of those that see one.
         """
         nx, ny, nz = grid.dims
         rows, words = ny * nz, -(-nx // 32)
-        projections = self.dev.upload(
-            [grid.projection(camera) for camera in self.cameras], np.float32
-        )
+        projections = [grid.projection(camera) for camera in self.cameras]
         bits = self.dev.empty((rows, words), np.uint32)
-        extents = self.dev.empty((rows, 3), np.uint32)
         self.program.launch(
             "carve",
             (words, rows),
             multiply_adds=VERTEX_WORK * 32 * words * rows * len(self.cameras),
             along=1,
-            nx=nx,
             ny=ny,
             rows=rows,
             words=words,
             views=len(self.cameras),
             least=self.least,
             forgiven=forgiven,
-            projections=projections,
+            projections=self.dev.upload(projections, np.float32),
             view_masks=self.view_masks,
             view_is_whole=self.view_is_whole,
             masks=self.masks,
             bits=bits,
         )
-        self.program.launch("row_extents", rows, rows=rows, words=words, bits=bits, extents=extents)
-        return Carving(grid, bits, extents.get())
-
-    def points(self, carving: Carving) -> tuple[Grid, np.ndarray]:
-        """(Grid, (N,) uint32 ascending ids): the smallest grid around the vertices inside, and
-        their ids there.
-        """
-        low, high = carving.bounds()
-        nx, ny, nz = (int(n) for n in high - low + 1)
-        counts = carving.extents[:, 0]
-        rows = len(counts)
-        j, k = np.arange(rows) % carving.grid.dims[1], np.arange(rows) // carving.grid.dims[1]
-        bases = nx * (j - low[1] + ny * (k - low[2])) - low[0]  # wraps below 0; the ids do not
-        ids = self.dev.empty((carving.count,), np.uint32)
-        self.program.launch(
-            "expand_rows",
-            rows,
-            rows=rows,
-            words=carving.bits.shape[1],
-            bits=carving.bits,
-            ids=ids,
-            row_starts=self.dev.upload(np.cumsum(counts) - counts, np.uint32),
-            row_bases=self.dev.upload(bases.astype(np.uint32)),
-        )
-        origin = np.asarray(carving.grid.origin) + carving.grid.edge * low
-        return Grid(tuple(float(x) for x in origin), carving.grid.edge, (nx, ny, nz)), ids.get()
-
-
-def _is_whole(view):
-    """Whether the mask touches no border of its image."""
-    mask = view.hull_alpha > MASK_THRESHOLD
-    return not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
+        found = self.dev.download(bits).view(np.uint8)
+        inside = np.unpackbits(found, axis=1, count=nx, bitorder="little")
+        return inside.view(bool).reshape(nz, ny, nx)
 
 
 def build_grid(
@@ -219,9 +153,7 @@ def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     carver = Carver(dev, _farthest_point_order(near, grid.centre - corner))
-    bits = carver.carve(grid.moved(-corner), forgiven).bits.get()
-    inside = np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")[:, : grid.dims[0]]
-    return np.flatnonzero(inside)
+    return np.flatnonzero(carver.carve(grid.moved(-corner), forgiven))
 
 
 def _box(views, given, forgiven):
@@ -253,25 +185,39 @@ def _search(dev, views, points, box, forgiven, limit):
     carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
 
     def carve(edge):
-        return carver.carve(Grid.centred_in(box, edge).rounded(), forgiven)
+        grid = Grid.centred_in(box, edge).rounded()
+        return _tight(grid, carver.carve(grid, forgiven))
 
     best = last = carve(smallest_edge(box, min(COARSE_CELLS, CELL_CAP)))
-    capped, rounds = False, 0
-    if not last.count:
+    capped, rounds, count = False, 0, len(last.ids)
+    if not count:
         raise UserError(explain_empty_hull(views, box))
-    while rounds < ROUNDS and not points <= last.count <= TOLERANCE * points:
-        box = last.box() if last.count else box
+    while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
+        if count:  # the next carving searches an edge around
+            box = last.grid.box + last.grid.edge * np.array([[-1], [1]])
         if limit is not None:
             box = np.stack([np.maximum(box[0], limit[0]), np.minimum(box[1], limit[1])])
-        wanted = last.grid.edge * (max(last.count, 0.5) / (AIM * points)) ** (1 / 3)
+        wanted = last.grid.edge * (max(count, 0.5) / (AIM * points)) ** (1 / 3)
         edge = max(wanted, smallest_edge(box, CELL_CAP))
         capped = edge > wanted
         if capped and edge > 0.99 * last.grid.edge:
             break  # the box shrinks no more
         last = carve(edge)
-        rounds += 1
-        best = min(best, last, key=lambda c: (c.count < points, abs(c.count - points)))
-    return Hull(*carver.points(best), capped and best.count < points)
+        count, rounds = len(last.ids), rounds + 1
+        best = min(best, last, key=lambda h: (len(h.ids) < points, abs(len(h.ids) - points)))
+    return replace(best, capped=capped and len(best.ids) < points)
+
+
+def _tight(grid, inside):
+    """The Hull of the vertices inside, (nz, ny, nx) bool, on the grid itself if there are none."""
+    if not inside.any():
+        return Hull(grid, np.empty(0, np.uint32))
+    used = [np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 1), (0, 2), (1, 2))]
+    low = np.array([places[0] for places in used])
+    part = inside[tuple(slice(places[0], places[-1] + 1) for places in reversed(used))]
+    origin = np.asarray(grid.origin) + grid.edge * low
+    tight = Grid(tuple(float(x) for x in origin), grid.edge, part.shape[::-1])
+    return Hull(tight, np.flatnonzero(part).astype(np.uint32))
 
 
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
@@ -282,19 +228,15 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
     one grid edge. A range stated by the dataset is kept, but widened to the ball itself, since
     points outside of it would be missing.
     """
-    stated = [view.depth_range for view in views if view.depth_range]
-    grid = hull.grid
+    stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
     half = grid.edge * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
     offsets = np.stack([view.camera.eye for view in views]) - grid.centre
     from_centre = np.linalg.norm(offsets, axis=1)
     from_box = np.linalg.norm(np.maximum(np.abs(offsets) - half, 0), axis=1)
     radius = (1 if stated else DEPTH_MARGIN) * np.linalg.norm(half)
     near = max(from_centre.min() - radius, from_box.min() / 2, grid.edge)
-    far = from_centre.max() + radius
-    return (
-        float(min([near, *(view_near for view_near, _ in stated)])),
-        float(max([far, *(view_far for _, view_far in stated)])),
-    )
+    ranges = np.array([(near, from_centre.max() + radius), *stated])
+    return float(ranges[:, 0].min()), float(ranges[:, 1].max())
 
 
 def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
@@ -311,24 +253,11 @@ def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
     closed.
     """
     gap = math.ceil(spacing_pixels(grid, [camera])) + 1
-    x, y, depth = project(camera, grid.positions(ids))
-    columns, rows = np.floor(x) + gap, np.floor(y) + gap
-    marked = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
-    inside = (depth > 0) & (columns >= 0) & (columns < marked.shape[1])
-    inside &= (rows >= 0) & (rows < marked.shape[0])
-    marked[rows[inside].astype(int), columns[inside].astype(int)] = True
+    wide = camera.crop(-gap, -gap, camera.width + 2 * gap, camera.height + 2 * gap)
+    column, row, is_shown = wide.pixels(grid.positions(ids))
+    marked = np.zeros((wide.height, wide.width), bool)
+    marked[row[is_shown], column[is_shown]] = True
     return closing(marked, disk(gap))[gap:-gap, gap:-gap]
-
-
-def project(camera: Camera, positions: np.ndarray) -> np.ndarray:
-    """(3, N) float64: x and y in pixels and the depth of (N, 3) world positions; those that are not
-    in front of the camera are in its centre.
-    """
-    right, down, depth = camera.pose[:, :3].T @ (positions - camera.eye).T
-    ahead = np.where(depth > 0, depth, np.inf)
-    return np.stack(
-        [camera.fx * right / ahead + camera.cx, camera.fy * down / ahead + camera.cy, depth]
-    )
 
 
 class Agreement(NamedTuple):
@@ -350,11 +279,9 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
     box: as build_grid() takes it. Raises UserError as build_grid() does.
     """
     kept = list(views)
-    left_out: dict[str, Any] = {}
-    if (
-        not any(one.has_mask for one in kept)
-        or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2
-    ):
+    left_out: dict[str, float] = {}
+    is_masked = any(one.has_mask for one in kept)
+    if not is_masked or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
         return Agreement(kept, left_out, 0)
     most = len(kept) // FORGIVING
     while len(left_out) < most:
@@ -376,8 +303,7 @@ def _shares_beside(dev, views, box, forgiven):
     hull = build_grid(dev, views, min(COMPARED_POINTS, CELL_CAP), box, forgiven)
     shares = []
     for view in views:
-        size = view.stored_camera.width, view.stored_camera.height
-        small = replace(view, downscale=fitting_downscale(size, COMPARED_SIZE))
+        small = view.near_size(COMPARED_SIZE)
         camera, k = small.camera, small.downscale
         mask = view.image[: camera.height * k : k, : camera.width * k : k, 3] > 127
         covered = dilation(silhouette(hull.grid, hull.ids, camera), disk(1))

@@ -2,21 +2,22 @@
 scene, and to check that a training resumes with the same photographs.
 """
 
-import base64
 import hashlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from pp_cl.errors import listing
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.readers.common import MOST, numbers
 from pp_cl.scene.views import Photograph, View
 
 STRAIGHT = Distortion()  # of a lens without distortion
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
-POSE, LENS, SIZE, RANGE = 12, 4, 2, 2  # numbers of a kept view; it may have no depth range
-MOST_SIDE, MOST_NUMBER = 2**24, 1e30  # what float32 holds as whole numbers, and as products
+POSE, LENS, RANGE = 12, 6, 2  # numbers of a kept view; it may have no depth range
+MOST_SIDE = 2**24  # what float32 holds as whole numbers
 
 
 def pixel_digest(
@@ -38,40 +39,39 @@ def identity(views: Sequence[View], listed: Sequence[View | Photograph]) -> dict
     """
     made = any(view.digest is None for view in views)
     pixels = None if made else {view.name: view.digest for view in views}
-    kept = [[view.name, packed_camera(view.file_camera, view.depth_range)] for view in views]
+    kept = [[view.name, kept_camera(view.file_camera, view.depth_range)] for view in views]
     return {"scene": fingerprint(listed), "pixels": pixels, "views": kept}
 
 
-def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> str:
-    """A camera and its depth range as text: float64, half as long as in JSON's digits."""
-    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
-    numbers = [*camera.pose.ravel(), *numbers, *(depth_range or ())]
-    return base64.b64encode(np.array(numbers, "<f8").data).decode()
+def kept_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> list[float]:
+    """The numbers of a camera and its depth range, which JSON keeps to the bit."""
+    lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+    return [float(number) for number in (*camera.pose.ravel(), *lens, *(depth_range or ()))]
 
 
 def kept_views(views: Any) -> list[Photograph]:
-    """The training views that identity() has kept. Raises ValueError for what it never makes."""
+    """The training views that identity() has kept. Raises ValueError or TypeError for what it never
+    makes.
+    """
     if not isinstance(views, list) or not views:
         raise ValueError("no list of views")
-    return [_unpacked(view) for view in views]
+    return [_unpacked(*view) for view in views]
 
 
-def _unpacked(view):
-    if not isinstance(view, list) or [type(part) for part in view] != [str, str]:
+def _unpacked(name, stored):
+    values = numbers(stored)
+    is_list = values is not None and values.ndim == 1
+    if type(name) is not str or not is_list or len(values) - (POSE + LENS) not in (0, RANGE):
         raise ValueError("a view without name or camera")
-    numbers = np.frombuffer(base64.b64decode(view[1], validate=True), "<f8")
-    if len(numbers) - (POSE + LENS + SIZE) not in (0, RANGE):
-        raise ValueError(f"a camera of {len(numbers)} numbers")
-    pose, (fx, fy, cx, cy, width, height, *near_far) = numbers[:POSE], numbers[POSE:].tolist()
-    pose = pose.reshape(3, 4).astype(np.float64)
-    turn = pose[:, :3]
-    sides = all(side.is_integer() and 1 <= side <= MOST_SIDE for side in (width, height))
-    if not (np.abs(numbers) < MOST_NUMBER).all() or min(fx, fy) <= 0 or not sides:
+    fx, fy, cx, cy, width, height, *near_far = values[POSE:].tolist()
+    pose = values[:POSE].reshape(3, 4)
+    is_whole = all(side.is_integer() and 1 <= side <= MOST_SIDE for side in (width, height))
+    if not (np.abs(values) < MOST).all() or min(fx, fy) <= 0 or not is_whole:
         raise ValueError("a camera that shows nothing")
-    if not np.allclose(turn.T @ turn, np.eye(3), rtol=0, atol=1e-4):
+    if not np.allclose(pose[:, :3].T @ pose[:, :3], np.eye(3), rtol=0, atol=1e-4):
         raise ValueError("a camera whose axes are not orthonormal")
     camera = Camera(pose, fx, fy, cx, cy, int(width), int(height))
-    return Photograph(view[0], camera, tuple(near_far) or None)
+    return Photograph(name, camera, tuple(near_far) or None)
 
 
 def fingerprint(views: Sequence[View | Photograph]) -> str:
@@ -97,5 +97,4 @@ def difference(
         return "its training views have other names or cameras"
     known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]
-    more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-    return f"{changed[0]}{more}: other pixels, or another mask" if changed else ""
+    return f"{listing(changed)}: other pixels, or another mask" if changed else ""

@@ -8,8 +8,9 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from threading import Lock
 from types import ModuleType
@@ -21,8 +22,8 @@ from tqdm import tqdm
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
-from pp_cl.files.image import ENDINGS, has_alpha, read_mask, read_rgba
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, listing, quoted
+from pp_cl.files.image import has_alpha, read_mask, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
@@ -47,6 +48,7 @@ from pp_cl.scene.views import (
     MIN_SIDE,
     Photograph,
     View,
+    border,
     check_downscale,
     evenly,
     fitting_downscale,
@@ -73,7 +75,7 @@ LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measu
 
 INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
 BESIDE = 0.5  # of what is transparent, that a mask which is not of the object holds
-NO_MASK = "no mask"
+NO_MASK, BAD_MASK = "no mask", "a mask that cannot be used"
 OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
 LEAST_VIEWS = 8  # for training that are left where some are left out
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
@@ -100,16 +102,6 @@ class Scene:
     splits: dict[str, list[View]]
     notes: Sequence[str] = ()
 
-    def reduced(self, downscale: int) -> "Scene":
-        """The same scene, its images reduced `downscale` times. Raises UserError as View.reduced
-        does.
-        """
-        splits = {
-            split: [view.reduced(downscale) for view in views]
-            for split, views in self.splits.items()
-        }
-        return replace(self, splits=splits)
-
 
 def open_scene(
     dev: Device,
@@ -124,30 +116,23 @@ def open_scene(
 
     most, listed, kept: as load_scene() takes them.
     """
-    path, downscale = config.scene.path, config.scene.downscale
+    path, downscale, masks = config.scene.path, config.scene.downscale, mask_rule(config)
     if path == DEMO:
         rendered = {split: demo.demo_views(dev, split, most) for split in splits}
-        return Scene(DEMO, None, rendered).reduced(downscale)
+        return Scene(DEMO, None, _reduced(rendered, downscale))
     scene = load_scene(
-        path,
-        splits,
-        most,
-        mask_rule(config),
-        downscale=downscale,
-        listed=listed,
-        dev=dev,
-        kept=kept,
+        path, splits, most, masks, downscale=downscale, listed=listed, dev=dev, kept=kept
     )
     views = scene.splits.get("train", [])
-    is_box_wanted = most is not None or config.scene.mask_from == "box"
     masked = [view for view in views if view.has_mask]
-    if masked and np.median([_share_of_border(view) for view in masked]) > INVERTED:
+    shares = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked]
+    if masked and np.median(shares) > INVERTED:
         warnings.warn(
             f"{path}: most masks hold the border of their image, as if they were inverted: they"
             " must be white on the object and black around it",
             stacklevel=2,
         )
-    if views and not is_box_wanted and not masked:
+    if views and not masked and most is None and config.scene.mask_from != "box":
         warnings.warn(
             f"{path}: no photograph has a mask: points fill the box that all cameras see;"
             " --mask-from color cuts out a uniform background, --masks FOLDER takes masks,"
@@ -155,13 +140,6 @@ def open_scene(
             stacklevel=2,
         )
     return scene
-
-
-def _share_of_border(view):
-    """Of the image, that the mask holds."""
-    alpha = view.image[..., 3]
-    border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
-    return (border > 127).mean()
 
 
 def mask_rule(config: Config) -> MaskRule:
@@ -257,21 +235,18 @@ def _masked(folder, reader, photographs, notes):
     transforms.json names besides says where images are of use, as nerfstudio takes it.
     """
     named = [one for one in photographs if one.mask]
-    if named and not (reader is transforms and _are_besides(folder, named[0])):
-        return photographs
     if named:
-        notes.done["masks that frames name are taken for where images are of use"] = [
-            one.name for one in named
-        ]
+        if reader is not transforms or not _are_besides(folder, named[0]):
+            return photographs
+        what = "masks that frames name are taken for where images are of use"
+        notes.done[what] = [one.name for one in named]
         photographs = [
             replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in photographs
         ]
     if reader is transforms and has_alpha(folder / photographs[0].name):
         return photographs
-    masks = find_masks(folder, [one.name for one in photographs])
-    if not masks:
-        return photographs
-    if reader is transforms:
+    masks = find_masks(folder, [one.name for one in photographs]) or {}
+    if masks and reader is transforms:
         place = PurePosixPath(next(iter(masks.values()))).parts[0]
         notes.done[f"masks are taken from {folder / place}, which no frame names"] = list(masks)
     return [replace(one, mask=masks.get(one.name)) for one in photographs]
@@ -281,14 +256,13 @@ def _are_besides(folder, photograph):
     """Whether an image has alpha of which the mask that its frame names is no part, or the scene
     has a folder of masks in which that mask does not lie.
     """
-    place = folder_named(folder, MASK_FOLDERS)
+    place, image = folder_named(folder, MASK_FOLDERS), folder / photograph.name
     if place and not photograph.mask.startswith(f"{place}/"):
         return True
     with suppress(UserError):
-        if has_alpha(folder / photograph.name):
-            alpha = read_rgba(folder / photograph.name)[..., 3]
-            mask = of_size(read_mask(folder / photograph.mask), alpha.shape[::-1], folder)
-            outside = alpha < OPAQUE // 2
+        if has_alpha(image):
+            outside = read_rgba(image)[..., 3] < OPAQUE // 2
+            mask = of_size(read_mask(folder / photograph.mask), outside.shape[::-1], folder)
             return bool(outside.any() and (mask[outside] > OPAQUE // 2).mean() > BESIDE)
     return False
 
@@ -297,40 +271,42 @@ def _ignoring(folder, places, photographs, split):
     """The photographs, with the masks of what says nothing that lie in one of the places in a
     folder. Raises UserError where a place has none for any training photograph.
     """
-    with suppress(UserError) if split != "train" else nullcontext():
+    try:
         found = find_masks(folder, [one.name for one in photographs], places) or {}
-        return [
-            replace(one, ignore=str(folder.absolute() / found[one.name]), ignores_black=False)
-            if one.name in found
-            else one
-            for one in photographs
-        ]
-    return photographs
+    except UserError:
+        if split == "train":
+            raise
+        return photographs
+    files = {name: str(folder.absolute() / mask) for name, mask in found.items()}
+    return [
+        replace(one, ignore=files[one.name], ignores_black=False) if one.name in files else one
+        for one in photographs
+    ]
 
 
 def _checked(folder, photograph):
-    """The photograph. Raises Unusable for a camera that shows nothing in float32, and where its
+    """The photograph; an Unusable for a camera that shows nothing in float32, and where its
     distortion folds.
     """
     image, camera = folder / photograph.name, photograph.camera
     focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    if not LEAST_FOCAL <= min(focal) <= max(focal) <= MOST_FOCAL:
-        what, least = f"focal lengths of {focal[0]:.3g} and {focal[1]:.3g}", LEAST_FOCAL
-    elif not -MOST_FOCAL <= min(middle) <= max(middle) <= MOST_FOCAL:
-        what, least = f"its principal point at {middle[0]:.3g}, {middle[1]:.3g}", -MOST_FOCAL
-    elif photograph.distortion.folds(camera):
-        raise Unusable(
+    for what, values, least in (
+        ("focal lengths", focal, LEAST_FOCAL),
+        ("a principal point", middle, -MOST_FOCAL),
+    ):
+        if not least <= min(values) <= max(values) <= MOST_FOCAL:
+            return Unusable(
+                f"{image}: its camera has {what} of {values[0]:.3g} and {values[1]:.3g} pixels,"
+                f" which must be {least:g} to {MOST_FOCAL:g}; correct the scene's file of cameras",
+                BROKEN_CAMERA,
+            )
+    if photograph.distortion.folds(camera):
+        return Unusable(
             f"{image}: its distortion coefficients fold the image over; correct them, or undistort"
             " the images with the program that found them",
             "distortion that folds",
         )
-    else:
-        return photograph
-    raise Unusable(
-        f"{image}: its camera has {what} pixels, which must be {least:g} to {MOST_FOCAL:g}; correct"
-        " the scene's file of cameras",
-        BROKEN_CAMERA,
-    )
+    return photograph
 
 
 def preset_downscale(path: str, preset: str) -> int:
@@ -372,8 +348,12 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
-    if not os.access(folder, os.R_OK | os.X_OK):
+    if not _is_readable(folder):
         raise UserError(f"{folder}: cannot be read; check its permissions")
+
+
+def _is_readable(folder):
+    return os.access(folder, os.R_OK | os.X_OK)
 
 
 def _reader_of(folder):
@@ -384,19 +364,16 @@ def _found_instead(folder):
     """What is in a folder without a scene, and where one is, in words."""
     inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     for near in (*folder.absolute().parents[:2], *filter(Path.is_dir, inside[:NEARBY])):
-        if os.access(near, os.R_OK | os.X_OK) and (reader := _reader_of(near)):
+        if _is_readable(near) and (reader := _reader_of(near)):
             return f"; {near} is one ({reader.FILES}); give that"
-    pictures = sum(entry.suffix.lower() in ENDINGS for entry in inside)
-    others = [quoted(e.name, 40) for e in inside if e.suffix.lower() not in ENDINGS]
-    found = [f"{pictures} image{'s' * (pictures > 1)}"] * bool(pictures) + others[:3]
-    found = ", ".join(found) + f" and {len(others) - 3} more" * (len(others) > 3)
     for file in (entry for entry in inside if entry.suffix.lower() == ".json"):
         with suppress(UserError):
             if isinstance(data := read_json(file), dict) and "frames" in data:
                 return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
+    found = listing([quoted(entry.name, 40) for entry in inside]) or "nothing"
     return (
-        f": {found or 'nothing'}, but no file of cameras that is known, such as"
-        " transforms.json or sparse/0; `pp-cl capture` makes one of photographs"
+        f": {found}, but no file of cameras that is known, such as transforms.json or sparse/0;"
+        " `pp-cl capture` makes one of photographs"
     )
 
 
@@ -425,50 +402,57 @@ def load_scene(
     folder, listed, lines = Path(path), listed or {}, []
     chosen = {}
     for split in splits:
-        listing = listed.get(split) or list_split(folder, split)
-        chosen[split] = evenly(listing.photographs, most)
-        lines += [f"{split}: {line}" for line in listing.notes]
+        frames, notes = listed.get(split) or list_split(folder, split)
+        chosen[split] = evenly(frames, most)
+        lines += [f"{split}: {line}" for line in notes]
         if masks.ignore:
             if not os.path.isdir(masks.ignore):
                 raise UserError(f"{masks.ignore}: no such folder; --ignore takes one of masks")
             chosen[split] = _ignoring(Path(masks.ignore), ["."], chosen[split], split)
     photographs = [one for some in chosen.values() for one in some]
-    _check_alike(folder, photographs)
-    if downscale:
-        for one in photographs:
-            check_downscale(one.name, one.camera, downscale)
+    _check_alike(folder, photographs, downscale)
     factor = shrink_factor(_sizes(photographs), downscale or 1)
     if dev is None and any(one.distortion for one in photographs):
         dev = open_device()
-    lock = Lock()
+    read = partial(_read_view, _Reducer(dev, factor), folder, masks, kept if factor > 1 else None)
     with ThreadPoolExecutor(reading(photographs, masks, factor)[0]) as pool:
-        reads = pool.map(
-            lambda one: _read_view(dev, lock, folder, one, masks, factor, kept), photographs
-        )
-        bar = tqdm(
-            reads, "reading images", len(photographs), unit="image", leave=False, disable=None
-        )
+        reads, count = pool.map(read, photographs), len(photographs)
+        bar = tqdm(reads, "reading images", count, unit="image", leave=False, disable=None)
         found = list(bar)
+    views: dict[str, list[View]] = {}
     is_some = any(isinstance(view, View) and view.is_masked for view in found)
     if masks.folder and not is_some:
         named_mask(Path(masks.folder), photographs[0].name)
-    read, left = {}, iter(found)
+    left = iter(zip(photographs, found, strict=True))
     for split, some in chosen.items():
-        notes, is_whole = Notes(), split == "train" and most is None
-        pairs = [(folder, one, next(left), masks if is_some else None) for one in some]
-        read[split] = list(notes.usable(pairs, lambda all: _usable(*all), lambda all: all[1].name))
-        notes.check(len(read[split]), LEAST_VIEWS if is_whole else 1)
-        if is_whole and NO_MASK in notes.left_out:
-            bare = [view for _, one, view, _ in pairs if one.name in notes.left_out[NO_MASK]]
+        told, is_whole = Notes(), split == "train" and most is None
+        bare: list[View] = []
+
+        def used(pair, bare=bare):
+            photograph, view = pair
+            if isinstance(view, Unusable) or view.is_masked or not is_some:
+                return view
+            bare.append(view)
+            return _lacks_mask(folder, photograph.name, masks)
+
+        pairs = [next(left) for _ in some]
+        usable = list(told.usable(pairs, used, lambda pair: pair[0].name))
+        told.check(len(usable), LEAST_VIEWS if is_whole else 1)
+        if is_whole and bare:
             with suppress(UserError):  # else they stay left out
-                filled = within_silhouettes(dev or open_device(), read[split], bare)
-                notes.done[OF_OTHERS] = notes.left_out.pop(NO_MASK)
+                usable += within_silhouettes(dev or open_device(), usable, bare)
+                told.done[OF_OTHERS] = told.left_out.pop(NO_MASK)
                 order = {one.name: i for i, one in enumerate(some)}
-                read[split] = sorted([*read[split], *filled], key=lambda view: order[view.name])
-        lines += [f"{split}: {line}" for line in notes.lines(len(read[split]))]
+                usable.sort(key=lambda view: order[view.name])
+        views[split] = usable
+        lines += [f"{split}: {line}" for line in told.lines(len(usable))]
     _tell(folder, lines)
-    scene = Scene(folder.resolve().name, folder, read, lines)
-    return scene.reduced(downscale // factor) if downscale else scene
+    views = _reduced(views, downscale // factor) if downscale else views
+    return Scene(folder.resolve().name, folder, views, lines)
+
+
+def _reduced(splits, downscale):
+    return {split: [view.reduced(downscale) for view in views] for split, views in splits.items()}
 
 
 def reading(
@@ -490,8 +474,8 @@ def _sizes(photographs):
     return [(one.camera.width, one.camera.height) for one in photographs]
 
 
-def _check_alike(folder, photographs):
-    """Raise UserError if only some photographs have a depth range."""
+def _check_alike(folder, photographs, downscale):
+    """Raise UserError if only some photographs have a depth range, or one cannot be reduced."""
     first = photographs[0]
     for one in photographs:
         if (one.depth_range is None) != (first.depth_range is None):
@@ -499,19 +483,18 @@ def _check_alike(folder, photographs):
                 f"{folder}: near and far are given for only one of {first.name} and {one.name}; "
                 "give them for all views or for none"
             )
+        if downscale:
+            check_downscale(one.name, one.camera, downscale)
 
 
-def _usable(folder, photograph, view, masks):
-    """The view of a photograph that was read. masks: by which others have one. Raises Unusable."""
-    if isinstance(view, Unusable):
-        raise view
-    if masks is None or view.is_masked:
-        return view
-    with _unusable(NO_MASK):
+def _lacks_mask(folder, name, masks):
+    """The Unusable of a view that has no mask, where others have one."""
+    try:
         if masks.folder:
-            named_mask(Path(masks.folder), photograph.name)
-        image = folder / photograph.name
-        raise UserError(f"{image}: has no mask, as others have; add it, or remove all")
+            named_mask(Path(masks.folder), name)
+        raise UserError(f"{folder / name}: has no mask, as others have; add it, or remove all")
+    except UserError as error:
+        return Unusable(error, NO_MASK)
 
 
 @contextmanager
@@ -520,36 +503,44 @@ def _unusable(why):
     try:
         yield
     except UserError as error:
-        raise Unusable(str(error), why) from error
+        raise Unusable(error, why) from error
 
 
-def _read_view(dev, lock, folder, photograph, masks, factor, kept):
-    """The View of a photograph, with its mask, free of distortion and reduced `factor` times; the
-    error of a view that cannot be used. lock: held by the one of several threads that uses the
-    device.
+class _Reducer:
+    """Frees images of distortion and reduces them `factor` times, for several threads."""
+
+    def __init__(self, dev, factor):
+        self.dev, self.factor, self._lock = dev, factor, Lock()
+
+    def __call__(self, image, photograph):
+        if not photograph.distortion:
+            return shrink(image, self.factor)
+        with self._lock:  # one of the threads uses the device
+            camera, lens = photograph.camera, photograph.distortion
+            return undistort(self.dev, image, camera, lens, self.factor)
+
+
+def _read_view(reduced, folder, masks, kept, photograph):
+    """The View of a photograph, with its mask, free of distortion and reduced; an Unusable where it
+    cannot be used.
     """
-    file, camera, lens = folder / photograph.name, photograph.camera, photograph.distortion
+    camera, factor = photograph.camera, reduced.factor
+    file, mask = folder / photograph.name, None
+    with suppress(UserError):  # of a folder that lacks it
+        mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
+    ignore = photograph.ignore and folder / photograph.ignore
+    found = kept and kept.find(photograph, [file, mask, ignore], (masks, factor))
     try:
-        mask = None
-        with suppress(UserError):  # of a folder that lacks it
-            mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
-        ignore = photograph.ignore and folder / photograph.ignore
-        files = [file, mask, ignore]
-        found = kept and factor > 1 and kept.find(photograph, files, (masks, factor))
-        with _unusable("a mask that cannot be used"):
-            ignored = _read_ignored(dev, lock, ignore, photograph, factor) if ignore else None
+        with _unusable(BAD_MASK):
+            ignored = _read_ignored(reduced, ignore, photograph) if ignore else None
         if found:
             image, digest = found
         else:
             image = read_rgba(file, (camera.width, camera.height))
-            with _unusable("a mask that cannot be used"):
+            with _unusable(BAD_MASK):
                 image = masks.apply(image, mask)
-            digest = pixel_digest(image, lens, ignored)
-            if lens:
-                with lock:
-                    image = undistort(dev, image, camera, lens, factor)
-            else:
-                image = shrink(image, factor)
+            digest = pixel_digest(image, photograph.distortion, ignored)
+            image = reduced(image, photograph)
             if masks.is_by_colour:
                 with _unusable("no uniform background"):
                     image = cut_out(image, photograph.name, masks.tolerance)
@@ -568,22 +559,14 @@ def _read_view(dev, lock, folder, photograph, masks, factor, kept):
         is_masked=mask is not None,
         ignored=ignored,
     )
-    if kept and factor > 1 and not found:
+    if kept and not found:
         kept.take(view)
     return view
 
 
-def _read_ignored(dev, lock, file, photograph, factor):
-    """(H // factor, W // factor) bool: the pixels of a view that a mask says nothing is known of,
-    in part or wholly.
-    """
+def _read_ignored(reduced, file, photograph):
+    """(H, W) bool: the pixels of a view that a mask says nothing is known of, in part or wholly."""
     camera = photograph.camera
     mask = of_size(read_mask(file), (camera.width, camera.height), file) > OPAQUE // 2
     mask = np.where(mask != photograph.ignores_black, np.uint8(OPAQUE), np.uint8(0))
-    image = np.dstack([mask] * 4)
-    if photograph.distortion:
-        with lock:
-            image = undistort(dev, image, camera, photograph.distortion, factor)
-    else:
-        image = shrink(image, factor)
-    return image[..., 3] > MASK_THRESHOLD
+    return reduced(np.dstack([mask] * 4), photograph)[..., 3] > MASK_THRESHOLD

@@ -13,6 +13,7 @@ from skimage.measure import label
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_mask, same_shape
 from pp_cl.scene.readers.found import mask_names
+from pp_cl.scene.views import border
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = 255
@@ -106,9 +107,9 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
     colours.
     """
     colour = image[..., :3] / 255.0
-    behind = np.median(_border(colour), axis=0)
+    behind = np.median(border(colour), axis=0)
     distance = np.linalg.norm(rgb2lab(colour) - rgb2lab(behind), axis=2)
-    share = (_border(distance) < 2 * tolerance).mean()
+    share = (border(distance) < 2 * tolerance).mean()
     if share < BORDER_SHARE:
         raise UserError(
             f"{name}: only {share:.0%} of its border have one colour, so --mask-from color finds no"
@@ -127,11 +128,6 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
     return (255 * rgba + 0.5).astype(np.uint8)
 
 
-def _border(image):
-    """The pixels of the outermost rows and columns, (N, ...)."""
-    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
-
-
 def _share_of(mixture, front, behind):
     """The share in [0, 1] of the front in mixtures of two colours, (H, W)."""
     step = front - behind
@@ -144,7 +140,7 @@ def _regions(places, with_holes):
     enough for holes.
     """
     regions = label(places, connectivity=1)
-    kept = np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]])
+    kept = border(regions)
     if with_holes:
         large = np.flatnonzero(np.bincount(regions.ravel()) > HOLE * regions.size)
         kept = np.append(kept, large)

@@ -16,7 +16,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, silhouette
 from pp_cl.scene.target import Target
-from pp_cl.scene.views import MASK_THRESHOLD, View, evenly, fitting_downscale, shrink
+from pp_cl.scene.views import MASK_THRESHOLD, View, evenly, shrink
 
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
@@ -45,8 +45,7 @@ def picture(
     others = [view for view in views if view.name not in tinted]
     shown = [one.view for one in tinted.values()] + evenly(others, SHOWN_VIEWS - len(tinted))
     for view in shown:
-        size = view.stored_camera.width, view.stored_camera.height
-        small = view.reduced(fitting_downscale(size, SHOWN_SIZE))
+        small = view.near_size(SHOWN_SIZE)
         image = to_8bit(target.whole(small))
         if view.name in tinted:
             rejected = silhouette(*tinted[view.name][2:], small.camera)

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.scene.hull import agreeing, build_grid, silhouette
-from pp_cl.scene.views import View, fitting_downscale
+from pp_cl.scene.views import View
 
 POINTS, SIDE = 250_000, 400  # of the hull, and pixels of the images in which it is looked at
 # The rim of a silhouette that is ignored: the hull is larger than the object, by 1 to 4 % of its
@@ -33,14 +33,14 @@ def within_silhouettes(dev: Device, views: Sequence[View], bare: Sequence[View])
     hull = build_grid(dev, agreement.views, POINTS)
     filled = []
     for view in bare:
-        size = view.stored_camera.width, view.stored_camera.height
-        small = replace(view, downscale=fitting_downscale(size, SIDE))
+        small = view.near_size(SIDE)
         covered = silhouette(hull.grid, hull.ids, small.camera)
         side = max(covered.shape)
         is_inside = _distance(covered) > INWARD * side
         is_outside = _distance(~covered) > max(OUTWARD * side, 1)
         inside, rim = (
-            _enlarged(a, size, small.downscale) for a in (is_inside, ~is_inside & ~is_outside)
+            _enlarged(a, view.image.shape, small.downscale)
+            for a in (is_inside, ~is_inside & ~is_outside)
         )
         image, ignored = view.image.copy(), rim if view.ignored is None else rim | view.ignored
         image[..., 3] = np.where(inside, image[..., 3], 0)
@@ -58,8 +58,8 @@ def _distance(covered):
     return distance_transform_edt(covered)
 
 
-def _enlarged(values, size, times):
-    """(H, W) of the pixels of a reduced image, for those of the image of a (width, height)."""
+def _enlarged(values, shape, times):
+    """(H, W) of the pixels of a reduced image, for those of the image of a shape (H, W, 4)."""
     whole = values.repeat(times, axis=0).repeat(times, axis=1)
-    beyond = [(0, n - m) for n, m in zip(size[::-1], whole.shape, strict=True)]
+    beyond = [(0, n - m) for n, m in zip(shape, whole.shape, strict=False)]
     return np.pad(whole, beyond, mode="edge")

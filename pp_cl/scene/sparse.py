@@ -3,6 +3,7 @@ names.
 """
 
 import os
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from plyfile import PlyData
 from pp_cl.errors import UserError
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.readers import colmap, transforms
-from pp_cl.scene.readers.common import MOST, fail_at, read_json
+from pp_cl.scene.readers.common import MOST, fail_at, numbers, read_json
 from pp_cl.scene.readers.found import find_image
 
 MOST_POINTS = 2**20  # that are read
@@ -31,41 +32,18 @@ def sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         if os.path.isfile(folder / named):
             return _read_ply(folder / find_image(folder, named, fail_at(file)))
     model = colmap.model_folder(folder)
-    if model is None:
-        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
-    points, colours = _read_model(model)
-    if isinstance(shared, dict) and shared.get("applied_transform"):
-        points = points @ _applied(shared["applied_transform"], file)
-    return points[:, :3], colours
-
-
-def _applied(rows, file):
-    """(4, 3): from COLMAP's world, (x, y, z, 1), to that of nerfstudio's frames."""
-    try:
-        matrix = np.array(rows, np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape not in ((3, 4), (4, 4)) or not (np.abs(matrix) < MOST).all():
-        raise fail_at(file, "applied_transform")("must be 3 rows of 4 numbers; correct it")
-    return matrix[:3].T
-
-
-def _read_model(folder):
-    """((N, 4) positions with 1 added, (N, 3) colours) of points3D.bin or points3D.txt."""
-    binary, text = folder / "points3D.bin", folder / "points3D.txt"
-    rows = []
-    if binary.is_file():
-        rows = _bounded(colmap.binary_points(binary))
-    elif text.is_file():
-        rows = _bounded(colmap.text_points(text))
-    table = np.array(rows, np.float64).reshape(-1, 6)
+    rows = colmap.read_points(model) if model else ()
+    table = np.array(list(islice(rows, MOST_POINTS)), np.float64).reshape(-1, 6)
     if not (np.abs(table) < MOST).all():
-        raise UserError(f"{folder}: its points3D hold NaN, Inf or a huge number; copy it again")
-    return np.pad(table[:, :3], ((0, 0), (0, 1)), constant_values=1), _bytes(table[:, 3:])
-
-
-def _bounded(rows):
-    return [row for _, row in zip(range(MOST_POINTS), rows, strict=False)]
+        raise UserError(f"{model}: its points3D hold NaN, Inf or a huge number; copy it again")
+    points = table[:, :3]
+    if isinstance(shared, dict) and (stated := shared.get("applied_transform")):
+        # from COLMAP's world to that of nerfstudio's frames
+        matrix = numbers(stated[:3] if isinstance(stated, list) else stated, (3, 4))
+        if matrix is None:
+            raise fail_at(file, "applied_transform")("must be 3 rows of 4 numbers; correct it")
+        points = points @ matrix[:, :3].T + matrix[:, 3]
+    return points, _bytes(table[:, 3:])
 
 
 def _bytes(colours):

@@ -25,7 +25,6 @@ LEAST_SHARE = 0.75  # of the size that a preset is made for: further down, detai
 # number, not what happens to be free: the same command gives the same bits on every machine.
 KEPT_BYTES = 2**29
 Item = TypeVar("Item")
-ROWS = 16  # of the smaller image at a time: what is summed stays in a cache
 
 
 @dataclass(frozen=True)
@@ -140,6 +139,11 @@ class View:
         check_downscale(self.name, self.file_camera, asked)
         return replace(self, downscale=downscale)
 
+    def near_size(self, side: int) -> "View":
+        """The same photograph reduced to about `side` pixels, as fitting_downscale() has it."""
+        size = self.stored_camera.width, self.stored_camera.height
+        return replace(self, downscale=fitting_downscale(size, side))
+
     def crop_camera(
         self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
     ) -> Camera:
@@ -225,32 +229,22 @@ def shrink(image: np.ndarray, factor: int) -> np.ndarray:
     if factor == 1:
         return image
     height, width = image.shape[0] // factor, image.shape[1] // factor
-    small = np.empty((height, width, 4), np.uint8)
-    for first in range(0, height, ROWS):
-        last = min(first + ROWS, height)
-        _write_means(image[factor * first : factor * last, : factor * width], small[first:last])
+    small, area = np.empty((height, width, 4), np.uint8), factor**2
+    columns = np.arange(0, factor * width, factor)
+    for row in range(height):
+        block = image[factor * row : factor * (row + 1), : factor * width].astype(np.uint16)
+        alpha = block[..., 3:]
+        block[..., :3] *= alpha
+        sums = np.add.reduceat(block.sum(0, dtype=np.uint32), columns, axis=0)
+        opacity = sums[:, 3:]
+        small[row, :, :3] = (sums[:, :3] + opacity // 2) // np.maximum(opacity, 1)
+        small[row, :, 3:] = (opacity + area // 2) // area
     return small
 
 
-def _write_means(image, small):
-    """shrink() of an image that blocks fill, into `small`."""
-    alpha = np.ascontiguousarray(image[..., 3])
-    opacity, area = _sums(alpha, small.shape[:2]), image[..., 0].size // small[..., 0].size
-    for i in range(3):
-        colour = _sums(np.multiply(image[..., i], alpha, dtype=np.uint16), small.shape[:2])
-        small[..., i] = (colour + opacity // 2) // np.maximum(opacity, 1)
-    small[..., 3] = (opacity + area // 2) // area
-
-
-def _sums(values, shape):
-    """uint32 sums of the blocks of one channel, of which there are `shape`: over rows first, whose
-    values lie side by side.
-    """
-    rows, columns = shape
-    values = values.reshape(rows, -1, values.shape[1]).sum(1, dtype=np.uint32)
-    return np.add.reduceat(
-        values, np.arange(0, values.shape[1], values.shape[1] // columns), axis=1
-    )
+def border(image: np.ndarray) -> np.ndarray:
+    """(N, ...) the pixels of the outermost rows and columns of an image (H, W, ...)."""
+    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
 
 
 def evenly(items: Sequence[Item], most: int | None) -> list[Item]:

@@ -9,10 +9,10 @@ import numpy as np
 
 from pp_cl.config import RANDOM, Config, load_config, text_of
 from pp_cl.device.device import Device
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, listing
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.network.unet import UNet
-from pp_cl.scene.agreement import disagreements, listing
+from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import Agreement, Hull, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import DEMO, scene_box
 from pp_cl.scene.outline import picture

@@ -1,5 +1,7 @@
 """Paths around an object: smooth, upright, and with the whole object in view."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.ball_views import CENTRE, ball_camera
@@ -11,18 +13,8 @@ from pp_cl.scene.camera_path import MARGIN, Surroundings, looked_at, through, up
 
 def turned(cameras, rotation, shift):
     """The cameras in a world that was turned and moved."""
-    return [
-        Camera(
-            np.column_stack([rotation @ c.pose[:, :3], rotation @ c.eye + shift]),
-            c.fx,
-            c.fy,
-            c.cx,
-            c.cy,
-            c.width,
-            c.height,
-        )
-        for c in cameras
-    ]
+    poses = [np.column_stack([rotation @ c.pose[:, :3], rotation @ c.eye + shift]) for c in cameras]
+    return [replace(camera, pose=pose) for camera, pose in zip(cameras, poses, strict=True)]
 
 
 @pytest.fixture

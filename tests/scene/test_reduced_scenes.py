@@ -1,6 +1,5 @@
 """Photographs that are reduced while they are read: numbers, choice, what a training sees."""
 
-import hashlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +9,8 @@ from support.scenes import write_ball_scene
 from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.identity import difference, fingerprint, identity
+from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import load_scene, open_scene, scene_frames
-from pp_cl.scene.target import Target
 from pp_cl.scene.views import KEPT_BYTES, kept_bytes, shrink, shrink_factor
 
 PHONE = (4000, 3000)
@@ -32,10 +30,6 @@ def test_blocks_become_their_mean(rng, factor):
         colour = (block[..., :3] * alpha[..., None]).sum((0, 1)) / max(alpha.sum(), 1)
         expected = image[y, x] if factor == 1 else [*colour, alpha.mean()]
         assert np.abs(small[y, x] - expected).max() <= 0.5 + 1e-9
-
-
-def test_white_stays_white_in_the_largest_blocks():
-    assert (shrink(np.full((130, 64, 4), 255, np.uint8), 64) == 255).all()
 
 
 @pytest.mark.parametrize(
@@ -92,24 +86,11 @@ def test_a_large_scene_is_kept_reduced_and_stays_itself(dev, scene, monkeypatch)
         assert same(view.camera, before.camera)  # exact, since 2 is a power of two
         assert same(view.file_camera, before.stored_camera)
         assert before.file_camera is before.stored_camera
-        assert view.digest == hashlib.sha256(pixels.tobytes()).hexdigest()[:16]
-    assert identity(views, views) == identity(whole, whole)
-    assert fingerprint(views) == fingerprint(scene_frames(scene))
     header = identity(whole, whole)
+    assert identity(views, views) == header
     assert difference(header, scene_frames(scene), views) == ""
     moved = views[0].moved((1, 2, 3))
     assert same(moved.file_camera, whole[0].moved((1, 2, 3)).stored_camera)
-
-
-def test_targets_of_a_large_scene_are_within_its_rounding(dev, scene, monkeypatch):
-    whole = opened(dev, scene, 4)
-    large(monkeypatch)
-    target = Target(dev)
-    for view, before in zip(opened(dev, scene, 4), whole, strict=True):
-        images = [target.whole(one) for one in (view, before)]
-        error = np.abs(images[0] - images[1])
-        # alpha and colour are rounded by half a level each
-        assert error.max() <= 1 / 255 and error.mean() < 0.2 / 255
 
 
 def test_pixels_stay_as_stored_where_nothing_is_reduced(dev, scene, monkeypatch):

@@ -11,7 +11,7 @@ from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import opened_checkpoint, save_checkpoint
 from pp_cl.scene.demo import demo_frames
-from pp_cl.scene.identity import packed_camera
+from pp_cl.scene.identity import kept_camera
 from pp_cl.training.checkpoint import load_run_state, stored_forms
 from pp_cl.training.exposure import decided_at
 
@@ -19,7 +19,7 @@ POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
     "pixels": None,
     "scene": "5ce0e",
-    "views": [[one.name, packed_camera(one.camera)] for one in demo_frames("train")[:3]],
+    "views": [[one.name, kept_camera(one.camera)] for one in demo_frames("train")[:3]],
     "step": STEP,
     "finished": False,
     "initial_points": 50,

@@ -40,6 +40,9 @@ REFUSED = {
     f"{name}, splits": (name, {"train": MANY[:6], "test": MANY[6:]}, "--hold-out")
     for name in ("colmap", "llff", "neus")
 } | {
+    "co3d, train alone": ("co3d", {"train": views()}, "--hold-out"),
+    "co3d, no test": ("co3d", {"train": views(), "val": views()}, "--hold-out"),
+    "co3d, split": ("co3d", dict.fromkeys(("train", "test", "eval"), views()), "--hold-out"),
     "nsvf, lenses": ("nsvf", held_out(views()), "one camera for all"),
     "nsvf, val alone": ("nsvf", {"val": views(alike=True)}, "no val without test"),
     "nsvf, split": ("nsvf", {"eval": views(alike=True)}, "knows the splits train, val, test"),

@@ -21,7 +21,7 @@ from pp_cl.scene.readers.common import (
     MOST,
     SPLITS,
     hold_out,
-    listing,
+    progress,
     read_json,
 )
 from pp_cl.scene.readers.found import Notes, find_image
@@ -33,7 +33,7 @@ ANNOTATIONS = "frame_annotations.jgz"
 # characters of a file of annotations, and frames in it: the largest category has less than half
 MOST_TEXT, MOST_FRAMES = 2**30, 2**20
 MOST_KEPT = 2**22  # characters of the frames of one sequence: 3,500 of them
-SPACES = re.compile(r"\s*")
+BETWEEN = re.compile(r"[\s,\[]*")  # objects of a list
 PIECE = 2**18  # characters that are unpacked at once; a frame takes some 1,200
 # PyTorch3D: x left, y up, z forwards; OpenCV: x right, y down, z forwards
 CV_FROM_P3D = np.diag([-1.0, -1.0, 1.0])
@@ -64,23 +64,18 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     folder = _whole(folder)
     file, listed = folder.parent / ANNOTATIONS, _set_list(folder)
     frames = [
-        Frame(file, {}, own, index, "frames")
+        Frame(file, {}, own, index)
         for index, own in _annotations(file, folder.name, file.stat().st_mtime_ns)
     ]
     if not frames:
         raise UserError(f"{file}: has no frame of the sequence {folder.name}; give another folder")
-    shown = [frame for frame in frames if _mass(frame) != 0]
-    numbered = sorted((_number(frame), frame.index, frame) for frame in shown)
-    chosen = [frame for _, _, frame in numbered]
+    chosen = sorted((frame for frame in frames if _mass(frame) != 0), key=_number)
     if listed is None:
         chosen = hold_out(chosen, split)
     else:
         chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
-    return list(
-        notes.usable(
-            listing(chosen), partial(_photograph, folder), lambda one: f"frame {one.index}"
-        )
-    )
+    read = partial(_photograph, folder)
+    return list(notes.usable(progress(chosen), read, lambda one: f"frame {one.index}"))
 
 
 def _whole(folder):
@@ -113,27 +108,27 @@ def _objects(opened):
     """(object, characters of it) of a JSON list of objects in a text file, one after the other.
     Raises ValueError for anything else, or more than MOST_TEXT characters.
     """
-    decode, text, at, left = json.JSONDecoder().raw_decode, "", 0, MOST_TEXT
-    due = "["  # what may come next, besides spaces
-    while due:
-        spaces = SPACES.match(text, at)
-        at = spaces.end()
-        if len(spaces[0]) >= PIECE:
-            raise ValueError(f"{PIECE} spaces in a row")
-        if len(text) - at < PIECE and (piece := opened.read(PIECE)):
-            left -= len(piece)
-            if left < 0:
-                raise ValueError(f"more than {MOST_TEXT} characters")
-            text, at = text[at:] + piece, 0
-        elif at == len(text) or text[at] not in due:
-            raise ValueError("is no list of annotations")
-        elif text[at] == "{":
+    decode, text, at = json.JSONDecoder().raw_decode, opened.read(PIECE), 0
+    left = MOST_TEXT - len(text)
+    if not text.lstrip().startswith("["):
+        raise ValueError("is no list of annotations")
+    while True:
+        piece = opened.read(PIECE) if len(text) - at < PIECE else ""
+        left -= len(piece)
+        if left < 0:
+            raise ValueError(f"more than {MOST_TEXT} characters")
+        text, at = text[at:] + piece, 0
+        at = BETWEEN.match(text).end()
+        if text[at:].startswith("]"):
+            return
+        if at < len(text):
             own, end = decode(text, at)
+            if not isinstance(own, dict):
+                raise ValueError("is no list of annotations")
             yield own, end - at
-            at, due = end, ",]"
-        else:
-            due = {"[": "{]", ",": "{", "]": ""}[text[at]]
-            at += 1
+            at = end
+        elif not piece:
+            raise ValueError("ends too early")
 
 
 def _number(frame):
@@ -148,8 +143,7 @@ def _mass(frame):
     mask = frame.get("mask")
     if not isinstance(mask, dict):
         return None
-    own = Frame(frame.file, {}, mask, frame.index, "mask of frame ")
-    return own.number("mass", above=-1)
+    return Frame(frame.file, {}, mask, frame.index, "mask of frame ").number("mass", above=-1)
 
 
 def _path(frame, key):
@@ -162,22 +156,18 @@ def _path(frame, key):
 
 
 def _photograph(folder, frame):
-    name, mask = (_found(folder, frame, key) for key in ("image", "mask"))
+    name = _found(folder, frame, "image")
+    mask = _found(folder, frame, "mask") if frame.get("mask") is not None else None
     size = image_size(folder / name)
     stated = frame.get("image").get("size")
-    if stated is not None and stated != [size[1], size[0]]:
-        raise frame.error(
-            "image",
-            f"has the size {quoted(stated, 40)} (height, width), but {name} has"
-            f" {size[0]}x{size[1]}",
-        )
+    if stated not in (None, [size[1], size[0]]):
+        there = f"but {name} has {size[0]}x{size[1]}; copy it again"
+        raise frame.error("image", f"has the size {quoted(stated, 40)} (height, width), {there}")
     return Photograph(name, _camera(frame, size), mask=mask)
 
 
 def _found(folder, frame, key):
-    """Path of an image relative to the sequence's folder; None where the frame has no mask."""
-    if key == "mask" and frame.get(key) is None:
-        return None
+    """Path of an image or mask relative to the sequence's folder."""
     path, fail = PurePosixPath(_path(frame, key)), partial(frame.error, key)
     if path.parts[:2] != (folder.parent.name, folder.name):
         raise fail(f"{str(path)!r} is not in {folder.parent.name}/{folder.name}; move it there")
@@ -188,7 +178,7 @@ def _camera(frame, size):
     """The Camera of a viewpoint: x_camera = x_world R + T, in PyTorch3D's axes."""
     own = frame.get("viewpoint")
     if not isinstance(own, dict):
-        raise Unusable(str(frame.error("viewpoint", "is missing; remove the frame")), "no pose")
+        raise Unusable(frame.error("viewpoint", "is missing; remove the frame"), "no pose")
     view = Frame(frame.file, {}, own, frame.index, "viewpoint of frame ")
     rotation, place = view.array("R", (3, 3)), view.array("T", (3,))
     focal, centre = view.array("focal_length", (2,)), view.array("principal_point", (2,))
@@ -210,22 +200,16 @@ def _camera(frame, size):
 
 def _set_list(folder):
     """{split: paths of images} of the sequence, each in one split only; None without a list."""
-    category, sequence = folder.parent, folder.name
+    category = folder.parent
     old = category / "set_lists.json"
     if old.is_file():
+        found = _listed(old, folder.name)
         kinds = {"train": "known", "test": "unseen"}
-        found = _listed(old, sequence)
-        return _disjoint(
-            {
-                split: set().union(*(paths for name, paths in found.items() if kind in name))
-                for split, kind in kinds.items()
-            }
-        )
+        named = {split: [found[name] for name in found if kinds[split] in name] for split in kinds}
+        return _disjoint({split: set().union(*paths) for split, paths in named.items()})
     files = sorted((category / "set_lists").glob("*.json"), key=lambda f: ("many" not in f.name, f))
-    for file in files:
-        if (found := _disjoint(_listed(file, sequence))) is not None:
-            return found
-    return None
+    found = (_disjoint(_listed(file, folder.name)) for file in files)
+    return next(filter(None, found), None)
 
 
 def _listed(file, sequence):
@@ -247,6 +231,6 @@ def _disjoint(found):
     frames.
     """
     train = found.get("train", set())
-    splits = {name: paths - train for name, paths in found.items() if name in ("val", "test")}
-    splits = {name: paths for name, paths in splits.items() if paths}
-    return {"train": train, **splits} if train and "test" in splits else None
+    others = {name: found.get(name, set()) - train for name in ("val", "test")}
+    splits = {"train": train} | {name: paths for name, paths in others.items() if paths}
+    return splits if train and "test" in splits else None

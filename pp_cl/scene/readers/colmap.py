@@ -8,8 +8,7 @@ over, since they are nearly all of a file.
 import os
 import struct
 import unicodedata
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -24,11 +23,11 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.readers.common import (
     MOST,
-    SPLITS,
     fail_at,
     fitted,
     hold_out,
-    listing,
+    progress,
+    two_splits,
 )
 from pp_cl.scene.readers.found import Notes, find_image, holds_images
 from pp_cl.scene.views import Photograph
@@ -68,6 +67,7 @@ MOST_PIXELS = 2**20  # a side; beyond it a number is no size
 MOST_ENTRIES = 2**17  # of a file, cameras or images
 MOST_NAME = 1024  # bytes of an image's name
 MOST_LINE = 2**22  # characters of a line: 150,000 2D points
+PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP
 UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it again"
 POINT2D_BYTES = 24  # x, y and the id of a 3D point
 TRACK_BYTES = 8  # the ids of an image and of a point in it
@@ -79,7 +79,7 @@ class Lens(NamedTuple):
     model: str
     width: int
     height: int
-    parameters: tuple[float, ...]
+    parameters: Sequence[float]
 
 
 class Image(NamedTuple):
@@ -89,17 +89,15 @@ class Image(NamedTuple):
 
     name: str
     camera: int
-    pose: np.ndarray
+    pose: Sequence[float]
+
+
+splits = two_splits
 
 
 def recognises(folder: Path) -> bool:
     """True if the folder has a model in one of the usual places."""
-    return model_folder(folder) is not None
-
-
-def splits(folder: Path) -> list[str]:
-    """Train and test: COLMAP knows no splits."""
-    return SPLITS
+    return bool(_models(folder))
 
 
 def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
@@ -108,19 +106,19 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
     Raises UserError naming the file, and the image.
     """
-    models = _models(folder)
-    model = _largest(models) or folder
-    if len(models) > 1:
-        notes.done[f"of {len(models)} models the largest is read"] = [str(model)]
+    model = model_folder(folder) or folder
+    if (count := len(_models(folder))) > 1:
+        notes.done[f"of {count} models the largest is read"] = [str(model)]
     lenses, images = read_model(model)
-    ordered = sorted(images, key=lambda image: image.name)
+    chosen = hold_out(sorted(images, key=lambda image: image.name), split)
     read = partial(_photograph, folder, model, lenses)
-    return list(notes.usable(listing(hold_out(ordered, split)), read, lambda one: one.name))
+    return list(notes.usable(progress(chosen), read, lambda image: image.name))
 
 
 def model_folder(folder: Path) -> Path | None:
     """Where a scene's model lies, of several that with most images; None where it has none."""
-    return _largest(_models(folder))
+    models = _models(folder)
+    return max(models, key=_count) if len(models) > 1 else next(iter(models), None)
 
 
 def _models(folder):
@@ -128,11 +126,6 @@ def _models(folder):
     places = [folder / place for place in PLACES if place != "." or holds_images(folder)]
     several = [near for place in PLACES[:-1] for near in sorted((folder / place).glob("[0-9]*"))]
     return [place for place in (*several, *places) if _suffix(place)]
-
-
-def _largest(models):
-    """Of several that with most images; None of none."""
-    return max(models, key=_count) if len(models) > 1 else next(iter(models), None)
 
 
 def _count(model):
@@ -156,33 +149,26 @@ def _photograph(folder, model, lenses, image):
     fail = fail_at(model, image.name)
     name, lens = find_image(folder, f"{IMAGES}/{image.name}", fail), lenses[image.camera]
     if isinstance(lens, Unusable):
-        raise lens
-    fx, fy, cx, cy, distortion = _intrinsics(folder, model, lens)
-    length = np.linalg.norm(image.pose[:4]) if _are_numbers(image.pose) else 0
-    if abs(length - 1) > 1e-3:
-        raise Unusable(str(fail("its pose is no unit quaternion and place; fix it")), "no pose")
-    w, x, y, z, *translation = image.pose
-    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    pose = np.column_stack([rotation, -rotation @ translation])
-    camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
-    camera = fitted(camera, image_size(folder / name, (lens.width, lens.height)), fail)
-    return Photograph(name, camera, distortion=distortion)
-
-
-def _intrinsics(folder, model, lens):
-    """(fx, fy, cx, cy, Distortion). Raises UserError for a model that is not one of OpenCV's."""
+        return lens
     if lens.model not in ONE_FOCAL + TWO_FOCALS:
         raise UserError(
             f"{model}: camera model {lens.model} is not read; convert with `colmap"
             f" image_undistorter --image_path {folder / IMAGES} --input_path {model} --output_path"
             " NEW` and give NEW"
         )
-    p = lens.parameters if lens.model in TWO_FOCALS else (lens.parameters[0], *lens.parameters)
+    numbers = lens.parameters
+    fx, fy, cx, cy, *coefficients = numbers if lens.model in TWO_FOCALS else (numbers[0], *numbers)
     is_fisheye = lens.model.endswith("FISHEYE")
-    perspective = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    names = ("k1", "k2", "k3", "k4") if is_fisheye else perspective
-    coefficients = dict(zip(names, p[4:], strict=False))
-    return *p[:4], Distortion(**coefficients, fisheye=is_fisheye)
+    order = ("k1", "k2", "k3", "k4") if is_fisheye else PERSPECTIVE
+    distortion = Distortion(**dict(zip(order, coefficients, strict=False)), fisheye=is_fisheye)
+    w, x, y, z, *place = image.pose
+    if not _are_numbers(image.pose) or abs(np.linalg.norm((w, x, y, z)) - 1) > 1e-3:
+        return Unusable(fail("its pose is no unit quaternion and place; fix it"), "no pose")
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    pose = np.column_stack([rotation, -rotation @ place])
+    camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
+    camera = fitted(camera, image_size(folder / name, (lens.width, lens.height)), fail)
+    return Photograph(name, camera, distortion=distortion)
 
 
 # The model ----------------------------------------------------------------------------------------
@@ -193,17 +179,27 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
     before text. Raises UserError naming the file, and the line or the place in it.
     """
     suffix = _suffix(folder)
-    read_cameras, read_images = (
-        (_binary_cameras, _binary_images) if suffix == ".bin" else (_text_cameras, _text_images)
-    )
+    is_binary = suffix == ".bin"
     lenses, images, names = {}, [], set()
     file = folder / f"cameras{suffix}"
-    for identity, lens in _bounded(file, read_cameras):
+    for where, (identity, lens) in _bounded(file, _binary_cameras if is_binary else _text_cameras):
+        model, width, height, parameters = lens
+        if model not in MODELS:
+            raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
+        if not 1 <= min(width, height) <= max(width, height) < MOST_PIXELS:
+            raise UserError(f"{where}: {width}x{height} pixels is no size; copy the file again")
         if identity in lenses:
             raise UserError(f"{file}: camera {identity} stands there twice; remove one")
+        if len(parameters) != MODELS[model] or not _are_numbers(parameters):
+            text = f"{MODELS[model]} parameters, finite and not huge; copy the file again"
+            lens = Unusable(f"{where}: {model} has {text}", BROKEN_CAMERA)
         lenses[identity] = lens
     file = folder / f"images{suffix}"
-    for image in _bounded(file, read_images):
+    for where, image in _bounded(file, _binary_images if is_binary else _text_images):
+        # the name goes into messages of one line
+        has_controls = any(unicodedata.category(letter) == "Cc" for letter in image.name)
+        if has_controls or not 1 <= len(image.name) <= MOST_NAME:
+            raise UserError(f"{where}: {image.name[:80]!r} is no name of an image; rename it")
         if image.camera not in lenses:
             raise UserError(
                 f"{file}: {image.name}: its camera {image.camera} is not in cameras{suffix}; copy"
@@ -219,36 +215,22 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
     return lenses, images
 
 
+def read_points(folder: Path) -> Iterator[tuple[float, ...]]:
+    """Each (x, y, z, red, green, blue) of the points3D in a model's folder, which may have none.
+    Raises UserError naming the file, and the line or the place in it.
+    """
+    binary, text = folder / "points3D.bin", folder / "points3D.txt"
+    if binary.is_file():
+        return _binary_points(binary)
+    return _text_points(text) if text.is_file() else iter(())
+
+
 def _bounded(file, read):
     """The entries of a file. Raises UserError where they are more than MOST_ENTRIES."""
     for count, entry in enumerate(read(file)):
         if count == MOST_ENTRIES:
             raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
         yield entry
-
-
-def _lens(where, model, size, parameters):
-    """The Lens; what is wrong with its parameters, an Unusable. Raises UserError beginning with
-    `where`.
-    """
-    if not all(1 <= side < MOST_PIXELS for side in size):
-        raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file again")
-    if len(parameters) != MODELS[model] or not _are_numbers(parameters):
-        return Unusable(
-            f"{where}: {model} has {MODELS[model]} parameters, finite and not huge; copy the file"
-            " again",
-            BROKEN_CAMERA,
-        )
-    return Lens(model, *size, tuple(parameters))
-
-
-def _image(where, name, camera, numbers):
-    """The Image; numbers: its pose. Raises UserError beginning with `where`."""
-    # the name goes into messages of one line
-    has_controls = any(unicodedata.category(letter) == "Cc" for letter in name)
-    if has_controls or not 1 <= len(name) <= MOST_NAME:
-        raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
-    return Image(name, camera, np.array(numbers, np.float64))
 
 
 def _are_numbers(values):
@@ -271,70 +253,71 @@ def _lines(file):
         raise refusal(file, error, "text") from None
 
 
+def _rows(file, lines, form, parse):
+    """(place in words, what parse(line) gives) of each of the lines that is no comment. Raises
+    UserError for one that is not of the form.
+    """
+    for number, line in lines:
+        if line and not line.startswith("#"):
+            where = f"{file}: line {number}"
+            try:
+                row = parse(line)
+            except (IndexError, ValueError, OverflowError):
+                raise UserError(f"{where}: is not {form}; copy the file again") from None
+            yield where, row
+
+
 def _text_cameras(file):
-    """Each (id, Lens)."""
-    for number, line in _lines(file):
-        if not line or line.startswith("#"):
-            continue
-        where, words = f"{file}: line {number}", line.split()
-        try:
-            identity, model, size = int(words[0]), words[1], (int(words[2]), int(words[3]))
-            parameters = [float(word) for word in words[4:]]
-        except (IndexError, ValueError, OverflowError):
-            raise UserError(
-                f"{where}: is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; copy the file again"
-            ) from None
-        if model not in MODELS:
-            raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
-        yield identity, _lens(where, model, size, parameters)
+    """Each (place in words, (id, Lens))."""
+
+    def parse(line):
+        identity, model, width, height, *parameters = line.split()
+        return int(identity), Lens(model, int(width), int(height), [float(p) for p in parameters])
+
+    return _rows(file, _lines(file), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", parse)
 
 
 def _text_images(file):
-    """Each Image; it has two lines, of which the second, its 2D points, may be empty."""
-    lines = _lines(file)
-    for number, line in lines:
-        if not line or line.startswith("#"):
-            continue
-        where, words = f"{file}: line {number}", line.split(maxsplit=9)
-        try:
-            numbers, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9]
-        except (IndexError, ValueError, OverflowError):
-            raise UserError(
-                f"{where}: is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; copy the file again"
-            ) from None
-        number, line = next(lines, (number, ""))
+    """Each (place in words, Image); it has two lines, of which the second, its 2D points, may be
+    empty.
+    """
+
+    def parse(line):
+        words = line.split(maxsplit=9)
+        return Image(words[9], int(words[8]), [float(word) for word in words[1:8]])
+
+    lines, form = _lines(file), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    for where, image in _rows(file, lines, form, parse):
+        number, line = next(lines, (0, ""))
         points = line.split()
         # else an image without its line of points would hide the next one
         if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
             raise UserError(
-                f"{file}: line {number}: must be the 2D points of {name[:80]!r}, X Y POINT3D_ID"
-                " each; give every image a second line, empty if it has none"
+                f"{file}: line {number}: must be the 2D points of {image.name[:80]!r}, X Y"
+                " POINT3D_ID each; give every image a second line, empty if it has none"
             )
-        yield _image(where, name, camera, numbers)
+        yield where, image
 
 
-def text_points(file: Path) -> Iterator[tuple[float, ...]]:
-    """Each (x, y, z, red, green, blue) of points3D.txt. Raises UserError naming file and line."""
-    for number, line in _lines(file):
-        if line and not line.startswith("#"):
-            try:
-                _, x, y, z, red, green, blue, *_ = map(float, line.split(maxsplit=8)[:8])
-                yield x, y, z, red, green, blue
-            except ValueError:
-                raise UserError(
-                    f"{file}: line {number}: is not POINT3D_ID X Y Z R G B; copy the file again"
-                ) from None
+def _text_points(file):
+    def parse(line):
+        _, x, y, z, red, green, blue, *_ = map(float, line.split(maxsplit=8)[:8])
+        return x, y, z, red, green, blue
+
+    for _, point in _rows(file, _lines(file), "POINT3D_ID X Y Z R G B", parse):
+        yield point
 
 
 # Binary -------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _opened(file):
-    """The binary file, which must be at its end when the block ends."""
+def _entries(file, take):
+    """take(opened) of a binary file, as often as its first number says; the file must end there."""
     try:
         with opened_regular(file) as opened:
-            yield opened
+            (count,) = _take(opened, "Q")
+            for _ in range(count):  # a count that is too large ends at the file's end
+                yield take(opened)
             size = os.fstat(opened.fileno()).st_size
             if opened.tell() != size:
                 raise ValueError(f"its entries end at byte {opened.tell()}, the file at {size}")
@@ -350,47 +333,42 @@ def _take(opened, form):
     return struct.unpack(f"<{form}", data)
 
 
-def _name(opened):
-    """The next text, which a zero byte ends. Raises ValueError."""
-    at = opened.tell()
-    text, end, _ = opened.read(MOST_NAME).partition(b"\0")
-    if not end:
-        raise ValueError(f"the name at byte {at} does not end")
-    opened.seek(at + len(text) + 1)
-    return text.decode()
-
-
 def _binary_cameras(file):
-    """Each (id, Lens)."""
-    names = dict(enumerate(MODELS))
-    with _opened(file) as opened:
-        (count,) = _take(opened, "Q")
-        for _ in range(count):  # a count that is too large ends at the file's end
-            identity, number, width, height = _take(opened, "IiQQ")
-            where = f"{file}: camera {identity}"
-            if number not in names:
-                raise UserError(f"{where}: {number} {UNKNOWN}")
-            parameters = _take(opened, "d" * MODELS[names[number]])
-            yield identity, _lens(where, names[number], (width, height), parameters)
+    """Each (place in words, (id, Lens))."""
+    names = list(MODELS)
+
+    def take(opened):
+        identity, number, width, height = _take(opened, "IiQQ")
+        if not 0 <= number < len(names):
+            raise ValueError(f"camera {identity}: {number} {UNKNOWN}")
+        parameters = _take(opened, "d" * MODELS[names[number]])
+        lens = Lens(names[number], width, height, parameters)
+        return f"{file}: camera {identity}", (identity, lens)
+
+    return _entries(file, take)
 
 
 def _binary_images(file):
-    """Each Image."""
-    with _opened(file) as opened:
-        (count,) = _take(opened, "Q")
-        for _ in range(count):
-            identity, *numbers, camera = _take(opened, "IdddddddI")
-            name = _name(opened)
-            (points,) = _take(opened, "Q")
-            opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
-            yield _image(f"{file}: image {identity}", name, camera, numbers)
+    """Each (place in words, Image)."""
+
+    def take(opened):
+        identity, *pose, camera = _take(opened, "IdddddddI")
+        at = opened.tell()
+        name, end, _ = opened.read(MOST_NAME).partition(b"\0")
+        if not end:
+            raise ValueError(f"the name at byte {at} does not end")
+        opened.seek(at + len(name) + 1)
+        (points,) = _take(opened, "Q")
+        opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
+        return f"{file}: image {identity}", Image(name.decode(), camera, pose)
+
+    return _entries(file, take)
 
 
-def binary_points(file: Path) -> Iterator[tuple[float, ...]]:
-    """Each (x, y, z, red, green, blue) of points3D.bin. Raises UserError naming the file."""
-    with _opened(file) as opened:
-        (count,) = _take(opened, "Q")
-        for _ in range(count):
-            _, *row, _, track = _take(opened, "QdddBBBdQ")
-            opened.seek(track * TRACK_BYTES, os.SEEK_CUR)
-            yield tuple(row)
+def _binary_points(file):
+    def take(opened):
+        _, *point, _, track = _take(opened, "QdddBBBdQ")
+        opened.seek(track * TRACK_BYTES, os.SEEK_CUR)
+        return point
+
+    return _entries(file, take)

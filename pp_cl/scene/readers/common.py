@@ -5,14 +5,14 @@ splits of formats that know none.
 import json
 import math
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.errors import UserError, quoted, shown
+from pp_cl.errors import Unusable, UserError, quoted, shown
 from pp_cl.files.image import ENDINGS, same_shape
 from pp_cl.files.untrusted import (
     opened_regular,
@@ -22,7 +22,8 @@ from pp_cl.files.untrusted import (
     refusal,
 )
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.found import Fail
+from pp_cl.scene.readers.found import Fail, Notes, numbered
+from pp_cl.scene.views import Photograph
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
 SPLITS = ["test", "train"]  # of a format that knows none
@@ -38,13 +39,18 @@ Item = TypeVar("Item")
 # Splits -------------------------------------------------------------------------------------------
 
 
+def two_splits(folder: Path) -> list[str]:
+    """splits() of the readers of formats that know none: test is what hold_out() takes."""
+    return SPLITS
+
+
 def hold_out(items: Sequence[Item], split: str) -> list[Item]:
     """The items of split train or test, of a format without splits: test is every eighth."""
     is_test = split == "test"
     return [item for index, item in enumerate(items) if (index % HELD_OUT == 0) == is_test]
 
 
-def listing(items: Sequence[Item]) -> Iterable[Item]:
+def progress(items: Sequence[Item]) -> Iterable[Item]:
     """The items, of which a progress bar shows on a terminal where there are thousands."""
     return tqdm(items, "listing", unit="image", leave=False, disable=None, delay=2)
 
@@ -66,6 +72,34 @@ def folder_images(folder: Path, name: str) -> list[str]:
     return [f"{name}/{image}" for image in found]
 
 
+def in_order(
+    file: Path,
+    cameras: Sequence[str],
+    images: Sequence[str],
+    split: str,
+    notes: Notes,
+    read: Callable[[int, str], Photograph],
+) -> list[Photograph]:
+    """The photographs of a split whose cameras, called so in a file, stand there in the order of
+    the names of their images. Where images are gone, the numbers in the names of the others tell
+    which. read(index, image) gives a Photograph. Raises UserError where nothing tells.
+    """
+    places = numbered(images, len(cameras))
+    if places is None:
+        raise UserError(
+            f"{file}: has {len(cameras)} cameras, but there are {len(images)} images beside"
+            f" {images[0]}; remove those without a camera, or copy both again"
+        )
+
+    def read_one(index):
+        if index not in places:
+            raise Unusable(f"{file}: {cameras[index]}: its image is gone", "no image")
+        return read(index, places[index])
+
+    chosen = hold_out(range(len(cameras)), split)
+    return list(notes.usable(chosen, read_one, cameras.__getitem__))
+
+
 def fail_at(*place: object) -> Fail:
     """fail(text) of a place: the file, and the part of it."""
     return lambda text: UserError(f"{': '.join(map(str, place))}: {text}")
@@ -78,8 +112,7 @@ def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
     width, height = camera.width, camera.height
     if not same_shape(size, (width, height)):
         is_turned = same_shape(size[::-1], (width, height))
-        what = "another shape; copy the images again"
-        what = "turned; write the images upright" if is_turned else what
+        what = "turned; write the images upright" if is_turned else "another shape; copy it again"
         raise fail(
             f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, {what}"
         )
@@ -136,19 +169,17 @@ def read_npy(file: Path) -> np.ndarray:
     """The array of a .npy file as float64. Raises UserError naming the file."""
     try:
         with opened_regular(file) as opened:
-            return _checked(file, "", _read_array(opened, MOST_ARRAYS))
-    except UserError:
-        raise
+            return _read_array(opened, MOST_ARRAYS)
     except Exception as error:  # numpy meets broken bytes with whatever comes up
         raise refusal(file, error, "numpy's arrays") from None
 
 
 def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
     """{name: array as float64} of the members of a .npz file whose names begin with `wanted`.
-    Raises UserError naming the file and the member.
+    Raises UserError naming the file.
     """
+    arrays, left = {}, MOST_ARRAYS
     try:
-        arrays, left = {}, MOST_ARRAYS
         with opened_zip(file) as archive:
             for entry in archive.infolist():
                 name = entry.filename.removesuffix(".npy")
@@ -157,35 +188,26 @@ def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
                 if entry.compress_type not in KINDS:  # others take memory of their own
                     raise ValueError(f"{name} is packed as numpy does not")
                 with archive.open(entry) as opened:
-                    arrays[name] = _checked(file, f"{name}: ", _read_array(opened, left))
+                    arrays[name] = _read_array(opened, left)
                 left -= arrays[name].nbytes
-        return arrays
-    except UserError:
-        raise
     except Exception as error:  # zipfile and numpy meet broken bytes with whatever comes up
         raise refusal(file, error, "numpy's arrays") from None
+    return arrays
 
 
 def _read_array(opened, most):
-    """The array of an opened .npy file, of numbers and of at most so many bytes as float64."""
+    """The array of an opened .npy file as float64, of which it takes at most so many bytes."""
     if np.lib.format.read_magic(opened) != (1, 0):  # others have headers of up to 4 GiB
         raise ValueError("is of another version than 1.0")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(opened)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(opened)
     if dtype.kind not in "fiu":
         raise ValueError(f"holds {dtype}, no numbers")
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or count * max(dtype.itemsize, 8) > most:
+    if min(shape, default=0) < 0 or math.prod(shape) * max(dtype.itemsize, 8) > most:
         raise ValueError(f"claims the shape {shown(str(shape), 40)}, more than {most} bytes")
-    data = opened.read(count * dtype.itemsize)
-    if len(data) < count * dtype.itemsize:
-        raise ValueError("ends too early")
-    array = np.frombuffer(data, dtype, count)
-    return array.reshape(shape, order="F" if fortran else "C").astype(np.float64)
-
-
-def _checked(file, name, array):
+    opened.seek(0)
+    array = np.lib.format.read_array(opened, allow_pickle=False).astype(np.float64)
     if not (np.abs(array) < MOST).all():
-        raise UserError(f"{file}: {name}holds NaN, Inf or a huge number; write it again")
+        raise ValueError("holds NaN, Inf or a huge number")
     return array
 
 
@@ -200,10 +222,12 @@ def read_numbers(file: Path) -> list[list[float]]:
     rows = []
     for number, line in enumerate(lines, 1):
         try:
-            rows.append([float(word) for word in line.split()])
+            row = [float(word) for word in line.split()]
         except ValueError:
+            row = [math.nan]
+        if not all(abs(value) < MOST for value in row):
             raise UserError(
-                f"{file}: line {number}: {line[:60]!r} are no numbers; write it again"
-            ) from None
-        _checked(file, f"line {number}: ", np.array(rows[-1]))
+                f"{file}: line {number}: {line[:60]!r} are no finite numbers; write it again"
+            )
+        rows.append(row)
     return [row for row in rows if row]

@@ -11,14 +11,13 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
-from pp_cl.errors import Unusable, UserError
+from pp_cl.errors import Unusable, UserError, listing
 from pp_cl.files.image import ENDINGS
 
 # where programs put the images that a name may mean, in their order, beside images_2, images_4 ...
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
 MASK_FOLDERS = ("masks", "mask")
 IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says nothing
-SHOWN = 3  # names of a kind
 CASED_ENDINGS = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
 
 Item = TypeVar("Item")
@@ -36,20 +35,25 @@ class Notes:
         self.done: dict[str, list[str]] = {}
         self._first: UserError | None = None
 
-    def leave_out(self, name: str, error: Unusable) -> None:
-        """Note that a view is left out, and why."""
-        self.left_out.setdefault(error.why, []).append(name)
-        self._first = self._first or error
-
     def usable(
-        self, items: Iterable[Item], read: Callable[[Item], Result], name: Callable[[Item], str]
+        self,
+        items: Iterable[Item],
+        read: Callable[[Item], Result | Unusable],
+        name: Callable[[Item], str],
     ) -> Iterator[Result]:
-        """What read() gives of the items, without those that are unusable."""
+        """What read() gives of the items, without those for which it raises or gives an Unusable:
+        they are left out.
+        """
         for item in items:
             try:
-                yield read(item)
+                found = read(item)
             except Unusable as error:
-                self.leave_out(name(item), error)
+                found = error
+            if isinstance(found, Unusable):
+                self.left_out.setdefault(found.why, []).append(name(item))
+                self._first = self._first or found
+            else:
+                yield found
 
     def check(self, left: int, least: int = 1) -> None:
         """Raise the error of the first view that was left out where fewer than `least`, or less
@@ -63,14 +67,9 @@ class Notes:
         """One line for each kind. left: the views that are not left out."""
         count = left + sum(map(len, self.left_out.values()))
         return [
-            f"{len(names)} of {count} views left out: {why} ({_some(names)})"
+            f"{len(names)} of {count} views left out: {why} ({listing(names)})"
             for why, names in self.left_out.items()
-        ] + [f"{what} ({_some(names)})" for what, names in self.done.items()]
-
-
-def _some(names):
-    more = len(names) - SHOWN
-    return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+        ] + [f"{what} ({listing(names)})" for what, names in self.done.items()]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -92,13 +91,13 @@ def find_image(
     root = os.path.realpath(folder)
     try:
         for form in dict.fromkeys((given, given.replace("\\", "/"))):
+            if not os.path.isabs(form) and posixpath.normpath(form).split("/")[0] == "..":
+                raise fail(
+                    f"{given[:80]!r} leaves the scene's folder; copy the image into it and write"
+                    " its path from there"
+                )
             for ending in endings:
                 path = os.path.join(root, form + ending)
-                if _leaves(root, form):
-                    raise fail(
-                        f"{given[:80]!r} leaves the scene's folder; copy the image into it and"
-                        " write its path from there"
-                    )
                 if os.path.isfile(path) and (inside := _inside(root, path)):
                     return inside
         parts = [p for p in given.replace("\\", "/").split("/") if p not in ("", ".")]
@@ -114,7 +113,7 @@ def find_image(
         raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
     bare = ", with or without the ending of an image" * (len(endings) > 1)
     text = f"no {kind} at {given[:80]!r}{bare}; copy it there or remove the frame"
-    raise Unusable(str(fail(text)), f"no {kind}")
+    raise Unusable(fail(text), f"no {kind}")
 
 
 def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:
@@ -129,11 +128,6 @@ def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:
     low, high = min(numbers), max(numbers)
     is_whole = low > -1 and len(set(numbers)) == len(numbers) and high - low == count - 1
     return {n - low: name for n, name in zip(numbers, names, strict=True)} if is_whole else None
-
-
-def _leaves(root, form):
-    """Whether a path that stands in a file leads out of the folder by its text."""
-    return not os.path.isabs(form) and posixpath.normpath(form).split("/")[0] == ".."
 
 
 def _inside(root, path):

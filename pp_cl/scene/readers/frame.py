@@ -1,6 +1,5 @@
 """One frame of a JSON file of cameras: its keys, checked, and the camera that they make."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,11 +69,10 @@ class Frame:
             return None
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not is_number or not max(above, -MOST) < value < min(below, MOST):
-            bounds = f" above {above:g}" * (above > -math.inf) + f" and below {below:g}" * (
-                below < math.inf
-            )
-            text = f"is {json.dumps(value)[:40]}; must be a finite number{bounds}"
-            raise Unusable(str(self.error(key, text)), BROKEN_CAMERA)
+            bounds = f" above {above:g}" if above > -math.inf else ""
+            bounds += f" and below {below:g}" if below < math.inf else ""
+            text = f"is {quoted(value, 40)}; must be a finite number{bounds}"
+            raise Unusable(self.error(key, text), BROKEN_CAMERA)
         return float(value)
 
     def array(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -82,7 +80,7 @@ class Frame:
         array = numbers(self.get(key), shape)
         if array is None:
             text = f"must be {'x'.join(map(str, shape))} finite numbers"
-            raise Unusable(str(self.error(key, text)), BROKEN_CAMERA)
+            raise Unusable(self.error(key, text), BROKEN_CAMERA)
         return array
 
     def image(self, key: str, folder: Path, endings: Sequence[str] = ("",)) -> str | None:
@@ -148,8 +146,8 @@ def distortion(frame: Frame) -> Distortion:
         value = frame.get(key)
         if value and str(value).upper() not in known:
             raise frame.error(key, f"{quoted(value, 40)} is not modelled; {UNDISTORT}")
-    model = str(frame.get("camera_model")).upper()
-    is_fisheye = bool(frame.get("is_fisheye")) or model in FISHEYES
+    is_fisheye = bool(frame.get("is_fisheye"))
+    is_fisheye |= str(frame.get("camera_model")).upper() in FISHEYES
     for key in ("p1", "p2") if is_fisheye else ("k4",):
         if frame.number(key):
             raise frame.error(key, f"is not modelled with this lens; {UNDISTORT}")
@@ -162,24 +160,20 @@ def rigid(value: Any, fail: Fail) -> np.ndarray:
     that is the same along all axes. Raises Unusable with the text of fail() where it holds no
     rotation and place.
     """
-
-    def unusable(text):
-        return Unusable(str(fail(text)), "no pose")
-
-    matrix = numbers(value)
+    matrix = numbers(value, (4, 4))
     if matrix is None:
-        raise unusable("must be 4x4 or 3x4 numbers")
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise unusable(f"has shape {matrix.shape}; must be 4x4 or 3x4 numbers")
-    if not (np.abs(matrix) < MOST).all():
-        raise unusable("holds NaN, Inf or a huge number; must be a camera-to-world matrix")
+        matrix = numbers(value, (3, 4))
+    if matrix is None:
+        raise Unusable(fail("must be 4x4 or 3x4 finite numbers, camera-to-world"), "no pose")
     if np.abs(matrix[3:] - [0, 0, 0, 1]).max(initial=0) > 1e-6:
-        raise unusable(f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
+        text = f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]"
+        raise Unusable(fail(text), "no pose")
     u, scale, vt = np.linalg.svd(matrix[:3, :3])
     alike = np.abs((scale / max(scale.mean(), 1 / MOST)) ** 2 - 1).max() <= ROTATION_TOLERANCE
     if not alike or np.linalg.det(u @ vt) < 0:
-        raise unusable(
-            f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}, "
-            f"determinant {np.linalg.det(matrix[:3, :3]):.4f}); remove shear and mirroring",
+        text = (
+            f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}, determinant"
+            f" {np.linalg.det(matrix[:3, :3]):.4f}); remove shear and mirroring"
         )
+        raise Unusable(fail(text), "no pose")
     return np.hstack([u @ vt, matrix[:3, 3:]])

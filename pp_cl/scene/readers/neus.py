@@ -8,17 +8,10 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
-from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.common import (
-    SPLITS,
-    fail_at,
-    folder_images,
-    hold_out,
-    read_npz,
-)
-from pp_cl.scene.readers.found import Notes, image_folder, numbered
+from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz, two_splits
+from pp_cl.scene.readers.found import Notes, image_folder
 from pp_cl.scene.views import Photograph
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
@@ -26,15 +19,12 @@ CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 IMAGES = ("image", "images", "rgb")
 MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours
 
+splits = two_splits
+
 
 def recognises(folder: Path) -> bool:
     """True if the folder has one of the files of cameras."""
     return _file(folder) is not None
-
-
-def splits(folder: Path) -> list[str]:
-    """Train and test: the format knows no splits."""
-    return SPLITS
 
 
 def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
@@ -45,29 +35,24 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     member.
     """
     file = _file(folder)
-    cameras, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
-    images = image_folder(folder, IMAGES)
-    names = folder_images(folder, images)
-    count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in cameras)
-    if (places := numbered(names, count)) is None:
-        raise UserError(
-            f"{file}: has {count} world_mat_i, but {images}/ has {len(names)} images; copy both"
-            " again"
-        )
+    matrices, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
+    count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in matrices)
+    cameras = [f"world_mat_{index}" for index in range(count)]
 
-    def read(index):
-        key, scale = f"world_mat_{index}", f"scale_mat_{index}"
-        if key not in cameras:
-            raise UserError(f"{file}: {key}: is missing; number the cameras from 0 on")
-        if index not in places:
-            raise Unusable(f"{file}: {key}: its image is gone from {images}", "no image")
-        size = image_size(folder / places[index])
-        camera, depth_range = _camera(cameras[key], size, fail_at(file, key)), None
-        if scale in scales:
-            depth_range = _depth_range(scales[scale], camera, fail_at(file, scale))
-        return Photograph(places[index], camera, depth_range)
+    def read(index, name):
+        key, scale = cameras[index], f"scale_mat_{index}"
+        if key not in matrices:
+            raise fail_at(file, key)("is missing; number the cameras from 0 on")
+        camera = _camera(matrices[key], image_size(folder / name), fail_at(file, key))
+        if scale not in scales:
+            return Photograph(name, camera)
+        middle, radius = _sphere(scales[scale], fail_at(file, scale))
+        distance = np.linalg.norm(camera.eye - middle)
+        near_far = max(distance - radius, 1e-3 * radius), distance + radius
+        return Photograph(name, camera, (float(near_far[0]), float(near_far[1])))
 
-    return list(notes.usable(hold_out(range(count), split), read, "world_mat_{}".format))
+    images = folder_images(folder, image_folder(folder, IMAGES))
+    return in_order(file, cameras, images, split, notes, read)
 
 
 def box(folder: Path) -> np.ndarray | None:
@@ -104,16 +89,8 @@ def _camera(matrix, size, fail):
     upper /= upper[2, 2]
     if abs(upper[0, 1]) * size[1] > MOST_SKEW * upper[1, 1]:
         raise fail(f"has a skew of {upper[0, 1]:.3g} pixels; cameras with skew are not modelled")
-    eye = -np.linalg.solve(left, matrix[:3, 3])
-    pose = np.column_stack([rotation.T, eye])
+    pose = np.column_stack([rotation.T, -np.linalg.solve(left, matrix[:3, 3])])
     return Camera(pose, upper[0, 0], upper[1, 1], upper[0, 2], upper[1, 2], *size)
-
-
-def _depth_range(matrix, camera, fail):
-    """(near, far) of the sphere around the object. Raises fail(text)."""
-    middle, radius = _sphere(matrix, fail)
-    distance = np.linalg.norm(camera.eye - middle)
-    return float(max(distance - radius, 1e-3 * radius)), float(distance + radius)
 
 
 def _sphere(matrix, fail):
@@ -122,9 +99,8 @@ def _sphere(matrix, fail):
     """
     if matrix.shape != (4, 4):
         raise fail(f"has shape {matrix.shape}; must be 4x4 numbers")
-    radius = abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3)
-    if radius == 0 or not np.allclose(
-        matrix[:3, :3] @ matrix[:3, :3].T, radius**2 * np.eye(3), atol=1e-3 * radius**2
-    ):
+    left = matrix[:3, :3]
+    radius = abs(np.linalg.det(left)) ** (1 / 3)
+    if radius == 0 or not np.allclose(left @ left.T / radius**2, np.eye(3), atol=1e-3):
         raise fail("is no scaling; leave it out")
     return matrix[:3, 3], radius

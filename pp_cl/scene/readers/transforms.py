@@ -6,6 +6,7 @@ and a writer of the former.
 import math
 from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from pp_cl.scene.readers.common import (
     fail_at,
     fitted,
     hold_out,
-    listing,
+    progress,
     read_json,
 )
 from pp_cl.scene.readers.found import CASED_ENDINGS, Notes
@@ -54,22 +55,22 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """
     files = _split_files(folder)
     file = files[split] if files else _single(folder)
-    data, read = _read(file), {}
-    for index, own in enumerate(listing(data["frames"])):
-        frame, one = Frame(file, data, own, index), None
-        name = given = _plain(str(frame.get("file_path")))
+    data = _read(file)
+    given, found = {}, {}  # by name: the path as the frame has it, and a Photograph or an Unusable
+    for index, own in enumerate(progress(data["frames"])):
+        frame = Frame(file, data, own, index)
+        name = path = _plain(str(frame.get("file_path")))
+        one: Any
         try:
             one = _read_frame(folder, frame)
             name = one.name
         except Unusable as error:
             one = error
-        if name in read:
+        if name in found:
             raise frame.error("file_path", f"{name!r} stands there twice; remove one")
-        read[name] = given, one
-    chosen = list(read)
-    if not files:
-        chosen = _of_split(file, data, {name: given for name, (given, _) in read.items()}, split)
-    return list(notes.usable(chosen, lambda name: _usable(read[name][1]), str))
+        given[name], found[name] = path, one
+    chosen = list(given) if files else _of_split(file, data, given, split)
+    return list(notes.usable(chosen, found.__getitem__, str))
 
 
 def box(folder: Path) -> np.ndarray | None:
@@ -111,12 +112,6 @@ def _plain(path):
     return PurePosixPath(path.replace("\\", "/")).as_posix()
 
 
-def _usable(found):
-    if isinstance(found, Unusable):
-        raise found
-    return found
-
-
 def _of_split(file, data, given, split):
     """Those of a transforms.json's names, {name: as its frame has it}, that belong to a split, in
     their order.
@@ -136,38 +131,21 @@ def _of_split(file, data, given, split):
 
 
 def _read_frame(folder, frame):
-    """The Photograph of one frame."""
-    name, mask = (
-        frame.image("file_path", folder, ["", *CASED_ENDINGS]),
-        frame.image("mask_path", folder),
-    )
+    """The Photograph of one frame, its camera of the image's size."""
+    name = frame.image("file_path", folder, ["", *CASED_ENDINGS])
+    mask = frame.image("mask_path", folder)
     if name is None:
         raise frame.error("file_path", "is missing; add the path of the image")
-    return Photograph(
-        name, _camera(folder, name, frame), _depth_range(frame), mask, distortion(frame)
-    )
-
-
-def _camera(folder, name, frame):
-    """The Camera, of the image's size."""
     stated = frame.number("w", above=0), frame.number("h", above=0)
     size = image_size(folder / name, None if None in stated else stated)
     whole = [one or side for one, side in zip(stated, size, strict=True)]
-    return fitted(pinhole(frame, *whole), size, partial(frame.error, "w"))
-
-
-def _depth_range(frame):
-    """(near, far), or None if neither is given."""
-    near, far = frame.number("near", above=0), frame.number("far", above=0)
-    if near is None and far is None:
-        return None
-    if near is None or far is None:
-        raise frame.error(
-            "near" if near is None else "far", "is missing; give both near and far, or neither"
-        )
-    if far <= near:
-        raise frame.error("far", f"is {far:g}; must be above near, {near:g}")
-    return near, far
+    camera = fitted(pinhole(frame, *whole), size, partial(frame.error, "w"))
+    near_far = frame.number("near", above=0), frame.number("far", above=0)
+    is_stated = near_far != (None, None)
+    if is_stated and (None in near_far or near_far[0] >= near_far[1]):
+        key = "near" if near_far[0] is None else "far"
+        raise frame.error(key, "near and far must both be given, far above near, or neither")
+    return Photograph(name, camera, near_far if is_stated else None, mask, distortion(frame))
 
 
 def write_scene(splits: dict[str, list[View]], folder: Path | str) -> None:

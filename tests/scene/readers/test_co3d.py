@@ -80,16 +80,6 @@ def test_projection_follows_pytorch3d(tmp_path, rng, size, kind):
     assert photograph.mask is None and (camera.width, camera.height) == size
 
 
-def test_sizes_may_differ_from_frame_to_frame(tmp_path):
-    given = {"train": views(size=(30, 22))[:4] + views(size=(21, 35))[4:8], "test": views()[8:]}
-    co3d.write(tmp_path, given, 1)
-    read = read_split(tmp_path / "object" / "sequence", "train", Notes())
-    for photograph, view in zip(read, given["train"], strict=True):
-        for name in ("fx", "fy", "cx", "cy", "width", "height"):
-            expected = getattr(view.stored_camera, name)
-            assert getattr(photograph.camera, name) == pytest.approx(expected, abs=1e-9)
-
-
 def test_set_lists_of_version_1(tmp_path):
     """Known frames are for training, unseen ones for testing, whatever the other word."""
     many = views()
@@ -137,21 +127,6 @@ def test_a_linked_sequence(sequence):
     sequence.rename(elsewhere)
     sequence.symlink_to(elsewhere)
     assert [len(read_split(sequence, split, Notes())) for split in ("train", "test")] == [9, 2]
-
-
-@pytest.mark.parametrize(
-    ("names", "version"),
-    [
-        (("train",), 2),
-        (("train", "val"), 2),
-        (("train", "test", "eval"), 2),
-        (("train", "test", "val"), 1),
-    ],
-)
-def test_splits_that_the_lists_cannot_tell_are_not_written(tmp_path, names, version):
-    with pytest.raises(UserError, match="--hold-out"):
-        co3d.write(tmp_path, dict.fromkeys(names, views()[:1]), version)
-    assert not list(tmp_path.iterdir())
 
 
 # --------------------------------------------------------------------------------------------------

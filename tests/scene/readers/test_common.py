@@ -15,7 +15,7 @@ from support.transforms_scenes import escape, refused
 
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import write_png
-from pp_cl.scene.load import load_scene
+from pp_cl.scene.load import load_scene, scene_frames
 from pp_cl.scene.readers import common
 from pp_cl.scene.readers.common import (
     fail_at,
@@ -52,10 +52,6 @@ def scene(request, tmp_path):
     return folder, folder / images, masks and folder / masks
 
 
-def test_an_unknown_split_is_told_with_those_there_are(scene):
-    refused(scene[0], "no split eval", "test, train", splits=("eval",))
-
-
 def test_links_of_the_user_are_followed(scene):
     """Of one image, and of whole folders, as large data lies on another disk."""
     folder, *places = scene
@@ -79,32 +75,50 @@ def cut(file):
 
 HARM = {
     "gone": (Path.unlink, "no (image|mask)"),
-    "cut": (cut, "(an image|a mask) that cannot be used|an image that cannot be read"),
-    "another shape": (lambda file: write_png(file, np.zeros((4, 4))), ""),
+    "cut": (cut, "a mask that cannot be used|an image that cannot be read"),
+    "of another shape": (lambda file: write_png(file, np.zeros((4, 4))), "a mask that cannot be"),
 }
 
 
-@pytest.mark.parametrize("harm", ("gone", "cut"))
+@pytest.mark.parametrize("harm", HARM)
 @pytest.mark.parametrize("place", (1, 2))
 def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(scene, place, harm):
     """By its image, or by its mask; of nine views for training eight must be left."""
     folder, where, (do, why) = scene[0], scene[place], HARM[harm]
     if where is None or (harm == "gone" and where.name == "rgb"):
         return  # nothing but the images lists them
+    if harm == "of another shape" and place == 1:
+        return  # is refused: of which of them is the camera?
     if (place, harm) == (2, "gone") and where.parent.name != "sequence" and no_frame_names(folder):
         return  # the hull of the others' masks tells: tests/scene/test_silhouette.py
-    before = load_scene(folder).splits["train"]
+    before = {view.name: view.stored_camera for view in load_scene(folder).splits["train"]}
     do(sorted(where.iterdir())[2])
     with pytest.warns(UserWarning, match=f"train: 1 of 9 views left out: ({why})") as told:
         left = load_scene(folder)
     assert len(told) == 1 and len(left.notes) == 1
     names = [view.name for view in left.splits["train"]]
-    assert names == [view.name for view in before if view.name in names] and len(names) == 8
+    assert names == [name for name in before if name in names] and len(names) == 8
+    for view in left.splits["train"]:
+        assert np.array_equal(view.stored_camera.pose, before[view.name].pose)
     do(sorted(where.iterdir())[4])
     refused(folder, folder.parent if folder.name == "sequence" else folder)
 
 
-def test_masks_of_another_size_and_of_another_shape(scene):
+def test_images_that_were_reduced(scene):
+    """After their cameras were found, as people do to save time."""
+    folder, images, _ = scene
+    if images.name in ("image", "rgb") or folder.name == "sequence":
+        return  # their cameras are for no stated size, or for the images as they are
+    before = scene_frames(folder)
+    for file in images.iterdir():
+        write_png(file, np.zeros((11, 15)))
+    for got, one in zip(scene_frames(folder), before, strict=True):
+        half = one.camera.downscaled(2)
+        np.testing.assert_allclose(got.camera.packed((1, 2)), half.packed((1, 2)), atol=1e-5)
+        assert (type(got.camera.width), type(got.camera.height)) == (int, int)
+
+
+def test_masks_of_another_size(scene):
     folder, _, masks = scene
     if masks is None:
         return
@@ -113,9 +127,6 @@ def test_masks_of_another_size_and_of_another_shape(scene):
     mask.resize((2 * mask.width, 2 * mask.height)).save(file)
     with pytest.warns(UserWarning, match="masks are resized to their images"):
         assert len(load_scene(folder).splits["train"]) == 9
-    write_png(file, np.zeros((4, 4)))
-    with pytest.warns(UserWarning, match="1 of 9 views left out: a mask that cannot be used"):
-        load_scene(folder)
 
 
 def test_no_folder_of_masks_at_all(scene):
@@ -136,19 +147,12 @@ def test_every_eighth_is_held_out():
     assert sorted(hold_out(range(18), "test") + hold_out(range(18), "train")) == list(range(18))
 
 
-def test_the_first_ending_that_exists(tmp_path):
-    write_png(tmp_path / "a.png", np.zeros((2, 2)))
-    assert find_image(tmp_path, "a", FAIL, ("", ".jpg", ".png")) == "a.png"
-    assert find_image(tmp_path, "./b/../a.png", FAIL) == "a.png"
-    with pytest.raises(UserError, match="'b', with or without the ending"):
-        find_image(tmp_path, "b", FAIL, ("", ".jpg"))
-
-
 @pytest.mark.parametrize(
     "given, there",
     [
         ("/home/ada/mug/images/a.png", "images/a.png"),
         (r"C:\Users\ada\mug\images\a.png", "images/a.png"),
+        (r".\images\a.png", "images/a.png"),
         ("images/a.jpg", "images/a.png"),
         ("images/A.PNG", "images/a.png"),
         ("images/a.png.png", "images/a.png"),
@@ -176,7 +180,10 @@ def test_which_image_a_name_means(tmp_path, given, there):
 def test_alpha_goes_before_and_two_that_differ_in_case_are_none(tmp_path):
     for name in ("a.jpg", "a.png", "bC.jpg", "Bc.jpg"):
         (tmp_path / name).write_bytes(b"")
-    assert find_image(tmp_path, "a", FAIL) == "a.png"
+    assert find_image(tmp_path, "a", FAIL) == find_image(tmp_path, "./b/../a.png", FAIL) == "a.png"
+    assert find_image(tmp_path, "a", FAIL, ("", ".jpg", ".png")) == "a.jpg", "first as it says"
+    with pytest.raises(UserError, match="'b', with or without the ending"):
+        find_image(tmp_path, "b", FAIL, ("", ".jpg"))
     with pytest.raises(Unusable):
         find_image(tmp_path, "bc.jpg", FAIL)
 
@@ -193,8 +200,6 @@ def test_places_in_a_list_of_which_some_are_gone():
 def test_paths_as_windows_writes_them(tmp_path):
     """Also as the name of a file, where a zip of Windows was unpacked elsewhere."""
     (tmp_path / "images").mkdir()
-    write_png(tmp_path / "images" / "a.png", np.zeros((2, 2)))
-    assert find_image(tmp_path, r".\images\a.png", FAIL) == "images/a.png"
     write_png(tmp_path / r"images\b.png", np.zeros((2, 2)))
     assert find_image(tmp_path, r"images\b.png", FAIL) == r"images\b.png"
     with pytest.raises(UserError, match="leaves the scene's folder"):
@@ -239,16 +244,22 @@ def test_what_numpy_writes(tmp_path, rng):
     assert read_npy(tmp_path / "whole.npy").tolist() == [[1, -2]]
     np.savez_compressed(tmp_path / "a.npz", cam_1=array, other=array)
     assert list(read_npz(tmp_path / "a.npz", "cam_")) == ["cam_1"]
+    with zipfile.ZipFile(tmp_path / "b.npz", "w", zipfile.ZIP_BZIP2) as archive:
+        archive.write(tmp_path / "0.npy", "cam_1.npy")
+    with refusing(tmp_path / "b.npz", "is packed as numpy does not"):
+        read_npz(tmp_path / "b.npz", "cam_")
 
 
 def test_json_of_at_most_so_many_bytes(tmp_path, monkeypatch):
-    (tmp_path / "a.json").write_text('{"frames": [1, 2]}')
+    (tmp_path / "a.json").write_text('{"frames": [1, 2]}', encoding="utf-8-sig")
     assert read_json(tmp_path / "a.json") == {"frames": [1, 2]}
-    monkeypatch.setattr(common, "MOST_JSON", 17)
-    unreadable(read_json, tmp_path / "a.json")
+    monkeypatch.setattr(common, "MOST_JSON", 20)
+    with refusing(tmp_path / "a.json"):
+        read_json(tmp_path / "a.json")
     monkeypatch.setattr("pp_cl.files.untrusted.MOST_VALUES", 2)
-    monkeypatch.setattr(common, "MOST_JSON", 18)
-    unreadable(read_json, tmp_path / "a.json")
+    monkeypatch.setattr(common, "MOST_JSON", 21)
+    with refusing(tmp_path / "a.json"):
+        read_json(tmp_path / "a.json")
 
 
 def test_lines_of_numbers(tmp_path):
@@ -271,34 +282,27 @@ HEADERS = {
 }
 
 
-def unreadable(read, *given):
-    with refusing(given[0]):
-        read(*given)
-
-
 @pytest.mark.parametrize("case", HEADERS)
 def test_headers_that_lie(tmp_path, case):
     """Of a .npy file with 16 numbers."""
     header = HEADERS[case].encode().ljust(1000) + b"\n"
     content = b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header + bytes(128)
     (tmp_path / "a.npy").write_bytes(content)
-    unreadable(read_npy, tmp_path / "a.npy")
+    with refusing(tmp_path / "a.npy"):
+        read_npy(tmp_path / "a.npy")
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.write(tmp_path / "a.npy", "cam.npy")
-    unreadable(read_npz, tmp_path / "a.npz", "cam")
+    with refusing(tmp_path / "a.npz"):
+        read_npz(tmp_path / "a.npz", "cam")
 
 
-@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\0", b"\x93NUMPY\x09\0" + bytes(100)])
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\0", b"\x93NUMPY\x02\0" + bytes(100)])
 def test_what_is_no_array(tmp_path, content):
     (tmp_path / "a.npy").write_bytes(content)
-    unreadable(read_npy, tmp_path / "a.npy")
-    unreadable(read_npz, tmp_path / "a.npy", "cam")
-
-
-def test_headers_of_up_to_4_gigabytes_are_not_read(tmp_path):
-    with (tmp_path / "a.npy").open("wb") as file:
-        np.lib.format.write_array(file, np.ones(3), version=(2, 0))
-    unreadable(read_npy, tmp_path / "a.npy")
+    with refusing(tmp_path / "a.npy"):
+        read_npy(tmp_path / "a.npy")
+    with refusing(tmp_path / "a.npy"):
+        read_npz(tmp_path / "a.npy", "cam")
 
 
 @pytest.mark.parametrize(
@@ -306,25 +310,8 @@ def test_headers_of_up_to_4_gigabytes_are_not_read(tmp_path):
 )
 def test_what_holds_no_finite_numbers(tmp_path, array):
     np.save(tmp_path / "a.npy", array)
-    unreadable(read_npy, tmp_path / "a.npy")
-
-
-@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_compressed_file_with_a_changed_byte(tmp_path, rng, method):
-    """Wherever it is, one line says so, unless the byte does not matter."""
-    np.save(tmp_path / "a.npy", rng.normal(size=(3, 4)))
-    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
-        archive.write(tmp_path / "a.npy", "cam.npy")
-    data, refusals = (tmp_path / "a.npz").read_bytes(), 0
-    for place in range(len(data)):
-        changed = bytearray(data)
-        changed[place] ^= 0xFF
-        (tmp_path / "a.npz").write_bytes(changed)
-        try:
-            read_npz(tmp_path / "a.npz", "cam")
-        except UserError:
-            refusals += 1
-    assert refusals > len(data) // 2
+    with refusing(tmp_path / "a.npy"):
+        read_npy(tmp_path / "a.npy")
 
 
 def test_all_arrays_of_a_file_count(tmp_path, monkeypatch):
@@ -333,4 +320,5 @@ def test_all_arrays_of_a_file_count(tmp_path, monkeypatch):
     np.savez(tmp_path / "a.npz", cam_1=np.zeros(16), other=np.zeros(9))
     assert len(read_npz(tmp_path / "a.npz", "cam_")) == 1
     np.savez(tmp_path / "b.npz", cam_1=np.zeros(9, "<f4"), cam_2=np.zeros(9, "<f4"))
-    unreadable(read_npz, tmp_path / "b.npz", "cam_")
+    with refusing(tmp_path / "b.npz"):
+        read_npz(tmp_path / "b.npz", "cam_")

@@ -43,14 +43,6 @@ def test_axes_are_down_right_and_back(tmp_path):
     assert photograph.depth_range is None and photograph.mask is None
 
 
-def test_images_smaller_than_the_poses_say(scene):
-    """LLFF's own factor: the focal length shrinks with the images."""
-    before = [p.camera.fx for p in read_split(scene, "train", Notes())]
-    edit(scene, lambda rows: rows * np.where(np.isin(np.arange(17), (4, 9, 14)), 4, 1))
-    after = [p.camera.fx for p in read_split(scene, "train", Notes())]
-    np.testing.assert_allclose(before, after)
-
-
 # --------------------------------------------------------------------------------------------------
 
 
@@ -75,19 +67,3 @@ def test_bad_poses(scene, case):
     change, word = BAD[case]
     edit(scene, change)
     refused(scene, scene / FILE, word)
-
-
-def test_sizes_are_whole_numbers(scene):
-    """Those of the file are float64, and stand in digests of cameras as they are."""
-    camera = read_split(scene, "train", Notes())[0].camera
-    assert (type(camera.width), type(camera.height)) == (int, int)
-
-
-def test_missing_images(scene):
-    """Numbers tell which; where the last is gone nothing does."""
-    before = {p.name: p.camera for p in read_split(scene, "train", Notes())}
-    (scene / "images" / "000003.png").unlink()
-    left = read_split(scene, "train", Notes())
-    assert len(left) == 8 and all(np.array_equal(before[p.name].pose, p.camera.pose) for p in left)
-    (scene / "images" / "000010.png").unlink()
-    refused(scene, scene / FILE, "9 images")

@@ -44,15 +44,6 @@ def test_projection_follows_opengl(tmp_path, rng):
         assert depth > 0 and np.allclose(found, expected, rtol=0, atol=1e-9)
 
 
-def test_defaults_of_nerf_synthetic(tmp_path):
-    write_scene(tmp_path)
-    scene = load_scene(tmp_path)
-    camera = scene.splits["train"][0].camera
-    assert camera.fx == camera.fy == 0.5 * SIZE[0] / math.tan(0.35)
-    assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
-    assert [view.depth_range for view in scene.splits["train"]] == [None] * 3
-
-
 def test_nerfstudio_names(tmp_path):
     """A frame's own key goes before the file's."""
 
@@ -76,22 +67,17 @@ def test_nerfstudio_names(tmp_path):
     ]
 
 
-def test_images_that_were_reduced(tmp_path):
-    """After w and h were written: what is in pixels is scaled to them, angles need not be."""
-    keys = {"fl_x": 60.0, "fl_y": 62.0, "cx": 25.0, "cy": 17.0}
-    write_scene(tmp_path, edit=lambda data: data.update(keys, w=2 * SIZE[0], h=2.0 * SIZE[1]))
-    camera = load_scene(tmp_path).splits["train"][0].camera
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 12.5, 8.5)
-    assert (camera.width, camera.height) == SIZE
-    camera = train_views(tmp_path, w=2 * SIZE[0], h=2 * SIZE[1])[0].camera
-    assert camera.fx == pytest.approx(0.5 * SIZE[0] / math.tan(0.35))
-    assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
-
-
 def test_an_image_that_is_turned(tmp_path):
     """Without EXIF that says so, nothing tells which way."""
     write_scene(tmp_path, edit=lambda data: data.update(w=SIZE[1], h=SIZE[0]))
     refused(tmp_path, tmp_path / "transforms_train.json", "w: is for", "turned", "upright")
+
+
+def test_angles_of_images_that_were_reduced(tmp_path):
+    """They stay; what is in pixels is scaled: tests/scene/readers/test_common.py."""
+    camera = train_views(tmp_path, w=2 * SIZE[0], h=2 * SIZE[1])[0].camera
+    assert camera.fx == pytest.approx(0.5 * SIZE[0] / math.tan(0.35))
+    assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
 
 
 @pytest.mark.parametrize("ending", (".JPG", ".jpeg", ".webp"))
@@ -123,30 +109,6 @@ def test_angle_of_height_and_single_focal_length(tmp_path):
     assert camera.fy == 0.5 * SIZE[1] / math.tan(0.25) != camera.fx
     camera = train_views(tmp_path, fl_x=40)[0].camera
     assert camera.fx == camera.fy == 40
-
-
-@pytest.mark.parametrize(
-    "given", ("train_1", "./train_1.png", "sub/../train_1", "{folder}/train_1", "linked")
-)
-def test_ways_to_name_an_image(tmp_path, given):
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "linked.png").symlink_to("train_1.png")
-    path = given.format(folder=tmp_path)
-    write_scene(tmp_path, edit=lambda data: data["frames"][1].update(file_path=path))
-    view = load_scene(tmp_path).splits["train"][1]
-    assert view.name == "train_1.png" and np.array_equal(
-        view.image, read_rgba(tmp_path / "train_1.png")
-    )
-
-
-def test_json_in_utf8_with_byte_order_mark(tmp_path):
-    data = write_scene(tmp_path, count=1)
-    (tmp_path / "train_0.png").rename(tmp_path / "köpfe.png")
-    data["frames"][0]["file_path"] = "köpfe"
-    (tmp_path / "transforms_train.json").write_text(
-        json.dumps(data, ensure_ascii=False), encoding="utf-8-sig"
-    )
-    assert load_scene(tmp_path).splits["train"][0].name == "köpfe.png"
 
 
 def test_rows_and_rounding_of_the_pose(tmp_path, rng):
