@@ -12,10 +12,8 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
-from itertools import pairwise
 
 from pp_cl import __version__
-from pp_cl.commands.options import METRICS
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
 from pp_cl.files.atomic import mend
 
@@ -37,8 +35,6 @@ COMMANDS = (
 )  # modules of pp_cl.commands
 
 
-# options whose value may be left out, and what it is then
-ALONE = {"--json": "-", "--metrics": ",".join(METRICS)}
 SIGPIPE = 13  # Windows has no name for it
 
 
@@ -108,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # letters that its encoding lacks
             stream.reconfigure(errors="backslashreplace")
     try:
-        options = _parse(sys.argv[1:] if argv is None else list(argv))
+        options = _parser().parse_args(argv)
         json_alone = getattr(options, "json", None) is sys.stdout
         with redirect_stdout(sys.stderr) if json_alone else nullcontext():
             options.run(options)
@@ -155,23 +151,6 @@ def _show(line):
 def _fail(message, status=2):
     _show_warning(message)
     return status
-
-
-def _parse(argv):
-    """The options. Where the words make no sense otherwise, the word after --json or --metrics is
-    what the command works on, as in `pp-cl info --json RUN`.
-    """
-    parser, errors = _parser(), []
-    for alone in ((), ("--json",), ("--metrics",), tuple(ALONE)):
-        words = list(argv)
-        for i, (word, value) in enumerate(pairwise(argv)):
-            if word in alone and not {*value.split(",")} <= {*METRICS}:
-                words[i] = f"{word}={ALONE[word]}"
-        try:
-            return parser.parse_args(words)
-        except _UsageError as error:
-            errors.append(error)
-    raise errors[0]
 
 
 def _parser():

@@ -21,7 +21,7 @@ from pp_cl.run import image_files, render_views
 @pytest.fixture(scope="module")
 def run(runs, tmp_path_factory):
     """A finished run on the ball, at a size whose reduction is no multiple of 4."""
-    changes = {"train__iterations": 40, "train__crop": 28, "train__final_prune_weight": 0}
+    changes = {"train__iterations": 40, "train__crop": 28, "train__prune_weight": 0}
     return runs.trained(tmp_path_factory.mktemp("evaluate") / "run", runs.ball(size=60), **changes)
 
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pp_cl.cli import _parse, main
+from pp_cl.cli import main
 from pp_cl.commands import options
 
 REFUSED = [
@@ -39,7 +39,7 @@ def test_texts_become_what_is_meant(tmp_path):
 
 
 def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypatch):
-    """One rule for every command; a RUN that follows --json is no file."""
+    """One rule for every command."""
     monkeypatch.setattr("pp_cl.device.discover.list_devices", lambda **_: [])
     file = tmp_path / "a.json"
     for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):
@@ -54,7 +54,7 @@ def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
         options.write_json_option(given.json, {"a": 1})
 
     monkeypatch.setattr("pp_cl.commands.info.run", talk)
-    assert main(["info", "--json", str(tmp_path)]) == 0
+    assert main(["info", str(tmp_path), "--json"]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out) == {"a": 1} and printed.err == f"measuring {tmp_path}\n"
     assert sys.stdout is not sys.stderr
@@ -75,27 +75,3 @@ def test_an_empty_value_is_refused(words, capsys):
         assert main(given) == 2
         error = capsys.readouterr().err
         assert f"{words[-1]}: is empty" in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "words, found",
-    [
-        ("bench --json conv", {"what": "conv", "json": "-"}),
-        ("bench --json a.json conv", {"what": "conv", "json": "a.json"}),
-        ("bench conv --json", {"what": "conv", "json": "-"}),
-        ("bench conv --json out", {"what": "conv", "json": "out"}),
-        ("sweep --out S --json out demo", {"scenes": ["demo"], "json": "out"}),
-        ("compare --metrics A B", {"prediction": "A", "truth": "B", "metrics": options.METRICS}),
-        ("eval --json --metrics RUN", {"metrics": options.METRICS, "json": "-"}),
-        ("eval --metrics RUN", {"run_folder": "RUN", "metrics": options.METRICS}),
-        ("eval RUN --metrics psnr", {"run_folder": "RUN", "metrics": ("psnr",)}),
-        ("info --json RUN", {"subject": "RUN", "json": "-"}),
-    ],
-)
-def test_a_word_after_an_option_that_may_stand_alone(tmp_path, monkeypatch, words, found):
-    """It is its value, unless the command then lacks what it works on."""
-    monkeypatch.chdir(tmp_path)
-    given = vars(_parse(words.split()))
-    given["json"] = "-" if given["json"] is sys.stdout else given["json"]
-    for name, value in found.items():
-        assert given[name] == value, name
