@@ -23,7 +23,7 @@ from pp_cl.scene.camera_path import up_of
 FAR = np.array([1e6, -1e6, 1e6])
 UNIT = 2.0**-24  # of the eyes: float64 holds them exactly 1e6 away, and the grid too
 NEAR = np.array([0.0, 512.0, -64.0])
-CHANGES = {"train__iterations": 24, "train__prune_every": 8}
+CHANGES = {"train__iterations": 24, "train__prune_every": 8, "train__prune_weight": 0.05}
 
 
 def trained(folder, by, *, unit=None, **changes):

@@ -14,8 +14,9 @@ from pp_cl.cli import main
 def test_views_are_measured_on_the_way_without_a_change_of_the_run(tmp_path, capsys):
     scene = write_ball_scene(tmp_path / "ball")
     plain, measured = tmp_path / "plain", tmp_path / "measured"
-    assert main(arguments(scene, plain)) == 0
-    assert main([*arguments(scene, measured), "--eval-every", "12"]) == 0
+    last = {"train__prune_weight": 0}
+    assert main(arguments(scene, plain, **last)) == 0
+    assert main([*arguments(scene, measured, **last), "--eval-every", "12"]) == 0
     assert checkpoint(plain) == checkpoint(measured)
     log = rows(measured)
     tests = {row["step"]: row["test_psnr"] for row in log if "test_psnr" in row}

@@ -45,7 +45,7 @@ def measured_psnr(out):
 def refined(scene, tmp_path_factory):
     """(Folder of a finished run that was refined once, command line of a longer one)."""
     out, changes = tmp_path_factory.mktemp("runs") / "refined", {"train__refine_at": "0.35,1"}
-    changes |= {"points__count": 300, "train__checkpoint_every": 3}
+    changes |= {"points__count": 300, "train__checkpoint_every": 3, "train__prune_weight": 0.05}
     changes["raster__radius"] = 1  # points lie 3 pixels apart
 
     def words(out, iterations):
@@ -128,7 +128,7 @@ def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch, share, s
     """Stopped before and after the refinement, which may come after the averages' beginning."""
     monkeypatch.setattr(*LOOKS)
     scene = write_ball_scene(tmp_path / "ball")
-    changes = {"train__refine_at": f"{share},1", "points__count": 300}
+    changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_weight": 0.05}
     changes["downscale"] = 1
     assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
     whole = checkpoint(tmp_path / "whole")

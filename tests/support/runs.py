@@ -25,6 +25,7 @@ SETTINGS = {
     "train.prune_every": 10,
     "train.checkpoint_every": 10,
     "train.log_every": 5,
+    "train.prune_weight": 0.5,
 }
 
 
