@@ -245,6 +245,12 @@ def text_of(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
+def field_of(key: str) -> dataclasses.Field:
+    """The dataclass field of a setting section.key."""
+    section, _, name = key.partition(".")
+    return next(f for f in dataclasses.fields(getattr(Config(), section)) if f.name == name)
+
+
 def help_lines() -> list[str]:
     """Lines `section.key = default  (help)` of all settings, each with the values of the presets
     that differ: the text of `--help`.

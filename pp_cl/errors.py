@@ -65,8 +65,7 @@ def shown(text: str, most: int = 100) -> str:
     """What others wrote, for a message: on one line, without control characters, of at most `most`
     characters.
     """
-    text = " ".join(text[: 4 * most].split())
-    text = "".join(letter if letter.isprintable() else "?" for letter in text)
+    text = one_line(" ".join(text[: 4 * most].split()))
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 

@@ -4,7 +4,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -189,15 +189,22 @@ def check_scene(path: str) -> None:
         raise UserError(f"{path}: the run's scene is not there; say where with --scene")
 
 
+def stored_config(folder: RunFolder, scene: str | None = None) -> Config:
+    """The settings of a run. scene: the folder of its scene, if that has moved. Raises UserError
+    where either is missing or broken.
+    """
+    if scene is not None:
+        check_scene(scene)
+    config = load_config(folder.config)
+    return configure(config, scene or config.scene.path)
+
+
 def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Run:
     """The run in a folder, finished or not. scene: the folder of its scene, if that has moved.
     Raises UserError naming the file that is missing or broken.
     """
-    if scene is not None:
-        check_scene(scene)
     place = RunFolder(folder)
-    config = load_config(place.config)
-    configure(config, scene or config.scene.path)
+    config = stored_config(place, scene)
     header, arrays = load_run_state(place, config)
     net = UNet.of_settings(dev, config.network)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
@@ -256,17 +263,16 @@ def evaluate(
     *,
     save_images: bool = False,
     out: Path | str | None = None,
-    on_view: Callable[[int, int], None] = lambda _measured, _views: None,
 ) -> dict[str, Any]:
     """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
     RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former. Where the
     run's photographs had gains, views are also measured after the best ones, exposed_alike().
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. on_view: called after each view with the number of
-    those measured and of all. Raises UserError for a missing or broken split, a folder that may not
-    be written, an `out` that holds something else than an evaluation, and a file in the place of
-    one that it writes which no evaluation has written as it is now.
+    place of what an earlier evaluation left. A progress bar shows on a terminal. Raises UserError
+    for a missing or broken split, a folder that may not be written, an `out` that holds something
+    else than an evaluation, and a file in the place of one that it writes which no evaluation has
+    written as it is now.
     """
     target = run.folder.evaluation(split) if out is None else Path(out)
     _check_target(target, is_new=out is not None)
@@ -282,7 +288,9 @@ def evaluate(
         remove_ours((target / "images").rglob("*"))
     rows: list[dict[str, Any]] = []
     costs, shown = [], []
-    for i, rendered in enumerate(render_views(run, views)):
+    every = render_views(run, views)
+    bar = tqdm(every, "measuring", len(views), unit="view", leave=False, disable=None)
+    for i, rendered in enumerate(bar):
         image, truth = rendered.image, rendered.truth
         rows.append({"name": rendered.name} | measure(image, truth))
         if "exposed" in run.header:
@@ -294,7 +302,6 @@ def evaluate(
         if save_images:
             images[i].parent.mkdir(parents=True, exist_ok=True)
             write_png(images[i], image)
-        on_view(i + 1, len(views))
     means = mean([{name: row[name] for name in metrics} for row in rows])
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
     if "exposed" in run.header:

@@ -44,6 +44,7 @@ from pp_cl.training.checkpoint import load_run_state, opened_run
 from pp_cl.training.memory import Room
 from pp_cl.training.start import NEVER, begin_network, fitting_hull, picture_of_masks
 
+PREVIEWS = 4  # of a training, besides an early one
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
 PLACES = (("scene", "path"), ("scene", "masks"), ("scene", "ignore"))
@@ -149,8 +150,8 @@ class Training:
                 if is_planned and budget.plan(trainer.step, seconds, took):
                     trainer.take_plan()
                     self.folder.configure(self.config.to_json())
-                if trainer.step == first and self._lacks_previews():  # the kernels are built
-                    self._preview_by = time.monotonic() + FIRST_PREVIEW
+                if trainer.step == first and not any(self.folder.previews.glob("*.png")):
+                    self._preview_by = time.monotonic() + FIRST_PREVIEW  # the kernels are built
                 row = self._after_step(log, terms, seconds)
                 if on_step:
                     on_step(trainer.step, row)
@@ -180,7 +181,7 @@ class Training:
             state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
             row = self._row(seconds) | terms.get() | state | measured
             log.write(row)
-        due = train.previews and step % -(-train.iterations // train.previews) == 0
+        due = step % -(-train.iterations // PREVIEWS) == 0
         if last or due or time.monotonic() >= self._preview_by:
             self._preview()
         due = step % train.checkpoint_every == 0 or time.monotonic() >= self._save_by
@@ -200,9 +201,6 @@ class Training:
             for image in [self._rendered(view)]
         ]
         return {"test_psnr": float(np.mean(found))}
-
-    def _lacks_previews(self):
-        return self.config.train.previews and not any(self.folder.previews.glob("*.png"))
 
     def _expect_save(self):
         """Set the time of the next checkpoint; the clock influences nothing else."""

@@ -35,8 +35,8 @@ class SceneConfig:
         " out a uniform background; box, none: no masks, points fill a box",
         choices=("given", "alpha", "color", "box", "none"),
     )
-    masks: str = setting("", "folder of masks named like the photographs, white on the object")
-    ignore: str = setting("", "folder of masks that are white where photographs say nothing")
+    masks: str = setting("", "masks named like the photographs, white on the object")
+    ignore: str = setting("", "masks that are white where photographs say nothing")
     mask_tolerance: float = setting(
         10.0,
         "largest CIELAB distance from the background's colour that still counts as background",
@@ -125,10 +125,16 @@ class NetworkConfig:
 class TrainConfig:
     """The optimisation."""
 
-    iterations: int = setting(8_000, "training steps; every schedule ends at the last", 1, 10**8)
+    iterations: int = setting(
+        8_000,
+        "training steps; every schedule ends at the last; more of them extend a finished run",
+        1,
+        10**8,
+    )
     minutes: float = setting(
         0.0,
-        "minutes of training: iterations follow from the measured speed (0: as set)",
+        "minutes for the steps, whose number follows from the measured speed, within 25 %; reading"
+        " the scene and `pp-cl eval` come on top (0: as many steps as set)",
         0,
         1440,
     )
@@ -204,14 +210,12 @@ class TrainConfig:
     prune_weight: float = setting(
         0.05,
         "prune points whose blend weight, summed over a step's pixels, has not reached this in any"
-        " step, or whose opacity is below 0.01 (0: off)",
+        " step, or whose opacity is below 0.01; after the last step, those that reach it in no"
+        " training view (0: off)",
         0,
         1e6,
     )
     prune_every: int = setting(250, "steps between two prunings", 1, 10**8)
-    prune_looks: int = setting(
-        100, "steps that must have had a point in view before it may be pruned", 1, 10**8
-    )
     refine_at: tuple = setting(
         (0.0, 0.0),
         "shares of the iterations after which images double in size and a point becomes eight;"
@@ -219,13 +223,6 @@ class TrainConfig:
         " pixels apart)",
         0,
         1,
-    )
-    final_prune_weight: float = setting(
-        0.05,
-        "after the last step, prune points that reach this blend weight in no training view (0:"
-        " off)",
-        0,
-        1e9,
     )
     ema: bool = setting(
         True, "average the parameters (EMA) over the last 15 % of the steps and keep the averages"
@@ -241,7 +238,6 @@ class TrainConfig:
         2**20,
     )
     log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
-    previews: int = setting(4, "preview images during the training, besides an early one", 0, 1000)
     eval_every: int = setting(
         0,
         "steps between two measurements of a few views of the split val, else test: test_psnr"

@@ -256,7 +256,7 @@ class Trainer:
         low or that too few training views show, and those that then hang in the air by few.
         """
         self.optimiser.apply_ema()
-        if self.config.train.final_prune_weight > 0:
+        if self.config.train.prune_weight > 0:
             self.renderer.release()  # for whole views with weights by pair
             self._keep(points_that_views_show(self.renderer, self.views, self.config))
             self._keep(points_of_large_parts(self.model))

@@ -4,7 +4,6 @@ import json
 import shutil
 
 import pytest
-from support.refused import failure
 from support.runs import arguments, spoken
 from support.scenes import write_ball_scene
 
@@ -31,13 +30,6 @@ def test_a_run_alone_is_exported(alone, tmp_path):
         assert main(["export", str(alone), "--format", kind, "--out", str(out)]) == 0
     frames = json.loads((scene / "transforms_train.json").read_text())["frames"]
     assert mesh.is_file() and len(frames) == len(list((scene / "train").iterdir())) == 8
-
-
-def test_a_run_alone_is_rendered_from_where_it_was_photographed(alone, tmp_path):
-    for path in ("orbit", "train"):
-        words = ["render", alone, "--path", path, "--out", tmp_path / path, "--seconds", "0.1"]
-        assert spoken(words[:6] if path == "train" else words)[0] == 0
-    assert len(list((tmp_path / "train").glob("*.png"))) == 8
 
 
 def test_a_run_alone_says_what_is_in_it(alone, tmp_path, capsys):
@@ -69,9 +61,3 @@ def test_a_run_alone_is_compressed_by_what_it_rendered(alone, tmp_path):
     losses = [trial["loss"] for trial in report["trials"] if trial["taken"]]
     assert losses[-1] == report["loss"] <= 1 and max(losses) > 0.05
     assert spoken(["info", out])[0] == 0
-
-
-@pytest.mark.parametrize("words", [["eval"], ["render", "--path", "test"]])
-def test_what_needs_photographs_says_so_in_one_line(alone, words):
-    told = failure(words[0], alone, *words[1:])
-    assert "ball" in told and "--scene" in told

@@ -4,7 +4,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from support.runs import arguments, train_and_interrupt
+from support.runs import arguments
 
 from pp_cl.cli import main
 from pp_cl.files.run_folder import RunFolder
@@ -57,12 +57,3 @@ def test_minutes_and_steps_say_when_and_the_bytes_are_the_same(
     assert main(arguments(scene, tmp_path / "run", **changes)) == 0
     assert saved == expected
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
-
-
-def test_a_run_goes_on_from_a_checkpoint_of_the_clock(scene, whole, saved, tmp_path, monkeypatch):
-    out, changes = tmp_path / "run", RARELY | {"train__checkpoint_minutes": 7.5}
-    train_and_interrupt(scene, out, 12, monkeypatch, **changes)
-    assert saved == [8]
-    assert main(arguments(scene, out, **changes)) == 0
-    assert saved == [8, 16, 24, 32, 40, 48, 56, 60]
-    assert (out / "checkpoint.npz").read_bytes() == whole

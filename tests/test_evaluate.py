@@ -21,7 +21,7 @@ from pp_cl.run import image_files, render_views
 @pytest.fixture(scope="module")
 def run(runs, tmp_path_factory):
     """A finished run on the ball, at a size whose reduction is no multiple of 4."""
-    changes = {"train__iterations": 40, "train__crop": 28, "train__final_prune_weight": 0}
+    changes = {"train__iterations": 40, "train__crop": 28, "train__prune_weight": 0}
     return runs.trained(tmp_path_factory.mktemp("evaluate") / "run", runs.ball(size=60), **changes)
 
 
@@ -152,26 +152,12 @@ def test_an_unfinished_run_is_marked(tmp_path, capsys, monkeypatch):
     assert "(unfinished" not in capsys.readouterr().out
 
 
-def files_of(folder):
-    """{path: bytes} of all files below a folder, the time of metrics.json and what is hidden left
-    out.
-    """
-    files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("[!.]*.*")}
-    if "metrics.json" in files:
-        result = json.loads(files["metrics.json"])
-        files["metrics.json"] = {**result, "seconds_per_frame": None}
-    return files
-
-
 def test_an_evaluation_is_written_elsewhere_on_request(run, tmp_path, capsys):
-    """With the same content; the run's folder stays as it is."""
-    copy, out = tmp_path / "run", tmp_path / "there" / "eval"
-    shutil.copytree(run, copy, ignore=shutil.ignore_patterns("eval"))
-    before = files_of(copy)
-    assert main(["eval", str(copy), "--save-images", "--out", str(out)]) == 0
-    assert f"wrote {out / 'metrics.json'}" in capsys.readouterr().out and files_of(copy) == before
-    first = files_of(out)
-    assert main(["eval", str(copy), "--save-images"]) == 0
-    assert files_of(copy / "eval") == first
-    assert main(["eval", str(copy), "--save-images", "--out", str(out)]) == 0
-    assert files_of(out) == first
+    """The run's folder stays as it is."""
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    out = tmp_path / "there" / "eval"
+    assert main(["eval", str(run), "--save-images", "--out", str(out)]) == 0
+    assert f"wrote {out / 'metrics.json'}" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+    written = {path.name for path in out.rglob("[!.]*.*")}
+    assert written == {"metrics.json", "comparison.png", "r_0.png", "r_1.png"}

@@ -26,10 +26,8 @@ SETTINGS = {
     "train.crop": 40,
     "train.sh_smoothing": 0.25,
     "train.prune_every": 20,
-    "train.prune_looks": 5,
-    "train.final_prune_weight": 0.2,
+    "train.prune_weight": 0.2,
     "train.log_every": 10,
-    "train.previews": 0,
 }
 
 # A network's rate changed by 1e-7 of itself and the form for GPUs move the loss by up to 2e-3 in
@@ -43,6 +41,7 @@ def measure(folder):
     out = folder / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pp_cl.train.SMOOTHING_EVERY", 1)
+        patch.setattr("pp_cl.training.schedule.PRUNE_LOOKS", 5)
         assert main(["train", scene, "--out", str(out), *set_words(SETTINGS)]) == 0
     assert main(["eval", str(out)]) == 0
     rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]

@@ -15,7 +15,7 @@ from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid
-from pp_cl.scene.load import load_scene, preset_downscale, scene_frames
+from pp_cl.scene.load import load_scene, scene_frames
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.scene.views import View
 from pp_cl.training.memory import Room
@@ -46,12 +46,6 @@ def trained(request, scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("mixed") / "run"
     assert main(arguments(scene, out, 1, train__crop=request.param)) == 0
     return out
-
-
-def test_sizes_are_kept(scene):
-    views = load_scene(scene).splits["train"]
-    assert [(v.camera.width, v.camera.height) for v in views] == [*SIZES] * 3
-    assert preset_downscale(scene, "tiny") == 1
 
 
 def test_a_training_learns_and_resumes_to_the_same_bytes(scene, trained, tmp_path, monkeypatch):

@@ -1,7 +1,8 @@
 """What a user has in the folders that commands write to stays as it is: a command leaves it alone,
-or refuses in one line.
+or refuses in one line. A disk that is full leaves nothing half written.
 """
 
+import errno
 import os
 import shutil
 from pathlib import Path
@@ -25,6 +26,7 @@ COMMANDS = {
     "eval in JSON": (["eval", "run", "--json", "a.json"], ("a.json",)),
     "film": (FILM, ()),
     "film elsewhere": ([*FILM, "--out", "a.gif"], ("a.gif",)),
+    "mp4 elsewhere": ([*FILM, "--out", "a.mp4"], ("a.mp4",)),
     "frames": ([*FILM, "--format", "png"], ()),
     "frames elsewhere": ([*FILM, "--format", "exr", "--out", "there"], ()),
     **{f"export {name}": (["export", "run", "--format", name], ()) for name in FORMATS},
@@ -101,3 +103,20 @@ def test_what_is_the_users_stays(work, scene, name, capsys):
     changed = made([path for path in new if path.name not in COMMANDS[name][1]], work)
     assert changed or COMMANDS[name][1] or name == "train"
     again(beside | changed)
+
+
+def full(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("name", [n for n in COMMANDS if "elsewhere" in n or COMMANDS[n][1]])
+def test_a_full_disk_is_one_line_and_nothing_is_left(work, scene, name, monkeypatch):
+    words = words_for(name, scene)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        patch.setattr(os, "replace", full)
+        status, lines = spoken(words)
+    told = [line for line in lines if line.startswith("pp-cl: ")]
+    assert status == 2 and len(told) == 1 and "space" in told[0] and ".tmp" not in told[0]
+    assert not list(work.rglob(".*.tmp*"))
+    assert main(words) == 0

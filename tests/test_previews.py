@@ -14,7 +14,7 @@ from pp_cl.cli import main
 def test_views_are_measured_on_the_way_without_a_change_of_the_run(tmp_path, capsys):
     scene = write_ball_scene(tmp_path / "ball")
     plain, measured = tmp_path / "plain", tmp_path / "measured"
-    last = {"train__final_prune_weight": 0}
+    last = {"train__prune_weight": 0}
     assert main(arguments(scene, plain, **last)) == 0
     assert main([*arguments(scene, measured, **last), "--eval-every", "12"]) == 0
     assert checkpoint(plain) == checkpoint(measured)
@@ -40,23 +40,16 @@ def test_the_split_val_is_measured_where_there_is_one(tmp_path):
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {},
-        {
-            "train__refine_at": "0.5,1",
-            "downscale": 1,
-            "points__count": 300,
-        },
-        {"raster__blend": "softmax", "raster__max_tracked": 4},
-    ],
+    [{}, {"train__refine_at": "0.5,1", "downscale": 1, "points__count": 300}],
 )
 def test_previews_leave_the_run_as_it_is(tmp_path, monkeypatch, changes):
     """Many in places of their own, one of them by the clock, against none but the last."""
     scene = write_ball_scene(tmp_path / "ball")
     none, many = tmp_path / "none", tmp_path / "many"
-    assert main(arguments(scene, none, **changes, train__previews=0)) == 0
-    monkeypatch.setattr("pp_cl.session.FIRST_PREVIEW", 0)
-    assert main(arguments(scene, many, **changes, train__previews=7)) == 0
+    for out, previews, first in ((none, 1, 1e9), (many, 7, 0)):
+        monkeypatch.setattr("pp_cl.session.PREVIEWS", previews)
+        monkeypatch.setattr("pp_cl.session.FIRST_PREVIEW", first)
+        assert main(arguments(scene, out, **changes)) == 0
     names = [[p.name for p in sorted((run / "previews").iterdir())] for run in (none, many)]
     assert names[0] == ["step_000060.png"]
     assert names[1] == [f"step_{step:06d}.png" for step in (1, *range(9, 60, 9), 60)]
@@ -69,4 +62,5 @@ def test_a_run_that_has_a_preview_needs_no_early_one(tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.session.FIRST_PREVIEW", 0)
     before = {p.name for p in (out / "previews").iterdir()}
     assert main(arguments(scene, out)) == 0
-    assert {p.name for p in (out / "previews").iterdir()} == before | {"step_000060.png"}
+    after = {p.name for p in (out / "previews").iterdir()}
+    assert after == before | {"step_000045.png", "step_000060.png"}

@@ -134,14 +134,6 @@ def test_a_call_may_see_beyond_the_models_depth_range(dev, rng):
     assert seen.pairs.total > 0
 
 
-def test_pictures_are_repeatable(dev, rng):
-    model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
-    renderer = Renderer(dev, model, RasterConfig())
-    first = renderer.render(camera, GAMMA)
-    np.testing.assert_array_equal(first, renderer.render(camera, GAMMA))
-    np.testing.assert_array_equal(first, Renderer(dev, model, RasterConfig()).render(camera, GAMMA))
-
-
 @pytest.mark.parametrize("blend", BLENDS)
 def test_the_early_stop_of_a_call_is_that_of_other_settings(dev, rng, blend):
     model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]

@@ -274,7 +274,7 @@ def demo() -> list[dict]:
     rows.append({"what": "exported page against the run's images", "result": f"{page['run']} dB"})
     run_program(*PP_CL, "compress", short, "--max-loss", "0.1dB", "--out", KEPT / "smaller")
     before, after = (read_found("info", *PP_CL, "info", r) for r in (short, KEPT / "smaller"))
-    mib = [about["checkpoint_bytes"] / 2**20 for about in (before, after)]
+    mib = [about["files"]["checkpoint.npz"] / 2**20 for about in (before, after)]
     rows.append({"what": "compressed by 0.1 dB", "result": f"{mib[0]:.1f} to {mib[1]:.1f} MiB"})
     return rows
 

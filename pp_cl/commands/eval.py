@@ -20,28 +20,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="FOLDER", help="folder to write to, instead of RUN/eval")
     add("--save-images", action="store_true", help="write every view to RUN/eval/images/")
     shared.add_json(parser)
-    shared.add_open(parser)
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.commands.progress import counted
     from pp_cl.device.discover import open_device
     from pp_cl.run import evaluate, load_run
 
     metrics = options.metrics
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, scene=options.scene)
-    with counted("view") as on_view:
-        result = evaluate(
-            run,
-            options.split,
-            metrics,
-            save_images=options.save_images,
-            out=options.out,
-            on_view=on_view,
-        )
+    result = evaluate(run, options.split, metrics, save_images=options.save_images, out=options.out)
     folder = run.folder
     state = "" if result["finished"] else f", unfinished, step {result['step']}"
     own = f"{folder} ({len(result['per_image'])} views{state})"
@@ -59,8 +49,6 @@ def run(options: argparse.Namespace) -> None:
         f"wrote {written / 'metrics.json'} and {written / 'comparison.png'} (prediction"
         " | truth | 4 x error)"
     )
-    if options.open:
-        shared.show(written / "comparison.png")
 
 
 def _table(result, ranked, width):

@@ -3,10 +3,10 @@
 import argparse
 
 from pp_cl.commands import options as shared
-from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS
 
 HELP = "describe a run or a scene; --picture draws its points over photographs"
+MASKS = ("masks", "ignore", "mask_from")
 MIB = 2**20
 
 
@@ -22,9 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write photographs with outlines of points and masks, of a scene also the cameras from"
         " two sides (PNG)",
     )
-    shared.add_open(parser)
     add("--preset", choices=PRESETS, help="of a scene: preset of the hull (tiny)")
-    shared.add_masks(parser)
+    shared.add_short(parser, MASKS)
     shared.add_set(parser, "of a scene: another setting, such as scene.box")
     shared.add_run_scene(parser)
     shared.add_device(parser)
@@ -39,13 +38,11 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.scene.load import DEMO
 
-    if options.open and not options.picture:
-        raise UserError("--open: there is no picture; name its file with --picture FILE")
     folder = RunFolder(options.subject)
     is_scene = options.subject == DEMO or folder.path.exists() or not nearby_run(folder.path)
     is_run = folder.config.exists() or not is_scene
     if is_run:
-        shared.refuse(options, ("masks", "ignore", "mask_from", "set", "preset"), "only of a scene")
+        shared.refuse(options, (*MASKS, "set", "preset"), "only of a scene")
     else:
         shared.refuse(options, ("scene",), "only of a run")
     image = None
@@ -55,7 +52,7 @@ def run(options: argparse.Namespace) -> None:
             image = run_picture(open_device(options.device), folder, options.scene)
     else:
         dev = open_device(options.device)
-        given = shared.read_short(options, ("masks", "ignore", "mask_from")) + options.set
+        given = shared.read_short(options, MASKS) + options.set
         facts, views, hull, found = describe_scene(
             dev, options.subject, options.preset or "tiny", given
         )
@@ -67,8 +64,6 @@ def run(options: argparse.Namespace) -> None:
         facts["picture"] = options.picture
         lines.append(f"wrote {options.picture}")
     shared.tell(options.json, facts, lines)
-    if options.open:
-        shared.show(options.picture)
 
 
 def _sizes(images):

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.config import assign, configure, load_config, preset
+from pp_cl.config import assign, configure, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import check_scene, load_run, scene_is_there
+from pp_cl.run import load_run, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.edits import read_edits
@@ -53,7 +53,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     scene: where its scene is now, if it has moved. Raises UserError naming the file that is missing
     or broken.
     """
-    config, rows, measured = _config(folder, scene), folder.rows(), folder.measured()
+    config, rows, measured = stored_config(folder, scene), folder.rows(), folder.measured()
     last = rows[-1] if rows else {}
     facts = {
         "run": str(folder),
@@ -73,7 +73,6 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "notes": [],
         "points": None,
         "grid": None,
-        "checkpoint_bytes": None,
         "device": last.get("device"),
         "seconds": last.get("seconds"),
         "psnr": next((row["psnr"] for row in reversed(rows) if "psnr" in row), None),
@@ -94,7 +93,6 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         facts["points"] = {"initial": header["initial_points"], "left": left}
         cameras = [one.camera.downscaled(config.scene.downscale) for one in photographs]
         facts["grid"] = grid | {"edge_pixels": spacing_pixels(Grid.of_header(grid), cameras)}
-        facts["checkpoint_bytes"] = folder.checkpoint.stat().st_size
     return facts
 
 
@@ -102,7 +100,7 @@ def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.
     """picture() of the points that a run has left, over renderings where its scene is missing.
     Raises UserError as run_facts does, and for a scene that is broken.
     """
-    config = _config(folder, scene)
+    config = stored_config(folder, scene)
     with opened_run(folder, config) as stored:
         grid = Grid.of_header(stored.header["grid"])
         points = Hull(grid, stored.array("points.ids"), capped=False)
@@ -118,13 +116,6 @@ def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.
     run = load_run(dev, folder.path)
     shown = evenly(run.photographs("train"), SHOWN_VIEWS)
     return picture(dev, run.rendered(shown, opaque=True), points)
-
-
-def _config(folder, scene):
-    if scene is not None:
-        check_scene(scene)
-    config = load_config(folder.config)
-    return configure(config, scene or config.scene.path)
 
 
 def _files(folder):

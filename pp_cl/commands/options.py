@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import sys
-import webbrowser
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
@@ -18,6 +17,7 @@ from pp_cl.presets import SHORT
 
 METRICS = ("psnr", "ssim", "lpips")
 MOST_SIDE = 8192  # pixels of an image that is rendered
+METAVARS = {"masks": "FOLDER", "ignore": "FOLDER", "mask_from": "HOW", "network": "RUN"}  # else N
 
 # ---- types
 
@@ -199,19 +199,15 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_masks(parser: argparse.ArgumentParser) -> None:
-    """Add --masks, --ignore and --mask-from, for read_short."""
-    parser.add_argument(
-        "--masks", metavar="FOLDER", help="masks named like the photographs, white on the object"
-    )
-    parser.add_argument(
-        "--ignore", metavar="FOLDER", help="masks that are white where photographs say nothing"
-    )
-    parser.add_argument(
-        "--mask-from",
-        metavar="HOW",
-        help="given (default), alpha, color (a uniform background), box or none",
-    )
+def add_short(parser: argparse.ArgumentParser, names: Iterable[str]) -> None:
+    """Add the options of settings with short names, for read_short."""
+    for name in names:
+        item = config.field_of(SHORT[name])
+        parser.add_argument(
+            f"--{name.replace('_', '-')}",
+            metavar=METAVARS.get(name, "N"),
+            help=item.metadata["help"].replace("%", "%%"),
+        )
 
 
 def read_short(options: argparse.Namespace, names: Iterable[str]) -> list[tuple[str, str, str]]:
@@ -222,19 +218,6 @@ def read_short(options: argparse.Namespace, names: Iterable[str]) -> list[tuple[
         for name, text in texts.items()
         if text is not None
     ]
-
-
-def add_open(parser: argparse.ArgumentParser) -> None:
-    """Add --open, for show."""
-    parser.add_argument(
-        "--open", action="store_true", help="show the written picture with the system's viewer"
-    )
-
-
-def show(path: Path | str) -> None:
-    """Open a picture with the system's viewer, or say that there is none."""
-    if not webbrowser.open(Path(path).resolve().as_uri()):
-        print(f"--open: this system names no viewer; open {path} yourself", file=sys.stderr)
 
 
 def add_set(parser: argparse.ArgumentParser, text: str) -> None:

@@ -6,7 +6,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
@@ -102,30 +102,6 @@ class Progress:
 def _print(line, stream):
     with suppress(OSError):  # of a full disk, which is no reason to stop
         print(line, file=stream, flush=True)
-
-
-@contextmanager
-def counted(noun: str, stream: TextIO | None = None) -> Iterator[Callable[[int, int], None]]:
-    """What to call with the number of things done, and of all, whenever one more is done. stream:
-    sys.stderr if not given.
-    """
-    stream = stream or sys.stderr
-    start = told = time.monotonic()
-    with tqdm(
-        unit=noun, leave=False, mininterval=REDRAWN, file=stream, disable=not stream.isatty()
-    ) as bar:
-
-        def tell(done: int, total: int) -> None:
-            nonlocal told
-            if done == 1:
-                bar.reset(total)
-            bar.update()
-            now = time.monotonic()
-            if bar.disable and now - told >= LINES_APART:
-                told, left = now, tqdm.format_interval((now - start) / done * (total - done))
-                _print(f"{done} of {total} {noun}s, {left} left", stream)
-
-        yield tell
 
 
 @contextmanager

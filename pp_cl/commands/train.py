@@ -26,26 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="tiny (default): images of about 200 pixels, minutes on a CPU; small: of 400, and"
         " full: of 800, longer; paper: the paper's numbers",
     )
-    add("--iterations", metavar="N", help="training steps; more of them extend a finished run")
-    add(
-        "--minutes",
-        metavar="N",
-        help="minutes for the steps, instead of --iterations; kept within a quarter (reading the"
-        " scene and `pp-cl eval` come on top)",
-    )
-    add("--points", metavar="N", help="points wanted in the visual hull")
-    add(
-        "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"
-    )
-    shared.add_masks(parser)
-    add(
-        "--network",
-        metavar="RUN",
-        help="begin with the network of another run of yours (default: the demo's), or random",
-    )
-    add("--seed", metavar="S", help="seed of all random choices (0)")
-    add("--memory", metavar="GIB", help="most device memory to use")
-    add("--eval-every", metavar="N", help="measure a few test views every N steps (never)")
+    shared.add_short(parser, SHORT)
     add(
         "--tensorboard",
         action="store_true",

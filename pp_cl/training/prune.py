@@ -12,7 +12,7 @@ from pp_cl.model import Model
 from pp_cl.render import Renderer
 from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
-from pp_cl.training.schedule import GAMMA
+from pp_cl.training import schedule
 from pp_cl.training.state import PointState
 
 LEAST_OPACITY = 0.01
@@ -22,7 +22,7 @@ SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
 
 def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainConfig) -> Array:
     """(M,) uint32, ascending: the points that are kept during training. A point is judged once
-    train.prune_looks steps had it in their image: it is kept if its blend weight reached
+    PRUNE_LOOKS steps had it in their image: it is kept if its blend weight reached
     train.prune_weight in one of them and its opacity is at least LEAST_OPACITY, and its
     counts start anew. Points seen less often are kept.
 
@@ -34,7 +34,7 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainC
     broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
-    judged = seen >= train.prune_looks
+    judged = seen >= schedule.PRUNE_LOOKS
     passes = (weight >= train.prune_weight) & (opacities >= LEAST_OPACITY)
     dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
     dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
@@ -50,14 +50,14 @@ def final_points_to_keep(
     least: int,
 ) -> Array:
     """(M,) uint32, ascending: the points of a finished training that weigh at least
-    train.final_prune_weight in `least` training views and have LEAST_OPACITY. NaN counts as
+    train.prune_weight in `least` training views and have LEAST_OPACITY. NaN counts as
     too little.
 
     max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
-    many it is train.final_prune_weight.
+    many it is train.prune_weight.
     """
     weight, seen = dev.download(max_weight), dev.download(times_seen)
-    keep = (weight >= train.final_prune_weight) & (seen >= least)
+    keep = (weight >= train.prune_weight) & (seen >= least)
     return _listed(dev, keep & (dev.download(opacity) >= LEAST_OPACITY), weight)
 
 
@@ -68,8 +68,8 @@ def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Co
     dev, cloud, train = renderer.dev, renderer.model.cloud, config.train
     max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
     for view in views:
-        drawn = renderer.forward(view.camera, GAMMA[1], until="weights")
-        renderer.record_weights(drawn, max_weight, seen, least=train.final_prune_weight)
+        drawn = renderer.forward(view.camera, schedule.GAMMA[1], until="weights")
+        renderer.record_weights(drawn, max_weight, seen, least=train.prune_weight)
         del drawn  # else its arrays would stay beside the larger ones of the next view
     least = 2 if len(views) >= MANY_VIEWS else 1
     return final_points_to_keep(dev, max_weight, seen, cloud.opacity, train, least)

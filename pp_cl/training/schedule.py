@@ -15,6 +15,7 @@ GAMMA = (0.1, 0.01)  # depth sharpness of the softmax, first and last step (supp
 SH_DECAY = 0.1  # last over first learning rate of the SH (supplemental)
 SH_DELAY = (0.0, 0.01, 0.02)  # warm-up of SH degrees 0, 1, 2, as a share of the iterations
 SMOOTHING_EVERY = 64  # steps
+PRUNE_LOOKS = 100  # steps that must have had a point in view before it may be pruned
 EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
@@ -74,7 +75,7 @@ def prunings(train: TrainConfig, start: int, end: int) -> int:
     if train.prune_weight == 0:
         return 0
     every, last = train.prune_every, min(end, train.iterations - 1)
-    return max(0, last // every - -(-(start + train.prune_looks) // every) + 1)
+    return max(0, last // every - -(-(start + PRUNE_LOOKS) // every) + 1)
 
 
 def refine_steps(train: TrainConfig) -> list[int]:

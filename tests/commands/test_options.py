@@ -39,7 +39,7 @@ def test_texts_become_what_is_meant(tmp_path):
 
 
 def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypatch):
-    """One rule for every command; a RUN that follows --json is no file."""
+    """One rule for every command."""
     monkeypatch.setattr("pp_cl.device.discover.list_devices", lambda **_: [])
     file = tmp_path / "a.json"
     for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):
@@ -54,7 +54,7 @@ def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
         options.write_json_option(given.json, {"a": 1})
 
     monkeypatch.setattr("pp_cl.commands.info.run", talk)
-    assert main(["info", "--json", str(tmp_path)]) == 0
+    assert main(["info", str(tmp_path), "--json"]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out) == {"a": 1} and printed.err == f"measuring {tmp_path}\n"
     assert sys.stdout is not sys.stderr

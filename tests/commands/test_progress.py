@@ -53,24 +53,6 @@ def test_elsewhere_there_is_a_plain_line_every_30_seconds(training, monkeypatch)
     assert "00:20 left" in lines[-1]
 
 
-def test_things_are_counted(monkeypatch):
-    """Of 200 that take a second each: a line every 30 seconds, or a bar on a terminal."""
-    now = [1000.0]
-    monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
-    monkeypatch.setattr("pp_cl.commands.progress.time.monotonic", lambda: now[0])
-    monkeypatch.setenv("COLUMNS", "120")  # the rate, as tqdm measures it, has any number of digits
-    plain, terminal = io.StringIO(), Terminal()
-    for stream in (plain, terminal):
-        with progress.counted("view", stream) as tell:
-            for done in range(1, 201):
-                now[0] += 1
-                tell(done, 200)
-    lines = plain.getvalue().splitlines()
-    assert [int(line.split()[0]) for line in lines] == list(range(30, 200, 30))
-    assert lines[1] == "60 of 200 views, 02:20 left"
-    assert "/200 " in terminal.getvalue() and "\n" not in terminal.getvalue()
-
-
 def test_a_terminal_has_one_line(training, monkeypatch):
     monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
     text = shown(training, Terminal(), monkeypatch)

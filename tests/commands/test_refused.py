@@ -80,7 +80,6 @@ REFUSED = [
     ("info run --scene run --masks run", "--masks"),
     ("info run --set train.seed=1", "--set"),
     ("info run --preset tiny", "--preset"),
-    ("info run --open", "--picture"),
     ("info BALL --scene BALL", "--scene"),
     ("compare run --edge 1", "--edge"),
     ("compare run run --edge 1", "--edge"),

@@ -101,15 +101,6 @@ def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys)
     assert {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()} == whole
 
 
-def test_the_test_views_are_what_eval_shows(trained, tmp_path):
-    assert main(["eval", trained, "--save-images"]) == 0
-    out = tmp_path / "views"
-    assert main(["render", trained, "--path", "test", "--out", str(out), "--format", "png"]) == 0
-    for i in range(2):
-        saved = read_rgba(f"{trained}/eval/images/r_{i}.png")
-        np.testing.assert_array_equal(read_rgba(out / f"{i:05d}.png"), saved)
-
-
 def test_transparent_frames_and_colours(trained, tmp_path):
     words = ["render", trained, "--path", "test", "--format", "png"]
     images = {}

@@ -93,18 +93,3 @@ def test_ignored_signals_stay_ignored(monkeypatch):
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and not caught
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def test_a_checkpoint_between_all_that_is_due_resumes_to_the_same_bytes(
-    scene, tmp_path, monkeypatch
-):
-    """After a refinement, between two smoothings, within the averages, not at a pruning."""
-    changes = {"train__refine_at": "0.5,1", "points__count": 300, "train__prune_looks": 4}
-    changes |= {"downscale": 1}
-    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
-    with monkeypatch.context() as patch:
-        signalling(patch, 53, signal.SIGINT)
-        assert main(arguments(scene, tmp_path / "run", **changes)) == 130
-    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
-    one, other = ((tmp_path / name / "checkpoint.npz").read_bytes() for name in ("whole", "run"))
-    assert one == other

@@ -107,5 +107,6 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
 
     save.append(RunFolder.save)
     monkeypatch.setattr(RunFolder, "save", saving)
-    assert main(arguments(scene, out, train__previews=3, train__checkpoint_every=20)) == 0
+    monkeypatch.setattr("pp_cl.session.PREVIEWS", 3)
+    assert main(arguments(scene, out, train__checkpoint_every=20)) == 0
     assert found == {20: (20, None, [20]), 40: (40, None, [40]), 60: (60, True, [60])}

@@ -306,7 +306,7 @@ REFUSED = {
 
 
 def train(folder, out):
-    sets = set_words(SETTINGS, train__iterations=3, train__previews=0)
+    sets = set_words(SETTINGS, train__iterations=3)
     return spoken(["train", folder, "--out", out, *sets])
 
 

@@ -44,11 +44,9 @@ SETTINGS = {
     "points.count": 300,
     "network.widths": "16,16,16",
     "train.crop": 12,
-    "train.prune_every": 2,
+    "train.prune_weight": 0.0,
     "train.checkpoint_every": 2,
     "train.log_every": 1,
-    "train.previews": 1,
-    "train.final_prune_weight": 0.0,
     "scene.downscale": 1,
 }
 

@@ -25,8 +25,7 @@ SETTINGS = {
     "train.prune_every": 10,
     "train.checkpoint_every": 10,
     "train.log_every": 5,
-    "train.previews": 2,
-    "train.final_prune_weight": 0.5,
+    "train.prune_weight": 0.5,
 }
 
 

@@ -10,8 +10,11 @@ from pp_cl.session import run_config
 from pp_cl.sweep.plan import plan
 
 ITERATIONS = 16
-SETS = SETTINGS | {"train.iterations": ITERATIONS, "train.checkpoint_every": 4}
-SETS |= {"train.previews": 0, "scene.downscale": 2}
+SETS = SETTINGS | {
+    "train.iterations": ITERATIONS,
+    "train.checkpoint_every": 4,
+    "scene.downscale": 2,
+}
 GIVEN = [(key, str(value), "--set") for key, value in SETS.items()]
 
 

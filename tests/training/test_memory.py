@@ -49,8 +49,7 @@ def test_it_is_within_15_percent_of_what_a_training_takes(plain, tmp_path, scene
     """Without prunings, so that it is known how many points there are."""
     if scene == "ball":
         scene = write_ball_scene(tmp_path / "ball", size=128)
-    settings |= {"train.iterations": 70, "train.prune_every": 1000, "train.final_prune_weight": 0}
-    settings |= {"train.prune_weight": 0}
+    settings |= {"train.iterations": 70, "train.prune_weight": 0}
     folder = RunFolder(tmp_path / "run")
     config = run_config(folder, scene, "tiny", [(*one, "test") for one in settings.items()])
     training = open_training(plain, folder, config, None)

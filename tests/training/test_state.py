@@ -21,7 +21,7 @@ pytestmark = pytest.mark.kernels  # of refine.cl
 
 
 def kept(dev, weights, least_weight, opacities, seen=None, least=1):
-    settings = TrainConfig(final_prune_weight=least_weight)
+    settings = TrainConfig(prune_weight=least_weight)
     arrays = weights, seen or [1] * len(weights), opacities
     arrays = (dev.upload(np.asarray(a, np.float32)) for a in arrays)
     indices = final_points_to_keep(dev, *arrays, settings, least)
@@ -90,17 +90,17 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
 
 def test_only_what_was_seen_is_judged(dev):
     """By the highest weight in a step, and counted anew; the rest keeps its counts."""
-    settings = TrainConfig(prune_weight=0.1, prune_looks=10, sh_rate=(1, 0, 0))
+    settings = TrainConfig(prune_weight=0.1, sh_rate=(1, 0, 0))
     cloud = PointCloud.create(dev, np.arange(6), 0)
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))
-    state.times_seen.set(np.float32([9, 10, 10, 10, 1000, 10]))
+    state.times_seen.set(np.float32([99, 100, 100, 100, 1000, 100]))
     opacity = dev.upload(np.float32([0, 1, 1, 0.01, 1, 1]))
     assert points_to_keep(dev, state, opacity, settings).get().tolist() == [0, 3, 4]
-    assert state.times_seen.get().tolist() == [9, 0, 0, 0, 0, 0]
+    assert state.times_seen.get().tolist() == [99, 0, 0, 0, 0, 0]
     assert not state.max_weight.get().any()
     opacity.set(np.float32([0, 1, 1, 0, 1, 1]))
-    state.times_seen.set(np.float32([20, 9, 9, 20, 0, 0]))
+    state.times_seen.set(np.float32([200, 99, 99, 200, 0, 0]))
     state.max_weight.set(np.float32([5, 0, 0, 5, 0, 0]))
     assert points_to_keep(dev, state, opacity, settings).get().tolist() == [1, 2, 4, 5]
 
@@ -108,20 +108,19 @@ def test_only_what_was_seen_is_judged(dev):
 @pytest.mark.parametrize("peak, opacity", [(np.nan, 1), (np.inf, 1), (0.5, np.nan), (0.5, -np.inf)])
 def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
     """Also of points that nobody has seen."""
-    settings = TrainConfig(prune_looks=10)
     cloud = PointCloud.create(dev, np.arange(2), 0)
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0, peak]))
     with pytest.raises(Diverged, match="^1 points have"):
-        points_to_keep(dev, state, dev.upload(np.float32([1, opacity])), settings)
+        points_to_keep(dev, state, dev.upload(np.float32([1, opacity])), TrainConfig())
 
 
 def test_one_judged_point_always_survives(dev):
-    settings = TrainConfig(prune_looks=1, prune_weight=1.0)
+    settings = TrainConfig(prune_weight=1.0)
     cloud = PointCloud.create(dev, np.arange(3), 2)
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0.1, 0.3, 0.2]))
-    state.times_seen.set(np.float32([10, 10, 10]))
+    state.times_seen.set(np.float32([100, 100, 100]))
     assert points_to_keep(dev, state, cloud.opacity, settings).get().tolist() == [1]
 
 
