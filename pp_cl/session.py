@@ -245,7 +245,8 @@ def open_training(
 
 
 def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
-    """A training in `folder` from its beginning; an open config.train.refine_at is decided.
+    """A training in `folder` from its beginning; what is open in config (train.refine_at,
+    raster.radius) is decided.
 
     Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
     written, and for pictures in it that would be lost.

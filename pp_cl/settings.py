@@ -73,10 +73,10 @@ class RasterConfig:
         choices=("soft", "disc", "sphere"),
     )
     radius: float = setting(
-        0.85,
-        "before points learn their own (train.offset_rate). soft: in point spacings; disc, sphere:"
-        " in world units at a depth range of 4",
-        1e-6,
+        0.0,
+        "before points learn their own (train.offset_rate). soft: in point spacings (0: one pixel"
+        " of the images); disc, sphere: in world units at a depth range of 4",
+        0,
         100,
     )
     blend: str = setting(

@@ -20,11 +20,14 @@ from pp_cl.scene.views import View
 from pp_cl.settings import NetworkConfig
 from pp_cl.training.checkpoint import opened_run
 from pp_cl.training.memory import Room
+from pp_cl.training.schedule import refine_steps
 
 OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 # train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
+# raster.radius where it is open, in point spacings: less leaves gaps, more only takes longer
+LEAST_RADIUS, MOST_RADIUS = 0.7, 1.15
 COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1.7 times less points
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
 # what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
@@ -87,13 +90,25 @@ def first_hull(
 def fitting_hull(
     dev: Device, config: Config, agreement: Agreement, room: Room
 ) -> tuple[Hull, tuple[float, float]]:
-    """first_hull() and its (near, far); config.train.refine_at becomes what it says. Where memory
-    is too small for points COARSEST pixels apart in the end, they are as close as it allows. Raises
-    UserError as Room.check_points() does.
+    """first_hull() and its (near, far); config.train.refine_at becomes what it says, and an open
+    raster.radius one pixel of the images. Where memory is too small for points COARSEST pixels
+    apart in the end, they are as close as it allows. Raises UserError as Room.check_points() does,
+    and for an open radius of footprints that are not soft.
     """
     is_open, train, coarsest = config.train.refine_at == OPEN, config.train, COARSEST
+    raster, is_radius_open = config.raster, config.raster.radius == 0
+    if is_radius_open and raster.footprint != "soft":
+        raise UserError(
+            f"raster.radius: is open, which raster.footprint={raster.footprint} cannot be; give it"
+            " in world units at a depth range of 4 (0.0015 in the paper)"
+        )
     while True:
         hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
+        if is_radius_open:
+            # refining halves the spacing, and doubles the images
+            pixels = spacing_pixels(hull.grid, [view.camera for view in agreement.views])
+            spacing = pixels / 2 ** len(refine_steps(train))
+            raster.radius = round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
         near_far = depth_range(agreement.views, hull)
         try:
             room.check_points(hull.grid, len(hull.ids), near_far)
