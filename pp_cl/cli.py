@@ -21,6 +21,7 @@ from pp_cl.files.atomic import mend
 
 COMMANDS = (
     "devices",
+    "make",
     "capture",
     "train",
     "eval",

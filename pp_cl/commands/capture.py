@@ -24,6 +24,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("source", metavar="INPUT", help="folder of photographs, or a video")
     add("--out", required=True, metavar="SCENE", help="folder of the scene")
     add("--from", dest="begin", choices=STAGES, help="repeat this stage and all after it")
+    add_hints(parser)
+    add(
+        "--replace-masks",
+        action="store_true",
+        help="make the masks again, also those that were fixed by hand",
+    )
+
+
+def add_hints(parser: argparse.ArgumentParser) -> None:
+    """Add what a capture is told of the photographs."""
+    add = parser.add_argument
     add(
         "--turntable",
         action=argparse.BooleanOptionalAction,
@@ -37,11 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mask-command",
         metavar="PROGRAM",
         help="program that makes masks, as 'rembg i {image} {mask}'",
-    )
-    add(
-        "--replace-masks",
-        action="store_true",
-        help="make the masks again, also those that were fixed by hand",
     )
     add(
         "--box",

@@ -57,18 +57,18 @@ def lattice(grid: Grid) -> tuple[np.ndarray, float]:
     return np.array(grid.origin) - grid.edge / 2, grid.edge / (PLACES // max(grid.dims))
 
 
-def page_text(run: Run, still: str = "") -> str:
+def page_text(run: Run, still: str = "", title: str = "") -> str:
     """The page. still: the file of a picture that stands for it where it is linked to, if any.
-    Raises UserError as check_drawable does.
+    title: instead of the name of the run's folder. Raises UserError as check_drawable does.
     """
     check_drawable(run)
     rows, low, span = pack(run, fit_harmonics(run))
     points = base64.b64encode(rows.tobytes()).decode()
-    return _filled(
+    return filled(
         "page.html",
         {
-            "title": html.escape(_name(run)),
-            "card": _card(still),
+            "title": html.escape(title or name_of(run.folder.path)),
+            "card": card(still),
             "about": f"{len(rows):,} points, {len(points) / 1e6:.1f} MB",
             "header": json.dumps(_header(run, low, span)).replace("<", "\\u003c"),
             "points": points,
@@ -77,13 +77,13 @@ def page_text(run: Run, still: str = "") -> str:
     )
 
 
-def _card(still):
+def card(still: str) -> str:
     """What programs that show links read of a page's picture."""
     large = '<meta name="twitter:card" content="summary_large_image">'
     return f'<meta property="og:image" content="{still}">\n{large}' if still else ""
 
 
-def _filled(template, parts):
+def filled(template: str, parts: dict[str, str]) -> str:
     """A template of this folder with its parts, {name: text}."""
     page = (Path(__file__).parent / template).read_text("utf-8")
     for name, text in parts.items():
@@ -91,9 +91,9 @@ def _filled(template, parts):
     return page
 
 
-def _name(run):
-    """Of a run's folder, which may be no UTF-8."""
-    return os.fsencode(run.folder.path.resolve().name).decode(errors="replace")
+def name_of(folder: Path) -> str:
+    """The name of a folder, which may be no UTF-8."""
+    return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
@@ -103,24 +103,29 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
     cards = {}
     with atomic_folder(folder) as unfinished:
         for run in runs:
-            stem = re.sub(r"[^A-Za-z0-9_-]+", "-", _name(run)).strip("-") or "run"
+            stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name_of(run.folder.path)).strip("-") or "run"
             while stem in cards or stem == "index":
                 stem += "-2"
-            centre, _ = run.ball
-            eye, up = first_look(run)
-            width, height = STILL
-            focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-            camera = Camera.look_at(eye, centre, up, fx=focal, width=width, height=height)
             write_text(unfinished / f"{stem}.html", page_text(run, f"{stem}.png"))
-            write_png(unfinished / f"{stem}.png", to_8bit(run.render(camera).colour))
-            cards[stem] = html.escape(_name(run))
+            write_png(unfinished / f"{stem}.png", still(run))
+            cards[stem] = html.escape(name_of(run.folder.path))
         figures = [
             f'<a href="{stem}.html"><img src="{stem}.png" alt="">{name}</a>'
             for stem, name in cards.items()
         ]
-        parts = {"card": _card(f"{next(iter(cards))}.png"), "figures": "\n".join(figures)}
-        write_text(unfinished / "index.html", _filled("gallery.html", parts))
+        parts = {"card": card(f"{next(iter(cards))}.png"), "figures": "\n".join(figures)}
+        write_text(unfinished / "index.html", filled("gallery.html", parts))
     return len(cards)
+
+
+def still(run: Run) -> np.ndarray:
+    """(H, W, 3) uint8: the run as a page of it begins, as large as STILL."""
+    centre, _ = run.ball
+    eye, up = first_look(run)
+    width, height = STILL
+    focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    camera = Camera.look_at(eye, centre, up, fx=focal, width=width, height=height)
+    return to_8bit(run.render(camera).colour)
 
 
 def check_drawable(run: Run) -> None:

@@ -82,7 +82,7 @@ def test_settings_and_commands_are_complete():
     for section, values in sections(Config()):
         assert all(f"| `{section}.{name}` |" in TABLES["settings"] for name in vars(values))
     assert all(f"## pp-cl {name}\n" in TABLES["commands"] for name in COMMANDS)
-    assert "- `--seed S`: " in TABLES["commands"]
+    assert "- `--seed N`: " in TABLES["commands"]
 
 
 def test_it_writes_what_changed_and_nothing_else(tmp_path, capsys, monkeypatch):
