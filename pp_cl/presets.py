@@ -14,6 +14,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
     "full": {
         "points.count": 170_000,
+        "raster.radius": 0.75,  # 1 takes longer here, for 0.2 dB less
         "train.iterations": 11_000,
         "train.crop": 256,
     },

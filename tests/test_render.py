@@ -54,7 +54,7 @@ def chained(model, settings, camera):
 
 
 SETTINGS = {
-    "soft": {},
+    "soft": {"radius": 0.85},
     "soft, wide": {"radius": 1.4},
     "disc": {"footprint": "disc", "radius": 0.0015},
     "disc, the paper's gradients": {"footprint": "disc", "radius": 0.0015, "max_tracked": 3},
@@ -94,7 +94,7 @@ def test_padding_does_not_move_the_picture(dev, rng):
     cropped.
     """
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
-    renderer = Renderer(dev, model, RasterConfig())
+    renderer = Renderer(dev, model, RasterConfig(radius=0.85))
     whole = renderer.forward(camera, GAMMA, until="features").features.get()
     odd = camera.crop(5, 7, 21, 19)
     assert renderer.render(odd, GAMMA).shape == (19, 21, 3)
@@ -105,7 +105,10 @@ def test_padding_does_not_move_the_picture(dev, rng):
 
 
 def test_a_view_in_which_few_tiles_could_be_skipped_is_computed_whole(dev, rng, monkeypatch):
-    renderer, camera = Renderer(dev, make_model(dev, rng), RasterConfig()), ring_cameras(1, 32)[0]
+    renderer, camera = (
+        Renderer(dev, make_model(dev, rng), RasterConfig(radius=0.85)),
+        ring_cameras(1, 32)[0],
+    )
     whole = renderer.render(camera, GAMMA)
     monkeypatch.setattr(pp_cl.network.unet, "LEAST_PIXELS", 0)
     monkeypatch.setattr(pp_cl.network.unet, "MOST_COMPUTED", 0)
@@ -115,7 +118,7 @@ def test_a_view_in_which_few_tiles_could_be_skipped_is_computed_whole(dev, rng, 
 def test_an_empty_view_is_the_background(dev, rng):
     model, camera = make_model(dev, rng), ring_cameras(1, 16)[0]
     away = replace(camera, pose=camera.pose * [-1, 1, -1, 1])  # turned round
-    renderer = Renderer(dev, model, RasterConfig())
+    renderer = Renderer(dev, model, RasterConfig(radius=0.85))
     result = renderer.forward(away, GAMMA, training=True)
     np.testing.assert_array_equal(result.features.get(), np.ones((16, 16, 16), np.float32))
     assert np.isfinite(result.image.get()).all()
@@ -149,7 +152,8 @@ def test_the_early_stop_of_a_call_is_that_of_other_settings(dev, rng, blend):
 
 @pytest.mark.parametrize("blend", BLENDS)
 def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, blend):
-    renderer = Renderer(dev, make_model(dev, rng, 300), RasterConfig(blend=blend))
+    settings = RasterConfig(blend=blend, radius=0.85)
+    renderer = Renderer(dev, make_model(dev, rng, 300), settings)
     near, far = (ring_cameras(1, size)[0] for size in (96, 48))
     first = renderer.forward(far, GAMMA, until="weights").pairs.capacity
     dev.reset_peak()
@@ -161,6 +165,6 @@ def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, 
 def test_an_image_beyond_the_boxes_of_points_is_refused(dev, rng):
     """Before anything is launched: they would wrap."""
     camera = replace(ring_cameras(1, 16)[0], width=2**16)
-    renderer = Renderer(dev, make_model(dev, rng), RasterConfig())
+    renderer = Renderer(dev, make_model(dev, rng), RasterConfig(radius=0.85))
     with pytest.raises(UserError, match="65536x16 pixels: at most 65535 each way"):
         renderer.forward(camera, GAMMA)

@@ -62,7 +62,7 @@ def test_it_is_within_15_percent_of_what_a_training_takes(plain, tmp_path, scene
 def room(dev, base="tiny", images=3, size=(800, 600), **changes):
     """Of a training with a small network."""
     config = preset(base)
-    settings = {"network.widths": "16,16,16"} | changes
+    settings = {"network.widths": "16,16,16", "raster.radius": "0.85"} | changes
     for key, value in settings.items():
         assign(config, key.replace("__", "."), value, "test")
     width, height = size
