@@ -26,8 +26,8 @@ OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 # train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
-# raster.radius where it is open, in point spacings: one pixel within these bounds; less is no better
-# where points lie farther apart
+# raster.radius where it is open, in point spacings: one pixel within these bounds; less is no
+# better where points lie farther apart
 LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
 COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1.7 times less points
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
