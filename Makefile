@@ -118,7 +118,7 @@ gpu-check: $(READY) ## compile and link all kernels for NVIDIA's, AMD's and Inte
 
 fuzz: $(READY) ## try damaged and odd input on all that pp-cl reads: COUNT (5000) examples of a property, SEED (0)
 	@COUNT=$(COUNT) $(BIN)/python -m pytest $(ON_ALL_CORES) --hypothesis-profile=fuzz --hypothesis-seed=$(SEED) \
-		$(ARGS) tests/test_fuzz.py tests/scene/readers/test_frame.py
+		$(ARGS) tests/test_fuzz.py tests/test_properties.py
 
 faults: $(READY) ## fail every call that changes a file of a training and an evaluation, kill them: minutes
 	@FAULTS=all $(BIN)/python -m pytest $(ON_ALL_CORES) -m slow tests/test_faults.py $(ARGS)

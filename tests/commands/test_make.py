@@ -6,9 +6,12 @@ import pytest
 from support.runs import spoken
 from support.scenes import write_ball_scene
 
+from pp_cl.capture import STAGES
 from pp_cl.cli import main
 from pp_cl.commands import make
+from pp_cl.files.atomic import write_json
 from pp_cl.files.image import read_rgba
+from pp_cl.files.manifest import begin_manifest
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +78,16 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
 
     def step(name, *given):
         steps.append((name, given))
+        for stage in STAGES if name == "capture" else ():
+            write_json(found / f"{stage}.json", {"line": f"{stage} done"})
         if name == "train":
             raise Enough
 
     monkeypatch.setattr(make, "_step", step)
-    monkeypatch.setattr(make, "_captured", lambda scene: [])
-    photographs = tmp_path / "photographs"
+    photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
+    found.mkdir(parents=True)
+    begin_manifest(tmp_path / "out")
     hints = ["--turntable", "--masks", "M", "--box=-1,-1,-1,1,1,2"]
     with pytest.raises(Enough):
         spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])
@@ -102,3 +108,10 @@ def test_hints_of_photographs_are_refused_for_a_scene(made, tmp_path):
     assert status == 2 and "--turntable" in lines[-1] and not (tmp_path / "new").exists()
     status, lines = spoken(["make", tmp_path / "none", "--out", tmp_path / "new"])
     assert status == 2 and "give photographs, a video or a scene" in lines[-1]
+
+
+def test_what_a_capture_has_found_is_told(tmp_path):
+    (tmp_path / "capture").mkdir()
+    for stage in STAGES:
+        write_json(tmp_path / f"capture/{stage}.json", {"line": f"{stage} done"})
+    assert make._captured(tmp_path) == [f"{stage}: {stage} done" for stage in STAGES]
