@@ -34,14 +34,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"minutes of training ({MINUTES:g}); finding the cameras and masks comes on top",
     )
-    add("--preset", choices=PRESETS, help="of the training (tiny; from 8 minutes on small, from 30 full)")
+    add(
+        "--preset",
+        choices=PRESETS,
+        help="of the training (tiny; from 8 minutes on small, from 30 full)",
+    )
     add_hints(parser)
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Do the steps that are left, and say what to open."""
-    from pp_cl.export.result import INDEX, MODEL, SPLAT, begin_result, write_result
+    from pp_cl.export.result import INDEX, SPLAT, begin_result, write_result
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import load
 
@@ -69,8 +73,7 @@ def run(options: argparse.Namespace) -> None:
     _step("eval", str(folder), "--split", split, *device)
     film = _film()
     _step("render", str(folder), "--out", str(out / film), *device)
-    for name, form in ((SPLAT, "splat"), (MODEL, "html")):
-        _step("export", str(folder), "--format", form, "--out", str(out / name), *device)
+    _step("export", str(folder), "--format", "splat", "--out", str(out / SPLAT), *device)
     write_result(load(folder.path, options.device), split, out, film, told)
     print(f"wrote {out / INDEX}: open it in a browser; `pp-cl view {folder}` shows the exact model")
 
@@ -92,9 +95,9 @@ def _is_scene(source):
 
 def _hints(options):
     """The words of a capture."""
-    words = (
-        [] if options.turntable is None else [f"--{'' if options.turntable else 'no-'}turntable"]
-    )
+    words = []
+    if options.turntable is not None:
+        words = ["--turntable" if options.turntable else "--no-turntable"]
     for name in ("masks", "mask_command"):
         if getattr(options, name):
             words += [f"--{name.replace('_', '-')}", getattr(options, name)]
