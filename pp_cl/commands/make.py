@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.commands.capture import add_hints
-from pp_cl.errors import UserError, one_line
+from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS
 
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
@@ -88,8 +88,8 @@ def _is_scene(source):
         )
     try:
         return bool(scene_format(source))
-    except UserError as error:
-        print(f"{source}: is no scene ({one_line(error, 120)}): finding cameras and masks")
+    except UserError:
+        print(f"{source}: no file of cameras that is known; capture finds them and the masks")
         return False
 
 
@@ -108,11 +108,12 @@ def _hints(options):
 
 
 def _captured(scene: Path) -> list[str]:
-    """What the stages of a capture have found, a line each."""
+    """What the stages of a capture have found, but for what the last one has written."""
     from pp_cl.capture import STAGES
     from pp_cl.scene.readers.common import read_json
 
-    return [f"{name}: {read_json(scene / 'capture' / f'{name}.json')['line']}" for name in STAGES]
+    *stages, _ = STAGES
+    return [f"{name}: {read_json(scene / 'capture' / f'{name}.json')['line']}" for name in stages]
 
 
 def _film():

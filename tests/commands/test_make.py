@@ -114,4 +114,4 @@ def test_what_a_capture_has_found_is_told(tmp_path):
     (tmp_path / "capture").mkdir()
     for stage in STAGES:
         write_json(tmp_path / f"capture/{stage}.json", {"line": f"{stage} done"})
-    assert make._captured(tmp_path) == [f"{stage}: {stage} done" for stage in STAGES]
+    assert make._captured(tmp_path) == [f"{stage}: {stage} done" for stage in list(STAGES)[:-1]]
