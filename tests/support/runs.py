@@ -18,6 +18,7 @@ from pp_cl.train import Trainer
 SETTINGS = {
     "train.iterations": 60,
     "points.count": 1500,
+    "raster.radius": 0.85,  # wider, and pruning so hard leaves gaps
     "network.widths": "16,16,16",
     "train.crop": 24,
     "train.opacity_rate": "0.1,0.01",  # in 60 steps something is to become opaque
