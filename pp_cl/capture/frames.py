@@ -19,6 +19,7 @@ from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import atomic_file, atomic_folder
 from pp_cl.files.image import ORIENTATION, in_srgb, is_deep_png
+from pp_cl.files.manifest import has_manifest
 from pp_cl.files.untrusted import opened_regular
 from pp_cl.scene.readers.found import MASK_FOLDERS
 
@@ -59,10 +60,9 @@ TONE_MAPPED = (
 )
 
 
-def take_images(source: Path, images: Path, scene: Path | None = None) -> dict[str, Any]:
+def take_images(source: Path, images: Path) -> dict[str, Any]:
     """Write the photographs of a folder, or the sharpest frame of each of FRAMES intervals of a
-    film, to the new folder `images`, upright, as JPEG or PNG. scene: a folder that may lie in the
-    source, of which nothing is taken.
+    film, to the new folder `images`, upright, as JPEG or PNG.
 
     Returns {"images": [{name, source, lens, focal, size, sharpness}], "left_out": [{source,
     reason}]}; lens is equal for photographs of one camera at one focal length; focal, in pixels, is
@@ -70,7 +70,7 @@ def take_images(source: Path, images: Path, scene: Path | None = None) -> dict[s
     """
     with atomic_folder(images) as unfinished:
         is_film = not source.is_dir()
-        taken = _frames(source, unfinished) if is_film else _photographs(source, unfinished, scene)
+        taken = _frames(source, unfinished) if is_film else _photographs(source, unfinished)
         found = list(taken)
         _leave_out(found)
         for one in found:
@@ -94,12 +94,12 @@ def take_images(source: Path, images: Path, scene: Path | None = None) -> dict[s
 # Photographs --------------------------------------------------------------------------------------
 
 
-def _photographs(folder, images, scene):
+def _photographs(folder, images):
     """The facts of each photograph, written to `images` where it can be read; of raw ones that they
     are left out.
     """
     needed("pillow_heif").register_heif_opener()
-    files = listed(folder, scene)
+    files = listed(folder)
     if not files:
         raise UserError(
             f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
@@ -119,19 +119,19 @@ def _photographs(folder, images, scene):
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         made = pool.map(lambda file, target: _take(folder, file, target), files, targets)
         yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
-    for file in listed(folder, scene, RAW):
+    for file in listed(folder, RAW):
         source = file.relative_to(folder).as_posix()
         yield {"source": source, "reason": f"is raw ({file.suffix}): write JPEGs of it"}
 
 
-def listed(folder: Path, scene: Path | None = None, endings: Sequence[str] = ENDINGS) -> list[Path]:
-    """The photographs of a folder and of those in it, hidden ones, folders of masks and the scene
-    left out; in the order of their names, 10 after 9.
+def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
+    """The photographs of a folder and of those in it, in the order of their names, 10 after 9.
+    Hidden ones are left out, and folders of masks and those that the program fills, as the scene.
     """
     found = []
     for place, folders, files in os.walk(folder):
         here = Path(place)
-        if scene and here != folder and here.resolve() == scene.resolve():
+        if here != folder and has_manifest(here):
             folders.clear()
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]

@@ -135,7 +135,7 @@ class Capture:
         """What photographs have come since they were taken, in words."""
         found = self._found("frames")
         known = {one["source"] for one in (*found["images"], *found["left_out"])}
-        files = frames.listed(self.source, self.scene) if self.source.is_dir() else []
+        files = frames.listed(self.source) if self.source.is_dir() else []
         names = [file.relative_to(self.source).as_posix() for file in files]
         new = [name for name in names if name not in known]
         return f"; {listing(new)} came later: --from frames takes all of them again" if new else ""
@@ -209,7 +209,7 @@ class Capture:
     # ---- the stages
 
     def _frames(self):
-        found = frames.take_images(self.source, self.frames, self.scene)
+        found = frames.take_images(self.source, self.frames)
         names = [one["name"] for one in evenly(found["images"], SHOWN_VIEWS)]
         shown = [read_rgba(self.frames / name) for name in names]
         shown = [shrink(one, fitting_downscale(one.shape[:2], SHOWN_SIZE)) for one in shown]

@@ -8,7 +8,6 @@ from pathlib import Path
 from pp_cl.commands import options as shared
 from pp_cl.commands.capture import add_hints
 from pp_cl.errors import UserError
-from pp_cl.presets import PRESETS
 
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
 EPILOG = """FOLDER then holds
@@ -36,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--preset",
-        choices=PRESETS,
+        choices=list(PRESET_FROM)[::-1],
         help="of the training (tiny; from 8 minutes on small, from 30 full)",
     )
     add_hints(parser)

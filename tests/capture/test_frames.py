@@ -16,6 +16,7 @@ from pp_cl.capture.stages import Capture
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.image import read_rgba
+from pp_cl.files.manifest import begin_manifest
 from pp_cl.files.video import write_video
 
 cv2 = pytest.importorskip("cv2")
@@ -268,8 +269,8 @@ def test_what_is_no_film_is_one_line_without_the_programs_banner(tmp_path):
 
 
 def test_photographs_of_several_rounds(shots, tmp_path):
-    """In a folder each, beside some at the top, without leading zeros; masks, raw files and the
-    scene itself are none.
+    """In a folder each, beside some at the top, without leading zeros; masks, raw files and what
+    the program has made are none.
     """
     places = [f"{i}.png" for i in (1, 2, 9, 10)]
     places += [f"{place}/{i}.png" for place in ("low", "high/1") for i in (8, 9, 10, 11)]
@@ -280,7 +281,8 @@ def test_photographs_of_several_rounds(shots, tmp_path):
         (tmp_path / place).parent.mkdir(parents=True)
         Image.fromarray(shots[0]).save(tmp_path / place)
     (tmp_path / "low/7.DNG").write_bytes(b"raw")
-    taken = take_images(tmp_path, tmp_path / "scene/capture", tmp_path / "scene")
+    begin_manifest(tmp_path / "scene")
+    taken = take_images(tmp_path, tmp_path / "scene/capture")
     ordered = [*places[:4], *places[8:], *places[4:8]]
     assert [one["source"] for one in taken["images"]] == ordered
     names = [one["name"] for one in taken["images"]]
