@@ -18,7 +18,7 @@ from pp_cl.run import Run
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS = "thumbnail.png", "views.png"
 FILMS = ("film.mp4", "film.webp")
-LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG16)"}
+LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM"}
 WHAT = {
     MODEL: "the model alone, one page that needs no network",
     SPLAT: "3D Gaussians, for SuperSplat, Blender and other viewers",
@@ -58,7 +58,7 @@ def write_result(run: Run, split: str, folder: Path, film: str, told: Sequence[s
     parts = {
         "title": html.escape(title),
         "card": card(STILL),
-        "film": _film(film),
+        "film": _player(film),
         "views": f"Views {views}: rendered, photographed, and four times their difference.",
         "figures": "\n".join(_row(*row) for row in _figures(run, found)),
         "notes": _notes([*told, *_left_out(run)]),
@@ -100,7 +100,7 @@ def _notes(lines):
     return f"<h2>About the photographs</h2>\n<ul>\n{items}\n</ul>"
 
 
-def _film(name):
+def _player(name):
     if name.endswith(".mp4"):
         return f'<video src="{name}" autoplay loop muted playsinline controls></video>'
     return f'<img src="{name}" alt="the object from all sides">'

@@ -29,9 +29,8 @@ class BlendWeights:
     without a point ends the pixel's list. pixel_slope: (P,) float32 alike, the factor s of the
     backward pass, dL/dopacity = s * gain (cl/raster/blend.cl); None without slopes.
     point_is_shaded: (N,) uint8, 1 for visible points. shaded_list: `shaded`, whose length is still
-    on its way.
-    point_slot: (N,) uint32, where a visible point stands in `shaded`, undefined for others.
-    transmittance: (HW,) float32 behind all hits, None with the softmax.
+    on its way. point_slot: (N,) uint32, where a visible point stands in `shaded`, undefined for
+    others. transmittance: (HW,) float32 behind all hits, None with the softmax.
     """
 
     blend: str

@@ -117,9 +117,10 @@ def _objects(opened):
         left -= len(piece)
         if left < 0:
             raise ValueError(f"more than {MOST_TEXT} characters")
-        text, at = text[at:] + piece, 0
-        at = BETWEEN.match(text).end()
-        if text[at:].startswith("]"):
+        if piece:
+            text, at = text[at:] + piece, 0
+        at = BETWEEN.match(text, at).end()
+        if text.startswith("]", at):
             return
         if at < len(text):
             own, end = decode(text, at)
