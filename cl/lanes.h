@@ -21,20 +21,30 @@
 #define LANE 0u
 #endif
 
+// Steps of a walk whose reads do not wait for each other: 4 on GPUs, where a read takes hundreds of
+// cycles, 1 on CPUs.
+#ifndef BATCH
+#define BATCH (LANES == 16 ? 1 : 4)
+#endif
+
 typedef LANED(float) floats;
 typedef LANED(int) ints;
 typedef LANED(uint) uints;
 
-#if LANES == 1
-// Loops over arrays of a work-item, which are in registers only where the indices are known.
+// Loops over arrays of a work-item, which are in a GPU's registers only where the indices are known.
+#if LANES == 16
+#define UNROLLED
+#else
 #define UNROLLED _Pragma("unroll")
+#endif
+
+#if LANES == 1
 #define LANES_FROM(p) (*(p))
 #define LANES_INTO(p, value) (*(p) = (value))
 #define ANY_LANE(v) ((v) != 0)
 #define SUM_LANES(v) (v)
 #define MAX_LANES(v) (v)
 #else
-#define UNROLLED
 #define LANES_FROM(p) LANED(vload)(0, p)
 #define LANES_INTO(p, value) LANED(vstore)(value, 0, p)
 #define ANY_LANE(v) any(v)

@@ -6,6 +6,7 @@
 // The background gets the transmittance T behind all hits. An opaque hit lets LEAST_THROUGH pass,
 // so that what lies behind it is known when gradients are computed.
 #include "common.h"
+#include "lanes.h"
 
 #ifndef SLOPES
 #define SLOPES 1  // 0: no slopes, which only gradients need
@@ -36,13 +37,21 @@ kernel void alpha_weights(
     const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
     float T = 1.0f;
     uint i = begin;
-    for (; i < end && T >= early_stop; i++) {
-        const uint2 hit = pair_point_closeness[(uint)pair_key[i]];
-        const float d = as_float(hit.y), alpha = opacity[hit.x] * d;
-        pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
-        if (SLOPES) pixel_slope[i] = T * d;
-        point_is_shaded[hit.x] = 1;
-        T *= fmax(1.0f - alpha, LEAST_THROUGH);
+    while (i < end && T >= early_stop) {
+        uint2 hits[BATCH];
+        float o[BATCH];
+        UNROLLED for (uint j = 0; j < BATCH; j++) {
+            hits[j] = pair_point_closeness[(uint)pair_key[j == 0 ? i : min(i + j, end - 1)]];
+            o[j] = opacity[hits[j].x];
+        }
+        UNROLLED for (uint j = 0; j < BATCH && i < end && T >= early_stop; j++, i++) {
+            const uint2 hit = hits[j];
+            const float d = as_float(hit.y), alpha = o[j] * d;
+            pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
+            if (SLOPES) pixel_slope[i] = T * d;
+            point_is_shaded[hit.x] = 1;
+            T *= fmax(1.0f - alpha, LEAST_THROUGH);
+        }
     }
     if (i < end) pixel_entry[i] = NONE;
     transmittance[q] = T;

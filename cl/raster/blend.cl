@@ -49,10 +49,22 @@ kernel void blend_forward(
     if (q >= hw) return;
     floats sum = 0.0f;
     float weights = 0.0f;
-    for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++) {
-        const float b = upper_float(pixel_entry[i]);
-        sum += b * load_part(shaded_features, point_slot[(uint)pixel_entry[i]]);
-        weights += b;
+    const uint end = pixel_offset[q + 1];
+    for (uint i = pixel_offset[q]; i < end && (uint)pixel_entry[i] != NONE; i += BATCH) {
+        float b[BATCH];
+        floats feature[BATCH];
+        bool listed = true;
+        UNROLLED for (uint j = 0; j < BATCH; j++) {
+            const ulong entry = j == 0 || i + j < end ? pixel_entry[i + j] : NONE;
+            listed = listed && (uint)entry != NONE;
+            b[j] = listed ? upper_float(entry) : 0.0f;
+            feature[j] = listed ? load_part(shaded_features, point_slot[(uint)entry]) : 0.0f;
+        }
+        UNROLLED for (uint j = 0; j < BATCH; j++) {
+            sum += b[j] * feature[j];
+            weights += b[j];
+        }
+        if (!listed) break;
     }
     store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
 }
@@ -120,23 +132,35 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gradient(
         }
     float T = transmittance[q], spread = 0.0f;
     float B = dot16(G, (float16)(BACKGROUND));
-    for (uint i = end; i-- > begin;) {
-        const float b = upper_float(pixel_entry[i]);
-        float own = dot16(G, shaded_features[point_slot[(uint)pixel_entry[i]]]);
-        if (spread_weight > 0.0f) {
-            const float z = upper_float(pair_key[i]) - nearest;
-            front -= b * (float2)(1.0f, z);
-            const float distances = z * (front.x - behind.x) - (front.y - behind.y);
-            own += 2.0f * spread_weight * distances;
-            spread += b * distances;
-            behind += b * (float2)(1.0f, z);
+    for (uint i = end; i > begin;) {
+        ulong key[BATCH];
+        float weight[BATCH], slope[BATCH], of_point[BATCH];
+        UNROLLED for (uint j = 0; j < BATCH; j++) {
+            const uint at = i - begin > j ? i - 1 - j : begin;
+            const ulong entry = pixel_entry[at];
+            key[j] = pair_key[at];
+            weight[j] = upper_float(entry);
+            slope[j] = pixel_slope[at];
+            of_point[j] = dot16(G, shaded_features[point_slot[(uint)entry]]);
         }
-        const float gain = own + g - B;
-        if (i - begin < tracked)
-            pair_gradient[(uint)pair_key[i]] = (float2)(b, pixel_slope[i] * gain);
-        if (b > 0.0f) {
-            T += b;  // in front of this hit
-            B += b / T * gain;
+        UNROLLED for (uint j = 0; j < BATCH && i > begin; j++) {
+            i--;
+            const float b = weight[j];
+            float own = of_point[j];
+            if (spread_weight > 0.0f) {
+                const float z = upper_float(key[j]) - nearest;
+                front -= b * (float2)(1.0f, z);
+                const float distances = z * (front.x - behind.x) - (front.y - behind.y);
+                own += 2.0f * spread_weight * distances;
+                spread += b * distances;
+                behind += b * (float2)(1.0f, z);
+            }
+            const float gain = own + g - B;
+            if (i - begin < tracked) pair_gradient[(uint)key[j]] = (float2)(b, slope[j] * gain);
+            if (b > 0.0f) {
+                T += b;  // in front of this hit
+                B += b / T * gain;
+            }
         }
     }
     if (spread_weight > 0.0f) pixel_spread[q] = spread;

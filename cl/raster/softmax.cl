@@ -8,6 +8,9 @@
 // is positive, and D does not vanish: a_i > 1 means o_i > gamma, and a d_i > 0 is at least 6e-8;
 // without any, b_0's numerator is at least 1/e.
 //
+// z and the exponents are written as fma(): NVIDIA's compiler fuses products and sums at some places
+// only, and equal hits got different weights.
+//
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
 #include "common.h"
@@ -45,8 +48,14 @@ ALWAYS_INLINE Hits load_hits(
     Hits h;
     h.opacity = LANES_FROM(o);
     h.closeness = LANES_FROM(d);
-    h.z = 1.0f - (LANES_FROM(depth) - cam->near) / (cam->far - cam->near);
+    const floats per_depth = 1.0f / (cam->far - cam->near);
+    h.z = fma(cam->near - LANES_FROM(depth), per_depth, (floats)(1.0f));
     return h;
+}
+
+// exp(a - M), where a = o z / gamma is above M by more than a rounding only where d = 0.
+ALWAYS_INLINE floats exponential(const floats o_z, const float sharpness, const float M) {
+    return exp(fmin(fma(o_z, (floats)(sharpness), (floats)(-M)), 0.0f));
 }
 
 // One work-item per pixel: reads its hits, nearest first, writes their weights b with their points,
@@ -57,8 +66,8 @@ ALWAYS_INLINE Hits load_hits(
 // than the share early_stop of the weight; differs from Pulsar: it looks only when its buffer is
 // flushed. One more entry, without a point, then ends the pixel's list.
 kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
-    const uint hw,  // pixels
-    const float gamma,
+    const uint hw,                             // pixels
+    const float sharpness,                     // 1 / gamma
     const float early_stop,                    // 0: none
     global const float *camera,                // (20) camera.h
     global const uint *pixel_offset,           // (HW+1)
@@ -74,18 +83,18 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const Camera cam = camera_load(camera);
     const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
     uint stop = end;
-    float M = EPS / gamma, D = 1.0f;  // the background alone
+    float M = EPS * sharpness, D = 1.0f;  // the background alone
     Hits h;
     for (uint first = begin; first < stop; first += LANES) {
         const uint count = min((uint)LANES, end - first);
         h = load_hits(&cam, pair_key + first, count, pair_point_closeness, opacity);
-        const floats a = h.opacity * h.z / gamma;
+        const floats o_z = h.opacity * h.z, a = o_z * sharpness;
         const float m = fmax(M, MAX_LANES(select((floats)(M), a, h.closeness > 0.0f)));
         D *= exp(M - m);
         M = m;
         float term[LANES], best[LANES];
-        LANES_INTO(term, h.opacity * h.closeness * exp(fmin(a - M, 0.0f)));
-        if (DROPS) LANES_INTO(best, exp(fmax(h.z, 0.0f) / gamma - M));
+        LANES_INTO(term, h.opacity * h.closeness * exponential(o_z, sharpness, M));
+        if (DROPS) LANES_INTO(best, exp(fma(fmax(h.z, 0.0f), (floats)(sharpness), (floats)(-M))));
         for (uint j = 0; j < count && first + j < stop; j++) {
             if (DROPS && best[j] < early_stop / (1.0f - early_stop) * D)
                 stop = first + j;
@@ -97,12 +106,11 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
         const uint count = min((uint)LANES, end - first);
         if (end - begin > LANES)
             h = load_hits(&cam, pair_key + first, count, pair_point_closeness, opacity);
-        const floats a = h.opacity * h.z / gamma;
-        // b/o; a > M only where d = 0
-        const floats share = h.closeness * exp(fmin(a - M, 0.0f)) / D;
+        const floats o_z = h.opacity * h.z;
+        const floats share = h.closeness * exponential(o_z, sharpness, M) / D;  // b/o
         float b[LANES], slope[LANES];
         LANES_INTO(b, h.opacity * share);
-        LANES_INTO(slope, share * (1.0f + a));
+        LANES_INTO(slope, share * (1.0f + o_z * sharpness));
         for (uint j = 0; j < min(count, stop - first); j++) {
             const uint i = first + j, point = pair_point_closeness[(uint)pair_key[i]].x;
             pixel_entry[i] = upsample(as_uint(b[j]), point);

@@ -25,6 +25,7 @@ MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
 MOST_LOG = 2**25  # bytes of a log: 80,000 rows
 MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
 MOST_NUMBER = 1e300  # in a row
+MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
 class RunFolder:
@@ -213,10 +214,13 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
     return row if is_row and min(numbers[:2]) >= 0 else None
 
 
-def _is_kept(value):
-    """Whether a value of JSON may be written again: no number in it is huge, infinite included."""
+def _is_kept(value, levels=MOST_LEVELS):
+    """Whether a value of JSON may be written again: no number in it is huge, infinite included, and
+    it is not nested deeply.
+    """
     if isinstance(value, (list, dict)):
-        return all(map(_is_kept, value.values() if isinstance(value, dict) else value))
+        inside = value.values() if isinstance(value, dict) else value
+        return levels > 0 and all(_is_kept(part, levels - 1) for part in inside)
     return not isinstance(value, (int, float)) or abs(value) < MOST_NUMBER
 
 

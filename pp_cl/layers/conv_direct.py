@@ -172,7 +172,7 @@ class DirectConv:
             return None
         if self.shape.direction is Direction.BACKWARD_INPUT:
             return packed_shape(k, co, ci)
-        return parts_shape(image_parts(self.shape)[0], k, ci, co)
+        return parts_shape(self._parts(), k, ci, co)
 
     def laid_out(self, weight: Array) -> Array:
         """A layer's weights (ceil(CO/16), K, K, CI, 16) as the kernels read them: a new array, or
@@ -321,6 +321,10 @@ class DirectConv:
         if tiles.size != self.shape.size:
             raise ValueError(f"tiles of {tiles.size} for a feature map of {self.shape.size}")
 
+    def _parts(self):
+        """Into how many parts the sum over an image for the gradient of weights is cut."""
+        return image_parts(self.shape)[0]
+
     def _multiply_adds(self, tiles):
         return tiles.number * SIDE**2 * self.shape.k**2 * self.shape.ci * self.shape.co
 
@@ -340,6 +344,10 @@ class DirectConv:
 
 def image_parts(shape: ConvShape) -> tuple[int, int]:
     """(parts, rows of each) into which the sum over an image for the gradient of weights is cut."""
-    limit = max(1, PARTIAL_FLOATS // math.prod(parts_shape(1, shape.k, shape.ci, shape.co)))
-    rows = max(ROWS_PER_PART, -(-shape.size[0] // limit))
+    rows = max(ROWS_PER_PART, -(-shape.size[0] // most_parts(shape)))
     return -(-shape.size[0] // rows), rows
+
+
+def most_parts(shape: ConvShape) -> int:
+    """The parts for which there is memory."""
+    return max(1, PARTIAL_FLOATS // math.prod(parts_shape(1, shape.k, shape.ci, shape.co)))

@@ -6,8 +6,8 @@ import math
 
 from pyopencl.array import Array
 
-from pp_cl.layers.conv_direct import DirectConv, Sources, image_parts
-from pp_cl.layers.tiles import SIDE, VECTOR, Tiles
+from pp_cl.layers.conv_direct import DirectConv, Sources, most_parts
+from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, grid_shape
 
 QUAD = 4  # channels of a work-item
 # Pixels of a work-item: two lines of a tile, ROWS in cl/layers/conv_local.cl.
@@ -21,6 +21,10 @@ CI_QUADS = {3: 4, 1: 8}
 # lose digits. Fewer of narrow images, so that it sums half as many pixels as the direct kernel,
 # which sums a row: errors stay below that one's.
 SUMMED = 4
+# Parts of that sum: each of at least so many tiles, and no more than fill a large GPU: so many
+# work-groups in all.
+PART_TILES = 8
+MOST_GROUPS = 512
 
 
 class LocalConv(DirectConv):
@@ -82,7 +86,7 @@ class LocalConv(DirectConv):
         """See DirectConv."""
         self._check(partial, tiles)
         k, ci, co, (_, width) = self.shape.k, self.shape.ci, self.shape.co, self.shape.size
-        run = max(SUMMED, -(-tiles.number // image_parts(self.shape)[0]))
+        run = max(SUMMED, -(-tiles.number // self._parts()))
         parts, first = -(-tiles.number // run), 0
         for source, c in zip(sources, self.shape.sources, strict=True):
             program, in_group, items = self._weights_program(c)
@@ -117,6 +121,14 @@ class LocalConv(DirectConv):
             partial=partial,
         )
         return parts
+
+    def _parts(self):
+        k, ci, co = self.shape.k, self.shape.ci, self.shape.co
+        quads = _quads(co, _is_aligned(*self.shape.sources, co))
+        groups = -(-ci // (QUAD * CI_QUADS[k])) * -(-co // (QUAD * quads))
+        tiles = math.prod(grid_shape(*self.shape.size))
+        wanted = min(-(-tiles // PART_TILES), -(-MOST_GROUPS // groups))
+        return min(wanted, most_parts(self.shape))
 
     def _local_program(self, kernel, tiles, channels, inputs):
         """(program, work-items, work-group) of a kernel for `channels` of `inputs` (channels), in

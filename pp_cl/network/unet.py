@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays, packed_arrays
+from pp_cl.device.buffers import PackedArrays, packed_arrays, table_bytes
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, blocking_of, choose
 from pp_cl.layers.conv_direct import (
@@ -396,3 +396,9 @@ class UNet:
                 conv = choose(self.dev, shape, self.variant)(self.dev, self.blocking, shape)
                 found[layer.name, direction, source] = conv
         return found
+
+    def work_bytes(self, size: Size, training: bool) -> int:
+        """Of the arrays that the convolutions of images of a size take beside a layer's own: the
+        weights as kernels read them, and the parts of the gradients.
+        """
+        return table_bytes(_work_table(self.work(size, training)))

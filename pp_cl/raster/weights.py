@@ -106,7 +106,7 @@ def _alpha_weights(dev, b, pairs, opacity, early_stop, slopes):
     """Front to back, weight = transmittance * opacity * closeness; early_stop is the transmittance
     below which the hits behind are dropped.
     """
-    dev.program("raster/alpha", SLOPES=int(slopes)).launch(
+    dev.program("raster/alpha", LANES=lanes(dev), SLOPES=int(slopes)).launch(
         "alpha_weights",
         pairs.pixels,
         hw=pairs.pixels,
@@ -131,7 +131,7 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, s
         "softmax_weights",
         pairs.pixels,
         hw=pairs.pixels,
-        gamma=gamma,
+        sharpness=1 / gamma,
         early_stop=early_stop,
         camera=camera_buffer,
         pixel_offset=pairs.pixel_offset,

@@ -36,9 +36,7 @@ GROWN = 1.25  # arrays of pairs have this much more room than is needed
 # training and in a rendering, and the channels of its largest buffer. Levels below have a quarter
 # of the pixels of the one above.
 MAPS = {"single": (4.5, 2.1, 1), "double": (6.0, 2.2, 1), "gated": (8.5, 3.0, 2)}
-# Copies of the network's parameters: themselves, gradient, two moments, and as kernels read them;
-# and sums of their gradients in slices, of which small networks have more.
-COPIES, SLICES, MOST_SLICES = 13, 24, 16 * MIB
+COPIES = 4  # of the network's parameters: themselves, gradient, two moments
 
 # The share of the points that pruning leaves by the next refinement or the last step, about: 0.45
 # to 0.73 on lego with the presets tiny, small and full.
@@ -81,7 +79,7 @@ class Room:
         self.dev = net.dev
         self.need: Need
         self._config = config
-        self._parameters = net.all_parameters.nbytes
+        self._net = net
         self._sizes = [(one.camera.width, one.camera.height) for one in photographs]
         cameras = [one.camera for one in photographs]
         self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
@@ -192,8 +190,11 @@ class Room:
         raster, train, blocks = config.raster, config.train, sh_blocks(config.points.sh_degree)
         if raster.footprint == "soft":  # as wide as points are apart, which refining halves
             radius /= 2 ** (len(refine_steps(train)) - left)
-        crop = _pixels(self._largest.downscaled(downscale << left), crop_side(train.crop, left))
-        image = _pixels(self._largest.downscaled(downscale), 0)
+        crop_size = _size_of(
+            self._largest.downscaled(downscale << left), crop_side(train.crop, left)
+        )
+        image_size = _size_of(self._largest.downscaled(downscale), 0)
+        crop, image = math.prod(crop_size), math.prod(image_size)
         area = math.pi * max(LEAST_RADIUS, radius / downscale) ** 2
         pairs = GROWN * points * min(area, image)
         shown = points if raster.early_stop == 0 else SHOWN * points
@@ -210,8 +211,9 @@ class Room:
         trained, rendered, widest = MAPS[config.network.blocks]
         channels = sum(width / 4**level for level, width in enumerate(config.network.widths))
         maps = 4 * channels * (crop * trained + image * rendered)
-        parameters = self._parameters * (COPIES + is_averaged)
-        parameters += min(SLICES * self._parameters, MOST_SLICES)
+        parameters = self._net.all_parameters.nbytes * (COPIES + is_averaged)
+        parameters += self._net.work_bytes(crop_size, True)
+        parameters += self._net.work_bytes(image_size, False)
         photograph = self._photographs // len(self._sizes)
         total = points * point + max(step, preview) + crop * TRAINED_PIXEL + maps
         total += parameters + photograph
@@ -245,10 +247,12 @@ def _averages(train):
     return ema_start(train.iterations) if train.ema else math.inf
 
 
-def _pixels(camera: Camera, side: int) -> int:
-    """Of a crop, in whole multiples of what the network needs; side 0: of the whole image."""
-    sides = (min(side, size) if side else size for size in (camera.width, camera.height))
-    return math.prod(size + -size % NETWORK_MULTIPLE for size in sides)
+def _size_of(camera: Camera, side: int) -> tuple[int, int]:
+    """(height, width) of a crop, in whole multiples of what the network needs; side 0: of the whole
+    image.
+    """
+    height, width = (min(side or size, size) for size in (camera.height, camera.width))
+    return height + -height % NETWORK_MULTIPLE, width + -width % NETWORK_MULTIPLE
 
 
 def _size(size):

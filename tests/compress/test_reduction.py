@@ -23,8 +23,10 @@ def test_weights_are_the_most_over_the_views(original):
     cameras = run.cameras("train")
     single = [point_weights(run, [camera]) for camera in cameras]
     assert np.array_equal(original.weights, np.max(single, axis=0))
-    alpha = run.render(cameras[0]).alpha
-    assert single[0].sum() == pytest.approx(alpha.sum(), rel=1e-3)
+    alpha, stop = run.render(cameras[0]).alpha, run.config.raster.early_stop
+    assert single[0].sum() == pytest.approx(
+        alpha.sum(), rel=stop
+    )  # what is behind it weighs nothing
     assert len(np.unique(single, axis=0)) == len(cameras)
 
 
