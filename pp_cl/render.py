@@ -22,7 +22,7 @@ from pp_cl.model import Model
 from pp_cl.raster.blend import BlendGradients, blend_backward, blend_forward, shade_forward
 from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
-from pp_cl.raster.project import ProjectedPoints, project_grid
+from pp_cl.raster.project import MOVED, ProjectedPoints, project_grid
 from pp_cl.raster.weights import (
     BlendWeights,
     blend_weights,
@@ -40,7 +40,7 @@ PAPER_DEPTH_RANGE = 4.0
 
 def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, float]) -> float:
     """The radius in world units of points whose offset is 0. edge: of the grid, world units."""
-    if settings.footprint == "soft":
+    if settings.footprint in MOVED:
         return settings.radius * edge
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
@@ -225,7 +225,8 @@ class Renderer:
         of the shaded features times the basis functions in the view's direction; the optimiser
         multiplies them as it moves each coefficient, and never stores them.
         """
-        moves = with_offsets and (self.settings.blend, self.settings.footprint) == ("alpha", "soft")
+        settings = self.settings
+        moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
         with self.dev.stage("backward"):
             return blend_backward(
                 self.dev,

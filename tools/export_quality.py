@@ -98,10 +98,10 @@ def _drawn(run, coefficients, cameras):
     """The images (H, W, 3) uint8 that a page would draw of coefficients (N, count, 3)."""
     positions = run.model.positions()
     drawn = []
-    for seen in observe(run, cameras, "drawing"):
+    for seen in observe(run, cameras, "drawing", blending=True):
         at = basis(directions(positions, seen.camera))[:, : coefficients.shape[1]]
-        matrix = seen.blend_matrix()
-        image = matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
+        colours, rest = seen.blended(np.einsum("nk,nkc->nc", at, coefficients))
+        image = colours + rest[:, None]
         drawn.append(to_8bit(image.reshape(seen.camera.height, seen.camera.width, 3)))
     return drawn
 

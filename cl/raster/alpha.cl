@@ -7,6 +7,7 @@
 // so that what lies behind it is known when gradients are computed.
 #include "common.h"
 #include "lanes.h"
+#include "raster/footprint.h"
 
 #ifndef SLOPES
 #define SLOPES 1  // 0: no slopes, which only gradients need
@@ -46,9 +47,15 @@ kernel void alpha_weights(
         }
         UNROLLED for (uint j = 0; j < BATCH && i < end && T >= early_stop; j++, i++) {
             const uint2 hit = hits[j];
-            const float d = as_float(hit.y), alpha = o[j] * d;
+            const float d = as_float(hit.y);
+            float alpha = o[j] * d;
+            bool shows = true;
+            if (FOOTPRINT == GAUSSIAN) {
+                shows = !(alpha < LEAST_ALPHA);
+                alpha = shows ? fmin(alpha, MOST_ALPHA) : 0.0f;
+            }
             pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
-            if (SLOPES) pixel_slope[i] = T * d;
+            if (SLOPES) pixel_slope[i] = shows ? T * d : 0.0f;
             point_is_shaded[hit.x] = 1;
             T *= fmax(1.0f - alpha, LEAST_THROUGH);
         }

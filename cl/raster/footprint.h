@@ -1,5 +1,5 @@
 // Footprints: which pixels a point covers, its closeness d there (1 in the centre, 0 at the rim)
-// and its depth. The one place that knows the three kinds.
+// and its depth. The one place that knows the four kinds.
 #ifndef PP_FOOTPRINT_H
 #define PP_FOOTPRINT_H
 
@@ -9,6 +9,13 @@
 #define DISC 0    // hard disc of the paper: d = 1 everywhere
 #define SOFT 1    // d falls linearly from the centre to the rim (ours)
 #define SPHERE 2  // Pulsar's sphere: depth of its front, sub-pixel rule, any radius
+// The Gaussian of 3D Gaussian splatting, as its viewers draw it: d = exp(-distance^2 / 2 variance),
+// the radius being the deviation, with LOW_PASS pixels^2 added to the variance.
+#define GAUSSIAN 3
+#define LOW_PASS 0.3f
+#define LEAST_ALPHA (1.0f / 255.0f)  // of a hit: below it viewers draw nothing
+#define MOST_ALPHA 0.99f
+#define DEVIATIONS 3.33f  // to the rim, where an opaque one falls below LEAST_ALPHA
 
 #ifndef FOOTPRINT
 #define FOOTPRINT SOFT
@@ -23,6 +30,17 @@
 // pixels.
 static inline float least_focal(const Camera *cam) {
     return fmin(cam->fx, cam->fy);
+}
+
+// Of a Gaussian in pixels, world units^2. z: along the camera's axis.
+#define VARIANCE(cam, radius, z)                                                                   \
+    ((radius) * (radius) + LOW_PASS * ((z) / least_focal(cam)) * ((z) / least_focal(cam)))
+
+// From the ray to the rim, world units, of a point at range t and z along the camera's axis.
+ALWAYS_INLINE floats
+footprint_reach(const Camera *cam, const floats radius, const floats t, const floats z) {
+    if (FOOTPRINT == GAUSSIAN) return DEVIATIONS * sqrt(VARIANCE(cam, radius, z));
+    return fmax(radius, LEAST_RADIUS * t / least_focal(cam));
 }
 
 // The footprints of LANES neighbouring points, one lane each.
@@ -51,7 +69,7 @@ ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
     const floats width = f->t / least_focal(cam);
     f->least = LEAST_RADIUS * width;
     f->tiny = f->radius < width;
-    f->reach = fmax(f->radius, f->least);
+    f->reach = footprint_reach(cam, f->radius, f->t, f->z);
     f->per_reach = 1.0f / f->reach;
     f->per_fx = 1.0f / cam->fx;
     f->per_fy = 1.0f / cam->fy;
@@ -87,7 +105,12 @@ ALWAYS_INLINE ints footprints_hit(
     const floats ex = f->y - f->z * my, ey = f->z * mx - f->x, ez = f->x * my - f->y * mx;
     const floats across2 = square(ex, ey, ez);  // the distance, squared, times m2
     hit = hit && across2 < f->reach * f->reach * m2 && f->x * mx + f->y * my + f->z > 0.0f;
+#if FOOTPRINT == GAUSSIAN
+    const floats deviations = f->per_reach * DEVIATIONS;
+    *closeness = exp(-0.5f * across2 / m2 * deviations * deviations);
+#else
     *closeness = FOOTPRINT == DISC ? (floats)(1.0f) : 1.0f - sqrt(across2 / m2) * f->per_reach;
+#endif
     *depth = f->t;
 #else
     const floats inverse = 1.0f / sqrt(m2);

@@ -78,7 +78,7 @@ ALWAYS_INLINE bool project(
     const floats front = t - radius;
     const ints kept =
         (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
-    const floats wide = fmax(radius, LEAST_RADIUS * t / least_focal(cam));
+    const floats wide = footprint_reach(cam, radius, t, cz);
     const floats reach = FOOTPRINT == SPHERE ? radius : wide;
     const ints near_image = reaches_image(cx, cz, wide, cam->fx, cam->cx, cam->width) &
                             reaches_image(cy, cz, wide, cam->fy, cam->cy, cam->height);

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
-from pp_cl.export.observe import directions, observe
+from pp_cl.export.observe import directions, look, observe, progress
 from pp_cl.run import Run
 
 COUNT = 9  # functions of basis()
@@ -36,25 +36,24 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
 
     Colours are blended as the features are, over white, and clamped at last: one point's may lie
     outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
-    gradients, preconditioned by A's blocks of a point. Blend weights are computed anew in each,
-    since those of all views would fill the memory.
+    gradients, preconditioned by A's blocks of a point. Views are weighed anew in each, since the
+    weights of all would fill the memory.
     """
     cameras, n = run.cameras("train"), run.model.cloud.count
     positions = run.model.positions()
 
-    def passes(text):
-        """(observation, blend matrix (HW, N), basis (N, count)) of each view."""
-        for seen in observe(run, cameras, text):
-            at = basis(directions(positions, seen.camera))[:, :count]
-            yield seen, seen.blend_matrix(), at
+    def functions(seen):
+        return basis(directions(positions, seen.camera))[:, :count]
 
     b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
-    for seen, matrix, at in passes("colours"):
-        picture = seen.picture()
-        colour = (picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
-        weight = matrix.sum(0)
-        b += at[:, :, None] * (matrix.T @ colour)[:, None]
-        blocks += (weight[:, None] * at)[:, :, None] * at[:, None]
+    for camera in progress(cameras, "colours"):
+        picture = run.render(camera)
+        colours = np.float32(picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
+        seen = look(run, camera, blending=True)
+        at, weights = functions(seen), seen.point_weights()
+        b += at[:, :, None] * seen.gathered(colours)[:, None]
+        blocks += (weights[:, None] * at)[:, :, None] * at[:, None]
+        del seen
     ridge = RIDGE * blocks[:, :1, 0] * (np.arange(count) > 0) + LEAST
     diagonal = np.arange(count)
     blocks[:, diagonal, diagonal] += ridge
@@ -63,9 +62,10 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
     def product(flat):
         coefficients = flat.reshape(b.shape)
         result = ridge[..., None] * coefficients
-        for _, matrix, at in passes("harmonics"):
-            colour = np.einsum("nk,nkc->nc", at, coefficients)
-            result += at[:, :, None] * (matrix.T @ (matrix @ colour))[:, None]
+        for seen in observe(run, cameras, "harmonics", blending=True):
+            at = functions(seen)
+            colours, _ = seen.blended(np.einsum("nk,nkc->nc", at, coefficients))
+            result += at[:, :, None] * seen.gathered(colours)[:, None]
         return result.ravel()
 
     def operator(function):

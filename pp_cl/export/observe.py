@@ -1,32 +1,32 @@
-"""Renders the training views of a run, with the blend weights of each point in them."""
+"""Renders the training views of a run, with what each point adds to them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
 from tqdm import tqdm
 
-from pp_cl.files.picture import Picture
-from pp_cl.raster.weights import listed_hits
+from pp_cl.raster.blend import blend_forward
+from pp_cl.raster.weights import ALL
 from pp_cl.render import RenderResult
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 
+COLOURS = slice(3)  # of the 16 features that are blended here; that behind them is 0 in all points
+
 
 @dataclass
 class Observation:
-    """A run's N points in a view of H x W pixels; gone once the next view is asked for."""
+    """A run's N points in a view of H x W pixels; gone once the next view is asked for. It is a
+    linear map, the blend weights (HW, N), which blended() applies and gathered() transposes, both
+    after observe(blending=True) alone.
+    """
 
     run: Run
     camera: Camera
     view: RenderResult
-
-    def picture(self) -> Picture:
-        """The view as the run renders it."""
-        return self.run.render(self.camera)
 
     def point_weights(self) -> np.ndarray:
         """(N,) float32: each point's blend weights, summed over the pixels."""
@@ -35,27 +35,59 @@ class Observation:
         self.run.renderer.record_weights(self.view, weights, seen)
         return weights.get()
 
-    def blend_matrix(self) -> csr_array:
-        """(HW, N) float32: the blend weight of each point in each pixel y*W + x."""
-        pairs = self.view.pairs
-        kept, point, weight = listed_hits(pairs, self.view.weights)
-        offset = np.concatenate([[0], np.cumsum(kept)])[pairs.pixel_offset.get()]
-        shape = pairs.pixels, pairs.points
-        matrix = csr_array((weight, point.astype(np.int32), offset), shape=shape)
-        pixels = np.arange(pairs.pixels).reshape(self.view.size)
-        return matrix[self.view.cropped(pixels).ravel()]
+    def blended(self, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """((HW, 3), (HW,)) float32: colours (N, 3) blended by the weights, and what the weights of
+        a pixel leave of 1.
+        """
+        dev, view = self.run.dev, self.view
+        shaded = view.weights.shaded.get()
+        rows = np.zeros((len(shaded), 16), np.float32)
+        rows[:, COLOURS] = colours[shaded]
+        dev.write(view.shaded_features[: len(shaded)], rows)
+        blend_forward(dev, view.pairs, view.weights, view.shaded_features, view.features)
+        pixels = view.cropped(dev.download(view.features)).reshape(-1, 16)
+        rest = pixels[:, 3]  # of the background, whose features are 1
+        return pixels[:, COLOURS] - rest[:, None], rest
+
+    def gathered(self, pixels: np.ndarray) -> np.ndarray:
+        """(N, 3) float32: of each point, the sum over the pixels (HW, 3) times its weights."""
+        dev, view = self.run.dev, self.view
+        padded = np.zeros((*view.size, 16), np.float32)
+        inside = view.cropped(padded)
+        inside[..., COLOURS] = pixels.reshape(*inside.shape[:2], 3)
+        gradients = self.run.renderer.backward_features(view, dev.upload(padded))
+        shaded = view.weights.shaded.get()
+        found = np.zeros((self.run.model.cloud.count, 3), np.float32)
+        found[shaded] = dev.download(gradients.shaded_features[: len(shaded)])[:, COLOURS]
+        return found
 
 
-def observe(run: Run, cameras: list[Camera], text: str) -> Iterator[Observation]:
+def observe(
+    run: Run, cameras: list[Camera], text: str, *, blending: bool = False
+) -> Iterator[Observation]:
     """What the points contribute to each camera's view, in turn; a progress bar with a text shows
     on a terminal.
     """
     seen = None
-    for camera in tqdm(cameras, desc=text, unit="view", leave=False, disable=None):
+    for camera in progress(cameras, text):
         if seen:
             del seen.view  # else its arrays would stay beside the larger ones of this view
-        seen = Observation(run, camera, run.renderer.forward(camera, run.gamma, until="weights"))
+        seen = look(run, camera, blending=blending)
         yield seen
+
+
+def progress(cameras: list[Camera], text: str) -> Iterable[Camera]:
+    """The cameras, with a progress bar on a terminal."""
+    return tqdm(cameras, desc=text, unit="view", leave=False, disable=None)
+
+
+def look(run: Run, camera: Camera, *, blending: bool = False) -> Observation:
+    """What the points contribute to a camera's view."""
+    if not blending:
+        return Observation(run, camera, run.renderer.forward(camera, run.gamma, until="weights"))
+    view = run.renderer.forward(camera, run.gamma, until="features", training=True)
+    view.weights = replace(view.weights, tracked=ALL)
+    return Observation(run, camera, view)
 
 
 def directions(positions: np.ndarray, camera: Camera) -> np.ndarray:

@@ -57,10 +57,10 @@ def coloured_points(run: Run, min_weight: float = 0.0) -> ColouredPoints:
     positions = run.model.positions()
     colours, best = np.zeros((cloud.count, 3), np.uint8), np.zeros(cloud.count, np.float32)
     for seen in observe(run, run.cameras("train"), "colours"):
-        weights = seen.point_weights()  # before the picture, which weighs the view anew
+        weights = seen.point_weights()
         higher = np.flatnonzero(weights > best)
         best[higher] = weights[higher]
-        colours[higher] = _colours(seen.picture(), seen.camera, positions[higher])
+        colours[higher] = _colours(run.render(seen.camera), seen.camera, positions[higher])
     rows = np.flatnonzero(best > min_weight)
     if not len(rows):
         raise UserError(

@@ -14,7 +14,7 @@ from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.points import four_blocks, stored_degree
-from pp_cl.raster.project import ProjectedPoints
+from pp_cl.raster.project import FOOTPRINTS, MOVED, ProjectedPoints
 from pp_cl.raster.weights import BlendWeights, clear_pairs
 
 ON_GPU = 4  # lanes there: each work-item reads vectors
@@ -124,8 +124,10 @@ def blend_backward(
     is_alpha, moves = weights.blend == "alpha", edge > 0
     if not is_alpha and (grad_alpha is not None or spread_weight > 0):
         raise ValueError("a softmax has no gradient of alpha and of spread")
-    if moves and not (is_alpha and points.footprint == "soft"):
-        raise ValueError("only soft points that are composited by alpha have gradients of offsets")
+    if moves and not (is_alpha and points.footprint in MOVED):
+        raise ValueError(
+            "only soft points and Gaussians composited by alpha have gradients of offsets"
+        )
     shaded = weights.shaded
     b.require(
         blend_backward_table(len(shaded_features), pairs.pixels, pairs.capacity, weights.blend)
@@ -143,7 +145,11 @@ def blend_backward(
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    program = _program(dev, moves)
+    program = (
+        _program(dev, FOOTPRINT=FOOTPRINTS.index(points.footprint), MOVES=1)
+        if moves
+        else _program(dev)
+    )
     if is_alpha:
         program.launch(
             "alpha_gradient",
@@ -185,5 +191,5 @@ def blend_backward(
     )
 
 
-def _program(dev, moves=False):
-    return dev.program("raster/blend", LANES=lanes(dev, ON_GPU), MOVES=int(moves))
+def _program(dev, **defines):
+    return dev.program("raster/blend", LANES=lanes(dev, ON_GPU), **defines)

@@ -30,7 +30,7 @@ class Pairs:
     The arrays have room for P pairs. If the view has more, pixel_offset is all zeros and the other
     arrays must not be read: find the pairs again with more room (room_needed()).
 
-    count: how many pairs there are.
+    footprint: of the points, one of FOOTPRINTS. count: how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
@@ -38,6 +38,7 @@ class Pairs:
     each pixel by depth, then by point.
     """
 
+    footprint: str
     count: Reading[int]
     point_offset: Array
     pixel_offset: Array
@@ -120,7 +121,13 @@ def find_pairs(
         _count_in_order(dev, program, b, n, pixels, room)
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     pairs = Pairs(
-        count, b.point_offset, b.pixel_offset, b.pair_pixel, b.pair_point_closeness, b.pair_key
+        points.footprint,
+        count,
+        b.point_offset,
+        b.pixel_offset,
+        b.pair_pixel,
+        b.pair_point_closeness,
+        b.pair_key,
     )
     program.launch(
         "pairs_scatter",

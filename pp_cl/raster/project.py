@@ -13,7 +13,9 @@ from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 
-FOOTPRINTS = ("disc", "soft", "sphere")  # numbered as in cl/raster/footprint.h, which explains them
+# numbered as in cl/raster/footprint.h, which explains them
+FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
+MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in edges of the grid
 
 
 @dataclass(frozen=True)

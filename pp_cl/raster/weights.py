@@ -14,6 +14,7 @@ from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 from pp_cl.device.scan import nonzero
 from pp_cl.raster.pairs import Pairs
+from pp_cl.raster.project import FOOTPRINTS
 
 BLENDS = ("softmax", "alpha")
 NO_POINT = 0xFFFFFFFF  # of an entry behind which hits were dropped
@@ -106,7 +107,12 @@ def _alpha_weights(dev, b, pairs, opacity, early_stop, slopes):
     """Front to back, weight = transmittance * opacity * closeness; early_stop is the transmittance
     below which the hits behind are dropped.
     """
-    dev.program("raster/alpha", LANES=lanes(dev), SLOPES=int(slopes)).launch(
+    dev.program(
+        "raster/alpha",
+        LANES=lanes(dev),
+        FOOTPRINT=FOOTPRINTS.index(pairs.footprint),
+        SLOPES=int(slopes),
+    ).launch(
         "alpha_weights",
         pairs.pixels,
         hw=pairs.pixels,

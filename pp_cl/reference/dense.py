@@ -11,6 +11,7 @@ Arrays = dict[str, np.ndarray]
 EPS = 1e-6
 DEPTH_RANGE = (2.0, 6.0)  # (near, far) where a test gives no other
 LEAST_RADIUS = 0.75
+LOW_PASS, DEVIATIONS, LEAST_ALPHA, MOST_ALPHA = 0.3, 3.33, 1 / 255, 0.99  # of Gaussians
 
 
 def camera_space(camera: Any, positions: np.ndarray) -> np.ndarray:
@@ -81,11 +82,16 @@ def geometry(
     t = np.linalg.norm(c, axis=1)[:, None]
     radius, width = radius[:, None], pixel_width(camera, t)
     least = LEAST_RADIUS * width
-    if kind in ("disc", "soft"):
+    if kind != "sphere":
         reach, ahead = np.maximum(radius, least), np.maximum(c @ r.T, 0)
+        variance = radius**2 + LOW_PASS * pixel_width(camera, c[:, 2:]) ** 2
+        if kind == "gaussian":
+            reach = DEVIATIONS * np.sqrt(variance)
         rho = np.linalg.norm(c[:, None] - ahead[..., None] * r[None], axis=2)
-        hit = rho < reach
+        hit = (rho < reach) & (ahead > 0)
         closeness = 1 - rho / reach if kind == "soft" else np.ones_like(rho)
+        if kind == "gaussian":
+            closeness = np.exp(-0.5 * rho**2 / variance)
         depth = np.broadcast_to(t, rho.shape)
         margin = np.abs(rho - reach) / width
     else:
@@ -105,6 +111,7 @@ def geometry(
         "depth": depth,
         "z": 1 - (depth - near) / (far - near),
         "margin": margin,
+        "limits": (LEAST_ALPHA, MOST_ALPHA) if kind == "gaussian" else (-np.inf, np.inf),
     }
 
 
@@ -195,7 +202,10 @@ def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
     front of a hit; background (HW,) what is left; hit (N, HW) used: those where T >= least.
     """
     hit, ranks = geometry_["hit"], order(geometry_)
+    least_alpha, most_alpha = geometry_["limits"]
     alpha_ = np.asarray(opacity, np.float64)[:, None] * geometry_["closeness"]
+    shows = alpha_ >= least_alpha
+    alpha_ = np.where(shows, np.minimum(alpha_, most_alpha), 0)
     weight, through, used = np.zeros(hit.shape), np.zeros(hit.shape), np.zeros_like(hit)
     background = np.ones(hit.shape[1])
     for q in np.flatnonzero(hit.any(axis=0)):
@@ -208,6 +218,7 @@ def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
             background[q] *= 1 - alpha_[i, q]
     return {
         "alpha": alpha_,
+        "shows": shows,
         "weight": weight,
         "through": through,
         "background": background,
@@ -277,7 +288,8 @@ def _alpha_slope(blend_, own, background, ranks):
         points = np.flatnonzero(blend_["hit"][:, q])
         rest = background[q]  # G times what is composited behind a hit
         for i in points[np.argsort(-ranks[points, q])]:
-            slope[i, q] = blend_["through"][i, q] * (own[i, q] - rest)
+            if blend_["shows"][i, q]:
+                slope[i, q] = blend_["through"][i, q] * (own[i, q] - rest)
             rest += blend_["alpha"][i, q] * (own[i, q] - rest)
     return slope
 

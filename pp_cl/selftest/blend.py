@@ -148,16 +148,20 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     positions, opacity = make_points(rng, n), rng.uniform(0, 1, n).astype(np.float32)
     features = rng.normal(size=(n, 16))
     grad = rng.normal(size=(camera.width * camera.height, 16))
-    for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0)):  # the last: of the least size
-        scene = PairedPoints(dev, camera, positions, radius)
+    # 1e-3: of the least size
+    for kind, radius, stop in (
+        *(("soft", radius, stop) for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0))),
+        *(("gaussian", radius, stop) for radius, stop in ((0.1, 0.0), (0.1, 0.05), (1e-3, 0.0))),
+    ):
+        scene = PairedPoints(dev, camera, positions, radius, kind=kind)
         scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
         gradients = scene.gradients(grad, edge=edge)["offset"]
         exact_geometry = scene.geometry()
         used = dense.alpha(exact_geometry, opacity, stop)["hit"]
 
-        def loss(offset, radius=radius, exact_geometry=exact_geometry, used=used):
+        def loss(offset, kind=kind, radius=radius, exact_geometry=exact_geometry, used=used):
             wide = radius * np.exp(offset[:, 3])
-            moved = dense.geometry(camera, positions + edge * offset[:, :3], wide, "soft")
+            moved = dense.geometry(camera, positions + edge * offset[:, :3], wide, kind)
             moved |= {"hit": used, "depth": exact_geometry["depth"]}
             return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
 

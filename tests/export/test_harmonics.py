@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from support.models import blend_matrix
 
 from pp_cl.export.harmonics import basis, fit_harmonics
-from pp_cl.export.observe import Observation, directions, observe
+from pp_cl.export.observe import directions, observe
 from pp_cl.files.picture import Picture
 
 
@@ -24,7 +25,7 @@ def test_the_functions_of_the_basis_are_orthogonal():
 def drawn(run, coefficients, seen):
     """(HW, 3): coefficients (N, 9, 3), blended over white."""
     positions = run.model.positions()
-    at, matrix = basis(directions(positions, seen.camera)), seen.blend_matrix()
+    at, matrix = basis(directions(positions, seen.camera)), blend_matrix(seen)
     return matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
 
 
@@ -34,13 +35,14 @@ def test_images_of_known_harmonics_are_reproduced(run, rng, monkeypatch):
         [np.full((n, 1, 3), 0.5), rng.normal(scale=0.02, size=(n, 8, 3))], axis=1
     ).astype(np.float32)
 
-    def picture(self):
-        image = drawn(run, known, self).reshape(30, 30, 3)
-        alpha = self.blend_matrix().sum(1).reshape(30, 30)
+    def picture(camera):
+        (seen,) = observe(run, [camera], "")
+        image = drawn(run, known, seen).reshape(30, 30, 3)
+        alpha = blend_matrix(seen).sum(1).reshape(30, 30)
         return Picture(image, alpha, alpha, alpha)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Observation, "picture", picture)
+        patch.setattr(run, "render", picture)
         found = fit_harmonics(run)
     for seen in observe(run, run.cameras("train")[::4], ""):
         error = np.abs(drawn(run, found, seen) - drawn(run, known, seen))

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.browser import ask, image_of
+from support.models import blend_matrix
 
 from pp_cl.errors import UserError
 from pp_cl.export.harmonics import basis
@@ -47,7 +48,7 @@ def predicted(run, page, camera):
     positions = run.model.positions()
     at = basis(directions(positions, camera))
     (seen,) = observe(run, [camera], "")
-    matrix = seen.blend_matrix()
+    matrix = blend_matrix(seen)
     image = matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
     return to_8bit(image.reshape(camera.height, camera.width, 3))
 

@@ -3,9 +3,11 @@
 import weakref
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
+from pp_cl.raster.weights import listed_hits
 from pp_cl.scene.grid import Grid
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
@@ -45,3 +47,13 @@ def drawn_alone(monkeypatch, renderer):
 
     monkeypatch.setattr(renderer, "forward", drawing)
     return drawn
+
+
+def blend_matrix(seen):
+    """(HW, N) sparse: the blend weight of each point in each pixel of an Observation."""
+    pairs = seen.view.pairs
+    kept, point, weight = listed_hits(pairs, seen.view.weights)
+    offset = np.concatenate([[0], np.cumsum(kept)])[pairs.pixel_offset.get()]
+    shape = pairs.pixels, pairs.points
+    matrix = csr_array((weight, point.astype(np.int32), offset), shape=shape)
+    return matrix[seen.view.cropped(np.arange(pairs.pixels).reshape(seen.view.size)).ravel()]
