@@ -32,7 +32,6 @@ from pp_cl.raster.weights import (
 from pp_cl.scene.camera import Camera
 from pp_cl.settings import RasterConfig
 
-NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
 MOST_SIDE = 2**16 - 1  # pixels of an image: the boxes of points have 16 bits
 # far - near of the scenes for which the paper's radius of 0.0015 was chosen
 PAPER_DEPTH_RANGE = 4.0
@@ -112,7 +111,7 @@ class Renderer:
         training: bool = False,
         gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
     ) -> RenderResult:
-        """Render a camera, which is padded to multiples of 4 pixels.
+        """Render a camera, which is padded to multiples of net.multiple pixels.
 
         until: the last stage wanted: blend weights, blended features or the network's image.
         gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
@@ -122,7 +121,7 @@ class Renderer:
         UNet.plan_tiles(); called after the wait for the device.
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
-        padded, left, top = camera.padded(NETWORK_MULTIPLE)
+        padded, left, top = camera.padded(net.multiple)
         size = (padded.height, padded.width)
         if max(size) > MOST_SIDE:
             raise UserError(

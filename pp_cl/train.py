@@ -13,7 +13,7 @@ from pp_cl.device.device import Device
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
 from pp_cl.network.tile_plan import gradient_tiles
-from pp_cl.render import NETWORK_MULTIPLE, Renderer, RenderResult
+from pp_cl.render import Renderer, RenderResult
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.training.crops import Crop, Crops
@@ -180,7 +180,7 @@ class Trainer:
         """A function that returns gradient_tiles of UNet.plan_tiles(); called once the device has
         been waited for anyway, so that looking at the target costs no wait of its own.
         """
-        padded, *offset = crop.camera.padded(NETWORK_MULTIPLE)
+        padded, *offset = crop.camera.padded(self.model.net.multiple)
         size = padded.height, padded.width
         if not self.model.net.is_planned(size):
             return lambda: None

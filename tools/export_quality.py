@@ -99,8 +99,8 @@ def _drawn(run, coefficients, cameras):
     positions = run.model.positions()
     drawn = []
     for seen in observe(run, cameras, "drawing", blending=True):
-        at = basis(directions(positions, seen.camera))[:, : coefficients.shape[1]]
-        colours, rest = seen.blended(np.einsum("nk,nkc->nc", at, coefficients))
+        at = basis(directions(positions[seen.shaded], seen.camera))[:, : coefficients.shape[1]]
+        colours, rest = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[seen.shaded]))
         image = colours + rest[:, None]
         drawn.append(to_8bit(image.reshape(seen.camera.height, seen.camera.width, 3)))
     return drawn

@@ -20,8 +20,8 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import multiplications
+from pp_cl.network.unet import UNet
 from pp_cl.raster.weights import listed_hits
-from pp_cl.render import NETWORK_MULTIPLE
 from pp_cl.session import open_training, run_config, stored_state
 from tools.peak import CopyBandwidth, PeakFlops
 
@@ -100,7 +100,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
         for name, taken in seconds.items()
         if len(taken) >= TIMED  # what every step does; pairs anew where there was too little room
     ]
-    padded, _, _ = trainer.crops.draw(0).camera.padded(NETWORK_MULTIPLE)
+    padded, _, _ = trainer.crops.draw(0).camera.padded(UNet.multiple)
     return {
         "points": cloud.count,
         "size": f"{padded.width}x{padded.height}",

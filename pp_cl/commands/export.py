@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
-from pp_cl.export import FORMATS
+from pp_cl.export import FORMATS, WINDOW
 
 HELP = "write a run in a format that other programs open"
 EPILOG = "\n".join(
@@ -15,7 +15,7 @@ EPILOG = "\n".join(
         "docs/export.md says more.",
     )
 )
-OF_POINTS = ("ply", "glb")
+OF_POINTS, OF_SPLATS = ("ply", "glb"), ("splat", "splat-spz", "splat-glb")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="ply, glb: leave out points whose blend weights add up to at most W in every training"
         " view (0: points that no view shows)",
     )
+    add(
+        "--window",
+        type=shared.integer(16, 16384),
+        metavar="PIXELS",
+        help="splats: fit the Gaussians for pictures of so many pixels on the longer side"
+        f" ({WINDOW}); up to 12 times those of the training images",
+    )
     shared.add_run_scene(parser)
     shared.add_device(parser)
 
@@ -48,6 +55,8 @@ def run(options: argparse.Namespace) -> None:
     name, folder = options.format, Path(options.run_folders[0])
     if name not in OF_POINTS:
         shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
+    if name not in OF_SPLATS:
+        shared.refuse(options, ("window",), f"only {', '.join(OF_SPLATS)} are fitted to a window")
     if name != "gallery" and len(options.run_folders) > 1:
         raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
     path = check_target(name, folder, Path(options.out) if options.out else None)
@@ -63,5 +72,12 @@ def run(options: argparse.Namespace) -> None:
         return run
 
     run, *others = options.run_folders
-    written = export(loaded(run), name, path, options.min_weight or 0.0, map(loaded, others))
+    written = export(
+        loaded(run),
+        name,
+        path,
+        min_weight=options.min_weight or 0.0,
+        window=options.window or WINDOW,
+        others=map(loaded, others),
+    )
     print(f"wrote {path}: {written}")

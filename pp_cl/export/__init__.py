@@ -1,5 +1,7 @@
 """Exports a run to other programs: films, point clouds, meshes, a web page, rendered views."""
 
+# Pixels on the longer side of the pictures for which splats are fitted: of a viewer's window
+WINDOW = 800
 # {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder;
 # what it is)}
 FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
@@ -7,6 +9,11 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         "splat.ply",
         (".ply",),
         "the .ply of 3D Gaussian splatting, for SuperSplat, Blender and all other viewers",
+    ),
+    "splat-spz": (
+        "splat.spz",
+        (".spz",),
+        "the same in a tenth of the bytes, for Scaniverse, Spark, PlayCanvas and Babylon.js",
     ),
     "splat-glb": ("splat.glb", (".glb",), "the same as glTF (KHR_gaussian_splatting)"),
     "ply": ("cloud.ply", (".ply",), "all points with colour, opacity and everything learned"),

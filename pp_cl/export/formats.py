@@ -9,12 +9,20 @@ from itertools import chain
 from pathlib import Path
 
 from pp_cl.errors import UserError
-from pp_cl.export import FORMATS
+from pp_cl.export import FORMATS, WINDOW
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.page import page_text, write_gallery
 from pp_cl.export.points import coloured_points, write_ply
-from pp_cl.export.splat import Y_DOWN, Y_UP, splats, write_splat_glb, write_splat_ply
+from pp_cl.export.splat import (
+    Y_DOWN,
+    Y_UP,
+    check_spz,
+    splats,
+    write_splat_glb,
+    write_splat_ply,
+    write_splat_spz,
+)
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
 from pp_cl.files.manifest import begin_manifest, check_ours
 from pp_cl.run import Run, image_files
@@ -41,11 +49,17 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
 
 
 def export(
-    run: Run, name: str, path: Path, min_weight: float = 0.0, others: Iterable[Run] = ()
+    run: Run,
+    name: str,
+    path: Path,
+    *,
+    min_weight: float = 0.0,
+    window: int = WINDOW,
+    others: Iterable[Run] = (),
 ) -> str:
     """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
-    min_weight: as --min-weight. others: further runs of a gallery. Raises UserError for what cannot
-    be written, before which nothing is.
+    min_weight, window: as the options. others: further runs of a gallery. Raises UserError for
+    what cannot be written, before which nothing is.
     """
     count = run.model.cloud.count
     if name == "mesh":
@@ -64,11 +78,15 @@ def export(
         splits = renderings(run)
         write_scene(splits, path)
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
-    if name in ("splat", "splat-glb"):
-        table, origin = splats(run, Y_DOWN if name == "splat" else Y_UP)
+    if name in ("splat", "splat-spz", "splat-glb"):
+        if name == "splat-spz":
+            check_spz()
+        table, origin = splats(run, Y_DOWN if name == "splat" else Y_UP, window)
         _begin_default(name, path)
         if name == "splat":
             write_splat_ply(path, table)
+        elif name == "splat-spz":
+            write_splat_spz(path, table)
         else:
             write_splat_glb(path, table, origin)
         return f"{len(table)} Gaussians"

@@ -43,16 +43,17 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
     positions = run.model.positions()
 
     def functions(seen):
-        return basis(directions(positions, seen.camera))[:, :count]
+        return basis(directions(positions[seen.shaded], seen.camera))[:, :count]
 
     b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
     for camera in progress(cameras, "colours"):
         picture = run.render(camera)
         colours = np.float32(picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
         seen = look(run, camera, blending=True)
-        at, weights = functions(seen), seen.point_weights()
-        b += at[:, :, None] * seen.gathered(colours)[:, None]
-        blocks += (weights[:, None] * at)[:, :, None] * at[:, None]
+        at, rows = functions(seen), seen.shaded
+        weights = seen.gathered(np.ones_like(colours))[:, :1]
+        b[rows] += at[:, :, None] * seen.gathered(colours)[:, None]
+        blocks[rows] += (weights * at)[:, :, None] * at[:, None]
         del seen
     ridge = RIDGE * blocks[:, :1, 0] * (np.arange(count) > 0) + LEAST
     diagonal = np.arange(count)
@@ -63,9 +64,9 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
         coefficients = flat.reshape(b.shape)
         result = ridge[..., None] * coefficients
         for seen in observe(run, cameras, "harmonics", blending=True):
-            at = functions(seen)
-            colours, _ = seen.blended(np.einsum("nk,nkc->nc", at, coefficients))
-            result += at[:, :, None] * seen.gathered(colours)[:, None]
+            at, rows = functions(seen), seen.shaded
+            colours, _ = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[rows]))
+            result[rows] += at[:, :, None] * seen.gathered(colours)[:, None]
         return result.ravel()
 
     def operator(function):

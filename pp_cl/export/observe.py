@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from tqdm import tqdm
@@ -20,8 +21,8 @@ COLOURS = slice(3)  # of the 16 features that are blended here; that behind them
 @dataclass
 class Observation:
     """A run's N points in a view of H x W pixels; gone once the next view is asked for. It is a
-    linear map, the blend weights (HW, N), which blended() applies and gathered() transposes, both
-    after observe(blending=True) alone.
+    linear map, the blend weights (HW, S) of the visible points, which blended() applies and
+    gathered() transposes, both after look(blending=True) alone.
     """
 
     run: Run
@@ -35,31 +36,32 @@ class Observation:
         self.run.renderer.record_weights(self.view, weights, seen)
         return weights.get()
 
+    @cached_property
+    def shaded(self) -> np.ndarray:
+        """(S,) indices of the visible points, ascending."""
+        return self.view.weights.shaded.get()
+
     def blended(self, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """((HW, 3), (HW,)) float32: colours (N, 3) blended by the weights, and what the weights of
+        """((HW, 3), (HW,)) float32: colours (S, 3) blended by the weights, and what the weights of
         a pixel leave of 1.
         """
         dev, view = self.run.dev, self.view
-        shaded = view.weights.shaded.get()
-        rows = np.zeros((len(shaded), 16), np.float32)
-        rows[:, COLOURS] = colours[shaded]
-        dev.write(view.shaded_features[: len(shaded)], rows)
+        rows = np.zeros((len(colours), 16), np.float32)
+        rows[:, COLOURS] = colours
+        dev.write(view.shaded_features[: len(rows)], rows)
         blend_forward(dev, view.pairs, view.weights, view.shaded_features, view.features)
         pixels = view.cropped(dev.download(view.features)).reshape(-1, 16)
         rest = pixels[:, 3]  # of the background, whose features are 1
         return pixels[:, COLOURS] - rest[:, None], rest
 
     def gathered(self, pixels: np.ndarray) -> np.ndarray:
-        """(N, 3) float32: of each point, the sum over the pixels (HW, 3) times its weights."""
+        """(S, 3) float32: of each point, the sum over the pixels (HW, 3) times its weights."""
         dev, view = self.run.dev, self.view
         padded = np.zeros((*view.size, 16), np.float32)
         inside = view.cropped(padded)
         inside[..., COLOURS] = pixels.reshape(*inside.shape[:2], 3)
         gradients = self.run.renderer.backward_features(view, dev.upload(padded))
-        shaded = view.weights.shaded.get()
-        found = np.zeros((self.run.model.cloud.count, 3), np.float32)
-        found[shaded] = dev.download(gradients.shaded_features[: len(shaded)])[:, COLOURS]
-        return found
+        return dev.download(gradients.shaded_features[: len(self.shaded)])[:, COLOURS]
 
 
 def observe(

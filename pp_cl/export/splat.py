@@ -1,38 +1,30 @@
-"""A run as 3D Gaussians without a network: the .ply of 3D Gaussian splatting, and glTF."""
+"""A run as 3D Gaussians without a network: the .ply of 3D Gaussian splatting, .spz, and glTF."""
 
 from __future__ import annotations
 
+import math
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pp_cl.errors import UserError
+from pp_cl.export.gaussians import CONSTANT, FACTORS, MOST_OPAQUE, ORDER, fit_gaussians
 from pp_cl.export.gltf import gltf_colours, write_glb
-from pp_cl.export.harmonics import COUNT, basis, fit_harmonics
+from pp_cl.export.harmonics import COUNT, basis
 from pp_cl.export.page import check_drawable
 from pp_cl.export.points import in_world, table_of, write_elements
+from pp_cl.files.atomic import atomic_path
 from pp_cl.files.image import to_8bit
 from pp_cl.run import Run
 from pp_cl.scene.camera_path import up_of
 
-# Of a Gaussian, in radii of the soft disc, whose alpha falls linearly to its rim: the root of its
-# second moment. With the disc's opacity in the centre a Gaussian then covers 0.91 of the disc. The
-# 0.3 pixels^2 that viewers add to its variance are not made up for: where a point covers a pixel,
-# as in the training views, they make it three times as large, but opacities that suit those views
-# leave gaps in larger windows.
-DEVIATION = 0.39
-MOST_OPAQUE, LEAST_OPAQUE = 0.99, 1 / 255  # what 3D Gaussian splatting clamps to, and leaves out
-CONSTANT = 0.28209479177387814  # the first of the functions below
-# 3D Gaussian splatting's functions of degrees 0 to 2 are basis()'s in this order, times these.
-ORDER = [0, 2, 3, 1, 4, 5, 7, 6, 8]
-FACTORS = np.array(
-    [
-        CONSTANT,
-        *(-0.4886025119029199, 0.4886025119029199, -0.4886025119029199),
-        *(1.0925484305920792, -1.0925484305920792, 0.31539156525252005),
-        *(-1.0925484305920792, 0.5462742152960396),
-    ]
-)
+LEAST_OPAQUE = 1 / 255  # what viewers leave out
+# In a .spz: steps of a place in the least deviation; of the harmonics of degrees 1 and 2, as
+# Niantic's own writer rounds them, whose bytes else hardly shrink.
+STEPS_OF_PLACE = 32
+STEPS_OF_DEGREE = 1 / 16, 1 / 8
 STORED = 16  # functions in a .ply: many programs read no file but of degree 3
 Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in glTF
 
@@ -46,36 +38,37 @@ SPLAT = np.dtype(
 )
 
 
-def splats(run: Run, up: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of SPLAT, (3,) origin): the run's points as Gaussians, in the world of its
-    scene turned so that its up, as far as the photographs tell, is `up`. Positions are relative to
-    the origin, which is 0 unless float32 is too coarse there. harmonics: in the order and with the
-    signs of 3D Gaussian splatting, of colours less 0.5, opacity: after the sigmoid. Points that no
-    training view shows are left out.
+def splats(run: Run, up: tuple[float, float, float], window: int) -> tuple[np.ndarray, np.ndarray]:
+    """((M,) records of SPLAT, (3,) origin): the run as Gaussians, fitted to pictures of `window`
+    pixels, in the world of its scene turned so that its up, as far as the photographs tell, is
+    `up`. Positions are relative to the origin, which is 0 unless float32 is too coarse there.
+    harmonics: in the order and with the signs of 3D Gaussian splatting, of colours less 0.5;
+    opacity: after the sigmoid. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    coefficients = fit_harmonics(run)
-    opacity = run.model.cloud.opacity.get().clip(0, MOST_OPAQUE)
-    rows = np.flatnonzero((opacity > LEAST_OPAQUE) & coefficients.any((1, 2)))
+    cloud, deviation = fit_gaussians(run, window)
+    opacity, offset = cloud.opacity.get().clip(0, MOST_OPAQUE), cloud.offset.get()
+    rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
     turn = Rotation.align_vectors([up], [up_of(run.cameras("train"))])[0].as_matrix()
-    positions = run.model.positions()[rows] @ turn.T
-    near = in_world(positions, run.model.grid.edge).dtype == np.float32
+    positions = grid.positions(cloud.ids.get()[rows]) + grid.edge * offset[rows, :3]
+    positions = positions @ turn.T
+    coefficients = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
+    near = in_world(positions, grid.edge).dtype == np.float32
     origin = np.zeros(3) if near else np.rint(positions.mean(0))
     table = np.zeros(len(rows), SPLAT)
     table["position"] = positions - origin
-    table["harmonics"] = _turned(coefficients[rows], turn)
+    table["harmonics"] = _turned(coefficients, turn)
     table["opacity"] = opacity[rows]
-    table["deviation"] = DEVIATION * run.config.raster.radius * run.model.grid.edge
-    table["deviation"] *= np.exp(run.model.cloud.offset.get()[rows, 3])
+    table["deviation"] = deviation * np.exp(offset[rows, 3])
     return table, origin
 
 
 def _turned(coefficients, turn):
-    """(M, 9, 3) of basis() to those of 3D Gaussian splatting, of directions that are turned."""
+    """Coefficients (M, 9, 3) of colours, of turned directions and of colours less 0.5."""
     seen = np.random.default_rng(0).normal(size=(64, 3))
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    theirs = basis(seen @ turn.T)[:, ORDER] * FACTORS
-    matrix = np.linalg.lstsq(theirs, basis(seen), rcond=None)[0]
+    before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
+    matrix = np.linalg.lstsq(after, before, rcond=None)[0]
     found = np.einsum("jk,nkc->njc", matrix, coefficients)
     found[:, 0] -= 0.5 / CONSTANT
     return found
@@ -98,6 +91,42 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     columns |= {"rot_0": nothing + 1} | dict.fromkeys(("rot_1", "rot_2", "rot_3"), nothing)
     # brush turns a model by this comment; others take y for the vertical axis anyway
     write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
+
+
+def check_spz() -> None:
+    """Raise UserError where the package that writes .spz is missing."""
+    if find_spec("gsply") is None:
+        raise UserError("splat-spz needs gsply; install it with `pip install gsply`")
+
+
+def write_splat_spz(path: Path, table: np.ndarray) -> None:
+    """Write splats() with y up as Niantic's .spz. Raises UserError as check_spz() and atomic_path
+    do.
+    """
+    check_spz()
+    from gsply import GSData, write_spz
+
+    place, count, rest = table["position"], len(table), table["harmonics"][:, 1:].copy()
+    for part, step in zip((rest[:, :3], rest[:, 3:]), STEPS_OF_DEGREE, strict=True):
+        np.rint(part / step, out=part)
+        part *= step
+    data = GSData.from_arrays(
+        np.ascontiguousarray(place),
+        np.log(table["deviation"]).repeat(3).reshape(-1, 3),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.log(table["opacity"] / (1 - table["opacity"])),
+        np.ascontiguousarray(table["harmonics"][:, 0]),
+        rest,
+        format="ply",
+    )
+    # places are numbers of 24 bits with a sign
+    room = 23 - math.ceil(math.log2(np.abs(place).max(initial=1e-6) * 1.001))
+    wanted = math.ceil(math.log2(STEPS_OF_PLACE / table["deviation"].min(initial=1)))
+    with atomic_path(path) as temporary:
+        write_spz(temporary, data, fractional_bits=max(0, min(room, wanted)))
+        with temporary.open("r+b") as file:  # gzip's time of writing, the one byte that differs
+            file.seek(4)
+            file.write(bytes(4))
 
 
 def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> None:

@@ -132,6 +132,35 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
     )
 
 
+def mean_forward(dev: Device, features: Array, image: Array, scale: int) -> None:
+    """image (H, W, 3) = means of the first three features of scale x scale pixels, of features
+    (scale H, scale W, C).
+    """
+    sizes = _mean_sizes(image, features, scale)
+    size = image.shape[1], image.shape[0]
+    dev.program("layers/output").launch(
+        "mean_forward", size, features=features, image=image, **sizes
+    )
+
+
+def mean_backward(dev: Device, grad_image: Array, grad_features: Array, scale: int) -> None:
+    """Write grad_features (scale H, scale W, C), 0 beyond the first three, from grad_image (H, W,
+    3).
+    """
+    sizes = _mean_sizes(grad_image, grad_features, scale)
+    size = grad_features.shape[1], grad_features.shape[0]
+    dev.program("layers/output").launch(
+        "mean_backward", size, grad_image=grad_image, grad_features=grad_features, **sizes
+    )
+
+
+def _mean_sizes(image, features, scale):
+    height, width, channels = image.shape
+    if channels != 3 or features.shape[:2] != (height * scale, width * scale):
+        raise ValueError(f"means of {scale}x{scale} pixels of {features.shape}: no {image.shape}")
+    return {"height": height, "width": width, "scale": scale, "channels": features.shape[2]}
+
+
 def _launch(dev, file, kernel, shape, result, size=None, *, tiles, **arguments):
     """Launch a kernel that computes the tiles of the array `result`. shape: its h, w, c, those of
     the smaller map; size: over which (height, width, channels) it runs, if not these.

@@ -51,7 +51,6 @@ from pp_cl.settings import NetworkConfig
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
-MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
 Size = tuple[int, int]  # (height, width)
 # What is computed for a convolution: its layer, a direction, the input whose gradient it is.
@@ -232,8 +231,10 @@ class UNet:
     "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device; all_parameters, all_gradients:
     the 1-D array that they lie in, with zeros between them. Weights and biases start uniform in
     +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient
-    0.
+    0. multiple: of which the sides of images are, in pixels.
     """
+
+    multiple = 4  # two poolings halve the height and the width
 
     def __init__(
         self,
@@ -331,7 +332,7 @@ class UNet:
             raise RuntimeError("UNet.freeze() was called: the network can no longer be trained")
         height, width, channels = x.shape
         taken = sum(self.layers[0].sources)
-        if height % MULTIPLE or width % MULTIPLE or channels != taken:
+        if height % self.multiple or width % self.multiple or channels != taken:
             raise ValueError(f"the network takes (4n, 4m, {taken}) features, not {x.shape}")
         if training not in self._passes:
             self._passes[training] = Pass(self, training)

@@ -15,6 +15,8 @@ from pp_cl.layers.simple import (
     gate_backward,
     gate_forward,
     maxpool2_forward,
+    mean_backward,
+    mean_forward,
     output_backward,
     output_forward,
     residual_backward,
@@ -207,6 +209,21 @@ def _output(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(grad_features.get(), expected, 2 * EPS)
 
 
+def _means(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Colours that are means of features, and the gradient."""
+    for height, width, scale in ((1, 1, 1), (31, 33, 1), (3, 257, 2), (5, 11, 3)):
+        features = _normal(rng, height * scale, width * scale, 16)
+        grad, image = _normal(rng, height, width, 3), dev.empty((height, width, 3))
+        mean_forward(dev, dev.upload(features), image, scale)
+        blocks = features.astype(np.float64).reshape(height, scale, width, scale, 16)
+        yield relative(image.get(), blocks.mean((1, 3))[..., :3], 2 * EPS)
+        grad_features = dev.empty(features.shape)
+        mean_backward(dev, dev.upload(grad), grad_features, scale)
+        expected = np.zeros(features.shape)
+        expected[..., :3] = grad.repeat(scale, 0).repeat(scale, 1) / scale**2
+        yield relative(grad_features.get(), expected, EPS)
+
+
 def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Sizes; features and gates from 1e-12 to 60, where expm1 would cancel and exp overflow."""
     for h, w, c in PLANES:
@@ -274,6 +291,7 @@ CASES = (
     Case("layers: max pooling", _max_pool),
     Case("layers: upsampling", _upsample),
     Case("layers: output", _output),
+    Case("layers: means in place of a network", _means),
     Case("layers: gate", _gate),
     Case("layers: tiles", _tiles),
 )

@@ -13,7 +13,7 @@ from pp_cl.errors import UserError
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.raster.points import PointCloud, sh_blocks
-from pp_cl.render import NETWORK_MULTIPLE, point_radius
+from pp_cl.render import point_radius
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import MOST_VERTICES, Grid
 from pp_cl.scene.load import DEMO, mask_rule, reading
@@ -252,7 +252,7 @@ def _size_of(camera: Camera, side: int) -> tuple[int, int]:
     image.
     """
     height, width = (min(side or size, size) for size in (camera.height, camera.width))
-    return height + -height % NETWORK_MULTIPLE, width + -width % NETWORK_MULTIPLE
+    return height + -height % UNet.multiple, width + -width % UNet.multiple
 
 
 def _size(size):

@@ -4,6 +4,7 @@ import json
 import struct
 from dataclasses import replace
 
+import gsply
 import numpy as np
 import plyfile
 import pytest
@@ -12,9 +13,21 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from support.splats import colours, draw_splats, read_splats
 
-from pp_cl.export.splat import DEVIATION, Y_DOWN, Y_UP, splats, write_splat_glb, write_splat_ply
+from pp_cl.errors import UserError
+from pp_cl.export import splat
+from pp_cl.export.gaussians import DEVIATION
+from pp_cl.export.splat import (
+    Y_DOWN,
+    Y_UP,
+    check_spz,
+    splats,
+    write_splat_glb,
+    write_splat_ply,
+    write_splat_spz,
+)
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.raster.points import MOST_OFFSET
 from pp_cl.scene.camera_path import up_of
 
 # of the training code of 3D Gaussian splatting, for its degree 3
@@ -26,7 +39,7 @@ LAYOUT += [f"rot_{i}" for i in range(4)]
 @pytest.fixture(scope="module")
 def ply(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("splat") / "a.ply"
-    write_splat_ply(path, splats(run, Y_DOWN)[0])
+    write_splat_ply(path, splats(run, Y_DOWN, 90)[0])
     return path
 
 
@@ -51,25 +64,58 @@ def test_the_header_is_that_of_the_training_code(ply):
 
 def test_what_is_no_colour(run, ply):
     vertex, found = plyfile.PlyData.read(str(ply))["vertex"], read_splats(ply)
-    up, positions = up_of(run.cameras("train")), run.model.positions()
+    up, grid = up_of(run.cameras("train")), run.model.grid
     turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
-    apart, point = cKDTree(positions).query(found["positions"] @ turn)
-    assert apart.max() < 1e-5 and 0.3 * len(positions) < len(set(point)) == len(point)
+    vertices = grid.positions(run.model.cloud.ids.get())
+    apart = cKDTree(vertices).query(found["positions"] @ turn, p=np.inf)[0]  # in a point's cell
+    assert apart.max() < (MOST_OFFSET + 1e-4) * grid.edge
+    assert 0.3 * len(vertices) < len(apart) <= len(vertices)
     assert turn @ up == pytest.approx([0, -1, 0])
     assert found["opacity"].min() > 1 / 255 and found["opacity"].max() < 0.991
-    growth = np.exp(run.model.cloud.offset.get()[point, 3])
-    squared = (DEVIATION * run.config.raster.radius * run.model.grid.edge * growth) ** 2
-    assert found["covariance"] == pytest.approx(squared[:, None, None] * np.eye(3))
+    variance = found["covariance"][:, 0, 0]
+    growth = np.sqrt(variance) / (DEVIATION * run.config.raster.radius * grid.edge)
+    assert np.abs(np.log(growth)).max() < MOST_OFFSET + 1e-4
+    assert found["covariance"] == pytest.approx(variance[:, None, None] * np.eye(3))
     assert all((vertex[f"n{axis}"] == 0).all() for axis in "xyz")
 
 
-def test_gaussians_look_like_the_run(run, ply):
-    """In a window of three times the size, each block of pixels averaged."""
-    found = read_splats(ply)
+def likeness(run, path, scale):
+    """PSNR of test views that are drawn in windows of `scale` times their size."""
+    found, measured = read_splats(path), []
     for camera in run.cameras("test"):
-        large = turned(run, camera.resized(3 * camera.width, 3 * camera.height))
-        blocks = draw_splats(found, large).reshape(camera.height, 3, camera.width, 3, 3)
-        assert psnr(to_8bit(blocks.mean((1, 3))), to_8bit(run.render(camera).colour)) > 25
+        large = turned(run, camera.resized(scale * camera.width, scale * camera.height))
+        blocks = draw_splats(found, large).reshape(camera.height, scale, camera.width, scale, 3)
+        measured.append(psnr(to_8bit(blocks.mean((1, 3))), to_8bit(run.render(camera).colour)))
+    return np.mean(measured)
+
+
+def test_gaussians_look_like_the_run_in_the_window_that_they_are_for(run, ply, tmp_path):
+    small = tmp_path / "small.ply"
+    write_splat_ply(small, splats(run, Y_DOWN, 30)[0])
+    assert likeness(run, ply, 3) > 37
+    assert likeness(run, small, 1) > 37 and likeness(run, ply, 1) < 30
+
+
+def test_the_spz_says_the_same_with_y_up(run, ply, tmp_path):
+    """To its bits: a 64th of a deviation, 1/255 of an opacity, exp(1/32) of a deviation."""
+    table, _ = splats(run, Y_UP, 90)
+    write_splat_spz(tmp_path / "a.spz", table)
+    found = gsply.read_spz(tmp_path / "a.spz")
+    assert found.means == pytest.approx(table["position"], abs=float(table["deviation"].min()) / 60)
+    assert 1 / (1 + np.exp(-found.opacities)) == pytest.approx(table["opacity"], abs=3e-3)
+    assert found.scales == pytest.approx(np.log(table["deviation"])[:, None].repeat(3, 1), abs=0.04)
+    assert found.quats == pytest.approx(np.tile([1.0, 0, 0, 0], (len(table), 1)), abs=1e-3)
+    assert found.sh0 == pytest.approx(table["harmonics"][:, 0], abs=0.02)
+    rest = table["harmonics"][:, 1:].clip(-0.99, 0.99)  # what 8 bits hold
+    assert np.abs(found.shN[:, :3] - rest[:, :3]).max() < 0.04
+    assert np.abs(found.shN - rest).max() < 0.07
+    assert (tmp_path / "a.spz").stat().st_size < ply.stat().st_size / 8
+
+
+def test_where_nothing_writes_spz_it_is_one_line(monkeypatch):
+    monkeypatch.setattr(splat, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match="pip install gsply"):
+        check_spz()
 
 
 def glb(path):
@@ -97,7 +143,7 @@ def glb(path):
 
 
 def test_the_glb_says_the_same_with_y_up(run, ply, tmp_path, rng):
-    table, origin = splats(run, Y_UP)
+    table, origin = splats(run, Y_UP, 90)
     write_splat_glb(tmp_path / "a.glb", table, origin)
     gltf, arrays = glb(tmp_path / "a.glb")
     (primitive,) = gltf["meshes"][0]["primitives"]
@@ -124,7 +170,7 @@ def test_the_glb_says_the_same_with_y_up(run, ply, tmp_path, rng):
 
 
 def test_programs_that_draw_points_read_the_glb(run, tmp_path):
-    table, origin = splats(run, Y_UP)
+    table, origin = splats(run, Y_UP, 90)
     write_splat_glb(tmp_path / "a.glb", table, origin)
     (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(cloud, trimesh.PointCloud) and len(cloud.vertices) == len(table)

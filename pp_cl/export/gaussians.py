@@ -1,0 +1,142 @@
+"""Gaussians fitted to a run's own renderings of its training views, as viewers of 3D Gaussian
+splatting draw them: without a network, and each widened by a third of a pixel^2.
+
+The trainer does it, with the footprint "gaussian" and means of features in place of the network.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+from pyopencl.array import Array
+from tqdm import tqdm
+
+from pp_cl.config import Config
+from pp_cl.device.device import Device
+from pp_cl.export.harmonics import fit_harmonics
+from pp_cl.layers.simple import mean_backward, mean_forward
+from pp_cl.model import Model
+from pp_cl.raster.points import PointCloud, sh_blocks
+from pp_cl.run import Run
+from pp_cl.scene.views import View
+from pp_cl.settings import TrainConfig
+from pp_cl.train import Trainer
+from pp_cl.training.crops import Crop, Crops
+
+STEPS = 1500
+CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of the window, of an image
+EARLY_STOP = 1e-4  # of viewers
+# Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
+# rim: the root of its second moment. With the disc's opacity it covers 0.91 of the disc.
+DEVIATION = 0.39
+MOST_OPAQUE = 0.99  # what viewers clamp to
+# 3D Gaussian splatting's functions of degrees 0 to 2 are basis()'s in this order, times these.
+ORDER = [0, 2, 3, 1, 4, 5, 7, 6, 8]
+CONSTANT = 0.28209479177387814
+FACTORS = np.array(
+    [
+        CONSTANT,
+        *(-0.4886025119029199, 0.4886025119029199, -0.4886025119029199),
+        *(1.0925484305920792, -1.0925484305920792, 0.31539156525252005),
+        *(-1.0925484305920792, 0.5462742152960396),
+    ]
+)
+
+
+class Means:
+    """In place of a UNet, without parameters: the image is the first three features, the means of
+    `scale` x `scale` pixels.
+    """
+
+    def __init__(self, dev: Device):
+        self.dev, self.scale = dev, 1
+        self.all_parameters, self.all_gradients = dev.zeros((1,)), dev.zeros((1,))
+        self._features: Any = None  # of the last forward()
+
+    multiple = 1  # of which the sides of images are
+
+    @staticmethod
+    def is_planned(size: tuple[int, int]) -> bool:
+        """See UNet: no tiles are left out."""
+        return False
+
+    def forward(self, x: Array, training: bool = True, plan: None = None) -> Array:
+        """(H, W, 3) image of the features x (scale H, scale W, C)."""
+        height, width, _ = x.shape
+        image = self.dev.empty((height // self.scale, width // self.scale, 3))
+        mean_forward(self.dev, x, image, self.scale)
+        self._features = x
+        return image
+
+    def backward(self, grad_image: Array) -> Array:
+        """(scale H, scale W, C) gradient of the features of the last forward()."""
+        grad_features = self.dev.empty(self._features.shape)
+        mean_backward(self.dev, grad_image, grad_features, self.scale)
+        return grad_features
+
+
+class LargeCrops(Crops):
+    """Crops whose cameras have `scale` times the pixels each way."""
+
+    def __init__(self, views: list[View], train: TrainConfig, scale: int):
+        super().__init__(views, train, 0)
+        self.scale = scale
+
+    def draw(self, step: int) -> Crop:
+        """See Crops."""
+        crop = super().draw(step)
+        size = crop.camera.width * self.scale, crop.camera.height * self.scale
+        return crop._replace(camera=crop.camera.resized(*size))
+
+
+def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
+    """(the points that training views show, as Gaussians, the deviation of one that has not grown):
+    fitted to pictures of about `window` pixels on the longer side. Of the features of their SH,
+    which are 3D Gaussian splatting's, the first three are sRGB colour.
+    """
+    dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
+    cloud, net = _cloud(run, coefficients), Means(dev)
+    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)  # type: ignore[arg-type]
+    views = run.rendered(run.photographs("train"), opaque=True)
+    longest = max(max(view.camera.width, view.camera.height) for view in views)
+    net.scale = min(max(1, round(window / longest)), CROP // LEAST_CROP)
+    config = _config(run.config, CROP // net.scale)
+    trainer = Trainer(dev, config, model, views)
+    trainer.crops = LargeCrops(trainer.views, config.train, net.scale)
+    for _ in tqdm(range(STEPS), "fitting Gaussians", unit="step", leave=False, disable=None):
+        trainer.train_step()
+    trainer.check()
+    trainer.finish()
+    return cloud, config.raster.radius * run.model.grid.edge
+
+
+def _cloud(run, coefficients):
+    """A copy of the run's points, those that have no coefficients (N, 9, 3) of basis() left out."""
+    dev, cloud = run.dev, run.model.cloud
+    rows = np.flatnonzero(coefficients.any((1, 2)))
+    sh = np.zeros((len(rows), 9, 16), np.float32)
+    sh[..., :3] = coefficients[rows][:, ORDER] / FACTORS[:, None]
+    begins = np.cumsum([block.count for block in sh_blocks(2)])[:-1]
+    return PointCloud(
+        dev.upload(cloud.ids.get()[rows]),
+        dev.upload(cloud.offset.get()[rows]),
+        dev.upload(cloud.opacity.get()[rows].clip(0, MOST_OPAQUE)),
+        [dev.upload(part) for part in np.split(sh, begins, axis=1)],
+    )
+
+
+def _config(given: Config, crop: int) -> Config:
+    """What the trainer follows here. crop: its side, pixels of the run's images."""
+    config = copy.deepcopy(given)
+    raster, train = config.raster, config.train
+    raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
+    raster.radius *= DEVIATION
+    train.iterations, train.crop, train.refine_at, train.ema = STEPS, crop, (), True
+    train.mask_weight = train.spread_weight = train.sh_smoothing = train.prune_weight = 0.0
+    train.exposure = "off"
+    # a fiftieth and a third of what points learn by whose colours a network makes
+    train.sh_rate, train.opacity_rate = (1e-2, 5e-3, 2.5e-3), (1e-2, 3e-3)
+    train.offset_rate = (1e-2, 1e-3)
+    return config
