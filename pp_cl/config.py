@@ -21,6 +21,7 @@ MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
+LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
 MEND_SETTINGS = "restore it or start a new run"
 
 
@@ -176,6 +177,25 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
             setattr(owner, name, str(Path(getattr(owner, name)).resolve()))
     validate(config, "settings", {key: origin for key, _, origin in given})
     return config
+
+
+def begin_with(
+    path: Path | str, given: list[tuple[str, Any, str]]
+) -> tuple[str, list[tuple[str, Any, str]]]:
+    """(preset, settings) of another run's config.json, all but those of its scene, with the given
+    ones on top: (key, value or its text, origin). Raises UserError as load_config.
+    """
+    config = load_config(path)
+    length = "train.minutes" if config.train.minutes else "train.iterations"
+    asked = {key for key, _, _ in given}
+    left_out = set(LENGTH) if asked & set(LENGTH) else set(LENGTH) - {length}
+    settings = [
+        (f"{section}.{name}", value, f"--config {path}")
+        for section, values in sections(config)
+        for name, value in vars(values).items()
+        if section != "scene" and f"{section}.{name}" not in left_out | asked
+    ]
+    return config.preset, settings + given
 
 
 def load_config(path: Path | str) -> Config:

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 from pp_cl.commands import options as shared
 from pp_cl.commands.view import open_browser
-from pp_cl.config import help_lines, load_config
+from pp_cl.config import begin_with, help_lines, load_config
 from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS, SHORT
 
@@ -25,6 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=PRESETS,
         help="tiny (default): images of about 200 pixels, minutes on a CPU; small: of 400, and"
         " full: of 800, longer; paper: the paper's numbers",
+    )
+    add(
+        "--config",
+        metavar="FILE",
+        help="begin with the settings of a config.json, all but those of its scene; options come"
+        " on top",
     )
     shared.add_short(parser, SHORT)
     add(
@@ -52,10 +58,15 @@ def run(options: argparse.Namespace) -> None:
         writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)
     given, is_new = shared.read_short(options, SHORT) + options.set, not folder.config.exists()
+    preset = options.preset
+    if options.config:
+        if preset:
+            raise UserError("--preset: --config has one already; leave one of them out")
+        preset, given = begin_with(options.config, given)
     if options.scene is None and is_new:
         raise UserError("SCENE: name the folder of a scene, or the word demo")
     scene = options.scene or load_config(folder.config).scene.path
-    config = run_config(folder, scene, options.preset, given, extends=True)
+    config = run_config(folder, scene, preset, given, extends=True)
     stored = stored_state(folder, config)
     if stored and is_finished(stored, config):
         print(

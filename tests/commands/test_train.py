@@ -110,3 +110,30 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
     monkeypatch.setattr("pp_cl.session.PREVIEWS", 3)
     assert main(arguments(scene, out, train__checkpoint_every=20)) == 0
     assert found == {20: (20, None, [20]), 40: (40, None, [40]), 60: (60, True, [60])}
+
+
+def test_a_run_begins_with_the_settings_of_another(tmp_path, capsys):
+    """All but those of its scene; resumed with the same words, and others on top."""
+    scene, file = write_ball_scene(tmp_path / "ball", views=4), tmp_path / "first" / "config.json"
+    changed = ("--set", "train.sh_eps=0.02", "--downscale", "1")
+    trained_lines(capsys, scene, "--out", tmp_path / "first", *changed)
+    other, out = write_ball_scene(tmp_path / "other", views=5), tmp_path / "second"
+    words = ["train", other, "--out", str(out), "--config", str(file)]
+    assert main([*words, "--seed", "3"]) == 0
+    first, second = (json.loads(path.read_text()) for path in (file, out / "config.json"))
+    assert second["scene"]["path"] == other and second["train"]["seed"] == 3
+    second["train"]["seed"] = first["train"]["seed"]
+    for section in ("points", "raster", "network", "train"):
+        assert second[section] == first[section]
+    assert second["train"]["sh_eps"] == 0.02 and second["train"]["iterations"] == 2
+    capsys.readouterr()
+    assert main([*words, "--seed", "3"]) == 0 and "finished" in capsys.readouterr().out
+    assert main([*words, "--seed", "3", "--iterations", "4"]) == 0
+    assert "trained 4 steps" in capsys.readouterr().out
+
+
+def test_a_file_and_a_preset_are_refused(tmp_path):
+    scene = write_ball_scene(tmp_path / "ball", views=4)
+    words = ["train", scene, "--out", str(tmp_path / "run"), "--config", str(tmp_path / "no.json")]
+    assert "--preset" in failure(*words, "--preset", "tiny")
+    assert "no.json" in failure(*words)
