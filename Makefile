@@ -82,6 +82,16 @@ format: $(MADE) ## format the Python files and the kernels
 docs: $(READY) ## write the tables, settings and commands in README.md and docs/
 	@$(BIN)/python -m tools.docs_tables
 
+# Links that leave docs/ are those of the repository's root; there docs/ is the root of the pages.
+site: $(MADE) ## build README.md and docs/ as a site in build/site; fails on a dead link
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check 'mkdocs-material>=9.5'
+	@rm -rf build/pages build/site
+	@mkdir -p build; cp -r docs build/pages; cp -r CONTRIBUTING.md CHANGELOG.md CITATION.cff LICENSE packaging tools build/pages
+	@cp README.md build/pages/index.md
+	@sed -i 's#](\.\./#](#g' build/pages/*.md
+	@sed -i 's#](docs/#](#g; s#"docs/#"#g; s#](README.md#](index.md#g' build/pages/index.md build/pages/C*.md
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -f packaging/mkdocs.yml
+
 results: $(READY) ## measure what README.md and docs/ state, and write it there: hours, with the scenes of PP_DATA
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,torch]'
 	@$(BIN)/python -m tools.results $(ARGS)
