@@ -42,6 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="splats: fit the Gaussians for pictures of so many pixels on the longer side"
         f" ({WINDOW}); up to 12 times those of the training images",
     )
+    add(
+        "--length",
+        nargs=3,
+        metavar=("A", "B", "METRES"),
+        help="how far apart two points of the object are, each as PHOTO:X,Y, a pixel of a training"
+        " photograph; kept in RUN/length.json: splats, points and meshes are in metres then",
+    )
     shared.add_run_scene(parser)
     shared.add_device(parser)
 
@@ -50,6 +57,7 @@ def run(options: argparse.Namespace) -> None:
     """Write the run, say what was written."""
     from pp_cl.device.discover import open_device
     from pp_cl.export.formats import check_target, export
+    from pp_cl.export.length import set_length
     from pp_cl.run import load_run
 
     name, folder = options.format, Path(options.run_folders[0])
@@ -59,6 +67,7 @@ def run(options: argparse.Namespace) -> None:
         shared.refuse(options, ("window",), f"only {', '.join(OF_SPLATS)} are fitted to a window")
     if name != "gallery" and len(options.run_folders) > 1:
         raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
+    ends = (*options.length[:2], _metres(options.length[2])) if options.length else None
     path = check_target(name, folder, Path(options.out) if options.out else None)
     device = open_device(options.device)
 
@@ -71,9 +80,13 @@ def run(options: argparse.Namespace) -> None:
             )
         return run
 
-    run, *others = options.run_folders
+    first, *others = options.run_folders
+    run = loaded(first)
+    if ends:
+        unit = set_length(run, *ends)
+        print(f"a unit of the scene is {unit:.6g} m")
     written = export(
-        loaded(run),
+        run,
         name,
         path,
         min_weight=options.min_weight or 0.0,
@@ -81,3 +94,10 @@ def run(options: argparse.Namespace) -> None:
         others=map(loaded, others),
     )
     print(f"wrote {path}: {written}")
+
+
+def _metres(text):
+    try:
+        return shared.number(1e-6, 1e6)(text)
+    except argparse.ArgumentTypeError as error:
+        raise UserError(f"--length {error}, in metres") from None

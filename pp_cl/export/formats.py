@@ -11,6 +11,7 @@ from pathlib import Path
 from pp_cl.errors import UserError
 from pp_cl.export import FORMATS, WINDOW
 from pp_cl.export.gltf import gltf_colours, write_glb
+from pp_cl.export.length import metres_per_unit
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.page import page_text, write_gallery
 from pp_cl.export.points import coloured_points, write_ply
@@ -61,12 +62,13 @@ def export(
     min_weight, window: as the options. others: further runs of a gallery. Raises UserError for
     what cannot be written, before which nothing is.
     """
-    count = run.model.cloud.count
+    count, metres = run.model.cloud.count, metres_per_unit(run)
+    unit = "" if metres == 1 else ", in metres"
     if name == "mesh":
         mesh = coloured_mesh(run)
         _begin_default(name, path)
-        write_mesh(path, mesh)
-        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"
+        write_mesh(path, replace(mesh, vertices=metres * mesh.vertices))
+        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unit}"
     if name == "html":
         text = page_text(run)
         _begin_default(name, path)
@@ -82,22 +84,25 @@ def export(
         if name == "splat-spz":
             check_spz()
         table, origin = splats(run, Y_DOWN if name == "splat" else Y_UP, window)
+        table["position"] *= metres
+        table["deviation"] *= metres
         _begin_default(name, path)
         if name == "splat":
             write_splat_ply(path, table)
         elif name == "splat-spz":
             write_splat_spz(path, table)
         else:
-            write_splat_glb(path, table, origin)
-        return f"{len(table)} Gaussians"
+            write_splat_glb(path, table, metres * origin)
+        return f"{len(table)} Gaussians{unit}"
     points = coloured_points(run, min_weight)
+    points = replace(points, positions=metres * points.positions)
     _begin_default(name, path)
     if name == "ply":
         write_ply(path, points, run.model.cloud)
     else:
         colours = gltf_colours(points.colours)
         write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})
-    return f"{len(points.rows)} of {count} points"
+    return f"{len(points.rows)} of {count} points{unit}"
 
 
 def _begin_default(name, path):

@@ -143,6 +143,8 @@ REFUSED = [
     ("export run --format obj", "obj"),
     ("export run --format ply --min-weight x", "--min-weight"),
     ("export run --format splat --window 8", "--window"),
+    ("export run --format ply --length a:1,2 b:1,2 x", "--length"),
+    ("export run --format ply --length a b 1", "PHOTO:X,Y"),
     ("render run --size large", "--size"),
     ("render run --fov nan", "--fov"),
     ("render run --seconds 0.001", "--seconds"),

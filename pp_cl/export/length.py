@@ -1,0 +1,88 @@
+"""True size: how many metres a unit of a run's scene is, from one length that is known."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+
+from pp_cl.errors import UserError, quoted, shown, suggestion
+from pp_cl.files.atomic import write_json
+from pp_cl.files.untrusted import read_json_text
+from pp_cl.run import Run
+
+FILE = "length.json"  # in the folder of a run
+MOST_BYTES = 2**16
+SMALLEST, LARGEST = 1e-9, 1e9  # metres a unit
+OPAQUE = 0.5  # least alpha of a pixel that shows the object
+
+
+def metres_per_unit(run: Run) -> float:
+    """What set_length() has found, 1 where it has not been called. Raises UserError for a broken
+    file.
+    """
+    path = run.folder.path / FILE
+    if not path.exists():
+        return 1.0
+    try:
+        metres = json.loads(read_json_text(path, MOST_BYTES))["metres_per_unit"]
+        if type(metres) not in (int, float) or not SMALLEST <= metres <= LARGEST:
+            raise ValueError(f"metres_per_unit is {quoted(metres, 40)}")
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise UserError(
+            f"{path}: is damaged ({shown(str(error))}); give --length again, or remove it"
+        ) from None
+    return float(metres)
+
+
+def set_length(run: Run, first: str, second: str, metres: float) -> float:
+    """Keep in the run's folder that two points of the object are so many metres apart, and return
+    how many a unit of the scene is; all exports of coordinates are in metres from then on. first,
+    second: PHOTO:X,Y, as `surface_point`. Raises UserError for two points at one place.
+    """
+    points = [surface_point(run, text) for text in (first, second)]
+    apart = float(np.linalg.norm(points[0] - points[1]))
+    if apart < run.model.grid.edge:
+        raise UserError(f"--length {first} {second}: show the same place; name two far apart")
+    found = float(metres) / apart
+    if not SMALLEST <= found <= LARGEST:
+        raise UserError(f"--length {metres:g}: a unit of the scene would be {found:g} m")
+    kept = {"metres_per_unit": found, "between": [first, second], "metres": float(metres)}
+    write_json(run.folder.path / FILE, kept)
+    return found
+
+
+def surface_point(run: Run, text: str) -> np.ndarray:
+    """(3,) world: what a pixel of a training photograph shows of the object. text: PHOTO:X,Y, the
+    photograph's path in the scene or the end of it, and pixels from its upper left corner. Raises
+    UserError where there is no such photograph or pixel, or no object in it.
+    """
+    found = re.fullmatch(r"(.+):([0-9.]+),([0-9.]+)", text)
+    try:
+        name, x, y = found[1], float(found[2]), float(found[3])  # type: ignore[index]
+    except (TypeError, ValueError):
+        raise UserError(
+            f"--length {shown(text)}: write PHOTO:X,Y, for example a.jpg:812,430"
+        ) from None
+    photographs = run.photographs("train")
+    matches = [one for one in photographs if one.name == name or one.name.endswith(f"/{name}")]
+    if len(matches) != 1:
+        names = [one.name for one in photographs]
+        why = "is in several folders" if matches else suggestion(name, names)
+        raise UserError(
+            f"--length {shown(text)}: no training photograph of that name; {why or names[0]}"
+        )
+    stored = matches[0].camera
+    if not (x < stored.width and y < stored.height):
+        raise UserError(
+            f"--length {shown(text)}: the photograph has {stored.width}x{stored.height} pixels"
+        )
+    camera = stored.downscaled(run.config.scene.downscale)
+    picture = run.render(camera)
+    column = min(int(x * camera.fx / stored.fx), camera.width - 1)
+    row = min(int(y * camera.fy / stored.fy), camera.height - 1)
+    if not picture.alpha[row, column] > OPAQUE:
+        raise UserError(f"--length {shown(text)}: the model shows no object there")
+    along = np.array([(x - stored.cx) / stored.fx, (y - stored.cy) / stored.fy, 1.0])
+    return stored.eye + picture.median_depth[row, column] * stored.pose[:, :3] @ along
