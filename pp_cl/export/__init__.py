@@ -23,6 +23,7 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         (".ply", ".glb"),
         "the surface with coloured vertices, .ply or .glb by --out",
     ),
+    "textured": ("model.glb", (".glb",), "the surface with few faces and a texture, y up"),
     "html": (
         "view.html",
         (".html",),

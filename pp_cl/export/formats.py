@@ -24,6 +24,7 @@ from pp_cl.export.splat import (
     write_splat_ply,
     write_splat_spz,
 )
+from pp_cl.export.texture import textured_mesh, write_textured
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
 from pp_cl.files.manifest import begin_manifest, check_ours
 from pp_cl.run import Run, image_files
@@ -69,6 +70,12 @@ def export(
         _begin_default(name, path)
         write_mesh(path, replace(mesh, vertices=metres * mesh.vertices))
         return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unit}"
+    if name == "textured":
+        solid = textured_mesh(run)
+        solid.apply_scale(metres)
+        _begin_default(name, path)
+        write_textured(path, solid)
+        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces{unit}"
     if name == "html":
         text = page_text(run)
         _begin_default(name, path)
