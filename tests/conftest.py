@@ -13,6 +13,7 @@ from support.runs import Runs
 from pp_cl.device import discover
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
+from pp_cl.export import gaussians, texture
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 
@@ -62,6 +63,15 @@ def cache_of_its_own(tmp_path_factory):
         yield
     if lent.exists() and not lent.is_symlink() and not kept.exists():  # fetched by a test
         shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def small_exports():
+    """Steps of fitting Gaussians, and texels: what a ball needs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gaussians, "STEPS", 200)
+        patch.setattr(texture, "SIDE", 256)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

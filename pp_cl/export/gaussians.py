@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from pp_cl.config import Config
 from pp_cl.device.device import Device
+from pp_cl.errors import UserError
 from pp_cl.export.harmonics import fit_harmonics
 from pp_cl.layers.simple import mean_backward, mean_forward
 from pp_cl.model import Model
@@ -116,6 +117,8 @@ def _cloud(run, coefficients):
     """A copy of the run's points, those that have no coefficients (N, 9, 3) of basis() left out."""
     dev, cloud = run.dev, run.model.cloud
     rows = np.flatnonzero(coefficients.any((1, 2)))
+    if not len(rows):
+        raise UserError(f"{run.folder}: the training views show no points; train it longer")
     sh = np.zeros((len(rows), 9, 16), np.float32)
     sh[..., :3] = coefficients[rows][:, ORDER] / FACTORS[:, None]
     begins = np.cumsum([block.count for block in sh_blocks(2)])[:-1]

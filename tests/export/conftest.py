@@ -2,16 +2,7 @@
 
 import pytest
 
-from pp_cl.export import gaussians
 from pp_cl.run import load_run
-
-
-@pytest.fixture(scope="session", autouse=True)
-def few_steps():
-    """Of fitting Gaussians: what a ball needs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaussians, "STEPS", 200)
-        yield
 
 
 @pytest.fixture(scope="session")

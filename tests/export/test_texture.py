@@ -30,7 +30,6 @@ def test_texels_are_each_in_one_face(rng):
 
 def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
-    monkeypatch.setattr(texture, "SIDE", 256)
     said = export(run, "textured", tmp_path / "a.glb")
     solid = trimesh.load(tmp_path / "a.glb", force="mesh")
     assert said == f"{len(solid.vertices)} vertices, {len(solid.faces)} faces"
