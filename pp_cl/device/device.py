@@ -194,7 +194,7 @@ class Device:
         Raises BuildError with the file, the options and the compiler's words when it does not
         build.
         """
-        key = (name, tuple(sorted(defines.items())))
+        key = name, frozenset(defines.items())
         if key not in self._programs:
             folder = kernel_folder()
             if " " in str(folder):  # PoCL 3.1 splits its options at spaces, quoted or not
@@ -202,7 +202,7 @@ class Device:
                     f"{folder}: OpenCL compilers cannot include from a folder with a space in its"
                     " path; move it"
                 )
-            macros = [f"-D{k}={v}" for k, v in key[1]]
+            macros = [f"-D{k}={v}" for k, v in sorted(defines.items())]
             start = time.perf_counter()
             self._programs[key] = Program(
                 self,

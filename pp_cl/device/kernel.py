@@ -163,11 +163,14 @@ class Kernel:
         names = {name for word in words for name in compile_formula(word).co_names}
         self._macros = {name: int(defines[name]) for name in names & defines.keys()}
         letters = {name.lower() for name in names}
-        # (parameter, dtype of a buffer, letter that a scalar gives a size to) in order
+        # (parameter, its name, dtype of a buffer, least and largest integer, letter that a scalar
+        # gives a size to) in order
         self._slots = [
             (
                 p,
+                p.name,
                 np.dtype(p.dtype) if p.space in ("global", "constant") else None,
+                *(p.limits or (1, 0)),
                 p.name.lower() if not p.space and p.name.lower() in letters else None,
             )
             for p in parameters
@@ -192,26 +195,31 @@ class Kernel:
             missing = [p.name for p in self.parameters if p.name not in values]
             unknown = [n for n in values if n not in self.names]
             raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
-        arguments, shapes, sizes = [], [], {}
-        for p, dtype, letter in self._slots:
-            value = values[p.name]
-            if dtype:
+        arguments: list[Any] = []
+        shapes: list[Any] = []
+        sizes: dict[str, int] = {}
+        for p, name, dtype, least, largest, letter in self._slots:
+            value = values[name]
+            if dtype is not None:
                 if not isinstance(value, cl_array.Array) or value.dtype != dtype:
                     raise TypeError(
-                        f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
-                        f"{dtype}"
+                        f"{self.label}: {name} is {_kind(value)}, expected a device array of"
+                        f" {dtype}"
                     )
-                arguments.append(value.data)
-                shapes.append((value.shape, value.strides))
+                arguments.append(value.data if value.offset else value.base_data)
+                shapes += value.shape, value.strides
+            elif type(value) is int and least <= value <= largest:
+                arguments.append(value)
+                if letter:
+                    sizes[letter] = value
             elif p.space == "local":
                 arguments.append(value)
             else:
-                quick = type(value) is int and p.limits and p.limits[0] <= value <= p.limits[1]
-                number = value if quick else self._scalar(p, value)
+                number = self._scalar(p, value)
                 arguments.append(number)
                 if letter:
                     sizes[letter] = int(number)
-        key = (*shapes, *sizes.values())
+        key = *shapes, *sizes.values()
         if key not in self._checked:
             self._check_buffers(values, sizes)
             if len(self._checked) > REMEMBERED:
@@ -275,7 +283,7 @@ class Kernel:
         """Compare the arrays with their parameters. sizes: {letter: size} of the scalars; the sizes
         of the other letters are added.
         """
-        for p, dtype, _ in self._slots:
+        for p, _, dtype, *_ in self._slots:
             if dtype is None:
                 continue
             array = values[p.name]

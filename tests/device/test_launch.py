@@ -24,9 +24,9 @@ def program(dev, tmp_path, monkeypatch):
     """SOURCE built on the guarded device."""
     (tmp_path / "toy.cl").write_text(SOURCE)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
-    dev._programs.pop(("toy", ()), None)
+    dev._programs.pop(("toy", frozenset()), None)
     yield dev.program("toy")
-    dev._programs.pop(("toy", ()), None)
+    dev._programs.pop(("toy", frozenset()), None)
 
 
 @pytest.fixture
