@@ -36,11 +36,9 @@ static inline float least_focal(const Camera *cam) {
 #define VARIANCE(cam, radius, z)                                                                   \
     ((radius) * (radius) + LOW_PASS * ((z) / least_focal(cam)) * ((z) / least_focal(cam)))
 
-// From the ray to the rim, world units, of a point at range t and z along the camera's axis.
-ALWAYS_INLINE floats
-footprint_reach(const Camera *cam, const floats radius, const floats t, const floats z) {
-    if (FOOTPRINT == GAUSSIAN) return DEVIATIONS * sqrt(VARIANCE(cam, radius, z));
-    return fmax(radius, LEAST_RADIUS * t / least_focal(cam));
+// From the ray to the rim of a Gaussian, world units.
+ALWAYS_INLINE floats gaussian_reach(const Camera *cam, const floats radius, const floats z) {
+    return DEVIATIONS * sqrt(VARIANCE(cam, radius, z));
 }
 
 // The footprints of LANES neighbouring points, one lane each.
@@ -69,7 +67,8 @@ ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
     const floats width = f->t / least_focal(cam);
     f->least = LEAST_RADIUS * width;
     f->tiny = f->radius < width;
-    f->reach = footprint_reach(cam, f->radius, f->t, f->z);
+    f->reach =
+        FOOTPRINT == GAUSSIAN ? gaussian_reach(cam, f->radius, f->z) : fmax(f->radius, f->least);
     f->per_reach = 1.0f / f->reach;
     f->per_fx = 1.0f / cam->fx;
     f->per_fy = 1.0f / cam->fy;

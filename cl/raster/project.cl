@@ -78,7 +78,9 @@ ALWAYS_INLINE bool project(
     const floats front = t - radius;
     const ints kept =
         (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
-    const floats wide = footprint_reach(cam, radius, t, cz);
+    const floats least = LEAST_RADIUS * t / least_focal(cam);
+    const floats wide =
+        FOOTPRINT == GAUSSIAN ? gaussian_reach(cam, radius, cz) : fmax(radius, least);
     const floats reach = FOOTPRINT == SPHERE ? radius : wide;
     const ints near_image = reaches_image(cx, cz, wide, cam->fx, cam->cx, cam->width) &
                             reaches_image(cy, cz, wide, cam->fy, cam->cy, cam->height);
