@@ -158,6 +158,7 @@ def _written(action: argparse.Action) -> str:
     if action.nargs == 0:
         return ", ".join(action.option_strings)
     value = action.metavar or "|".join(map(str, action.choices or [action.dest.upper()]))
+    value = value if isinstance(value, str) else " ".join(value)
     if not action.option_strings:
         return value
     return f"{', '.join(action.option_strings)} {f'[{value}]' if action.nargs == '?' else value}"

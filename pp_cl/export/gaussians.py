@@ -139,7 +139,7 @@ def _config(given: Config, crop: int) -> Config:
     train.iterations, train.crop, train.refine_at, train.ema = STEPS, crop, (), True
     train.mask_weight = train.spread_weight = train.sh_smoothing = train.prune_weight = 0.0
     train.exposure = "off"
-    # a fiftieth and a third of what points learn by whose colours a network makes
+    # of the defaults a fiftieth and a third, with which what begins nearly right diverges
     train.sh_rate, train.opacity_rate = (1e-2, 5e-3, 2.5e-3), (1e-2, 3e-3)
     train.offset_rate = (1e-2, 1e-3)
     return config

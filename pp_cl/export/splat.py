@@ -49,7 +49,7 @@ def splats(run: Run, up: tuple[float, float, float], window: int) -> tuple[np.nd
     cloud, deviation = fit_gaussians(run, window)
     opacity, offset = cloud.opacity.get().clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
-    turn = Rotation.align_vectors([up], [up_of(run.cameras("train"))])[0].as_matrix()
+    turn = upright(run, up)
     positions = grid.positions(cloud.ids.get()[rows]) + grid.edge * offset[rows, :3]
     positions = positions @ turn.T
     coefficients = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
@@ -61,6 +61,11 @@ def splats(run: Run, up: tuple[float, float, float], window: int) -> tuple[np.nd
     table["opacity"] = opacity[rows]
     table["deviation"] = deviation * np.exp(offset[rows, 3])
     return table, origin
+
+
+def upright(run: Run, up: tuple[float, float, float]) -> np.ndarray:
+    """(3, 3) rotation that makes what is up in the training views `up`."""
+    return Rotation.align_vectors([up], [up_of(run.cameras("train"))])[0].as_matrix()
 
 
 def _turned(coefficients, turn):

@@ -12,7 +12,6 @@ import numpy as np
 import trimesh
 from PIL import Image
 from scipy.ndimage import distance_transform_edt, map_coordinates
-from scipy.spatial.transform import Rotation
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
@@ -20,13 +19,12 @@ from pp_cl.errors import UserError
 from pp_cl.export.fusion import COVERED
 from pp_cl.export.mesh import surface
 from pp_cl.export.observe import progress
-from pp_cl.export.splat import Y_UP
+from pp_cl.export.splat import Y_UP, upright
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.camera_path import up_of
 
 FACES = 60_000  # at most: marching cubes make more of the same surface
 SIDE = 2048  # texels
@@ -77,9 +75,8 @@ def textured_mesh(run: Run) -> trimesh.Trimesh:
         metallicFactor=0.0,
         roughnessFactor=1.0,
     )
-    turn = Rotation.align_vectors([Y_UP], [up_of(run.cameras("train"))])[0].as_matrix()
     return trimesh.Trimesh(
-        (vertices + middle) @ turn.T,
+        (vertices + middle) @ upright(run, Y_UP).T,
         faces,
         visual=TextureVisuals(uv, material=material),
         process=False,
