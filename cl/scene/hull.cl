@@ -3,29 +3,44 @@
 // b.
 #include "common.h"
 
-// One work-item per word of a mask's row: reads the alpha of its 32 pixels and of their neighbours,
-// writes the set of pixels with an alpha above `threshold` in their 3x3 neighbourhood. That margin
-// of 1 pixel keeps vertices that touch the silhouette.
+// One work-item per word of a mask's row: reads the alpha of its 32 pixels, writes the set of those
+// above `threshold`.
 kernel void pack_mask(
     const uint width,  // pixels
     const uint height,
     const uint words,  // words per row
-    const uint first,  // the mask's first word in `masks`
     const uint threshold,
     global const uchar *alpha,  // (height, width)
-    global uint *masks)         // (M)
+    global uint *mask)          // (W) height * words
 {
     const uint word = get_global_id(0), y = get_global_id(1);
     if (word >= words || y >= height) return;
-    // bit b: column 32 word - 1 + b has such a pixel in the three rows
-    ulong columns = 0;
-    for (uint v = max(y, 1u) - 1; v <= min(y + 1, height - 1); v++)
-        for (uint b = 0; b < 34; b++) {
-            // wraps left of the image, so it is no smaller than the width there
-            const uint x = 32 * word + b - 1;
-            if (x < width && alpha[v * width + x] > threshold) columns |= 1ul << b;
-        }
-    masks[first + y * words + word] = (uint)(columns | columns >> 1 | columns >> 2);
+    uint columns = 0;
+    for (uint x = 32 * word; x < min(width, 32 * word + 32); x++)
+        columns |= (uint)(alpha[y * width + x] > threshold) << (x - 32 * word);
+    mask[y * words + word] = columns;
+}
+
+// One work-item per word of a mask's row: writes the set of pixels that have one of the mask in
+// their 3x3 neighbourhood. Bits beyond the row's last pixel say nothing.
+kernel void widen_mask(
+    const uint height,        // pixels
+    const uint words,         // words per row
+    const uint first,         // the written mask's first word in `masks`
+    global const uint *mask,  // (W) height * words
+    global uint *masks)       // (M)
+{
+    const uint word = get_global_id(0), y = get_global_id(1);
+    if (word >= words || y >= height) return;
+    uint left = 0, columns = 0, right = 0;  // of the three rows, and of the words beside
+    for (uint v = max(y, 1u) - 1; v <= min(y + 1, height - 1); v++) {
+        const size_t at = v * words + word;
+        if (word > 0) left |= mask[at - 1];
+        columns |= mask[at];
+        if (word + 1 < words) right |= mask[at + 1];
+    }
+    masks[first + y * words + word] =
+        columns | columns << 1 | columns >> 1 | left >> 31 | right << 31;
 }
 
 // One work-item per word of 32 vertices along x: projects them into the views, one view after the

@@ -16,9 +16,13 @@ WHEEL_V = np.cross(WHEEL, MERIDIAN)
 ECLIPTIC = np.cos(np.pi / 3) * MERIDIAN + np.sin(np.pi / 3) * WHEEL_V
 
 
-def dilated_mask(alpha: np.ndarray, threshold: int) -> np.ndarray:
-    """(H, W) bool: some pixel of the 3x3 neighbourhood has an alpha above the threshold."""
-    return np.asarray(sliding_window_view(np.pad(alpha > threshold, 1), (3, 3)).any((2, 3)))
+def dilated_mask(alpha: np.ndarray, threshold: int, margin: int) -> np.ndarray:
+    """(H, W) bool: some pixel at most `margin` rows and columns away has an alpha above the
+    threshold.
+    """
+    side = 2 * margin + 1
+    padded = np.pad(alpha > threshold, margin)
+    return np.asarray(sliding_window_view(padded, (side, side)).any((2, 3)))
 
 
 def kept(
@@ -31,7 +35,9 @@ def kept(
     seen, rejecting = np.zeros((2, len(positions)), int)
     border = np.full(len(positions), np.inf)
     for view in views:
-        camera, mask = view.stored_camera, dilated_mask(view.image[..., 3], threshold)
+        camera, mask = view.stored_camera, dilated_mask(
+            view.image[..., 3], threshold, 1 + view.downscale
+        )
         x, y, z = camera.pose[:, :3].T @ (positions - camera.eye).T
         front = np.flatnonzero(z > 0)
         x, y, z = x[front], y[front], z[front]

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -50,17 +51,17 @@ def _views(rng, share):
 
 
 def _masks(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Dilated by a pixel and packed to bits."""
-    for view in _views(rng, 0.05):
+    """Widened by two pixels, of a reduced image by more, and packed to bits."""
+    for view, downscale in itertools.product(_views(rng, 0.002), (1, 2, 35)):
         height, width = view.image.shape[:2]
-        words = Carver(dev, [view]).masks.get().reshape(height, -1)
+        words = Carver(dev, [replace(view, downscale=downscale)]).masks.get().reshape(height, -1)
         bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")[:, :width]
-        yield exact(bits, dilated_mask(view.image[..., 3], MASK_THRESHOLD))
+        yield exact(bits, dilated_mask(view.image[..., 3], MASK_THRESHOLD, 1 + downscale))
 
 
 def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Which vertices enough images see and few enough masks reject, and their numbers."""
-    views = _views(rng, 0.15)
+    views = _views(rng, 0.05)
     carver = Carver(dev, views)
     for nx, forgiven in itertools.product(SIZES, (0, 1, 2)):
         edge, ny, nz = 2 / nx, 7, 5

@@ -128,12 +128,19 @@ def test_the_cell_cap_limits_the_grid(dev, carvings, monkeypatch):
 
 
 @pytest.mark.large
-def test_reduced_views_carve_the_same_hull(dev):
-    """Masks and cameras of the stored resolution are used."""
+def test_masks_are_widened_by_a_pixel_of_the_reduced_images(dev):
+    """Three stored pixels more on either side: they are the camera's distance over its focal length
+    wide.
+    """
     views = ball_views()
-    whole, reduced = (build_grid(dev, v, 2000) for v in (views, [v.reduced(4) for v in views]))
-    assert whole.grid == reduced.grid
-    np.testing.assert_array_equal(whole.ids, reduced.ids)
+    grid = Grid.centred_in(CENTRE + 1.3 * RADIUS * np.array([[-1], [1]]), RADIUS / 60)
+    whole, wide = (
+        np.ptp(grid.positions(hull.hull_on(dev, v, grid)), axis=0)
+        for v in (views, [view.reduced(4) for view in views])
+    )
+    camera = views[0].stored_camera
+    pixel = np.linalg.norm(camera.eye - CENTRE) / camera.fx
+    np.testing.assert_allclose(wide - whole, 2 * 3 * pixel, atol=pixel)
 
 
 @pytest.mark.large

@@ -20,7 +20,7 @@ def test_between_the_bounds_it_is_one_pixel(tmp_path):
     out = tmp_path / "run"
     words = ["train", "demo", "--out", out, "--points", "200000", "--iterations", "1"]
     assert spoken(words)[0] == 0
-    assert load_config(out / "config.json").raster.radius == pytest.approx(0.99, abs=0.02)
+    assert load_config(out / "config.json").raster.radius == pytest.approx(0.92, abs=0.02)
 
 
 def test_other_footprints_are_given_a_radius(tmp_path):
