@@ -32,6 +32,9 @@ CROWDED = 0.3  # of 3x3 pixels that look like the background: the object has sin
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
+# A side of the box cuts the object if its outermost layer holds this share of the vertices of the
+# fullest one: then it moves out by so much of the box's diagonal, at most so often.
+TOUCHING, GROWTH, GROWTHS = 0.02, 0.1, 3
 SOFT = 1.0  # pixels of the cut image over which a border is refined
 FLAT = 1e-3  # variance of colours, of 1, below which a border follows no edge
 
@@ -41,17 +44,19 @@ def cut_out_all(
     box: np.ndarray,
     points: np.ndarray,
     inside: np.ndarray,
+    outside: np.ndarray,
     seen: Sequence[np.ndarray],
     turns: bool,
 ) -> None:
     """Set the masks of the windows that have none. Raises UserError for a box in which nothing
     stands.
 
-    box, points, seen, turns: as write_masks() takes them. inside: (N,) bool, the points in the box.
+    box, points, seen, turns: as write_masks() takes them. inside, outside: (N,) bool, the points of
+    the object and of the background; others are on nobody's side.
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    seeds = {i: _seeds(windows[i], box, points, inside, seen[i]) for i in left}
+    seeds = {i: _seeds(windows[i], box, points, inside, outside, seen[i]) for i in left}
     labels = [
         seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
     ]
@@ -67,12 +72,12 @@ def cut_out_all(
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
 
     cut(1)
-    outside = [some == cv2.GC_BGD for some in labels]
+    around = [some == cv2.GC_BGD for some in labels]
 
     def beside():
-        return [some & ~one.mask for some, one in zip(outside, windows, strict=True)]
+        return [some & ~one.mask for some, one in zip(around, windows, strict=True)]
 
-    differences = backdrop.differences(windows, points[~inside], beside() if turns else None)
+    differences = backdrop.differences(windows, points[outside], beside() if turns else None)
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
@@ -87,6 +92,22 @@ def cut_out_all(
         windows[i].mask = without_islands(windows[i].mask)
 
 
+def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
+    """(2, 3) box whose sides are moved out where they cut the object off, as the hull of the masks
+    has it, but for what it stands on; None where no side does.
+    """
+    hull, _, edge = forgiving_hull(windows, box)
+    grown, by = box.copy(), GROWTH * np.linalg.norm(box[1] - box[0])
+    for axis in range(3):
+        _, layer = np.unique(hull[:, axis].round(6), return_inverse=True)
+        least = TOUCHING * np.bincount(layer).max()
+        for side, sign in ((0, -1), (1, 1)):
+            touching = (np.abs(hull[:, axis] - box[side, axis]) <= edge / 2).sum()
+            if touching > least and (side, axis) != (0, 2):
+                grown[side, axis] += sign * by
+    return None if (grown == box).all() else grown
+
+
 def without_islands(mask: np.ndarray) -> np.ndarray:
     """(H, W) bool: the mask but for regions smaller than ISLAND times the largest, which are mostly
     things beside the object in its colours.
@@ -97,7 +118,7 @@ def without_islands(mask: np.ndarray) -> np.ndarray:
     return (areas >= max(1, ISLAND * areas.max()))[regions]
 
 
-def _seeds(one, box, points, inside, seen):
+def _seeds(one, box, points, inside, outside, seen):
     """(H, W) uint8 of GrabCut's labels: points of the object that the photograph shows, those of
     the background, what is outside the box; what is close to the object's points is probable.
     """
@@ -113,9 +134,8 @@ def _seeds(one, box, points, inside, seen):
     near = _dots(one, points[inside & (points[:, 2] > foot)], radius)
     near = _closed(near, round(NEAR * CUT_SIDE))
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
-    shown_inside = inside[seen]
-    sure = seen[shown_inside & (points[seen, 2] > foot)]
-    labels[_dots(one, points[seen[~shown_inside]], radius)] = cv2.GC_BGD
+    sure = seen[inside[seen] & (points[seen, 2] > foot)]
+    labels[_dots(one, points[seen[outside[seen]]], radius)] = cv2.GC_BGD
     labels[_dots(one, points[sure], radius)] = cv2.GC_FGD
     return labels
 

@@ -15,7 +15,16 @@ from skimage.measure import label
 from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
-from pp_cl.capture.cut import FORGIVEN, cut_out_all, forgiving_hull, gap_of, silhouette, whole_mask
+from pp_cl.capture.cut import (
+    FORGIVEN,
+    GROWTHS,
+    cut_out_all,
+    forgiving_hull,
+    gap_of,
+    grown_box,
+    silhouette,
+    whole_mask,
+)
 from pp_cl.capture.packages import needed
 from pp_cl.capture.window import dilated, place_of, window
 from pp_cl.errors import UserError, listing, shown
@@ -54,10 +63,11 @@ def write_masks(
     fitted: Callable[[str, np.ndarray], np.ndarray] = lambda _, mask: mask,
     command: str | None = None,
     turns: bool = False,
-) -> tuple[str, list[str]]:
+    grows: bool = False,
+) -> tuple[str, list[str], np.ndarray]:
     """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
-    lies there is kept, and helps to make the others. Returns one line on what was done, and the
-    names of photographs whose masks contradict the others, the worst first.
+    lies there is kept, and helps to make the others. Returns one line on what was done, the names
+    of photographs whose masks contradict the others, the worst first, and the box.
 
     scene: the folder that the photographs' names are relative to; their images have no distortion.
     box: (2, 3) around the object. points: (N, 3) in the scene's world. seen: for each photograph
@@ -65,8 +75,9 @@ def write_masks(
     they were taken, which may be named like the photographs' sources, as {name: source} has them;
     fitted(name, mask) is such a mask, (H, W) uint8, for the image. command: of a program that makes
     masks, which {image} and {mask} stand for. turns: the object turns before a background that
-    stands still. Raises UserError for masks that are given and missing or broken, a program that
-    fails, a box in which nothing is seen.
+    stands still. grows: whether the box is enlarged where it cuts off what is cut out. Raises
+    UserError for masks that are given and missing or broken, a program that fails, a box in which
+    nothing is seen.
     """
     words = None if command is None else program_words(command)
     (scene / "masks").mkdir(exist_ok=True)
@@ -91,13 +102,14 @@ def write_masks(
         of_object = [points[some[inside[some]]] for some in seen]
         how |= _uniform(scene, in_view, windows, box, of_object)
         if _without_mask(scene, in_view):
-            how |= _cut(scene, in_view, windows, box, points, inside, seen, turns)
+            box, found = _cut(scene, in_view, windows, box, points, inside, seen, turns, grows)
+            how |= found
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     wrong = _contradicting(scene, photographs, box)
     if wrong:
         shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
         counts += f"; {len(wrong)} contradict the others: {listing(shares)}"
-    return counts, list(wrong)
+    return counts, list(wrong), box
 
 
 def _without_mask(scene, photographs):
@@ -249,15 +261,22 @@ def _before_uniform(window, points, with_holes):
     return mask if held >= ON_MASK else None
 
 
-def _cut(scene, photographs, windows, box, points, inside, seen, turns):
-    """Cut out what has no mask, and write it. Returns {what: how many}."""
+def _cut(scene, photographs, windows, box, points, inside, seen, turns, grows):
+    """Cut out what has no mask, and write it. Returns the box, and {what: how many}."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    cut_out_all(windows, box, points, inside, seen, turns)
+    for growth in range(1 + GROWTHS):
+        outside = ((points <= box[0]) | (points >= box[1])).any(1)
+        cut_out_all(windows, box, points, inside, outside, seen, turns)
+        larger = grown_box(windows, box) if grows and growth < GROWTHS else None
+        if larger is None:
+            break
+        box = larger
+        windows = [_window(scene, one, box) for one in photographs]
     for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
         name = photographs[i].name
         mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
         write_png(mask_file(scene, name), mask)
-    return {"cut out": len(left)}
+    return box, {"cut out": len(left)}
 
 
 def picture(

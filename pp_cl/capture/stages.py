@@ -299,8 +299,10 @@ class Capture:
         }
 
     def _masks(self):
-        model, corners = self._world()
-        given, dropped = self.options["masks"], read_edits(self.scene).dropped
+        model, before = self._world()
+        corners, edits = before, read_edits(self.scene)
+        given, dropped = self.options["masks"], edits.dropped
+        is_given = self.options["box"] is not None or edits.box is not None
         taken = {one.name: one for one in poses.photographs(model)}
         photographs = [replace(one, distortion=Distortion()) for one in taken.values()]
         points, seen = poses.points(model, FOLLOWED)
@@ -323,13 +325,17 @@ class Capture:
                 fitted=fitted,
                 command=self.options["mask_command"],
                 turns=self._found("matches")["turns"],
+                grows=not is_given,
             )
 
-        line, wrong = write(kept)
+        line, wrong, corners = write(kept)
         if dropped:  # they have had no say in the others
             write(range(len(photographs)))
         self._show("masks", masks.picture(self.scene, photographs, wrong))
-        return {"line": line}
+        if (corners == before).all():
+            return {"line": line}
+        size = " x ".join(f"{side:.2f}" for side in np.ptp(corners, axis=0))
+        return {"line": f"{line}; the box cut the object: now {size}", "box": corners.tolist()}
 
     def _scene(self):
         model, corners = self._world()
@@ -361,12 +367,16 @@ class Capture:
 
     def _world(self):
         """(pycolmap's model in the scene's world, (2, 3) box of the object there: the user's, if
-        one was chosen in the page of `pp-cl view`).
+        one was chosen in the page of `pp-cl view`; once masks are made, the one that they
+        need).
         """
         model, found = needed("pycolmap").Reconstruction(self.model), self._found("box")
         _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
         edited = read_edits(self.scene).box
-        return model, np.array(found["box"]) if edited is None else edited
+        if edited is not None:
+            return model, edited
+        grown = self._found("masks").get("box") if self._is_done("masks") else None
+        return model, np.array(grown or found["box"])
 
 
 def _option(name):

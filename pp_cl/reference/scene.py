@@ -35,8 +35,9 @@ def kept(
     seen, rejecting = np.zeros((2, len(positions)), int)
     border = np.full(len(positions), np.inf)
     for view in views:
-        camera, mask = view.stored_camera, dilated_mask(
-            view.image[..., 3], threshold, 1 + view.downscale
+        camera, mask = (
+            view.stored_camera,
+            dilated_mask(view.image[..., 3], threshold, 1 + view.downscale),
         )
         x, y, z = camera.pose[:, :3].T @ (positions - camera.eye).T
         front = np.flatnonzero(z > 0)

@@ -72,9 +72,10 @@ class Capture:
 
     def write(self, **options):
         """The line of write_masks."""
-        return write_masks(
+        line, _, self.box = write_masks(
             self.folder, self.photographs, self.box, self.points, self.seen, **options
-        )[0]
+        )
+        return line
 
     def agreement(self):
         """(V,) intersection over union of each mask with the true one."""
@@ -124,6 +125,24 @@ def test_the_object_is_cut_out_of_any_background(capture):
     assert len(np.unique(read_mask(capture.file(0)))) > 4, "no soft border"
 
 
+def test_a_box_that_cuts_the_object_grows(capture):
+    """Where it has no points, and but for what it stands on."""
+    whole, cut_off = capture.box.copy(), capture.box.copy()
+    cut_off[1, [0, 2]] = 0.4
+    capture.box = cut_off
+    held = (capture.points[: capture.count] < cut_off[1]).all(1)
+    kept = np.append(held, np.ones(len(capture.points) - capture.count, bool))
+    capture.seen = [seen[kept[seen]] for seen in capture.seen]
+    capture.write()
+    assert capture.agreement().min() < 0.8 and (capture.box == cut_off).all()
+    for i in range(VIEWS):
+        capture.file(i).unlink()
+    capture.write(grows=True)
+    assert capture.agreement().min() > 0.95
+    assert (capture.box[1, [0, 2]] > 0.8).all() and capture.box[0, 2] == cut_off[0, 2]
+    assert (np.abs(capture.box) < 1.3 * whole[1]).all()
+
+
 def test_what_lies_around_the_object_is_no_seed(capture):
     """Labels on the table are on nobody's side, so that colours decide."""
     reach = 0.78 * (1 + 2 * MARGIN * np.sqrt(3))  # as find_world() has it around the ball
@@ -131,7 +150,7 @@ def test_what_lies_around_the_object_is_no_seed(capture):
     lying, own = [0.7, 0, -0.75], [0, 0, 0.5]
     one = window(np.zeros((SIZE, SIZE, 3), np.uint8), capture.photographs[0], box)
     points, both = np.array([lying, own]), np.array([0, 1])
-    labels = cut._seeds(one, box, points, np.array([True, True]), both)
+    labels = cut._seeds(one, box, points, np.ones(2, bool), np.zeros(2, bool), both)
     _, rows, columns = one.inside(points)
     assert labels[rows[0], columns[0]] != cut.cv2.GC_FGD
     assert labels[rows[1], columns[1]] == cut.cv2.GC_FGD
