@@ -58,15 +58,10 @@ def add_hints(parser: argparse.ArgumentParser) -> None:
 
 
 def _box(text):
-    """The type of --box: AUTO, or six numbers, two corners that differ in x, y and z."""
-    from pp_cl.commands.options import number
+    """The type of --box: AUTO, or two corners."""
+    from pp_cl.commands.options import box
 
-    if text == AUTO:
-        return text
-    corners = [number(-1e6, 1e6)(word) for word in text.split(",")]
-    if len(corners) != 6 or any(a == b for a, b in zip(corners, corners[3:], strict=False)):
-        raise argparse.ArgumentTypeError(f"{text}: write two corners, as -1,-1,-1,1,1,1")
-    return corners
+    return text if text == AUTO else box(text)
 
 
 def run(options: argparse.Namespace) -> None:

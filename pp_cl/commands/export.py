@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
-from pp_cl.export import FORMATS, WINDOW
+from pp_cl.export import AXES, FORMATS, WINDOW
 
 HELP = "write a run in a format that other programs open"
 EPILOG = "\n".join(
@@ -16,6 +16,7 @@ EPILOG = "\n".join(
     )
 )
 OF_POINTS, OF_SPLATS = ("ply", "glb"), ("splat", "splat-spz", "splat-glb")
+PLACED = (*OF_POINTS, *OF_SPLATS, "mesh", "textured")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,6 +50,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="how far apart two points of the object are, each as PHOTO:X,Y, a pixel of a training"
         " photograph; kept in RUN/length.json: splats, points and meshes are in metres then",
     )
+    add(
+        "--box",
+        type=shared.box,
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        help="splats, points and meshes: only what lies in it, in the units and axes of the scene;"
+        " write --box=-1,-1,...",
+    )
+    add(
+        "--axes",
+        choices=AXES,
+        help="the scene's, or turned so that the object stands upright in viewers (splats,"
+        " textured: viewer; points, mesh: scene)",
+    )
     shared.add_run_scene(parser)
     shared.add_device(parser)
 
@@ -65,6 +79,8 @@ def run(options: argparse.Namespace) -> None:
         shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
     if name not in OF_SPLATS:
         shared.refuse(options, ("window",), f"only {', '.join(OF_SPLATS)} are fitted to a window")
+    if name not in PLACED:
+        shared.refuse(options, ("box", "axes"), f"only {', '.join(PLACED)} hold coordinates")
     if name != "gallery" and len(options.run_folders) > 1:
         raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
     ends = (*options.length[:2], _metres(options.length[2])) if options.length else None
@@ -91,6 +107,8 @@ def run(options: argparse.Namespace) -> None:
         path,
         min_weight=options.min_weight or 0.0,
         window=options.window or WINDOW,
+        box=options.box,
+        axes=options.axes,
         others=map(loaded, others),
     )
     print(f"wrote {path}: {written}")

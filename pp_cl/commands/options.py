@@ -85,6 +85,14 @@ def widths(text: str) -> tuple[int, ...]:
     return found
 
 
+def box(text: str) -> list[float]:
+    """The type of a box: six numbers, two corners that differ in x, y and z."""
+    corners = [number(-1e6, 1e6)(word) for word in text.split(",")]
+    if len(corners) != 6 or any(a == b for a, b in zip(corners, corners[3:], strict=False)):
+        raise argparse.ArgumentTypeError(f"{text}: write two corners, as -1,-1,-1,1,1,1")
+    return corners
+
+
 def size(text: str) -> tuple[int, int]:
     """The type of (width, height) of an image."""
     try:

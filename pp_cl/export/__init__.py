@@ -2,6 +2,7 @@
 
 # Pixels on the longer side of the pictures for which splats are fitted: of a viewer's window
 WINDOW = 800
+SCENE, VIEWER = AXES = "scene", "viewer"  # whose axes coordinates have
 # {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder;
 # what it is)}
 FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
@@ -23,7 +24,7 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         (".ply", ".glb"),
         "the surface with coloured vertices, .ply or .glb by --out",
     ),
-    "textured": ("model.glb", (".glb",), "the surface with few faces and a texture, y up"),
+    "textured": ("model.glb", (".glb",), "the surface with few faces and a texture"),
     "html": (
         "view.html",
         (".html",),

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
+
 from pp_cl.errors import UserError
-from pp_cl.export import FORMATS, WINDOW
+from pp_cl.export import FORMATS, SCENE, VIEWER, WINDOW
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.length import metres_per_unit
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.page import page_text, write_gallery
-from pp_cl.export.points import coloured_points, write_ply
+from pp_cl.export.points import coloured_points, in_world, inside, write_ply
 from pp_cl.export.splat import (
     Y_DOWN,
     Y_UP,
     check_spz,
     splats,
+    upright,
     write_splat_glb,
     write_splat_ply,
     write_splat_spz,
@@ -57,21 +60,32 @@ def export(
     *,
     min_weight: float = 0.0,
     window: int = WINDOW,
+    box: Sequence[float] | None = None,
+    axes: str | None = None,
     others: Iterable[Run] = (),
 ) -> str:
     """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
-    min_weight, window: as the options. others: further runs of a gallery. Raises UserError for
-    what cannot be written, before which nothing is.
+    min_weight, window, box, axes: as the options. others: further runs of a gallery. Raises
+    UserError for what cannot be written, before which nothing is.
     """
     count, metres = run.model.cloud.count, metres_per_unit(run)
     unit = "" if metres == 1 else ", in metres"
+    within = None if box is None else np.sort(np.reshape(box, (2, 3)), axis=0)
+    inside(run.model.positions(), within)  # raises early
+    turn = np.eye(3)
+    if (axes or (SCENE if name in ("mesh", "ply", "glb") else VIEWER)) == VIEWER:
+        turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
+
+    def placed(positions):
+        return metres * in_world(positions @ turn.T, run.model.grid.edge)
+
     if name == "mesh":
-        mesh = coloured_mesh(run)
+        mesh = coloured_mesh(run, within)
         _begin_default(name, path)
-        write_mesh(path, replace(mesh, vertices=metres * mesh.vertices))
+        write_mesh(path, replace(mesh, vertices=placed(mesh.vertices)))
         return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unit}"
     if name == "textured":
-        solid = textured_mesh(run)
+        solid = textured_mesh(run, turn, within)
         solid.apply_scale(metres)
         _begin_default(name, path)
         write_textured(path, solid)
@@ -90,7 +104,7 @@ def export(
     if name in ("splat", "splat-spz", "splat-glb"):
         if name == "splat-spz":
             check_spz()
-        table, origin = splats(run, Y_DOWN if name == "splat" else Y_UP, window)
+        table, origin = splats(run, turn, window, within)
         table["position"] *= metres
         table["deviation"] *= metres
         _begin_default(name, path)
@@ -101,8 +115,8 @@ def export(
         else:
             write_splat_glb(path, table, metres * origin)
         return f"{len(table)} Gaussians{unit}"
-    points = coloured_points(run, min_weight)
-    points = replace(points, positions=metres * points.positions)
+    points = coloured_points(run, min_weight, within)
+    points = replace(points, positions=placed(points.positions))
     _begin_default(name, path)
     if name == "ply":
         write_ply(path, points, run.model.cloud)

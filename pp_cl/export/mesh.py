@@ -17,6 +17,7 @@ from pp_cl.export.points import (
     ColouredPoints,
     coloured_points,
     in_world,
+    inside,
     place_and_colour,
     table_of,
     write_elements,
@@ -37,9 +38,10 @@ class Mesh:
     colours: np.ndarray
 
 
-def surface(run: Run) -> tuple[np.ndarray, np.ndarray]:
+def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """(vertices (V, 3) of in_world(), faces (F, 3) int32) of the surface that the depths of the
-    training views agree on, by marching cubes. Raises UserError where they show none.
+    training views agree on, by marching cubes; with a box (2, 3) only the faces in it. Raises
+    UserError where there is none.
     """
     grid = box_around(run.model.grid, run.model.cloud.ids.get())
     cameras = tqdm(run.cameras("train"), "depths", unit="view", leave=False, disable=None)
@@ -49,14 +51,16 @@ def surface(run: Run) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"{run.folder}: the training views show no surface; train it longer")
     vertices, faces, _, _ = marching_cubes(outside, 0, gradient_direction="ascent")
     positions = np.asarray(grid.origin) + grid.edge * (vertices[:, ::-1] - 1)
-    return in_world(positions, grid.edge), faces.astype(np.int32)
+    faces = faces[inside(positions, box)[faces].all(1)]
+    used, faces = np.unique(faces, return_inverse=True)
+    return in_world(positions[used], grid.edge), faces.reshape(-1, 3).astype(np.int32)
 
 
-def coloured_mesh(run: Run) -> Mesh:
+def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
     """surface(), each vertex in the mean colour of the nearest points by their weight over the
     squared distance.
     """
-    vertices, faces = surface(run)
+    vertices, faces = surface(run, box)
     return Mesh(vertices, faces, _colours(vertices, coloured_points(run), run.model.grid.edge))
 
 

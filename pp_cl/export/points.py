@@ -46,12 +46,14 @@ class ColouredPoints:
     opacity: np.ndarray
 
 
-def coloured_points(run: Run, min_weight: float = 0.0) -> ColouredPoints:
+def coloured_points(
+    run: Run, min_weight: float = 0.0, box: np.ndarray | None = None
+) -> ColouredPoints:
     """The points that weigh more than min_weight in some training view, with their colours in the
     view where they weigh most: that of the pixel which shows their centre, without the background.
 
-    No colour is invented for points that no training view shows: they are left out. Raises
-    UserError where no point is left.
+    No colour is invented for points that no training view shows: they are left out. box: (2, 3)
+    that holds the points, or None. Raises UserError where no point is left.
     """
     cloud = run.model.cloud
     positions = run.model.positions()
@@ -67,6 +69,7 @@ def coloured_points(run: Run, min_weight: float = 0.0) -> ColouredPoints:
             f"--min-weight {min_weight:g}: no point weighs more in any training view (at most "
             f"{best.max(initial=0):.3g}); lower it"
         )
+    rows = rows[inside(positions[rows], box)]
     return ColouredPoints(
         rows,
         in_world(positions[rows], run.model.grid.edge),
@@ -74,6 +77,20 @@ def coloured_points(run: Run, min_weight: float = 0.0) -> ColouredPoints:
         best[rows],
         cloud.opacity.get()[rows],
     )
+
+
+def inside(positions: np.ndarray, box: np.ndarray | None) -> np.ndarray:
+    """(N,) bool: which positions (N, 3) lie in a box (2, 3) of the world, all where there is none.
+    Raises UserError where none does.
+    """
+    if box is None:
+        return np.ones(len(positions), bool)
+    found = ((positions >= box[0]) & (positions <= box[1])).all(1)
+    if not found.any():
+        ends = (positions.min(0), positions.max(0))
+        low, high = (",".join(f"{x:.3g}" for x in corner) for corner in ends)
+        raise UserError(f"--box: nothing lies in it; the run reaches from {low} to {high}")
+    return found
 
 
 def in_world(positions: np.ndarray, edge: float) -> np.ndarray:

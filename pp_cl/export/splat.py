@@ -14,7 +14,7 @@ from pp_cl.export.gaussians import CONSTANT, FACTORS, MOST_OPAQUE, ORDER, fit_ga
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.harmonics import COUNT, basis
 from pp_cl.export.page import check_drawable
-from pp_cl.export.points import in_world, table_of, write_elements
+from pp_cl.export.points import in_world, inside, table_of, write_elements
 from pp_cl.files.atomic import atomic_path
 from pp_cl.files.image import to_8bit
 from pp_cl.run import Run
@@ -38,20 +38,22 @@ SPLAT = np.dtype(
 )
 
 
-def splats(run: Run, up: tuple[float, float, float], window: int) -> tuple[np.ndarray, np.ndarray]:
+def splats(
+    run: Run, turn: np.ndarray, window: int, box: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """((M,) records of SPLAT, (3,) origin): the run as Gaussians, fitted to pictures of `window`
-    pixels, in the world of its scene turned so that its up, as far as the photographs tell, is
-    `up`. Positions are relative to the origin, which is 0 unless float32 is too coarse there.
-    harmonics: in the order and with the signs of 3D Gaussian splatting, of colours less 0.5;
-    opacity: after the sigmoid. Raises UserError as check_drawable does.
+    pixels, in the world of its scene turned by (3, 3), those in a box (2, 3) or all. Positions are
+    relative to the origin, which is 0 unless float32 is too coarse there. harmonics: in the order
+    and with the signs of 3D Gaussian splatting, of colours less 0.5; opacity: after the sigmoid.
+    Raises UserError as check_drawable and inside() do.
     """
     check_drawable(run)
     cloud, deviation = fit_gaussians(run, window)
     opacity, offset = cloud.opacity.get().clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
-    turn = upright(run, up)
     positions = grid.positions(cloud.ids.get()[rows]) + grid.edge * offset[rows, :3]
-    positions = positions @ turn.T
+    held = inside(positions, box)
+    rows, positions = rows[held], positions[held] @ turn.T
     coefficients = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
     near = in_world(positions, grid.edge).dtype == np.float32
     origin = np.zeros(3) if near else np.rint(positions.mean(0))

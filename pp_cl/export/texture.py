@@ -19,7 +19,6 @@ from pp_cl.errors import UserError
 from pp_cl.export.fusion import COVERED
 from pp_cl.export.mesh import surface
 from pp_cl.export.observe import progress
-from pp_cl.export.splat import Y_UP, upright
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture
@@ -42,15 +41,15 @@ def check_texture() -> None:
         )
 
 
-def textured_mesh(run: Run) -> trimesh.Trimesh:
-    """The surface of the training views' depths with y up, as glTF has it; in scene units. Raises
-    UserError as surface() and check_texture().
+def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> trimesh.Trimesh:
+    """The surface of the training views' depths, of which a box (2, 3) may hold a part, turned by
+    (3, 3); in scene units. Raises UserError as surface() and check_texture().
     """
     check_texture()
     import fast_simplification
     import xatlas
 
-    vertices, faces = surface(run)
+    vertices, faces = surface(run, box)
     middle = vertices.mean(0, dtype=np.float64)
     vertices = (vertices - middle).astype(np.float32)
     if len(faces) > FACES:
@@ -76,7 +75,7 @@ def textured_mesh(run: Run) -> trimesh.Trimesh:
         roughnessFactor=1.0,
     )
     return trimesh.Trimesh(
-        (vertices + middle) @ upright(run, Y_UP).T,
+        (vertices + middle) @ turn.T,
         faces,
         visual=TextureVisuals(uv, material=material),
         process=False,

@@ -4,9 +4,11 @@ import shutil
 
 import numpy as np
 import pytest
+import trimesh
 
-from pp_cl.export import FORMATS
+from pp_cl.export import AXES, FORMATS
 from pp_cl.export.formats import check_target, export, renderings
+from pp_cl.export.splat import Y_DOWN, Y_UP, upright
 from pp_cl.files.image import to_8bit
 from pp_cl.run import load_run
 from pp_cl.scene.load import load_scene
@@ -32,6 +34,23 @@ def test_a_scene_can_be_given_its_folder(run, tmp_path):
     path = check_target("scene", tmp_path, tmp_path / "empty")
     assert export(run, "scene", path) == "12 train views, 2 test views"
     assert len(load_scene(path, ("test",)).splits["test"]) == 2
+
+
+@pytest.mark.parametrize("name", ["ply", "mesh", "textured", "splat"])
+def test_a_box_holds_a_part_and_axes_turn_it(name, run, tmp_path):
+    box, places = (-1, -1, -1, 1, 1, 0.25), {}
+    suffix = FORMATS[name][1][0]
+    for axes in AXES:
+        path = tmp_path / f"{axes}{suffix}"
+        export(run, name, path, window=60, box=box, axes=axes)
+        read = trimesh.load(path, process=False)
+        [some] = read.geometry.values() if suffix == ".glb" else [read]
+        places[axes] = some.vertices
+    edge = run.model.grid.edge
+    assert places["scene"][:, 2].max() == pytest.approx(0.25, abs=2 * edge)
+    assert places["scene"][:, 2].min() < -0.5, "there is more of the ball below"
+    turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
+    np.testing.assert_allclose(places["scene"] @ turn.T, places["viewer"], atol=1e-5)
 
 
 def test_they_read_back_as_a_scene(run, tmp_path):

@@ -28,23 +28,18 @@ def text_of(one, position):
     return f"{one.name}:{x:.3f},{y:.3f}"
 
 
-def rims(run, one, share):
+def rims(one, share):
     """Two points of the ball, left and right of its middle in a photograph, and their distance."""
-    centre = run.model.positions().mean(0)
-    towards = one.camera.eye - centre
-    towards /= np.linalg.norm(towards)
+    towards = one.camera.eye / np.linalg.norm(one.camera.eye)
     right = np.cross(one.camera.pose[:, 1], towards)
     right /= np.linalg.norm(right)
-    radius = np.linalg.norm(run.model.positions() - centre, axis=1).max()
-    ends = [
-        centre + radius * (np.sqrt(1 - share**2) * towards + s * share * right) for s in (-1, 1)
-    ]
-    return ends, 2 * share * radius
+    ends = [RADIUS * (np.sqrt(1 - share**2) * towards + s * share * right) for s in (-1, 1)]
+    return ends, 2 * share * RADIUS
 
 
 def test_pixels_tell_where_the_surface_is(mine):
     one = mine.photographs("train")[2]
-    ends, length = rims(mine, one, 0.6)
+    ends, length = rims(one, 0.6)
     found = [surface_point(mine, text_of(one, end)) for end in ends]
     assert np.linalg.norm(found[0] - found[1]) == pytest.approx(length, rel=0.08)
     assert metres_per_unit(mine) == 1
@@ -61,7 +56,7 @@ def test_exports_are_in_metres(mine, tmp_path, name):
 
     before = spans(tmp_path / "a.ply")
     one = mine.photographs("train")[0]
-    first, second = (text_of(one, end) for end in rims(mine, one, 0.6)[0])
+    first, second = (text_of(one, end) for end in rims(one, 0.6)[0])
     apart = np.linalg.norm(surface_point(mine, first) - surface_point(mine, second))
     assert set_length(mine, first, second, 0.24) == pytest.approx(0.24 / apart)
     assert spans(tmp_path / "b.ply") == pytest.approx(np.multiply(before, 0.24 / apart), rel=1e-3)

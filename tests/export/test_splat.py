@@ -21,6 +21,7 @@ from pp_cl.export.splat import (
     Y_UP,
     check_spz,
     splats,
+    upright,
     write_splat_glb,
     write_splat_ply,
     write_splat_spz,
@@ -39,7 +40,7 @@ LAYOUT += [f"rot_{i}" for i in range(4)]
 @pytest.fixture(scope="module")
 def ply(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("splat") / "a.ply"
-    write_splat_ply(path, splats(run, Y_DOWN, 90)[0])
+    write_splat_ply(path, splats(run, upright(run, Y_DOWN), 90)[0])
     return path
 
 
@@ -91,14 +92,14 @@ def likeness(run, path, scale):
 
 def test_gaussians_look_like_the_run_in_the_window_that_they_are_for(run, ply, tmp_path):
     small = tmp_path / "small.ply"
-    write_splat_ply(small, splats(run, Y_DOWN, 30)[0])
+    write_splat_ply(small, splats(run, upright(run, Y_DOWN), 30)[0])
     assert likeness(run, ply, 3) > 37
     assert likeness(run, small, 1) > 37 and likeness(run, ply, 1) < 30
 
 
 def test_the_spz_says_the_same_with_y_up(run, ply, tmp_path):
     """To its bits: a 64th of a deviation, 1/255 of an opacity, exp(1/32) of a deviation."""
-    table, _ = splats(run, Y_UP, 90)
+    table, _ = splats(run, upright(run, Y_UP), 90)
     write_splat_spz(tmp_path / "a.spz", table)
     found = gsply.read_spz(tmp_path / "a.spz")
     assert found.means == pytest.approx(table["position"], abs=float(table["deviation"].min()) / 60)
@@ -143,7 +144,7 @@ def glb(path):
 
 
 def test_the_glb_says_the_same_with_y_up(run, ply, tmp_path, rng):
-    table, origin = splats(run, Y_UP, 90)
+    table, origin = splats(run, upright(run, Y_UP), 90)
     write_splat_glb(tmp_path / "a.glb", table, origin)
     gltf, arrays = glb(tmp_path / "a.glb")
     (primitive,) = gltf["meshes"][0]["primitives"]
@@ -170,7 +171,7 @@ def test_the_glb_says_the_same_with_y_up(run, ply, tmp_path, rng):
 
 
 def test_programs_that_draw_points_read_the_glb(run, tmp_path):
-    table, origin = splats(run, Y_UP, 90)
+    table, origin = splats(run, upright(run, Y_UP), 90)
     write_splat_glb(tmp_path / "a.glb", table, origin)
     (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(cloud, trimesh.PointCloud) and len(cloud.vertices) == len(table)
