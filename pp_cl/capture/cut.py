@@ -34,7 +34,8 @@ FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
 # A side of the box cuts the object if its outermost layer holds this share of the vertices of the
 # fullest one: then it moves out by so much of the box's diagonal, at most so often.
-TOUCHING, GROWTH, GROWTHS = 0.02, 0.1, 3
+TOUCHING, GROWTH, GROWTHS = 0.03, 0.05, 4
+MOSTLY_SEEN = 0.5  # of the windows
 SOFT = 1.0  # pixels of the cut image over which a border is refined
 FLAT = 1e-3  # variance of colours, of 1, below which a border follows no edge
 
@@ -44,19 +45,17 @@ def cut_out_all(
     box: np.ndarray,
     points: np.ndarray,
     inside: np.ndarray,
-    outside: np.ndarray,
     seen: Sequence[np.ndarray],
     turns: bool,
 ) -> None:
     """Set the masks of the windows that have none. Raises UserError for a box in which nothing
     stands.
 
-    box, points, seen, turns: as write_masks() takes them. inside, outside: (N,) bool, the points of
-    the object and of the background; others are on nobody's side.
+    box, points, seen, turns: as write_masks() takes them. inside: (N,) bool, the object's points.
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    seeds = {i: _seeds(windows[i], box, points, inside, outside, seen[i]) for i in left}
+    seeds = {i: _seeds(windows[i], box, points, inside, seen[i]) for i in left}
     labels = [
         seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
     ]
@@ -77,7 +76,7 @@ def cut_out_all(
     def beside():
         return [some & ~one.mask for some, one in zip(around, windows, strict=True)]
 
-    differences = backdrop.differences(windows, points[outside], beside() if turns else None)
+    differences = backdrop.differences(windows, points[~inside], beside() if turns else None)
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
@@ -93,10 +92,15 @@ def cut_out_all(
 
 
 def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
-    """(2, 3) box whose sides are moved out where they cut the object off, as the hull of the masks
-    has it, but for what it stands on; None where no side does.
+    """(2, 3) box whose sides are moved out where they cut the object off, but for what it stands
+    on; None where no side does. The object is the hull of the masks as far as most windows see it,
+    as beyond that hardly any mask bounds it.
     """
     hull, _, edge = forgiving_hull(windows, box)
+    seen = np.bincount(np.concatenate([one.inside(hull)[0] for one in windows]), None, len(hull))
+    hull = hull[seen >= MOSTLY_SEEN * len(windows)]
+    if not len(hull):
+        return None
     grown, by = box.copy(), GROWTH * np.linalg.norm(box[1] - box[0])
     for axis in range(3):
         _, layer = np.unique(hull[:, axis].round(6), return_inverse=True)
@@ -118,7 +122,7 @@ def without_islands(mask: np.ndarray) -> np.ndarray:
     return (areas >= max(1, ISLAND * areas.max()))[regions]
 
 
-def _seeds(one, box, points, inside, outside, seen):
+def _seeds(one, box, points, inside, seen):
     """(H, W) uint8 of GrabCut's labels: points of the object that the photograph shows, those of
     the background, what is outside the box; what is close to the object's points is probable.
     """
@@ -134,8 +138,9 @@ def _seeds(one, box, points, inside, outside, seen):
     near = _dots(one, points[inside & (points[:, 2] > foot)], radius)
     near = _closed(near, round(NEAR * CUT_SIDE))
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
-    sure = seen[inside[seen] & (points[seen, 2] > foot)]
-    labels[_dots(one, points[seen[outside[seen]]], radius)] = cv2.GC_BGD
+    shown_inside = inside[seen]
+    sure = seen[shown_inside & (points[seen, 2] > foot)]
+    labels[_dots(one, points[seen[~shown_inside]], radius)] = cv2.GC_BGD
     labels[_dots(one, points[sure], radius)] = cv2.GC_FGD
     return labels
 

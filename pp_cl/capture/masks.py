@@ -265,8 +265,7 @@ def _cut(scene, photographs, windows, box, points, inside, seen, turns, grows):
     """Cut out what has no mask, and write it. Returns the box, and {what: how many}."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
     for growth in range(1 + GROWTHS):
-        outside = ((points <= box[0]) | (points >= box[1])).any(1)
-        cut_out_all(windows, box, points, inside, outside, seen, turns)
+        cut_out_all(windows, box, points, inside, seen, turns)
         larger = grown_box(windows, box) if grows and growth < GROWTHS else None
         if larger is None:
             break

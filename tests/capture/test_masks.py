@@ -150,7 +150,7 @@ def test_what_lies_around_the_object_is_no_seed(capture):
     lying, own = [0.7, 0, -0.75], [0, 0, 0.5]
     one = window(np.zeros((SIZE, SIZE, 3), np.uint8), capture.photographs[0], box)
     points, both = np.array([lying, own]), np.array([0, 1])
-    labels = cut._seeds(one, box, points, np.ones(2, bool), np.zeros(2, bool), both)
+    labels = cut._seeds(one, box, points, np.array([True, True]), both)
     _, rows, columns = one.inside(points)
     assert labels[rows[0], columns[0]] != cut.cv2.GC_FGD
     assert labels[rows[1], columns[1]] == cut.cv2.GC_FGD
