@@ -171,8 +171,7 @@ def test_the_picture_draws_the_points_around_the_object(scene, is_run, tmp_path,
         assert main(arguments(scene, subject, train__iterations=2, train__prune_weight=0)) == 0
     assert main(["info", str(subject), "--picture", str(path)]) == 0
     assert f"wrote {path}" in capsys.readouterr().out
-    # in pixels; the hull is wider by the margins of masks and points
-    radius = BALL / math.sqrt(16 - BALL**2) * 24 / math.tan(0.35)  # of the ball
+    radius = BALL / math.sqrt(16 - BALL**2) * 24 / math.tan(0.35)  # of the ball, in pixels
     top = 0 if is_run else LEAST_WIDTH // 2
     for colour in () if is_run else (CAMERA, BOX):
         off = np.abs(read_rgba(path)[:top, :, :3] - np.array(colour)).max(-1)
@@ -180,7 +179,7 @@ def test_the_picture_draws_the_points_around_the_object(scene, is_run, tmp_path,
     for tile in range(8):
         y, x = np.nonzero(outlined(path, tile, top)) - np.array([[23.5], [23.5]])
         off = np.hypot(x, y) - radius
-        assert off.max() < 5
+        assert off.max() < 5  # the masks' margins, and a point's width
         directions = np.arctan2(y, x)[np.abs(off) < 5] / (2 * np.pi) * 24
         assert set(np.floor(directions)) == set(range(-12, 12))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
-from pp_cl.export import AXES, FORMATS, WINDOW
+from pp_cl.export import AXES, AXES_OF, FORMATS, WINDOW
 
 HELP = "write a run in a format that other programs open"
 EPILOG = "\n".join(
@@ -16,7 +16,6 @@ EPILOG = "\n".join(
     )
 )
 OF_POINTS, OF_SPLATS = ("ply", "glb"), ("splat", "splat-spz", "splat-glb")
-PLACED = (*OF_POINTS, *OF_SPLATS, "mesh", "textured")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,8 +78,8 @@ def run(options: argparse.Namespace) -> None:
         shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
     if name not in OF_SPLATS:
         shared.refuse(options, ("window",), f"only {', '.join(OF_SPLATS)} are fitted to a window")
-    if name not in PLACED:
-        shared.refuse(options, ("box", "axes"), f"only {', '.join(PLACED)} hold coordinates")
+    if name not in AXES_OF:
+        shared.refuse(options, ("box", "axes"), f"only {', '.join(AXES_OF)} hold coordinates")
     if name != "gallery" and len(options.run_folders) > 1:
         raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
     ends = (*options.length[:2], _metres(options.length[2])) if options.length else None

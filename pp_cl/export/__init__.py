@@ -2,7 +2,10 @@
 
 # Pixels on the longer side of the pictures for which splats are fitted: of a viewer's window
 WINDOW = 800
-SCENE, VIEWER = AXES = "scene", "viewer"  # whose axes coordinates have
+SCENE, VIEWER = AXES = "scene", "viewer"
+# {format of coordinates: whose axes they have, unless others are asked for}
+AXES_OF = dict.fromkeys(("splat", "splat-spz", "splat-glb", "textured"), VIEWER)
+AXES_OF |= dict.fromkeys(("ply", "glb", "mesh"), SCENE)
 # {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder;
 # what it is)}
 FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pp_cl.errors import UserError
-from pp_cl.export import FORMATS, SCENE, VIEWER, WINDOW
+from pp_cl.export import AXES_OF, FORMATS, VIEWER, WINDOW
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.length import metres_per_unit
 from pp_cl.export.mesh import coloured_mesh, write_mesh
@@ -70,10 +70,11 @@ def export(
     """
     count, metres = run.model.cloud.count, metres_per_unit(run)
     unit = "" if metres == 1 else ", in metres"
-    within = None if box is None else np.sort(np.reshape(box, (2, 3)), axis=0)
-    inside(run.model.positions(), within)  # raises early
-    turn = np.eye(3)
-    if (axes or (SCENE if name in ("mesh", "ply", "glb") else VIEWER)) == VIEWER:
+    within, turn = None, np.eye(3)
+    if box is not None:
+        within = np.sort(np.reshape(box, (2, 3)), axis=0)
+        inside(run.model.positions(), within)  # an empty one is refused before any work
+    if (axes or AXES_OF.get(name)) == VIEWER:
         turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
 
     def placed(positions):

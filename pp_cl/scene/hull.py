@@ -31,7 +31,7 @@ LEAST_SEEING = 3  # images that see a vertex: what lies behind the object is in 
 MOST_BESIDE, TIMES_USUAL = 0.05, 3.0
 MOST_LEFT_OUT = 1 / 8  # of the views
 # The mean share beside the hull for which masks are forgiven, one more until it is less or this
-# share of them is: rendered masks have 0.002, those of photographs up to 0.1. What the hull lacks
+# share of them is: rendered masks have 0, those of photographs 0.0001 to 0.016. What the hull lacks
 # is lost, and what it has too much training prunes: mary_rose's sound views gain 1.4 dB by 12
 # masks of 60 in place of 4.
 MOST_MISSED, MOST_FORGIVEN = 0.0002, 1 / 4
