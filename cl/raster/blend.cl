@@ -37,7 +37,7 @@ static inline float upper_float(const ulong word) {
 
 // One work-item per part of a pixel: reads its hits and their points' features, writes the blended
 // features.
-kernel void blend_forward(
+kernel __attribute__((vec_type_hint(floats))) void blend_forward(
     const uint hw,                          // pixels
     global const uint *pixel_offset,        // (HW+1)
     global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
