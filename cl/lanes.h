@@ -27,6 +27,18 @@
 #define BATCH (LANES == 16 ? 1 : 4)
 #endif
 
+// Asks for what lies at a global address before it is read, on CPUs, where walks over hits and
+// points wait mostly for what lies anywhere in memory. They look so many hits or points ahead.
+#define HITS_AHEAD 32
+#define POINTS_AHEAD 8
+#define READ_AHEAD(address)
+#if LANES == 16 && defined(__has_builtin)
+#if __has_builtin(__builtin_prefetch)
+#undef READ_AHEAD
+#define READ_AHEAD(address) __builtin_prefetch((global const char *)(address))
+#endif
+#endif
+
 typedef LANED(float) floats;
 typedef LANED(int) ints;
 typedef LANED(uint) uints;

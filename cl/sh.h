@@ -32,4 +32,17 @@ static inline void sh_basis_of_point(global const float *camera, const float4 po
     sh_basis(c.x * cam.right + c.y * cam.down + c.z * cam.forward, basis);
 }
 
+// Asks for the coefficients of the point whose turn it is in a while, where they are arrays of rows
+// of `width` elements.
+#define SH_READ_AHEAD(i, width)                                                                    \
+    {                                                                                              \
+        const size_t row = (size_t)(i) * (width);                                                  \
+        READ_AHEAD(sh_0 + row);                                                                    \
+        for (uint b = 0; b < 3 * (width); b += (width)) {                                          \
+            if (DEGREE >= 1) READ_AHEAD(sh_1 + 3 * row + b);                                       \
+            if (DEGREE >= 2) READ_AHEAD(sh_2a + 3 * row + b);                                      \
+            if (DEGREE >= 2 && b < 2 * (width)) READ_AHEAD(sh_2b + 2 * row + b);                   \
+        }                                                                                          \
+    }
+
 #endif

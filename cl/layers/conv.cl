@@ -6,9 +6,6 @@
 // scalars, and does K * BLOCKS * PIXELS vector multiply-adds with them. PIXELS and BLOCKS are
 // chosen so that accumulators and weights fit a device's registers (Blocking in
 // pp_cl/layers/conv_direct.py).
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones.
 #include "common.h"
 #include "layers/tiles.h"
 #include "vector.h"
@@ -86,7 +83,7 @@ any_is_computed(global const float *tile_count, const int x0, const int y, const
 // One work-item per (PIXELS pixels, row, BLOCKS * 16 output channels): reads their neighbourhood in
 // x, then in x2 (the concatenation [x, x2] without making it), and writes those of out that lie in
 // a tile to compute.
-kernel __attribute__((vec_type_hint(float16))) void conv_forward(
+kernel void conv_forward(
     const int height,
     const int width,
     const int c1,
@@ -137,7 +134,7 @@ kernel __attribute__((vec_type_hint(float16))) void conv_forward(
 // those of grad_x that lie in a tile to compute: the convolution of grad_out with the flipped and
 // transposed weights (conv_backward_weights.cl). masked: x is the output of a ReLU and grad_x the
 // gradient of that ReLU's input, so that the mask costs no pass of its own.
-kernel __attribute__((vec_type_hint(float16))) void conv_backward_input(
+kernel void conv_backward_input(
     const int height,
     const int width,
     const int c,

@@ -1,8 +1,5 @@
 // The weight side of a K x K convolution (K = KERNEL_SIZE): its weight and bias gradients, and the
 // flipped weights from which its input gradient is computed.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones.
 #include "lanes.h"
 #include "layers/tiles.h"
 
@@ -22,7 +19,7 @@
 // as one vector at the mirrored place. Lanes beyond the channels taken are 0. Rows of `table`: first
 // work-item, taps (K * K), output channels, input channels taken, the first of them, input channels
 // of the weights, where weights and vectors begin.
-kernel __attribute__((vec_type_hint(float16))) void conv_flip_weights(
+kernel void conv_flip_weights(
     const uint n,  // work-items
     const uint rows,
     global const int *table,      // (rows, 8)
@@ -56,7 +53,7 @@ static inline float16 counted(global const float *grad, const float count, const
 // walks its rows of x with the gradients of the K output pixels that see each pixel, and writes its
 // part of the sums: dL/dweight in rows (ky, kx, channel) of partial, dL/dbias in the last row.
 // Needs no border test: it visits only pixels that exist. A gradient counts as often as its tile.
-kernel __attribute__((vec_type_hint(float16))) void conv_backward_weights(
+kernel void conv_backward_weights(
     const int height,
     const int width,
     const int c,
@@ -135,7 +132,7 @@ kernel __attribute__((vec_type_hint(float16))) void conv_backward_weights(
 // writes LANES values of a gradient. Rows of `table`: first row of partial of all weights, rows of
 // one part and group of 16 output channels (K * K * ci + 1), such groups, parts, where the parts,
 // the gradient of the weights and that of the biases begin.
-kernel __attribute__((vec_type_hint(floats))) void conv_sum_parts(
+kernel void conv_sum_parts(
     const uint n,  // rows of partial, of one part of all weights
     const uint rows,
     global const int *table,        // (rows, 8)

@@ -2,9 +2,6 @@
 // features and then the gates of each pixel, out = ELU(features) * sigmoid(gates). A work-item is
 // (LANES channels, x, y) of out: one vector of a pixel, shorter at the last channels. It writes
 // where its tile is computed (tiles.h).
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones.
 #include "common.h"
 #include "lanes.h"
 #include "layers/tiles.h"
@@ -26,7 +23,7 @@ ALWAYS_INLINE floats sigmoid(const floats x, const floats decay) {
 
 // One work-item per (LANES channels, x, y) of out: reads its features and gates, writes
 // ELU(features) * sigmoid(gates).
-kernel __attribute__((vec_type_hint(floats))) void gate_forward(
+kernel void gate_forward(
     const int h,
     const int w,
     const int c,
@@ -48,7 +45,7 @@ kernel __attribute__((vec_type_hint(floats))) void gate_forward(
 
 // One work-item per (LANES channels, x, y) of out: reads features, gates and gradient, writes the
 // gradients of features and gates.
-kernel __attribute__((vec_type_hint(floats))) void gate_backward(
+kernel void gate_backward(
     const int h,
     const int w,
     const int c,

@@ -1,16 +1,13 @@
 // The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling. A
 // work-item is (LANES channels, x, y): one vector of a pixel, shorter at the last channels. It
 // writes where its tile is computed (tiles.h); max pooling writes everywhere.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones.
 #include "common.h"
 #include "lanes.h"
 #include "layers/tiles.h"
 
 // One work-item per (LANES channels, x, y) of out: reads the 2x2 pixels it covers, writes their
 // mean.
-kernel __attribute__((vec_type_hint(floats))) void avgpool2_forward(
+kernel void avgpool2_forward(
     const int h,  // of out
     const int w,
     const int c,
@@ -32,7 +29,7 @@ kernel __attribute__((vec_type_hint(floats))) void avgpool2_forward(
 // One work-item per (LANES channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds
 // the gradient from x's other use. If masked, it then sets it to 0 where x <= 0: x is the output of
 // a ReLU, grad_x becomes the gradient of that ReLU's input.
-kernel __attribute__((vec_type_hint(floats))) void avgpool2_backward(
+kernel void avgpool2_backward(
     const int h,  // of out
     const int w,
     const int c,
@@ -57,7 +54,7 @@ kernel __attribute__((vec_type_hint(floats))) void avgpool2_backward(
 
 // One work-item per (LANES channels, x, y) of out: reads the 2x2 pixels it covers, writes their
 // largest; an odd last row or column of x is left out, as PyTorch does.
-kernel __attribute__((vec_type_hint(floats))) void maxpool2_forward(
+kernel void maxpool2_forward(
     const int h,  // of out
     const int w,
     const int c,
@@ -80,7 +77,7 @@ kernel __attribute__((vec_type_hint(floats))) void maxpool2_forward(
 // high and wide, that lie in its pixel, and all of them in one tile. Each is the pixel of x that
 // its centre lies in and the nearest ones beside it, weighted 3/4 and 1/4 along each axis
 // (bilinear, align_corners False, the border repeated).
-kernel __attribute__((vec_type_hint(floats))) void upsample2_forward(
+kernel void upsample2_forward(
     const int h,  // of x
     const int w,
     const int c,
@@ -112,7 +109,7 @@ kernel __attribute__((vec_type_hint(floats))) void upsample2_forward(
 
 // One work-item per (LANES channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it,
 // writes their weighted sum.
-kernel __attribute__((vec_type_hint(floats))) void upsample2_backward(
+kernel void upsample2_backward(
     const int h,  // of x
     const int w,
     const int c,

@@ -8,9 +8,6 @@
 //
 // One work-item per compute unit (work-groups of 1): an image's tiles are many, and each slice is
 // used over and over.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones, and take 30 times as long to build them.
 #include "layers/winograd.h"
 
 #ifndef BLOCKS
@@ -148,7 +145,7 @@ ALWAYS_INLINE void convolve(
 
 // One work-item per compute unit: takes tiles, reads their neighbourhood in x, then in x2 (the
 // concatenation [x, x2] without making it), and writes those tiles of out.
-kernel __attribute__((vec_type_hint(float16))) void winograd_forward(
+kernel void winograd_forward(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
     const int co,
@@ -167,7 +164,7 @@ kernel __attribute__((vec_type_hint(float16))) void winograd_forward(
 // One work-item per compute unit: takes tiles, reads their neighbourhood in grad_out, and writes
 // those tiles of grad_x, which is the convolution of grad_out with the flipped weights. masked: x
 // is the output of a ReLU and grad_x the gradient of its input.
-kernel __attribute__((vec_type_hint(float16))) void winograd_backward_input(
+kernel void winograd_backward_input(
     const int c,
     const int co,
     const int masked,

@@ -3,9 +3,6 @@
 // With inputs V = B^T d B and gradients Z = A g A^T of a tile, the gradient of the transformed
 // weights is the sum of V o Z over all tiles: position by position a product of matrices (CI x
 // tiles) (tiles x CO). The weights' own is G^T ... G of it.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones, and take 30 times as long to build them.
 #include "layers/winograd.h"
 
 #ifndef BLOCKS
@@ -144,7 +141,7 @@ ALWAYS_INLINE void store_gradients(
 // ci_part x CO_PART channels and one of tile_parts stretches of tile_list: walks those tiles in
 // [x, x2] (without making it) and grad_out, and writes its part of the sums: dL/dweight in rows
 // (ky, kx, channel) of partial, dL/dbias in the last row.
-kernel __attribute__((vec_type_hint(float16))) void winograd_backward_weights(
+kernel void winograd_backward_weights(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
     const int co,

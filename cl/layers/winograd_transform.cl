@@ -1,8 +1,5 @@
 // Winograd's transform of the weights of a 3x3 convolution, G g G^T (winograd.h), to the layout
 // that winograd.cl reads.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones.
 #include "layers/winograd.h"
 
 // Three rows of three weights in t -> their values at all positions, of one input channel and 16
@@ -25,7 +22,7 @@ ALWAYS_INLINE void store_kernel(
 // kernels with the roles of input and output channels exchanged. Rows of `table`: first work-item,
 // channels, groups of 16 channels of the result, where weights and values begin, first input
 // channel taken, input channels of the weights, 1 for an input gradient.
-kernel __attribute__((vec_type_hint(float16))) void winograd_transform(
+kernel void winograd_transform(
     const uint n,  // work-items
     const uint rows,
     global const int *table,      // (rows, 8)

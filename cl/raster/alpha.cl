@@ -39,6 +39,8 @@ kernel void alpha_weights(
     float T = 1.0f;
     uint i = begin;
     while (i < end && T >= early_stop) {
+        READ_AHEAD(
+            pair_point_closeness + (uint)pair_key[min(i + HITS_AHEAD, pixel_offset[hw] - 1)]);
         uint2 hits[BATCH];
         float o[BATCH];
         UNROLLED for (uint j = 0; j < BATCH; j++) {

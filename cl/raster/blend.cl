@@ -18,9 +18,6 @@
 // respect to b_i to G.f_i in the same way.
 //
 // A kernel of each blend writes (b, s gain) of the hits by pair, where each point finds its own.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones, up to 8 times slower.
 #include "common.h"
 #include "lanes.h"
 #include "raster/offset.h"
@@ -37,7 +34,7 @@ static inline float upper_float(const ulong word) {
 
 // One work-item per part of a pixel: reads its hits and their points' features, writes the blended
 // features.
-kernel __attribute__((vec_type_hint(floats))) void blend_forward(
+kernel void blend_forward(
     const uint hw,                          // pixels
     global const uint *pixel_offset,        // (HW+1)
     global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
@@ -71,7 +68,7 @@ kernel __attribute__((vec_type_hint(floats))) void blend_forward(
 
 // One work-item per pixel: reads its `tracked` nearest hits and their points' features, writes what
 // each adds to the gradients of its point, by softmax.
-kernel __attribute__((vec_type_hint(float16))) void softmax_gradient(
+kernel void softmax_gradient(
     const uint hw,                          // pixels
     const uint tracked,                     // hits of a pixel that get gradients
     global const uint *pixel_offset,        // (HW+1)
@@ -99,7 +96,7 @@ kernel __attribute__((vec_type_hint(float16))) void softmax_gradient(
 // One work-item per pixel: reads its hits, farthest first, and their points' features, writes what
 // each of the `tracked` nearest ones adds to the gradients of its point, by alpha compositing, with
 // those of alpha and of the spread; and the spread.
-kernel __attribute__((vec_type_hint(float16))) void alpha_gradient(
+kernel void alpha_gradient(
     const uint hw,       // pixels
     const uint tracked,  // hits of a pixel that get gradients
     const int has_grad_alpha,
@@ -125,11 +122,13 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gradient(
     const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
     float2 front = 0.0f, behind = 0.0f;  // sums of b and b z of the hits there
     uint end = begin;
-    for (; end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE; end++)
+    for (; end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE; end++) {
+        READ_AHEAD(shaded_features + point_slot[(uint)pixel_entry[end]]);
         if (spread_weight > 0.0f) {
             const float z = upper_float(pair_key[end]) - nearest;
             front += upper_float(pixel_entry[end]) * (float2)(1.0f, z);
         }
+    }
     float T = transmittance[q], spread = 0.0f;
     float B = dot16(G, (float16)(BACKGROUND));
     for (uint i = end; i > begin;) {
@@ -168,7 +167,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gradient(
 
 // One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes
 // the gradients of its features and, the first one, of its opacity and offset.
-kernel __attribute__((vec_type_hint(floats))) void blend_backward(
+kernel void blend_backward(
     const uint s,                              // visible points
     const float edge,                          // of the grid, world units
     global const uint *shaded,                 // (S) their indices

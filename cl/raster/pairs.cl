@@ -5,9 +5,6 @@
 // On CPUs, where an atomic addition takes as long as the rest of a pair, they are counted in the
 // order of the pairs, by a work-item per compute unit: pairs_band_sizes and pairs_split list the
 // pairs by bands of the image, pairs_count counts those of its band.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones, which is slower.
 #include "common.h"
 #include "raster/footprint.h"
 
@@ -75,7 +72,7 @@ ALWAYS_INLINE Footprints footprints_load(
 //
 // A compiler that rounds otherwise here than in project.cl finds one hit more or less of a point in
 // a million: one too many is left out, one that is missing becomes a pair without weight.
-kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
+kernel void pairs_fill(
     const uint n,                        // points
     const uint p,                        // pairs for which there is room
     global const float *camera,          // (20) camera.h
@@ -267,7 +264,7 @@ merge(global const ulong *keys, const uint middle, const uint count, global ulon
 
 // One work-item per pixel: sorts its keys in place. GPUs, on which its arrays would lie in the
 // device's memory, run the two kernels below instead.
-kernel __attribute__((vec_type_hint(uint16))) void pairs_sort(
+kernel void pairs_sort(
     const uint hw,                    // pixels
     global const uint *pixel_offset,  // (HW+1)
     global ulong *scratch,            // (P)

@@ -160,7 +160,7 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
 
 // One work-item per LANES points: reads their grid indices and offsets, writes their numbers of
 // hits and, if any is above 0, their radii, camera-space positions and distances, and boxes.
-kernel __attribute__((vec_type_hint(floats))) void project_grid(
+kernel void project_grid(
     const uint n,                       // points
     global const float *camera,         // (20) camera.h
     global const float *grid,           // (8) grid.h
@@ -205,7 +205,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
 
 // One work-item per LANES spheres: reads their positions and radii, writes the same as
 // project_grid.
-kernel __attribute__((vec_type_hint(floats))) void project_spheres(
+kernel void project_spheres(
     const uint n,                      // spheres
     global const float *camera,        // (20) camera.h
     global const float *positions,     // (N, 3) world

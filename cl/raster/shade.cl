@@ -43,6 +43,7 @@ kernel void shade_forward(
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
+    SH_READ_AHEAD(shaded[min(g + POINTS_AHEAD, s - 1)], 1)
     SHADE(LOAD_FLOAT, i, features)
     store_part(features, shaded_features, g);
 }
@@ -62,6 +63,7 @@ kernel void shade_forward_half(
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
+    SH_READ_AHEAD(shaded[min(g + POINTS_AHEAD, s - 1)], CHANNELS)
     SHADE(LOAD_HALF, i, features)
     store_part(features, shaded_features, g);
 }

@@ -10,9 +10,6 @@
 //
 // z and the exponents are written as fma(): NVIDIA's compiler fuses products and sums at some places
 // only, and equal hits got different weights.
-//
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
-// ones, up to 8 times slower.
 #include "common.h"
 #include "camera.h"
 #include "lanes.h"
@@ -65,7 +62,7 @@ ALWAYS_INLINE floats exponential(const floats o_z, const float sharpness, const 
 // A hit is dropped, with all behind it, once even an opaque, centred hit (o = d = 1) would have less
 // than the share early_stop of the weight; differs from Pulsar: it looks only when its buffer is
 // flushed. One more entry, without a point, then ends the pixel's list.
-kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
+kernel void softmax_weights(
     const uint hw,                             // pixels
     const float sharpness,                     // 1 / gamma
     const float early_stop,                    // 0: none

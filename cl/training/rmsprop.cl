@@ -74,6 +74,9 @@ kernel void rmsprop_move(
 {
     const uint row = get_global_id(0) / ROW_PARTS;
     const size_t g = min(row, s - 1), i = shaded[g];
+    const size_t soon = shaded[min(row + POINTS_AHEAD, s - 1)];
+    READ_AHEAD(v + soon);
+    SH_READ_AHEAD(soon, 1)
     const uint last = last_step[i];
 #if ROW_PARTS > 1
     barrier(CLK_GLOBAL_MEM_FENCE);  // all parts of a point have read it
