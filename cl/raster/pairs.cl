@@ -1,10 +1,11 @@
-// Pairs: every hit of a point in a pixel. pairs_fill writes them point by point and, on GPUs, counts
-// them by pixel; pairs_scatter writes a key (depth << 32 | pair) of each into the list of its pixel;
-// the sorts order each list by depth, then by pair and so by point.
+// Pairs: every hit of a point in a pixel. pairs_fill writes them point by point; then a key (depth <<
+// 32 | pair) of each is written into the list of its pixel, and the lists are sorted by depth, then
+// by pair and so by point.
 //
-// On CPUs, where an atomic addition takes as long as the rest of a pair, they are counted in the
-// order of the pairs, by a work-item per compute unit: pairs_band_sizes and pairs_split list the
-// pairs by bands of the image, pairs_count counts those of its band.
+// On GPUs, pairs_fill finds the place of a pair in its list by counting those of the pixel, and
+// pairs_scatter writes its key there. On CPUs, where an atomic addition takes as long as the rest of
+// a pair, pairs_bucket_sizes and pairs_bucket write the keys into buckets, one for each stretch of
+// the image, and pairs_list makes lists of a bucket, which its core's cache holds.
 #include "common.h"
 #include "raster/footprint.h"
 
@@ -18,20 +19,15 @@
 // fewer, writing alternates more often between the pairs of 16 points, which lie far apart.
 #define CELLS (LANES > 1 ? 32 : 1)
 
-// The place of a pair in the list of its pixel; CPUs find it later.
+// The place of a pair in the list of its pixel, on GPUs.
 #define PLACE(pixel) (LANES > 1 ? 0u : atomic_inc(&pixel_count[pixel]))
 
-#ifndef MOST_BANDS
-#define MOST_BANDS 64
+#ifndef BUCKETS
+#define BUCKETS 256  // at most
 #endif
 
-// Of a pixel: bands, a power of two, take turns, STRIPE pixels at a time, so that neighbouring pairs
-// mostly belong to one.
-#define STRIPE 2048
-#define BAND(pixel) (((pixel) / STRIPE) & (bands - 1))
-
-// Of `total` pairs, the first one of a chunk; there are as many chunks as bands.
-#define CHUNK_START(chunk) ((uint)((ulong)total * (chunk) / bands))
+// Of `total` pairs, the first one of a chunk.
+#define CHUNK_START(chunk) ((uint)((ulong)total * (chunk) / chunks))
 
 // Reads the footprints of the points from `first` on, of which `count` exist; the others have empty
 // boxes.
@@ -135,87 +131,47 @@ kernel void pairs_fill(
         }
 }
 
-// One work-item per chunk: reads the pixels of its pairs, writes how many each band has of them.
-kernel void pairs_band_sizes(
+// One work-item per chunk: reads the pixels of its pairs, writes how many each bucket has of them.
+kernel void pairs_bucket_sizes(
     const uint n,                     // points
     const uint p,                     // pairs for which there is room
-    const uint bands,                 // and chunks
+    const uint chunks,                // of the pairs
+    const uint stretch,               // log2 of the pixels of a bucket
     global const uint *point_offset,  // (N+1)
     global const uint *pair_pixel,    // (P)
-    global uint *band_size)           // (?) of each band, by chunk
+    global uint *bucket_size)         // (?) of each bucket, by chunk
 {
     const uint chunk = get_global_id(0), total = point_offset[n] > p ? 0 : point_offset[n];
-    if (chunk >= bands) return;
-    uint size[MOST_BANDS] = {0};
+    if (chunk >= chunks) return;
+    uint size[BUCKETS] = {0};
     for (uint pair = CHUNK_START(chunk); pair < CHUNK_START(chunk + 1); pair++)
-        size[BAND(pair_pixel[pair])]++;
-    for (uint band = 0; band < bands; band++)
-        band_size[band * bands + chunk] = size[band];
+        size[pair_pixel[pair] >> stretch]++;
+    for (uint bucket = 0; bucket < BUCKETS; bucket++)
+        bucket_size[bucket * chunks + chunk] = size[bucket];
 }
 
-// One work-item per chunk: reads the pixels of its pairs, writes the pairs to the list of their band,
-// behind those of the chunks before.
-kernel void pairs_split(
+// One work-item per chunk: writes the keys of its pairs into their buckets, behind those of the
+// chunks before.
+kernel void pairs_bucket(
     const uint n,                     // points
     const uint p,                     // pairs for which there is room
-    const uint bands,                 // and chunks
+    const uint chunks,                // of the pairs
+    const uint stretch,               // log2 of the pixels of a bucket
     global const uint *point_offset,  // (N+1)
     global const uint *pair_pixel,    // (P)
-    global const uint *band_size,     // (?) of each band, by chunk
-    global ulong *listed)             // (P) pixel << 32 | pair, by band
+    global const ulong *pair_place,   // (P) depth << 32
+    global const uint *bucket_size,   // (?) of each bucket, by chunk
+    global ulong *bucket_key)         // (P) depth << 32 | pair, by bucket, there by pair
 {
     const uint chunk = get_global_id(0), total = point_offset[n] > p ? 0 : point_offset[n];
-    if (chunk >= bands) return;
-    uint next[MOST_BANDS], start = 0;
-    for (uint i = 0; i < bands * bands; i++) {
-        if (i % bands == chunk) next[i / bands] = start;
-        start += band_size[i];
+    if (chunk >= chunks) return;
+    uint next[BUCKETS], start = 0;
+    for (uint i = 0; i < BUCKETS * chunks; i++) {
+        if (i % chunks == chunk) next[i / chunks] = start;
+        start += bucket_size[i];
     }
-    for (uint pair = CHUNK_START(chunk); pair < CHUNK_START(chunk + 1); pair++) {
-        const uint pixel = pair_pixel[pair];
-        listed[next[BAND(pixel)]++] = upsample(pixel, pair);
-    }
-}
-
-// One work-item per band: reads its list, writes the places of its pairs and counts them by pixel.
-kernel void pairs_count(
-    const uint hw,                 // pixels
-    const uint bands,              // and chunks
-    global const uint *band_size,  // (?) of each band, by chunk
-    global const ulong *listed,    // (P) pixel << 32 | pair, by band
-    global ulong *pair_place,      // (P) depth << 32, becomes depth << 32 | place
-    global uint *pixel_count)      // (HW)
-{
-    const uint band = get_global_id(0);
-    if (band >= bands) return;
-    for (uint first = band * STRIPE; first < hw; first += bands * STRIPE)
-        for (uint q = first; q < min(first + STRIPE, hw); q++)
-            pixel_count[q] = 0;
-    uint i = 0, end = 0;
-    for (uint k = 0; k < (band + 1) * bands; k++) {
-        if (k == band * bands) i = end;
-        end += band_size[k];
-    }
-    for (; i < end; i++)
-        pair_place[(uint)listed[i]] |= pixel_count[listed[i] >> 32]++;
-}
-
-// One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
-//
-// volatile: else compilers for AVX-512 write the keys of several pairs with one scatter
-// instruction, which takes five times as long where processors run it key by key.
-kernel void pairs_scatter(
-    const uint p,                     // pairs for which there is room
-    const uint hw,                    // pixels
-    global const uint *pair_pixel,    // (P)
-    global const ulong *pair_place,   // (P) depth << 32 | place in the list of the pixel
-    global const uint *pixel_offset,  // (HW+1) first key of each pixel
-    global volatile ulong *pair_key)  // (P) depth << 32 | pair, by pixel
-{
-    const uint pair = get_global_id(0);
-    if (pair >= p || pair >= pixel_offset[hw]) return;
-    const ulong place = pair_place[pair];
-    pair_key[pixel_offset[pair_pixel[pair]] + (uint)place] = upsample((uint)(place >> 32), pair);
+    for (uint pair = CHUNK_START(chunk); pair < CHUNK_START(chunk + 1); pair++)
+        bucket_key[next[pair_pixel[pair] >> stretch]++] = pair_place[pair] | pair;
 }
 
 // Minus the number of depths in [first, end) that are smaller than each of z. A function of vectors:
@@ -262,18 +218,8 @@ merge(global const ulong *keys, const uint middle, const uint count, global ulon
     }
 }
 
-// One work-item per pixel: sorts its keys in place. GPUs, on which its arrays would lie in the
-// device's memory, run the two kernels below instead.
-kernel void pairs_sort(
-    const uint hw,                    // pixels
-    global const uint *pixel_offset,  // (HW+1)
-    global ulong *scratch,            // (P)
-    global ulong *pair_key)           // (P) by pixel
-{
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
-    global ulong *keys = pair_key + begin, *other = scratch + begin;
+// Sorts `count` keys, which are ordered by pair, in place.
+static inline void sort_list(global ulong *keys, const uint count, global ulong *other) {
     if (count <= FEW) {
         for (uint i = 1; i < count; i++) {
             const ulong key = keys[i];
@@ -287,7 +233,7 @@ kernel void pairs_sort(
     uint passes = 0;
     for (uint width = RUN; width < count; width *= 2)
         passes++;
-    // so that the last pass ends in pair_key
+    // so that the last pass ends in `keys`
     global ulong *from = keys, *to = passes % 2 ? other : keys;
     for (uint first = 0; first < count; first += RUN)
         sort_run(from + first, min((uint)RUN, count - first), to + first);
@@ -298,6 +244,64 @@ kernel void pairs_sort(
             merge(
                 from + first, min(width, count - first), min(2 * width, count - first), to + first);
     }
+}
+
+// One work-item per bucket: reads its keys, writes those of each of its pixels, sorted, and where
+// they start.
+kernel void pairs_list(
+    const uint hw,                   // pixels
+    const uint chunks,               // of the pairs
+    const uint stretch,              // log2 of the pixels of a bucket
+    global const uint *bucket_size,  // (?) of each bucket, by chunk
+    global const uint *pair_pixel,   // (P)
+    global ulong *bucket_key,        // (P) by bucket; overwritten
+    global uint *pixel_offset,       // (HW+1)
+    global ulong *pair_key)          // (P) by pixel
+{
+    const uint bucket = get_global_id(0), first = bucket << stretch;
+    if (bucket >= BUCKETS || first >= hw) return;
+    const uint last = min(first + (1u << stretch), hw);
+    uint begin = 0, end = 0;
+    for (uint i = 0; i < (bucket + 1) * chunks; i++) {
+        if (i == bucket * chunks) begin = end;
+        end += bucket_size[i];
+    }
+    // of each pixel: how many keys it has, where they start, where the next one belongs
+    for (uint q = first; q < last; q++)
+        pixel_offset[q] = 0;
+    for (uint i = begin; i < end; i++)
+        pixel_offset[pair_pixel[(uint)bucket_key[i]]]++;
+    uint start = begin;
+    for (uint q = first; q < last; q++) {
+        const uint count = pixel_offset[q];
+        pixel_offset[q] = start;
+        start += count;
+    }
+    for (uint i = begin; i < end; i++)
+        pair_key[pixel_offset[pair_pixel[(uint)bucket_key[i]]]++] = bucket_key[i];
+    start = begin;
+    for (uint q = first; q < last; q++) {
+        const uint behind = pixel_offset[q];
+        pixel_offset[q] = start;
+        sort_list(pair_key + start, behind - start, bucket_key + start);
+        start = behind;
+    }
+    if (last == hw) pixel_offset[hw] = end;
+}
+
+// One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
+kernel void pairs_scatter(
+    const uint p,                     // pairs for which there is room
+    const uint hw,                    // pixels
+    global const uint *pair_pixel,    // (P)
+    global const ulong *pair_place,   // (P) depth << 32 | place in the list of the pixel
+    global const uint *pixel_offset,  // (HW+1) first key of each pixel
+    global ulong *pair_key)           // (P) depth << 32 | pair, by pixel
+{
+    const uint pair = get_global_id(0);
+    if (pair >= p || pair >= pixel_offset[hw]) return;
+    const ulong place = pair_place[pair];
+    pair_key[pixel_offset[pair_pixel[pair]] + (uint)place] = upsample((uint)(place >> 32), pair);
 }
 
 // One work-item per key: writes it at its place within its run, RUN keys of its pixel.

@@ -19,7 +19,8 @@ from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
 # keys ranked at once by comparing all with all, on CPUs 16 a step; longer lists are merged
 RUN, CPU_RUN = 64, 128
-MOST_BANDS = 64  # of the image, in which CPUs count side by side
+BUCKETS = 256  # of pairs, at most, which CPUs sort side by side
+MOST_CHUNKS = 64  # of pairs, which CPUs put into buckets side by side
 LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
 
 
@@ -76,8 +77,8 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
         "pair_pixel": ((pairs,), np.uint32),
         "pair_point_closeness": ((pairs, 2), np.uint32),
         "pair_key": ((pairs,), np.uint64),
-        # (depth, place in the pixel's list) of each pair until the keys are written, then for
-        # sorting them, at last the entries of weights.py
+        # of each pair its depth and place, or its key by bucket, then for sorting keys, at last the
+        # entries of weights.py
         "pair_scratch": ((pairs,), np.uint64),
     }
 
@@ -90,12 +91,12 @@ def find_pairs(
     """
     n, pixels = len(points.point_box), size[0] * size[1]
     b.require(pairs_table(n, pixels, room))
-    pair_place = b.pair_scratch
+    pair_place = b.pair_key if dev.is_cpu else b.pair_scratch  # either is written later
     program = dev.program(
         "raster/pairs",
         LANES=lanes(dev),
         RUN=CPU_RUN if dev.is_cpu else RUN,
-        MOST_BANDS=MOST_BANDS,
+        BUCKETS=BUCKETS,
         FOOTPRINT=FOOTPRINTS.index(points.footprint),
     )
     exclusive_scan(dev, points.point_count, b.point_offset)
@@ -117,9 +118,6 @@ def find_pairs(
         pair_place=pair_place,
         pixel_count=b.pixel_count,
     )
-    if dev.is_cpu:
-        _count_in_order(dev, program, b, n, pixels, room)
-    exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     pairs = Pairs(
         points.footprint,
         count,
@@ -129,6 +127,10 @@ def find_pairs(
         b.pair_point_closeness,
         b.pair_key,
     )
+    if dev.is_cpu:
+        _list_by_bucket(dev, program, b, n, pixels, room)
+        return pairs
+    exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     program.launch(
         "pairs_scatter",
         room,
@@ -139,45 +141,36 @@ def find_pairs(
         pixel_offset=b.pixel_offset,
         pair_key=b.pair_key,
     )
-    if dev.is_cpu:
-        program.launch(
-            "pairs_sort",
-            pixels,
-            hw=pixels,
-            pixel_offset=b.pixel_offset,
-            scratch=b.pair_scratch,
-            pair_key=b.pair_key,
-        )
-    else:
-        _sort_in_parallel(program, pairs, b.pair_scratch)
+    _sort_in_parallel(program, pairs, b.pair_scratch)
     return pairs
 
 
-def _count_in_order(dev, program, b, n, pixels, room):
-    """Write pixel_count, and the place of each pair in the list of its pixel."""
-    bands = min(MOST_BANDS, 1 << (dev.info["compute_units"].bit_length() - 1))
-    band_size = dev.scratch("bands", MOST_BANDS**2, np.uint32)
-    listed = b.pair_key  # written later
-    chunks = {
-        "n": n,
-        "p": room,
-        "bands": bands,
-        "point_offset": b.point_offset,
+def _list_by_bucket(dev, program, b, n, pixels, room):
+    """Write the keys, sorted, and pixel_offset."""
+    chunks = min(MOST_CHUNKS, dev.info["compute_units"])
+    stretch = (-(-pixels // BUCKETS) - 1).bit_length()  # 2^stretch pixels each
+    bucket_size = dev.scratch("buckets", BUCKETS * chunks, np.uint32)
+    shared = {
+        "chunks": chunks,
+        "stretch": stretch,
         "pair_pixel": b.pair_pixel,
-        "band_size": band_size,
+        "bucket_size": bucket_size,
     }
-    program.launch("pairs_band_sizes", bands, local=1, **chunks)
-    program.launch("pairs_split", bands, local=1, listed=listed, **chunks)
+    filled = {"n": n, "p": room, "point_offset": b.point_offset, **shared}
+    program.launch("pairs_bucket_sizes", chunks, local=1, **filled)
+    bucket_key = b.pair_scratch
     program.launch(
-        "pairs_count",
-        bands,
+        "pairs_bucket", chunks, local=1, pair_place=b.pair_key, bucket_key=bucket_key, **filled
+    )
+    program.launch(
+        "pairs_list",
+        ((pixels - 1) >> stretch) + 1,
         local=1,
         hw=pixels,
-        bands=bands,
-        band_size=band_size,
-        listed=listed,
-        pair_place=b.pair_scratch,
-        pixel_count=b.pixel_count,
+        bucket_key=bucket_key,
+        pixel_offset=b.pixel_offset,
+        pair_key=b.pair_key,
+        **shared,
     )
 
 
