@@ -28,15 +28,17 @@
 #endif
 
 // Asks for what lies at a global address before it is read, on CPUs, where walks over hits and
-// points wait mostly for what lies anywhere in memory. They look so many hits or points ahead.
+// points wait mostly for what lies anywhere in memory. They look so many hits or points ahead. A
+// simulator that cannot defines it as (void), too.
 #define HITS_AHEAD 32
 #define POINTS_AHEAD 8
-#define READ_AHEAD(address)
-#if LANES == 16 && defined(__has_builtin)
+#if LANES == 16 && !defined(READ_AHEAD) && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
-#undef READ_AHEAD
 #define READ_AHEAD(address) __builtin_prefetch((global const char *)(address))
 #endif
+#endif
+#ifndef READ_AHEAD
+#define READ_AHEAD (void)
 #endif
 
 typedef LANED(float) floats;
