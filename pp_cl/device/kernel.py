@@ -43,9 +43,7 @@ SCALARS = {
     "double": np.float64,
 }
 
-_KERNEL = re.compile(
-    r"^(?:__)?kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s*)?void\s+(\w+)\s*\(", re.MULTILINE
-)
+_KERNEL = re.compile(r"^kernel\s+void\s+(\w+)\s*\(", re.MULTILINE)
 _PARAMETER = re.compile(
     r"^(?:(global|constant|local)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
     r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$"

@@ -24,7 +24,7 @@ def helpers_without_static(source):
 
 def silent_kernels(source):
     """The lines above a kernel say who a work-item is, what it reads and what it writes."""
-    heads = re.finditer(r"^kernel\b[^(]*(?:\(\(.*?\)\))?[^(]*?(\w+)\(", source, re.M)
+    heads = re.finditer(r"^kernel\b[^(]*?(\w+)\(", source, re.M)
     above = {m[1]: source[: m.start()].splitlines()[-1:] for m in heads}
     return [f"{n}: no comment above it" for n, x in above.items() if not x or x[0][:2] != "//"]
 
@@ -39,7 +39,7 @@ PLANTED = [
     (silent_kernels, "kernel void f(\n    const int n)\n{\n}", "f: no comment above it"),
     (
         silent_kernels,
-        "// f\n\nkernel __attribute__((vec_type_hint(float16))) void f(\n    const int n)\n{\n}",
+        "// f\n\nkernel void f(\n    const int n)\n{\n}",
         "f: no comment above it",
     ),
 ]
@@ -69,6 +69,17 @@ def test_a_planted_violation_is_found(check, source, expected):
 def test_the_rule_holds_everywhere(check):
     found = {name: check(source) for name, source in SOURCES.items()}
     assert not {name: complaints for name, complaints in found.items() if complaints}
+
+
+def included(name):
+    """The headers that a file includes, and those that these do."""
+    found = set(re.findall(r'#include "(.*)"', SOURCES[name]))
+    return found.union(*map(included, found))
+
+
+def test_kernels_are_declared_by_the_macro_of_common_h():
+    kernels = [name for name in SOURCES if name.endswith(".cl")]
+    assert not [name for name in kernels if "common.h" not in included(name)]
 
 
 def test_headers_are_included():
