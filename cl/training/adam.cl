@@ -47,27 +47,3 @@ kernel void ema_update(
     const floats a = load_lanes(ema + i, count);
     store_lanes(a + weight * (load_lanes(parameter + i, count) - a), ema + i, count);
 }
-
-// One work-item per LANES values: the same of an EMA of 16 bits; a weight of 1 copies.
-kernel void ema_update_half(
-    const uint n,                   // values, a multiple of LANES
-    const float weight,             // of the parameter
-    global const float *parameter,  // (...) n values
-    global half *ema)               // (...) n values
-{
-    const size_t i = get_global_id(0);
-    if (LANES * i >= n) return;
-    const floats now = load_lanes(parameter + LANES * i, LANES), a = LANED(vload_half)(i, ema);
-    LANED(vstore_half)(weight < 1.0f ? a + weight * (now - a) : now, i, ema);
-}
-
-// One work-item per LANES values: writes an EMA of 16 bits to a parameter.
-kernel void ema_take_half(
-    const uint n,             // values, a multiple of LANES
-    global const half *ema,   // (...) n values
-    global float *parameter)  // (...) n values
-{
-    const size_t i = get_global_id(0);
-    if (LANES * i >= n) return;
-    store_lanes(LANED(vload_half)(i, ema), parameter + LANES * i, LANES);
-}

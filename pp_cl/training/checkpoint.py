@@ -12,7 +12,7 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import parameter_table, unet_layers
-from pp_cl.raster.points import SH_DEGREES, sh_blocks
+from pp_cl.raster.points import SH_DEGREES
 from pp_cl.scene.grid import MOST_VERTICES, Grid
 from pp_cl.scene.identity import kept_views
 from pp_cl.training.exposure import decided_at
@@ -152,10 +152,10 @@ def stored_forms(
 
 def _training_state(config, n, step, network):
     """The table of what is there until the last step is done."""
-    blocks, settings = sh_blocks(config.points.sh_degree), config.train
+    settings = config.train
     points = PointState.table(n)
     table = {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
     if settings.ema and step >= ema_start(settings.iterations):
-        points |= {f"a.{name}": row for name, row in PointState.ema_table(n, blocks).items()}
+        points |= {f"a.{name}": row for name, row in PointState.ema_table(n).items()}
         table |= {f"average.{name}": row for name, row in network.items()}
     return table | {f"state.{name}": row for name, row in points.items()}

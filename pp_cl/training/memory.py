@@ -205,7 +205,7 @@ class Room:
         }
         point = table_bytes(learned) + VIEW_POINT + NEIGHBOURS * (train.sh_smoothing > 0)
         if is_averaged:
-            point += table_bytes(PointState.ema_table(1, blocks))
+            point += table_bytes(PointState.ema_table(1))
         step = share * (pairs * TRAINED_PAIR + shown * TRAINED_FEATURES)
         preview = pairs * PAIR + shown * FEATURES  # takes turns with a step
         trained, rendered, widest = MAPS[config.network.blocks]

@@ -87,25 +87,25 @@ class Optimiser:
         """Update the EMA of points and network: average += weight * (parameter - average); the
         first call starts them as copies.
         """
-        rows = PointState.ema_table(self.model.cloud.count, self.model.cloud.blocks)
-        rows["network"] = self.model.net.all_parameters.shape, np.float32
         for averages, parameters in self._averaged():
             for name, parameter in parameters.items():
-                first = name not in averages
-                if first:
-                    averages[name] = self.dev.empty(*rows[name])
-                ema_update(self.dev, averages[name], parameter, 1.0 if first else weight)
+                if name in averages:
+                    ema_update(self.dev, averages[name], parameter, weight)
+                else:
+                    averages[name] = self.dev.empty(parameter.shape)
+                    self.dev.copy(averages[name], parameter)
 
     def apply_ema(self) -> None:
         """Copy the EMA, if there is one, into the model's parameters, and release it."""
         for averages, parameters in self._averaged():
             for name in list(averages):
-                ema_take(self.dev, averages.pop(name), parameters[name])
+                self.dev.copy(parameters[name], averages.pop(name))
 
     def _averaged(self):
         """[(averages, the parameters of the same names)] of the points and of the network."""
+        learned = self.model.cloud.learned()
         return [
-            (self.state.averages, self.model.cloud.learned()),
+            (self.state.averages, {name: learned[name] for name in PointState.ema_table(0)}),
             (self.averages, {"network": self.model.net.all_parameters}),
         ]
 
@@ -174,33 +174,16 @@ def adam_update(
 
 
 def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None:
-    """Move an EMA, in place: ema += weight * (parameter - ema). A weight of 1 copies, whatever it
-    held.
+    """Move an EMA, in place: ema += weight * (parameter - ema).
 
-    ema, parameter: float32 arrays of one shape, any; or an EMA of float16, of a multiple of 16
-    values. Raises ValueError when the shapes differ.
+    ema, parameter: float32 arrays of one shape, any. Raises ValueError when the shapes differ.
     """
     _same_shape(ema, parameter)
-    if ema.dtype == np.float16:
-        _launch_ema(dev, "ema_update_half", parameter, ema, weight=weight)
-    elif weight == 1:
-        dev.copy(ema, parameter)
-    else:
-        _launch_ema(dev, "ema_update", parameter, ema, weight=weight)
-
-
-def ema_take(dev: Device, ema: Array, parameter: Array) -> None:
-    """Overwrite a parameter by its EMA, both as ema_update() takes them."""
-    if ema.dtype == np.float16:
-        _launch_ema(dev, "ema_take_half", parameter, ema)
-    else:
-        dev.copy(parameter, ema)
-
-
-def _launch_ema(dev, kernel, parameter, ema, **weight):
     n = parameter.size
     program = dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2)
-    program.launch(kernel, -(-n // lanes(dev)), n=n, parameter=parameter, ema=ema, **weight)
+    program.launch(
+        "ema_update", -(-n // lanes(dev)), n=n, weight=weight, parameter=parameter, ema=ema
+    )
 
 
 def rmsprop_update(

@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table, compact_rows, gather_rows
 from pp_cl.device.device import Device
-from pp_cl.raster.points import PointCloud, ShBlock
+from pp_cl.raster.points import PointCloud, sh_blocks
 
 
 class PointState:
@@ -33,13 +33,13 @@ class PointState:
         }
 
     @staticmethod
-    def ema_table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
-        """The averages of n points: those of the SH coefficients in 16 bits, whose rounding is far
-        below what ten updates a time constant leave of their noise.
+    def ema_table(n: int) -> Table:
+        """The averages of n points: of all but their harmonics above degree 0, whose averages would
+        take most of the memory and gain 0.02 dB (docs/recipe.md).
         """
-        table = PointCloud.table(n, blocks)
+        table = PointCloud.table(n, sh_blocks(0))
         del table["ids"]
-        return table | {block.name: (table[block.name][0], np.float16) for block in blocks}
+        return table
 
     @property
     def max_weight(self) -> Array:

@@ -32,7 +32,7 @@ def kept(dev, weights, least_weight, opacities, seen=None, least=1):
 def filled(dev, cloud, rng):
     """A state of the cloud, averages among it, of random numbers."""
     state = PointState(dev, cloud)
-    averages = PointState.ema_table(cloud.count, cloud.blocks)
+    averages = PointState.ema_table(cloud.count)
     state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
     for array in state.arrays().values():
         array.set((1e3 * rng.random(array.shape)).astype(array.dtype))
@@ -65,7 +65,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     del array  # else it is not released
     state = filled(dev, cloud, rng)
     host = fetched(cloud.arrays(dev) | state.arrays())
-    assert len(host) == 6 + 2 + 2 + 6 + 2
+    assert len(host) == 6 + 2 + 2 + 3 + 2
     keep = np.arange(0, 1000, share, dtype=np.uint32)
     indices = dev.upload(keep)
     before, dev.peak_bytes = dev.bytes, dev.bytes
@@ -79,7 +79,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     old, new = (
         PointCloud.table(n, cloud.blocks)
         | PointState.table(n)
-        | {f"ema.{name}": row for name, row in PointState.ema_table(n, cloud.blocks).items()}
+        | {f"ema.{name}": row for name, row in PointState.ema_table(n).items()}
         for n in (1000, cloud.count)
     )
     small = [name for name in new if table_bytes({name: new[name]}) <= scratch]
