@@ -83,10 +83,13 @@ kernel void softmax_gradient(
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
-    const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
+    const uint begin = pixel_offset[q], count = min(pixel_offset[q + 1] - begin, tracked);
+    uint end = begin;
+    for (; end < begin + count && (uint)pixel_entry[end] != NONE; end++)
+        READ_AHEAD(shaded_features + point_slot[(uint)pixel_entry[end]]);
     const float16 G = grad_features[q];
     const float rest = dot16(G, features[q]);
-    for (uint i = begin; i < begin + min(count, tracked) && (uint)pixel_entry[i] != NONE; i++) {
+    for (uint i = begin; i < end; i++) {
         const float own = dot16(G, shaded_features[point_slot[(uint)pixel_entry[i]]]);
         const float b = upper_float(pixel_entry[i]);
         pair_gradient[(uint)pair_key[i]] = (float2)(b, pixel_slope[i] * (own - rest));
