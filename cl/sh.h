@@ -32,8 +32,8 @@ static inline void sh_basis_of_point(global const float *camera, const float4 po
     sh_basis(c.x * cam.right + c.y * cam.down + c.z * cam.forward, basis);
 }
 
-// Asks for the coefficients of the point whose turn it is in a while, where they are arrays of rows
-// of `width` elements.
+// READ_AHEAD() of all coefficients of point i in sh_0, sh_1, sh_2a and sh_2b, up to DEGREE. width:
+// elements of a row of 16 channels, 1 of float16 or 16 of half.
 #define SH_READ_AHEAD(i, width)                                                                    \
     {                                                                                              \
         const size_t row = (size_t)(i) * (width);                                                  \

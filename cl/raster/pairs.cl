@@ -23,7 +23,7 @@
 #define PLACE(pixel) (LANES > 1 ? 0u : atomic_inc(&pixel_count[pixel]))
 
 #ifndef BUCKETS
-#define BUCKETS 256  // at most
+#define BUCKETS 256  // at most, of a power of two of pixels each
 #endif
 
 // Of `total` pairs, the first one of a chunk.
@@ -218,7 +218,7 @@ merge(global const ulong *keys, const uint middle, const uint count, global ulon
     }
 }
 
-// Sorts `count` keys, which are ordered by pair, in place.
+// Sorts `count` keys, which are ordered by pair, in place. other: memory for as many.
 static inline void sort_list(global ulong *keys, const uint count, global ulong *other) {
     if (count <= FEW) {
         for (uint i = 1; i < count; i++) {
@@ -289,7 +289,7 @@ kernel void pairs_list(
     if (last == hw) pixel_offset[hw] = end;
 }
 
-// One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
+// One work-item per pair, on GPUs: writes its key at its place. Bits of floats >= 0 sort like the floats.
 kernel void pairs_scatter(
     const uint p,                     // pairs for which there is room
     const uint hw,                    // pixels

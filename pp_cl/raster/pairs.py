@@ -77,8 +77,8 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
         "pair_pixel": ((pairs,), np.uint32),
         "pair_point_closeness": ((pairs, 2), np.uint32),
         "pair_key": ((pairs,), np.uint64),
-        # of each pair its depth and place, or its key by bucket, then for sorting keys, at last the
-        # entries of weights.py
+        # on GPUs the depth and place of each pair, on CPUs its key by bucket; then for sorting
+        # keys, at last the entries of weights.py
         "pair_scratch": ((pairs,), np.uint64),
     }
 
@@ -91,7 +91,7 @@ def find_pairs(
     """
     n, pixels = len(points.point_box), size[0] * size[1]
     b.require(pairs_table(n, pixels, room))
-    pair_place = b.pair_key if dev.is_cpu else b.pair_scratch  # either is written later
+    pair_place = b.pair_key if dev.is_cpu else b.pair_scratch  # until the keys are written
     program = dev.program(
         "raster/pairs",
         LANES=lanes(dev),
