@@ -34,7 +34,8 @@
 #define POINTS_AHEAD 8
 #if LANES == 16 && !defined(READ_AHEAD) && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
-#define READ_AHEAD(address) __builtin_prefetch((global const char *)(address))
+// through a number, since its argument is a pointer to private memory
+#define READ_AHEAD(address) __builtin_prefetch((const void *)(uintptr_t)(address))
 #endif
 #endif
 #ifndef READ_AHEAD
