@@ -173,10 +173,13 @@ kernel void alpha_gradient(
 kernel void blend_backward(
     const uint s,                              // visible points
     const float edge,                          // of the grid, world units
+    const float radius,                        // of a point without offsets, world units
     global const uint *shaded,                 // (S) their indices
     global const float *camera,                // (20) camera.h
-    global const float *point_radius,          // (N) read with MOVES, as the next two
+    global const float *point_radius,          // (N) read with MOVES, as the next ones
     global const float4 *point_camera,         // (N, 4) x, y, z, distance
+    global const float4 *point_white,          // (?, 4) (N, 4) read of Gaussians, as the next one
+    global const float *cloud_offset,          // (?, OFFSETS) (N, OFFSETS), cloud.h
     global const float *opacity,               // (N)
     global const uint *point_offset,           // (N+1)
     global const uint *pair_pixel,             // (P)
@@ -185,14 +188,18 @@ kernel void blend_backward(
     global const float16 *grad_features,       // (H, W, 16) G
     global float16 *grad_shaded_features,      // (?, 16) a row for each
     global float *grad_opacity,                // (?) alike
-    global float4 *grad_offset)                // (?, 4) alike, with MOVES
+    global float *grad_offset)                 // (?, OFFSETS) alike, with MOVES
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
     const Camera cam = camera_load(camera);
     OffsetGradient moved;
-    if (MOVES) moved = offset_begin(&cam, point_camera[i], point_radius[i]);
+#if MOVES && FOOTPRINT == GAUSSIAN
+    moved = offset_begin(&cam, point_camera[i], point_white[i]);
+#elif MOVES
+    moved = offset_begin(&cam, point_camera[i], point_radius[i]);
+#endif
     floats dL_df = 0.0f;
     float dL_do = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
@@ -209,5 +216,10 @@ kernel void blend_backward(
     store_part(dL_df, grad_shaded_features, g);
     if (ROW_PART != 0) return;
     grad_opacity[g] = dL_do;
-    if (MOVES) grad_offset[g] = offset_end(&moved, &cam, edge);
+#if MOVES && FOOTPRINT == GAUSSIAN
+    OFFSETS_AT(grad_offset, g) =
+        offset_end(&moved, &cam, edge, radius, OFFSETS_AT(cloud_offset, i));
+#elif MOVES
+    OFFSETS_AT(grad_offset, g) = offset_end(&moved, &cam, edge);
+#endif
 }

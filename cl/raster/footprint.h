@@ -9,10 +9,11 @@
 #define DISC 0    // hard disc of the paper: d = 1 everywhere
 #define SOFT 1    // d falls linearly from the centre to the rim (ours)
 #define SPHERE 2  // Pulsar's sphere: depth of its front, sub-pixel rule, any radius
-// The Gaussian of 3D Gaussian splatting, as its viewers draw it: d = exp(-distance^2 / 2 variance),
-// the radius being the deviation, with LOW_PASS pixels^2 added to the variance.
+// The Gaussian of 3D Gaussian splatting, as its viewers draw it: d = exp(-|s|^2 / 2) with s the
+// distance from the centre in deviations, on the screen, where its covariance is J C J^T + LOW_PASS I:
+// C in space, J the derivative of the projection in the centre. Its depth is along the camera's axis.
 #define GAUSSIAN 3
-#define LOW_PASS 0.3f
+#define LOW_PASS 0.3f                // pixels^2
 #define LEAST_ALPHA (1.0f / 255.0f)  // of a hit: below it viewers draw nothing
 #define MOST_ALPHA 0.99f
 #define DEVIATIONS 3.33f  // to the rim, where an opaque one falls below LEAST_ALPHA
@@ -32,15 +33,6 @@ static inline float least_focal(const Camera *cam) {
     return fmin(cam->fx, cam->fy);
 }
 
-// Of a Gaussian in pixels, world units^2. z: along the camera's axis.
-#define VARIANCE(cam, radius, z)                                                                   \
-    ((radius) * (radius) + LOW_PASS * ((z) / least_focal(cam)) * ((z) / least_focal(cam)))
-
-// From the ray to the rim of a Gaussian, world units.
-ALWAYS_INLINE floats gaussian_reach(const Camera *cam, const floats radius, const floats z) {
-    return DEVIATIONS * sqrt(VARIANCE(cam, radius, z));
-}
-
 // The footprints of LANES neighbouring points, one lane each.
 typedef struct {
     floats x, y, z;     // centre, camera axes
@@ -55,10 +47,15 @@ typedef struct {
     // reciprocals, since dividing 16 lanes by one number is slower than multiplying them
     floats per_reach;
     float per_fx, per_fy;
+#if FOOTPRINT == GAUSSIAN
+    floats u, v;      // centre, pixels
+    floats white[3];  // deviations at (x, y) pixels from it: (white[0] x + white[1] y, white[2] y)
+#endif
 } Footprints;
 
 // Fills in the fields that follow from the others.
 ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
+#pragma OPENCL FP_CONTRACT OFF
     f->columns = f->rows = 0;
     UNROLLED for (uint j = 0; j < LANES; j++) {
         f->columns = max(f->columns, f->box[2][j] - f->box[0][j] + 1);
@@ -67,11 +64,14 @@ ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
     const floats width = f->t / least_focal(cam);
     f->least = LEAST_RADIUS * width;
     f->tiny = f->radius < width;
-    f->reach =
-        FOOTPRINT == GAUSSIAN ? gaussian_reach(cam, f->radius, f->z) : fmax(f->radius, f->least);
+    f->reach = fmax(f->radius, f->least);
     f->per_reach = 1.0f / f->reach;
     f->per_fx = 1.0f / cam->fx;
     f->per_fy = 1.0f / cam->fy;
+#if FOOTPRINT == GAUSSIAN
+    f->u = f->x / f->z * cam->fx + cam->cx;
+    f->v = f->y / f->z * cam->fy + cam->cy;
+#endif
 }
 
 // The squared length. A function of vectors: else PoCL splits them in those that it is called from.
@@ -81,6 +81,25 @@ ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
 }
 
 // Tests pixel (column, row) of each point's box: lanes that hit are not 0.
+#if FOOTPRINT == GAUSSIAN
+ALWAYS_INLINE ints footprints_hit(
+    const Camera *cam,
+    const Footprints *f,
+    const int column,
+    const int row,
+    floats *closeness,
+    floats *depth) {
+#pragma OPENCL FP_CONTRACT OFF
+    const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
+    const floats dx = LANED(convert_float)(x) + 0.5f - f->u;
+    const floats dy = LANED(convert_float)(y) + 0.5f - f->v;
+    const floats sx = f->white[0] * dx + f->white[1] * dy, sy = f->white[2] * dy;
+    const floats s2 = sx * sx + sy * sy;
+    *closeness = exp(-0.5f * s2);
+    *depth = f->z;
+    return x <= LANES_FROM(f->box[2]) && y <= LANES_FROM(f->box[3]) && s2 < DEVIATIONS * DEVIATIONS;
+}
+#else
 ALWAYS_INLINE ints footprints_hit(
     const Camera *cam,
     const Footprints *f,
@@ -104,12 +123,7 @@ ALWAYS_INLINE ints footprints_hit(
     const floats ex = f->y - f->z * my, ey = f->z * mx - f->x, ez = f->x * my - f->y * mx;
     const floats across2 = square(ex, ey, ez);  // the distance, squared, times m2
     hit = hit && across2 < f->reach * f->reach * m2 && f->x * mx + f->y * my + f->z > 0.0f;
-#if FOOTPRINT == GAUSSIAN
-    const floats deviations = f->per_reach * DEVIATIONS;
-    *closeness = exp(-0.5f * across2 / m2 * deviations * deviations);
-#else
     *closeness = FOOTPRINT == DISC ? (floats)(1.0f) : 1.0f - sqrt(across2 / m2) * f->per_reach;
-#endif
     *depth = f->t;
 #else
     const floats inverse = 1.0f / sqrt(m2);
@@ -129,5 +143,6 @@ ALWAYS_INLINE ints footprints_hit(
 #endif
     return hit;
 }
+#endif
 
 #endif

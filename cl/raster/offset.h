@@ -1,29 +1,98 @@
 // Gradients of the offsets of soft points and of Gaussians, composited by alpha: what moving and
-// widening a point changes by the closeness d of its hits. How the order of hits and the harmonics
+// shaping a point changes by the closeness d of its hits. How the order of hits and the harmonics
 // change is left out.
+#ifndef PP_OFFSET_H
+#define PP_OFFSET_H
+
+#include "cloud.h"
+#include "raster/footprint.h"
+
+#if FOOTPRINT == GAUSSIAN
+// d = exp(-|s|^2 / 2), s = W e with e from the centre u to the pixel; S = (W^T W)^-1 is the covariance
+// on the screen. With w = W^T s = S^-1 e:
+// dd/du = d w,   dd/dS = d w w^T / 2
 //
+// S = A A^T + LOW_PASS I, A = M L, with the rows m of M as project.cl has them and G = sum dL/dd d w w^T:
+// dL/dA = G A,   dL/dL = M^T dL/dA,   dL/dM = dL/dA L^T
+// m_0 = fx/z (right - x/z forward):   dm_0/dx = -fx/z^2 forward,   dm_0/dz = -m_0/z + fx x/z^3 forward
+
+typedef struct {
+    float3 centre;  // of the point, camera axes
+    float2 place;   // the same on the screen, pixels
+    float3 white;
+    float2 dL_du;
+    float3 G;  // xx, xy, yy
+} OffsetGradient;
+
+// Nothing is summed yet. centre: in camera axes, with the range. white: of Footprints.
+static inline OffsetGradient
+offset_begin(const Camera *cam, const float4 centre, const float4 white) {
+    OffsetGradient sum;
+    sum.centre = centre.xyz;
+    sum.place =
+        (float2)(centre.x / centre.z * cam->fx + cam->cx, centre.y / centre.z * cam->fy + cam->cy);
+    sum.white = white.xyz;
+    sum.dL_du = 0.0f;
+    sum.G = 0.0f;
+    return sum;
+}
+
+// Adds what one hit in pixel q says, of closeness d > 0.
+static inline void
+offset_add(OffsetGradient *sum, const Camera *cam, const uint q, const float d, const float dL_dd) {
+    const float2 pixel = (float2)(q % cam->width + 0.5f, q / cam->width + 0.5f);
+    const float2 e = pixel - sum->place;
+    const float sx = sum->white.x * e.x + sum->white.y * e.y, sy = sum->white.z * e.y;
+    const float2 w = (float2)(sum->white.x * sx, sum->white.y * sx + sum->white.z * sy);
+    const float dL = dL_dd * d;
+    sum->dL_du += dL * w;
+    sum->G += dL * (float3)(w.x * w.x, w.x * w.y, w.y * w.y);
+}
+
+// Of the offset from the vertex, in edges of the grid, and of the triangle. offset: the point's own.
+static inline float16 offset_end(
+    const OffsetGradient *sum,
+    const Camera *cam,
+    const float edge,
+    const float radius,
+    const float16 offset) {
+    const float x = sum->centre.x, y = sum->centre.y, z = sum->centre.z;
+    const float fx = cam->fx / z, fy = cam->fy / z;
+    const float3 m0 = fx * (cam->right - x / z * cam->forward);
+    const float3 m1 = fy * (cam->down - y / z * cam->forward);
+    // the rows of L
+    const float3 l0 = radius * (float3)(exp(offset.s3), 0.0f, 0.0f);
+    const float3 l1 = radius * (float3)(offset.s6, exp(offset.s4), 0.0f);
+    const float3 l2 = radius * (float3)(offset.s7, offset.s8, exp(offset.s5));
+    const float3 a0 = m0.x * l0 + m0.y * l1 + m0.z * l2, a1 = m1.x * l0 + m1.y * l1 + m1.z * l2;
+    const float3 b0 = sum->G.x * a0 + sum->G.y * a1, b1 = sum->G.y * a0 + sum->G.z * a1;
+    const float3 dL_dm0 = (float3)(dot(l0, b0), dot(l1, b0), dot(l2, b0));
+    const float3 dL_dm1 = (float3)(dot(l0, b1), dot(l1, b1), dot(l2, b1));
+    const float ahead0 = dot(dL_dm0, cam->forward), ahead1 = dot(dL_dm1, cam->forward);
+    const float dL_dx = fx * (sum->dL_du.x - ahead0 / z);
+    const float dL_dy = fy * (sum->dL_du.y - ahead1 / z);
+    const float dL_dz = -(x * dL_dx + y * dL_dy + dot(dL_dm0, m0) + dot(dL_dm1, m1)) / z;
+    const float3 place = edge * (dL_dx * cam->right + dL_dy * cam->down + dL_dz * cam->forward);
+    const float3 of_1 = m0.y * b0 + m1.y * b1, of_2 = m0.z * b0 + m1.z * b1;  // rows of dL/dL
+    return (float16)(place, l0.x * (m0.x * b0.x + m1.x * b1.x), l1.y * of_1.y, l2.z * of_2.z,
+                     radius * of_1.x, radius * of_2.x, radius * of_2.y, (float4)(0.0f),
+                     (float3)(0.0f));
+}
+#else
 // d = 1 - rho / h with rho = |e|, e = c - (c.r) r: of the centre c from the unit ray r
 // dd/dc = -e / (rho h),   dL/dd = o/d dL/do (alpha.cl)
 // With m along the ray, of any length: e = c - (c.m)/(m.m) m, which takes no root.
 //
 // dd/d(log h) = rho / h = 1 - d. The least h is not the point's own and grows with the range t = |c|:
 // then dd/dc has rho/h^2 dh/dc = (1 - d) c/t^2 more instead.
-//
-// Gaussian: d = exp(-rho^2 / 2v), v = r^2 + LOW_PASS w^2, with the width w = z / f of a pixel
-// dd/dc = -d e/v + d rho^2/v (LOW_PASS w^2/v) / z along the axis,   dd/d(log r) = d rho^2/v r^2/v
-#ifndef PP_OFFSET_H
-#define PP_OFFSET_H
-
-#include "raster/footprint.h"
 
 #define LEAST_RHO 1e-3f  // of h: nearer to its ray a point has no direction away from it
 
 typedef struct {
     float3 centre;  // of the point, camera axes
     float per_fx, per_fy;
-    float h;              // radius of its footprint, world units
-    float growth;         // dh/dc = growth h c where h is the least one, else 0
-    float variance, own;  // v of a Gaussian, and the share r^2/v of it
+    float h;       // radius of its footprint, world units
+    float growth;  // dh/dc = growth h c where h is the least one, else 0
     float3 dL_dc;
     float dL_dlog;  // of h
 } OffsetGradient;
@@ -38,8 +107,6 @@ offset_begin(const Camera *cam, const float4 centre, const float radius) {
     sum.per_fy = 1.0f / cam->fy;
     sum.h = h;
     sum.growth = h > radius ? 1.0f / (t * t) : 0.0f;
-    sum.variance = VARIANCE(cam, radius, centre.z);
-    sum.own = radius * radius / sum.variance;
     sum.dL_dc = 0.0f;
     sum.dL_dlog = 0.0f;
     return sum;
@@ -51,24 +118,17 @@ offset_add(OffsetGradient *sum, const Camera *cam, const uint q, const float d, 
     const float mx = (q % cam->width + 0.5f - cam->cx) * sum->per_fx;
     const float my = (q / cam->width + 0.5f - cam->cy) * sum->per_fy;
     const float3 m = (float3)(mx, my, 1.0f), c = sum->centre, e = c - dot(c, m) / dot(m, m) * m;
-#if FOOTPRINT == GAUSSIAN
-    const float exponent = dot(e, e) / sum->variance, dL = dL_dd * d;
-    sum->dL_dlog += dL * exponent * sum->own;
-    sum->dL_dc -= dL / sum->variance * e;
-    sum->dL_dc.z += dL * exponent * (1.0f - sum->own) / c.z;
-#else
     const float per_rho_h = 1.0f / (fmax(1.0f - d, LEAST_RHO) * sum->h * sum->h);
     sum->dL_dlog += dL_dd * (1.0f - d);
     sum->dL_dc += dL_dd * (sum->growth * (1.0f - d) * c - per_rho_h * e);
-#endif
 }
 
 // Of the offset from the vertex, in edges of the grid, and of the logarithm of the radius.
 static inline float4 offset_end(const OffsetGradient *sum, const Camera *cam, const float edge) {
     const float3 of = sum->dL_dc;
     const float3 world = edge * (of.x * cam->right + of.y * cam->down + of.z * cam->forward);
-    const bool is_least = FOOTPRINT != GAUSSIAN && sum->growth > 0.0f;
-    return (float4)(world, is_least ? 0.0f : sum->dL_dlog);
+    return (float4)(world, sum->growth > 0.0f ? 0.0f : sum->dL_dlog);
 }
+#endif
 
 #endif

@@ -37,7 +37,8 @@ ALWAYS_INLINE Footprints footprints_load(
     const uint count,
     global const float *point_radius,
     global const float4 *point_camera,
-    global const ushort4 *point_box) {
+    global const ushort4 *point_box,
+    global const float4 *point_white) {
     Footprints f;
     float place[4][LANES], radius[LANES];
     for (uint j = 0; j < LANES; j++) {
@@ -59,6 +60,16 @@ ALWAYS_INLINE Footprints footprints_load(
     f.z = LANES_FROM(place[2]);
     f.t = LANES_FROM(place[3]);
     f.radius = LANES_FROM(radius);
+#if FOOTPRINT == GAUSSIAN
+    for (uint j = 0; j < LANES; j++) {
+        const float4 white = point_white[first + min(j, count - 1)];
+        place[0][j] = white.x;
+        place[1][j] = white.y;
+        place[2][j] = white.z;
+    }
+    for (uint k = 0; k < 3; k++)
+        f.white[k] = LANES_FROM(place[k]);
+#endif
     footprints_prepare(cam, &f);
     return f;
 }
@@ -75,6 +86,7 @@ kernel void pairs_fill(
     global const float *point_radius,    // (N)
     global const float4 *point_camera,   // (N, 4) x, y, z, t
     global const ushort4 *point_box,     // (N, 4) first x, first y, last x, last y
+    global const float4 *point_white,    // (?, 4) (N, 4) Footprints.white of Gaussians; else unread
     global const uint *point_offset,     // (N+1) first pair of each point
     global uint *pair_pixel,             // (P)
     global uint2 *pair_point_closeness,  // (P, 2) point, bits of d in [0, 1]
@@ -86,7 +98,8 @@ kernel void pairs_fill(
     const uint count = min((uint)LANES, n - first);
     if (point_offset[first] == point_offset[first + count]) return;
     const Camera cam = camera_load(camera);
-    const Footprints f = footprints_load(&cam, first, count, point_radius, point_camera, point_box);
+    const Footprints f =
+        footprints_load(&cam, first, count, point_radius, point_camera, point_box, point_white);
     // of each point: its next pair, where they end, the first pixel of its box
     uint next[LANES], end[LANES], corner[LANES];
     for (uint j = 0; j < count; j++) {

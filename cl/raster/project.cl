@@ -4,14 +4,41 @@
 #include "camera.h"
 #include "grid.h"
 #include "lanes.h"
+#include "cloud.h"
 #include "raster/footprint.h"
 
 // Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside
 // the eye.
 #define LEAST_COSINE 1e-6f
 
-// First and last pixel that may be hit along one axis, before clipping to the image: -2 to size +
-// 1.
+#if FOOTPRINT == SPHERE
+// from floor(first) to ceil(last): Pulsar's box is part of its hit rule
+#define MARGIN 0.0f
+#define ROUND_FIRST 0
+#define ROUND_LAST 1
+#else
+#define MARGIN 0.01f  // pixels; far above the rounding of places
+#define ROUND_FIRST 1
+#define ROUND_LAST 0
+#endif
+
+// First and last pixel along one axis whose centres lie between two places, before clipping to the
+// image: -2 to size + 1. low, high: in pixels, less half of one; not bounded: of the whole image.
+ALWAYS_INLINE void pixels_between(
+    const floats low,
+    const floats high,
+    const ints bounded,
+    const float size,
+    ints *first,
+    ints *last) {
+    const floats from = clamp(select((floats)(-2.0f), low, bounded), -2.0f, size);
+    const floats to = clamp(select((floats)(size), high, bounded), -2.0f, size);
+    // x + 2 >= 0, so truncation is floor
+    *first = LANED(convert_int)(from + 2.0f) - 2 + ROUND_FIRST;
+    *last = LANED(convert_int)(to + 2.0f) - 2 + ROUND_LAST;
+}
+
+// First and last pixel that a sphere may hit along one axis.
 //
 // The tangents from the eye to a circle of radius r at (u, z), u = x or y, have slopes m with (m z
 // - u)^2 = r^2 (1 + m^2); a circle that reaches the eye's plane has no bounds.
@@ -24,23 +51,10 @@ ALWAYS_INLINE void tangents(
     const float size,
     ints *first,
     ints *last) {
-#if FOOTPRINT == SPHERE
-    // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
-    const float margin = 0.0f;
-    const int round_first = 0, round_last = 1;
-#else
-    const float margin = 0.01f;  // pixels; far above the rounding of the slopes
-    const int round_first = 1, round_last = 0;
-#endif
     const floats scale = z * z - reach * reach, root = reach * sqrt(u * u + scale);
-    const floats low = (u * z - root) / scale * focal + (centre - 0.5f - margin);
-    const floats high = (u * z + root) / scale * focal + (centre - 0.5f + margin);
-    const ints bounded = z > reach;
-    const floats from = clamp(select((floats)(-2.0f), low, bounded), -2.0f, size);
-    const floats to = clamp(select((floats)(size), high, bounded), -2.0f, size);
-    // x + 2 >= 0, so truncation is floor
-    *first = LANED(convert_int)(from + 2.0f) - 2 + round_first;
-    *last = LANED(convert_int)(to + 2.0f) - 2 + round_last;
+    const floats low = (u * z - root) / scale * focal + (centre - 0.5f - MARGIN);
+    const floats high = (u * z + root) / scale * focal + (centre - 0.5f + MARGIN);
+    pixels_between(low, high, z > reach, size, first, last);
 }
 
 // Whether circles around (u, z), u = x or y, come so near to the image along that axis that they
@@ -59,16 +73,72 @@ ALWAYS_INLINE ints reaches_image(
            (high * z - u >= -(1.0f + fabs(high)) * wide);
 }
 
+#if FOOTPRINT == GAUSSIAN
+// First and last pixel that a Gaussian may hit along one axis, by its variance there.
+ALWAYS_INLINE void gaussian_pixels(
+    const floats centre,
+    const floats variance,
+    const float size,
+    ints *first,
+    ints *last) {
+    const floats reach = DEVIATIONS * sqrt(variance);
+    const floats low = centre - reach - (0.5f + MARGIN), high = centre + reach - (0.5f - MARGIN);
+    pixels_between(low, high, variance > 0.0f, size, first, last);
+}
+
+// How a Gaussian at (x, y, z) in camera axes spreads on the screen. lower: L of its covariance L L^T
+// in world axes: its diagonal, then (1, 0), (2, 0), (2, 1). Writes the variances along x and y, and
+// Footprints.white.
+//
+// With the derivative J of the projection and A = J R L, the covariance S = A A^T + LOW_PASS I has
+// the determinant |a_0 x a_1|^2 + LOW_PASS (|a_0|^2 + |a_1|^2) + LOW_PASS^2, a sum without
+// cancellation. white is the inverse of a triangle U with S = U U^T.
+ALWAYS_INLINE void gaussian_spread(
+    const Camera *cam,
+    const floats x,
+    const floats y,
+    const floats z,
+    const floats lower[6],
+    floats *variance_x,
+    floats *variance_y,
+    floats white[3]) {
+    const floats across[2] = {x / z, y / z}, scale[2] = {cam->fx / z, cam->fy / z};
+    floats a[2][3];
+    for (int row = 0; row < 2; row++) {
+        const float3 axis = row ? cam->down : cam->right;
+        const floats m0 = scale[row] * (axis.x - across[row] * cam->forward.x);
+        const floats m1 = scale[row] * (axis.y - across[row] * cam->forward.y);
+        const floats m2 = scale[row] * (axis.z - across[row] * cam->forward.z);
+        a[row][0] = m0 * lower[0] + m1 * lower[3] + m2 * lower[4];
+        a[row][1] = m1 * lower[1] + m2 * lower[5];
+        a[row][2] = m2 * lower[2];
+    }
+    const floats xx = square(a[0][0], a[0][1], a[0][2]), yy = square(a[1][0], a[1][1], a[1][2]);
+    const floats xy = a[0][0] * a[1][0] + a[0][1] * a[1][1] + a[0][2] * a[1][2];
+    const floats wide = square(
+        a[0][1] * a[1][2] - a[0][2] * a[1][1], a[0][2] * a[1][0] - a[0][0] * a[1][2],
+        a[0][0] * a[1][1] - a[0][1] * a[1][0]);
+    const floats determinant = wide + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS;
+    *variance_x = xx + LOW_PASS;
+    *variance_y = yy + LOW_PASS;
+    white[2] = 1.0f / sqrt(*variance_y);
+    white[0] = 1.0f / (sqrt(determinant) * white[2]);
+    white[1] = -xy * white[2] / sqrt(determinant);
+}
+#endif
+
 // Points in world axes to camera axes, each with the box of pixels that it may hit; false if none
 // hits any, as it is for most points of a crop, and nothing else is known of them then. A point is
 // culled, with (0, 0, 0, -1) and no pixel, if it is too near or too far (measured at the sphere's
-// front, as in Pulsar), behind the eye, or not finite, for which every comparison is false.
+// front, as in Pulsar), behind the eye, or not finite, for which every comparison is false. lower:
+// of Gaussians, as gaussian_spread() has it.
 ALWAYS_INLINE bool project(
     const Camera *cam,
     const floats x,
     const floats y,
     const floats z,
     const floats radius,
+    const floats lower[6],
     Footprints *f) {
     const floats vx = x - cam->eye.x, vy = y - cam->eye.y, vz = z - cam->eye.z;
     const floats cx = cam->right.x * vx + cam->right.y * vy + cam->right.z * vz;
@@ -78,16 +148,21 @@ ALWAYS_INLINE bool project(
     const floats front = t - radius;
     const ints kept =
         (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
-    const floats least = LEAST_RADIUS * t / least_focal(cam);
-    const floats wide =
-        FOOTPRINT == GAUSSIAN ? gaussian_reach(cam, radius, cz) : fmax(radius, least);
+    ints x0, y0, x1, y1;
+#if FOOTPRINT == GAUSSIAN
+    floats variance_x, variance_y;
+    gaussian_spread(cam, cx, cy, cz, lower, &variance_x, &variance_y, f->white);
+    gaussian_pixels(cx / cz * cam->fx + cam->cx, variance_x, cam->width, &x0, &x1);
+    gaussian_pixels(cy / cz * cam->fy + cam->cy, variance_y, cam->height, &y0, &y1);
+#else
+    const floats wide = fmax(radius, LEAST_RADIUS * t / least_focal(cam));
     const floats reach = FOOTPRINT == SPHERE ? radius : wide;
     const ints near_image = reaches_image(cx, cz, wide, cam->fx, cam->cx, cam->width) &
                             reaches_image(cy, cz, wide, cam->fy, cam->cy, cam->height);
     if (!ANY_LANE(kept & near_image)) return false;
-    ints x0, y0, x1, y1;
     tangents(cx, cz, reach, cam->fx, cam->cx, cam->width, &x0, &x1);
     tangents(cy, cz, reach, cam->fy, cam->cy, cam->height, &y0, &y1);
+#endif
     x0 = max(x0, (ints)(0));
     y0 = max(y0, (ints)(0));
     x1 = min(x1, (ints)(cam->width - 1));
@@ -128,7 +203,8 @@ ALWAYS_INLINE void store_points(
     const uint count,
     global float4 *point_camera,
     global ushort4 *point_box,
-    global uint *point_count) {
+    global uint *point_count,
+    global float4 *point_white) {
     if (!any_hit) {
         for (uint j = 0; j < count; j++)
             point_count[first + j] = 0;
@@ -147,6 +223,13 @@ ALWAYS_INLINE void store_points(
         point_box[i] = (ushort4)(f->box[0][j], f->box[1][j], f->box[2][j], f->box[3][j]);
         point_count[i] = hits[j];
     }
+#if FOOTPRINT == GAUSSIAN
+    LANES_INTO(place[0], f->white[0]);
+    LANES_INTO(place[1], f->white[1]);
+    LANES_INTO(place[2], f->white[2]);
+    for (uint j = 0; j < count; j++)
+        point_white[first + j] = (float4)(place[0][j], place[1][j], place[2][j], 0.0f);
+#endif
 }
 
 // id / n lane by lane, which no vector instruction does; *id becomes the remainder.
@@ -161,42 +244,61 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
 // One work-item per LANES points: reads their grid indices and offsets, writes their numbers of
 // hits and, if any is above 0, their radii, camera-space positions and distances, and boxes.
 kernel void project_grid(
-    const uint n,                       // points
-    global const float *camera,         // (20) camera.h
-    global const float *grid,           // (8) grid.h
-    global const uint *point_id,        // (N)
-    const float radius,                 // of a point without offsets, world units
-    global const float4 *cloud_offset,  // (N, 4) from the vertex, in edges; log of the radius
-    global float *point_radius,         // (N)
-    global float4 *point_camera,        // (N, 4) x, y, z, t; t = -1: culled
-    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
-    global uint *point_count)   // (N)
+    const uint n,                      // points
+    global const float *camera,        // (20) camera.h
+    global const float *grid,          // (8) grid.h
+    global const uint *point_id,       // (N)
+    const float radius,                // of a point without offsets, world units
+    global const float *cloud_offset,  // (N, OFFSETS) cloud.h
+    global float *point_radius,        // (N)
+    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
+    global ushort4 *point_box,   // (N, 4) first x, first y, last x, last y; none where last < first
+    global uint *point_count,    // (N)
+    global float4 *point_white)  // (?, 4) (N, 4) Footprints.white of Gaussians, 0; else untouched
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
     const uint count = min((uint)LANES, n - first);
     const Camera cam = camera_load(camera);
     uint id[LANES];
-    float offset[4][LANES], radii[LANES];
+    float offset[9][LANES], radii[LANES];
     for (uint j = 0; j < LANES; j++) {
         const size_t row = first + min(j, count - 1);
         id[j] = point_id[row];
-        offset[0][j] = cloud_offset[row].x;
-        offset[1][j] = cloud_offset[row].y;
-        offset[2][j] = cloud_offset[row].z;
-        offset[3][j] = cloud_offset[row].w;
+        const Offsets o = OFFSETS_AT(cloud_offset, row);
+        offset[0][j] = o.s0;
+        offset[1][j] = o.s1;
+        offset[2][j] = o.s2;
+        offset[3][j] = o.s3;
+#if FOOTPRINT == GAUSSIAN
+        offset[4][j] = o.s4;
+        offset[5][j] = o.s5;
+        offset[6][j] = o.s6;
+        offset[7][j] = o.s7;
+        offset[8][j] = o.s8;
+#endif
     }
     // as grid_position() has it
     uints i = LANES_FROM(id);
     uints j = divide(&i, (uint)grid[4]);
     const uints k = divide(&j, (uint)grid[5]);
     Footprints f;
+#if FOOTPRINT == GAUSSIAN
+    const floats of_all = radius;
+    floats lower[6];
+    for (uint axis = 0; axis < 3; axis++) {
+        lower[axis] = radius * exp(LANES_FROM(offset[3 + axis]));
+        lower[3 + axis] = radius * LANES_FROM(offset[6 + axis]);
+    }
+#else
+    const floats of_all = radius * exp(LANES_FROM(offset[3])), *lower = 0;
+#endif
     const bool any_hit = project(
         &cam, grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0])),
         grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1])),
-        grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])),
-        radius * exp(LANES_FROM(offset[3])), &f);
-    store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
+        grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])), of_all, lower, &f);
+    store_points(
+        &cam, &f, any_hit, first, count, point_camera, point_box, point_count, point_white);
     if (!any_hit) return;
     LANES_INTO(radii, f.radius);
     for (uint j = 0; j < count; j++)
@@ -211,8 +313,9 @@ kernel void project_spheres(
     global const float *positions,     // (N, 3) world
     global const float *point_radius,  // (N)
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
-    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
-    global uint *point_count)   // (N)
+    global ushort4 *point_box,   // (N, 4) first x, first y, last x, last y; none where last < first
+    global uint *point_count,    // (N)
+    global float4 *point_white)  // (?, 4) as project_grid
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
@@ -227,7 +330,9 @@ kernel void project_spheres(
         radius[j] = point_radius[i];
     }
     Footprints f;
+    const floats radii = LANES_FROM(radius), lower[6] = {radii, radii, radii, 0.0f, 0.0f, 0.0f};
     const bool any_hit =
-        project(&cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), &f);
-    store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
+        project(&cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), radii, lower, &f);
+    store_points(
+        &cam, &f, any_hit, first, count, point_camera, point_box, point_count, point_white);
 }

@@ -11,6 +11,7 @@
 // one.
 #include "common.h"
 #include "lanes.h"
+#include "cloud.h"
 #include "sh.h"
 
 #ifndef DEGREE
@@ -59,13 +60,13 @@ kernel void rmsprop_move(
     global const float *camera,                  // (20) camera.h
     global const float4 *point_camera,           // (N, 4) x, y, z, distance
     global const float16 *grad_shaded_features,  // (?, 16) G, a row for each visible point
-    global const float4 *grad_offset,            // (?, 4) alike, unread without MOVES_OFFSET
+    global const float *grad_offset,             // (?, OFFSETS) alike, unread without MOVES_OFFSET
     global const float *grad_opacity,            // (?) alike
     global uint *last_step,                      // (N) of each point's last gradient, 0: none
     global float16 *v,                           // (N, 16)
-    global float4 *v_offset,                     // (N, 4)
+    global float *v_offset,                      // (N, OFFSETS)
     global float *v_opacity,                     // (N)
-    global float4 *offset,                       // (N, 4)
+    global float *offset,                        // (N, OFFSETS) cloud.h
     global float *opacity,                       // (N)
     global float16 *sh_0,                        // (N, 1, 16)
     global float16 *sh_1,                        // (?, ?, 16) (N, 3, 16), untouched at degree 0
@@ -81,7 +82,7 @@ kernel void rmsprop_move(
 #if ROW_PARTS > 1
     barrier(CLK_GLOBAL_MEM_FENCE);  // all parts of a point have read it
 #endif
-    const float4 o = MOVES_OFFSET ? grad_offset[g] : (float4)(0.0f);
+    const Offsets o = MOVES_OFFSET ? OFFSETS_AT(grad_offset, g) : (Offsets)(0.0f);
     const float a = grad_opacity[g];
     // a NaN is a gradient
     if (row >= s || !(any(grad_shaded_features[g] != 0.0f) || any(o != 0.0f) || a != 0.0f)) return;
@@ -93,10 +94,10 @@ kernel void rmsprop_move(
         const float moved = opacity[i] - rate_opacity * a / (sqrt(w) + point_eps);
         opacity[i] = BOUNDED(moved, 0.0f, 1.0f);
         if (MOVES_OFFSET) {
-            const float4 u = decay * v_offset[i] + DECAY2 * o * o, most = MOST_OFFSET;
-            v_offset[i] = u;
-            const float4 shifted = offset[i] - rate_offset * o / (sqrt(u) + point_eps);
-            offset[i] = BOUNDED(shifted, -most, most);
+            const Offsets u = decay * OFFSETS_AT(v_offset, i) + DECAY2 * o * o, most = MOST_OFFSET;
+            OFFSETS_AT(v_offset, i) = u;
+            const Offsets shifted = OFFSETS_AT(offset, i) - rate_offset * o / (sqrt(u) + point_eps);
+            OFFSETS_AT(offset, i) = BOUNDED(shifted, -most, most);
         }
     }
     const floats G = load_part(grad_shaded_features, g);

@@ -10,6 +10,7 @@ from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
+from pp_cl.raster.points import offset_width
 from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints, projection_table
 from pp_cl.raster.weights import BlendWeights
 
@@ -25,8 +26,13 @@ def project_spheres(
 ) -> ProjectedPoints:
     """Project points anywhere. positions: (N, 3) float32, world. point_radius: (N,)."""
     n = len(positions)
-    b.require(projection_table(n))
-    program = dev.program("raster/project", LANES=lanes(dev), FOOTPRINT=FOOTPRINTS.index(footprint))
+    b.require(projection_table(n, footprint))
+    program = dev.program(
+        "raster/project",
+        LANES=lanes(dev),
+        FOOTPRINT=FOOTPRINTS.index(footprint),
+        OFFSETS=offset_width(footprint),
+    )
     program.launch(
         "project_spheres",
         -(-n // lanes(dev)),
@@ -37,9 +43,16 @@ def project_spheres(
         point_camera=b.point_camera,
         point_box=b.point_box,
         point_count=b.point_count,
+        point_white=b.point_white,
     )
     return ProjectedPoints(
-        footprint, camera_buffer, b.point_camera, b.point_box, b.point_count, point_radius
+        footprint,
+        camera_buffer,
+        b.point_camera,
+        b.point_box,
+        b.point_count,
+        point_radius,
+        b.point_white,
     )
 
 

@@ -1,5 +1,6 @@
-"""Gaussians fitted to a run's own renderings of its training views, as viewers of 3D Gaussian
-splatting draw them: without a network, and each widened by a third of a pixel^2.
+"""Gaussians of three axes fitted to a run's own renderings of its training views and of as many
+views between them, as viewers of 3D Gaussian splatting draw them: without a network, and each
+widened by a third of a pixel^2.
 
 The trainer does it, with the footprint "gaussian" and means of features in place of the network.
 """
@@ -7,6 +8,7 @@ The trainer does it, with the footprint "gaussian" and means of features in plac
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +21,15 @@ from pp_cl.errors import UserError
 from pp_cl.export.harmonics import fit_harmonics
 from pp_cl.layers.simple import mean_backward, mean_forward
 from pp_cl.model import Model
-from pp_cl.raster.points import PointCloud, sh_blocks
+from pp_cl.raster.points import PointCloud, offset_width, sh_blocks
 from pp_cl.run import Run
+from pp_cl.scene.camera_path import between
 from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
 from pp_cl.train import Trainer
 from pp_cl.training.crops import Crop, Crops
 
-STEPS = 1500
+STEPS = 3000
 CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of the window, of an image
 EARLY_STOP = 1e-4  # of viewers
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
@@ -93,14 +96,17 @@ class LargeCrops(Crops):
 
 
 def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
-    """(the points that training views show, as Gaussians, the deviation of one that has not grown):
+    """(the points that training views show, as Gaussians, the deviation of one without offsets):
     fitted to pictures of about `window` pixels on the longer side. Of the features of their SH,
     which are 3D Gaussian splatting's, the first three are sRGB colour.
     """
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud, net = _cloud(run, coefficients), Means(dev)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)  # type: ignore[arg-type]
-    views = run.rendered(run.photographs("train"), opaque=True)
+    photographs = run.photographs("train")
+    more = between([one.camera for one in photographs])
+    photographs += [replace(one, camera=c) for one, c in zip(photographs, more, strict=True)]
+    views = run.rendered(photographs, opaque=True)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     net.scale = min(max(1, round(window / longest)), CROP // LEAST_CROP)
     config = _config(run.config, CROP // net.scale)
@@ -113,18 +119,31 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     return cloud, config.raster.radius * run.model.grid.edge
 
 
+def triangles(offset: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) L of the covariances L L^T of Gaussians, in deviations of one without offsets.
+    offset: (N, 16), cl/cloud.h.
+    """
+    lower = np.zeros((len(offset), 3, 3))
+    lower[:, range(3), range(3)] = np.exp(offset[:, 3:6])
+    lower[:, [1, 2, 2], [0, 0, 1]] = offset[:, 6:9]
+    return lower
+
+
 def _cloud(run, coefficients):
     """A copy of the run's points, those that have no coefficients (N, 9, 3) of basis() left out."""
     dev, cloud = run.dev, run.model.cloud
     rows = np.flatnonzero(coefficients.any((1, 2)))
     if not len(rows):
         raise UserError(f"{run.folder}: the training views show no points; train it longer")
+    given = cloud.offset.get()[rows]
+    offset = np.zeros((len(rows), offset_width("gaussian")), np.float32)
+    offset[:, :3], offset[:, 3:6] = given[:, :3], given[:, 3:]  # round, as large as the points
     sh = np.zeros((len(rows), 9, 16), np.float32)
     sh[..., :3] = coefficients[rows][:, ORDER] / FACTORS[:, None]
     begins = np.cumsum([block.count for block in sh_blocks(2)])[:-1]
     return PointCloud(
         dev.upload(cloud.ids.get()[rows]),
-        dev.upload(cloud.offset.get()[rows]),
+        dev.upload(offset),
         dev.upload(cloud.opacity.get()[rows].clip(0, MOST_OPAQUE)),
         [dev.upload(part) for part in np.split(sh, begins, axis=1)],
     )
@@ -139,7 +158,7 @@ def _config(given: Config, crop: int) -> Config:
     train.iterations, train.crop, train.refine_at, train.ema = STEPS, crop, (), True
     train.mask_weight = train.spread_weight = train.sh_smoothing = train.prune_weight = 0.0
     train.exposure = "off"
-    # of the defaults a fiftieth and a third, with which what begins nearly right diverges
-    train.sh_rate, train.opacity_rate = (1e-2, 5e-3, 2.5e-3), (1e-2, 3e-3)
-    train.offset_rate = (1e-2, 1e-3)
+    # of the defaults a seventeenth and two thirds: what begins nearly right must not diverge
+    train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (2e-2, 6e-3)
+    train.offset_rate = (2e-2, 2e-3)
     return config

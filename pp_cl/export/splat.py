@@ -10,7 +10,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl.errors import UserError
-from pp_cl.export.gaussians import CONSTANT, FACTORS, MOST_OPAQUE, ORDER, fit_gaussians
+from pp_cl.export.gaussians import (
+    CONSTANT,
+    FACTORS,
+    MOST_OPAQUE,
+    ORDER,
+    fit_gaussians,
+    triangles,
+)
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.harmonics import COUNT, basis
 from pp_cl.export.page import check_drawable
@@ -33,7 +40,8 @@ SPLAT = np.dtype(
         ("position", "<f4", 3),
         ("harmonics", "<f4", (COUNT, 3)),
         ("opacity", "<f4"),
-        ("deviation", "<f4"),
+        ("deviations", "<f4", 3),
+        ("turn", "<f4", 4),
     ]
 )
 
@@ -44,7 +52,9 @@ def splats(
     """((M,) records of SPLAT, (3,) origin): the run as Gaussians, fitted to pictures of `window`
     pixels, in the world of its scene turned by (3, 3), those in a box (2, 3) or all. Positions are
     relative to the origin, which is 0 unless float32 is too coarse there. harmonics: in the order
-    and with the signs of 3D Gaussian splatting, of colours less 0.5; opacity: after the sigmoid.
+    and with the signs of 3D Gaussian splatting, of colours less 0.5; opacity: after the sigmoid;
+    deviations: along a Gaussian's own axes, which the quaternion turn (w, x, y, z) turns to the
+    world's.
     Raises UserError as check_drawable and inside() do.
     """
     check_drawable(run)
@@ -61,7 +71,9 @@ def splats(
     table["position"] = positions - origin
     table["harmonics"] = _turned(coefficients, turn)
     table["opacity"] = opacity[rows]
-    table["deviation"] = deviation * np.exp(offset[rows, 3])
+    axes, table["deviations"], _ = np.linalg.svd(deviation * turn @ triangles(offset[rows]))
+    axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
+    table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
     return table, origin
 
 
@@ -94,8 +106,8 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     rest = harmonics[:, 1:].transpose(2, 1, 0).reshape(-1, len(table))  # all of a channel together
     columns |= {f"f_rest_{i}": column for i, column in enumerate(rest)}
     columns["opacity"] = np.log(table["opacity"] / (1 - table["opacity"]))
-    columns |= dict.fromkeys(("scale_0", "scale_1", "scale_2"), np.log(table["deviation"]))
-    columns |= {"rot_0": nothing + 1} | dict.fromkeys(("rot_1", "rot_2", "rot_3"), nothing)
+    columns |= {f"scale_{i}": np.log(table["deviations"][:, i]) for i in range(3)}
+    columns |= {f"rot_{i}": table["turn"][:, i] for i in range(4)}
     # brush turns a model by this comment; others take y for the vertical axis anyway
     write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
 
@@ -113,14 +125,14 @@ def write_splat_spz(path: Path, table: np.ndarray) -> None:
     check_spz()
     from gsply import GSData, write_spz
 
-    place, count, rest = table["position"], len(table), table["harmonics"][:, 1:].copy()
+    place, rest = table["position"], table["harmonics"][:, 1:].copy()
     for part, step in zip((rest[:, :3], rest[:, 3:]), STEPS_OF_DEGREE, strict=True):
         np.rint(part / step, out=part)
         part *= step
     data = GSData.from_arrays(
         np.ascontiguousarray(place),
-        np.log(table["deviation"]).repeat(3).reshape(-1, 3),
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.log(table["deviations"]),
+        table["turn"].copy(),
         np.log(table["opacity"] / (1 - table["opacity"])),
         np.ascontiguousarray(table["harmonics"][:, 0]),
         rest,
@@ -128,7 +140,8 @@ def write_splat_spz(path: Path, table: np.ndarray) -> None:
     )
     # places are numbers of 24 bits with a sign
     room = 23 - math.ceil(math.log2(np.abs(place).max(initial=1e-6) * 1.001))
-    wanted = math.ceil(math.log2(STEPS_OF_PLACE / table["deviation"].min(initial=1)))
+    widest = table["deviations"].max(axis=1)
+    wanted = math.ceil(math.log2(STEPS_OF_PLACE / widest.min(initial=1)))
     with atomic_path(path) as temporary:
         write_spz(temporary, data, fractional_bits=max(0, min(room, wanted)))
         with temporary.open("r+b") as file:  # gzip's time of writing, the one byte that differs
@@ -145,8 +158,8 @@ def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> 
         "POSITION": place + origin if origin.any() else place,
         # of programs that draw points instead
         "COLOR_0": gltf_colours(to_8bit(0.5 + CONSTANT * table["harmonics"][:, 0])),
-        f"{extension}:ROTATION": np.tile(np.array([0, 0, 0, 1], np.float32), (len(table), 1)),
-        f"{extension}:SCALE": table["deviation"].repeat(3).reshape(-1, 3),
+        f"{extension}:ROTATION": np.roll(table["turn"], -1, axis=1),  # x, y, z, w
+        f"{extension}:SCALE": table["deviations"].copy(),
         f"{extension}:OPACITY": table["opacity"],
     }
     for k in range(COUNT):

@@ -13,7 +13,7 @@ from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.pairs import Pairs
-from pp_cl.raster.points import four_blocks, stored_degree
+from pp_cl.raster.points import four_blocks, offset_width, stored_degree
 from pp_cl.raster.project import FOOTPRINTS, MOVED, ProjectedPoints
 from pp_cl.raster.weights import BlendWeights, clear_pairs
 
@@ -65,7 +65,9 @@ def blend_forward(
     )
 
 
-def blend_backward_table(shaded: int, pixels: int, pairs: int, blend: str) -> Table:
+def blend_backward_table(
+    shaded: int, pixels: int, pairs: int, blend: str, footprint: str = "soft"
+) -> Table:
     """The buffers of the backward pass for a number of pixels, and room for numbers of visible
     points and of pairs. blend: one of BLENDS.
     """
@@ -74,7 +76,7 @@ def blend_backward_table(shaded: int, pixels: int, pairs: int, blend: str) -> Ta
         "pixel_spread": ((pixels if blend == "alpha" else 1,), np.float32),
         "grad_shaded_features": ((shaded, 16), np.float32),
         "grad_opacity": ((shaded,), np.float32),
-        "grad_offset": ((shaded if blend == "alpha" else 1, 4), np.float32),
+        "grad_offset": ((shaded if blend == "alpha" else 1, offset_width(footprint)), np.float32),
     }
 
 
@@ -84,7 +86,8 @@ class BlendGradients:
     those of all other points are 0.
 
     shaded_features: (S, 16). opacity: (S,). offset: (S, 4), of soft points composited by alpha, by
-    what the closeness of their hits changes; None if not asked for. pixel_spread: (HW,), undefined
+    what the closeness of their hits changes, and of Gaussians (S, 16); None if not asked for.
+    pixel_spread: (HW,), undefined
     without its weight. pair_gradient: (P, 2), by pair of a visible point the blend weight b and
     what the hit adds to dL/dopacity, both 0 where it is dropped or not tracked.
     """
@@ -129,9 +132,8 @@ def blend_backward(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )
     shaded = weights.shaded
-    b.require(
-        blend_backward_table(len(shaded_features), pairs.pixels, pairs.capacity, weights.blend)
-    )
+    rows = len(shaded_features), pairs.pixels, pairs.capacity
+    b.require(blend_backward_table(*rows, weights.blend, points.footprint))
     clear_pairs(dev, pairs, weights, b.pair_gradient)
     of_hits = {
         "hw": pairs.pixels,
@@ -145,11 +147,10 @@ def blend_backward(
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    program = (
-        _program(dev, FOOTPRINT=FOOTPRINTS.index(points.footprint), MOVES=1)
-        if moves
-        else _program(dev)
-    )
+    of_points: dict[str, int] = {"OFFSETS": offset_width(points.footprint)}
+    if moves:
+        of_points |= {"FOOTPRINT": FOOTPRINTS.index(points.footprint), "MOVES": 1}
+    program = _program(dev, **of_points)
     if is_alpha:
         program.launch(
             "alpha_gradient",
@@ -168,10 +169,13 @@ def blend_backward(
         shaded.size * row_parts(dev, ON_GPU),
         s=shaded.size,
         edge=edge,
+        radius=points.radius,
         shaded=shaded,
         camera=points.camera_buffer,
         point_radius=points.point_radius,
         point_camera=points.point_camera,
+        point_white=points.point_white,
+        cloud_offset=b.grad_offset if points.cloud_offset is None else points.cloud_offset,
         opacity=opacity,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,

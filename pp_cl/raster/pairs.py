@@ -112,6 +112,7 @@ def find_pairs(
         point_radius=points.point_radius,
         point_camera=points.point_camera,
         point_box=points.point_box,
+        point_white=points.point_white,
         point_offset=b.point_offset,
         pair_pixel=b.pair_pixel,
         pair_point_closeness=b.pair_point_closeness,

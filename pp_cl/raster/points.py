@@ -44,6 +44,12 @@ SH_BLOCKS = (
 )
 SH_DEGREES = (0, 1, 2)
 MOST_OFFSET = 0.5  # edges along each axis: a point stays in its cell; radii times 0.61 to 1.65
+MOST_OF_GAUSSIANS = 2.0  # edges, logarithms and deviations
+
+
+def offset_width(footprint: str) -> int:
+    """Numbers in a row of PointCloud.offset: of Gaussians those of cl/raster/footprint.h."""
+    return 16 if footprint == "gaussian" else 4
 
 
 def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
@@ -69,7 +75,8 @@ class PointCloud:
 
     ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
     point in its cell, in edges of the grid, and the logarithm of its radius over
-    point_radius() of the settings; up to MOST_OFFSET. opacity: (N) float32 in [0, 1]. sh: the
+    point_radius() of the settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up
+    to MOST_OF_GAUSSIANS: see cl/raster/footprint.h. opacity: (N) float32 in [0, 1]. sh: the
     SH coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained
     any more.
     """
@@ -83,6 +90,11 @@ class PointCloud:
     def count(self) -> int:
         """Number of points."""
         return len(self.ids)
+
+    @property
+    def most_offset(self) -> float:
+        """The bound of `offset`."""
+        return MOST_OFFSET if self.offset.shape[1] == 4 else MOST_OF_GAUSSIANS
 
     @property
     def blocks(self) -> tuple[ShBlock, ...]:

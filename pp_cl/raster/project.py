@@ -12,6 +12,7 @@ from pyopencl.array import Array
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
+from pp_cl.raster.points import offset_width
 
 # numbered as in cl/raster/footprint.h, which explains them
 FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
@@ -26,7 +27,9 @@ class ProjectedPoints:
     uint32, pixels that are hit. The others are undefined in a run of LANES points without hits.
     point_camera: (N, 4) float32, x, y, z in camera axes and the distance from the eye; (0, 0, 0,
     -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels
-    that may be hit; last < first means none. point_radius: (N,) float32, world units.
+    that may be hit; last < first means none. point_radius: (N,) float32, world units. Of Gaussians
+    alone: point_white, (N, 4) float32, from pixels to deviations (cl/raster/footprint.h); and the
+    cloud_offset and radius of project_grid().
     """
 
     footprint: str
@@ -35,15 +38,19 @@ class ProjectedPoints:
     point_box: Array
     point_count: Array
     point_radius: Array
+    point_white: Array
+    cloud_offset: Array | None = None
+    radius: float = 0.0
 
 
-def projection_table(n: int) -> Table:
+def projection_table(n: int, footprint: str = "soft") -> Table:
     """The buffers for n points."""
     return {
         "point_camera": ((n, 4), np.float32),
         "point_box": ((n, 4), np.uint16),
         "point_count": ((n,), np.uint32),
         "point_radius": ((n,), np.float32),
+        "point_white": ((n if footprint == "gaussian" else 1, 4), np.float32),
     }
 
 
@@ -61,11 +68,16 @@ def project_grid(
     """Project the points, each in the cell of a grid's vertex, into a camera.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
-    PointCloud.offset. radius: of points without offsets, world units.
+    PointCloud.offset; of Gaussians (N, 16). radius: of points without offsets, world units.
     """
     n = point_id.size
-    b.require(projection_table(n))
-    program = dev.program("raster/project", LANES=lanes(dev), FOOTPRINT=FOOTPRINTS.index(footprint))
+    b.require(projection_table(n, footprint))
+    program = dev.program(
+        "raster/project",
+        LANES=lanes(dev),
+        FOOTPRINT=FOOTPRINTS.index(footprint),
+        OFFSETS=offset_width(footprint),
+    )
     program.launch(
         "project_grid",
         -(-n // lanes(dev)),
@@ -79,7 +91,16 @@ def project_grid(
         point_camera=b.point_camera,
         point_box=b.point_box,
         point_count=b.point_count,
+        point_white=b.point_white,
     )
     return ProjectedPoints(
-        footprint, camera_buffer, b.point_camera, b.point_box, b.point_count, b.point_radius
+        footprint,
+        camera_buffer,
+        b.point_camera,
+        b.point_box,
+        b.point_count,
+        b.point_radius,
+        b.point_white,
+        cloud_offset,
+        radius,
     )

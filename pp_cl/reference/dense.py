@@ -67,31 +67,38 @@ def geometry(
     radius: np.ndarray | float,
     kind: str,
     *,
+    covariance: np.ndarray | None = None,
     depth_range: tuple[float, float] = DEPTH_RANGE,
 ) -> Arrays:
     """Dict of (N, HW) arrays: hit, closeness, depth, z = normalised depth, and margin = distance of
     the hit test from its edge, in pixels.
 
-    radius: (N,) world units. Points that are left out hit nothing. Pulsar's box, part of the
-    sphere's rule, is included.
+    radius: (N,) world units. covariance: (N, 3, 3) of Gaussians, world units squared; None: round
+    ones. Points that are left out hit nothing. Pulsar's box, part of the sphere's rule, is
+    included.
     """
     radius = np.broadcast_to(np.asarray(radius, np.float64), (len(positions),))
     c, r = camera_space(camera, positions), rays(camera)
     ok = kept(camera, positions, radius, depth_range)
     c = np.where(ok[:, None], c, [0.0, 0.0, 1.0])
     t = np.linalg.norm(c, axis=1)[:, None]
+    round_ones = radius[:, None, None] ** 2 * np.eye(3)
     radius, width = radius[:, None], pixel_width(camera, t)
     least = LEAST_RADIUS * width
-    if kind != "sphere":
+    if kind == "gaussian":
+        away, inverse = screen_gaussians(
+            camera, c, round_ones if covariance is None else covariance
+        )
+        deviations = np.sqrt(np.einsum("nqi,nij,nqj->nq", away, inverse, away).clip(0))
+        hit, closeness = deviations < DEVIATIONS, np.exp(-0.5 * deviations**2)
+        depth = np.broadcast_to(c[:, 2:], hit.shape)
+        with np.errstate(divide="ignore"):
+            margin = np.linalg.norm(away, axis=2) * np.abs(1 - DEVIATIONS / deviations)
+    elif kind != "sphere":
         reach, ahead = np.maximum(radius, least), np.maximum(c @ r.T, 0)
-        variance = radius**2 + LOW_PASS * pixel_width(camera, c[:, 2:]) ** 2
-        if kind == "gaussian":
-            reach = DEVIATIONS * np.sqrt(variance)
         rho = np.linalg.norm(c[:, None] - ahead[..., None] * r[None], axis=2)
         hit = (rho < reach) & (ahead > 0)
         closeness = 1 - rho / reach if kind == "soft" else np.ones_like(rho)
-        if kind == "gaussian":
-            closeness = np.exp(-0.5 * rho**2 / variance)
         depth = np.broadcast_to(t, rho.shape)
         margin = np.abs(rho - reach) / width
     else:
@@ -113,6 +120,39 @@ def geometry(
         "margin": margin,
         "limits": (LEAST_ALPHA, MOST_ALPHA) if kind == "gaussian" else (-np.inf, np.inf),
     }
+
+
+def gaussians(
+    camera: Any, vertices: np.ndarray, edge: float, offset: np.ndarray, radius: float
+) -> Arrays:
+    """geometry() of Gaussians in the cells of a grid. vertices: (N, 3) world. offset: (N, 9) or
+    more, as cl/cloud.h has it. radius: of one without offsets, world units.
+    """
+    lower = np.zeros((len(offset), 3, 3))
+    lower[:, range(3), range(3)] = radius * np.exp(offset[:, 3:6])
+    lower[:, [1, 2, 2], [0, 0, 1]] = radius * offset[:, 6:9]
+    positions = vertices + edge * offset[:, :3]
+    covariance = lower @ lower.transpose(0, 2, 1)
+    return geometry(camera, positions, radius, "gaussian", covariance=covariance)
+
+
+def screen_gaussians(
+    camera: Any, c: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """((N, HW, 2) from the centres of Gaussians to those of the pixels, (N, 2, 2) inverse of their
+    covariances on the screen). c: (N, 3) in camera axes. covariance: (N, 3, 3) in world axes.
+    """
+    (x, y, z), focal = c.T, (camera.fx, camera.fy)
+    jacobian = np.zeros((len(c), 2, 3))
+    for axis, place in enumerate((x, y)):
+        jacobian[:, axis, axis] = focal[axis] / z
+        jacobian[:, axis, 2] = -focal[axis] * place / z**2
+    jacobian = jacobian @ camera.pose[:, :3].T
+    spread = jacobian @ covariance @ jacobian.transpose(0, 2, 1) + LOW_PASS * np.eye(2)
+    centre = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+    row, column = np.mgrid[: camera.height, : camera.width]
+    pixels = np.stack([column, row], -1).reshape(-1, 2) + 0.5
+    return pixels - centre[:, None], np.linalg.inv(spread)
 
 
 def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:

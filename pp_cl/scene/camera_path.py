@@ -15,6 +15,7 @@ from pp_cl.scene.camera import Camera, look_at
 MARGIN = 0.95  # of the image that the object may fill
 HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles a picture would spin
 TURNS = 2  # of a spiral
+NEIGHBOURS = 4  # of a camera, in whose directions another lies between()
 SAMPLED_POINTS = 20_000
 
 
@@ -110,6 +111,31 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         replace(first.with_angle(2 * math.atan(0.5 / width)), pose=np.column_stack([turn, eye]))
         for turn, eye, width in zip(turns, eyes, widths, strict=True)
     ]
+
+
+def between(cameras: Sequence[Camera]) -> list[Camera]:
+    """For each camera, one half-way to another around what they look at, which it shows in the same
+    pixel: in turn to the nearest, the second, the third and the fourth of all directions. A camera
+    that has none on its side is itself.
+    """
+    centre = looked_at(cameras)
+    offsets = np.stack([camera.eye - centre for camera in cameras])
+    distances = np.linalg.norm(offsets, axis=1)
+    directions = offsets / np.maximum(distances, np.finfo(float).tiny)[:, None]
+    found = []
+    for i, camera in enumerate(cameras):
+        cosines = directions @ directions[i]
+        nearest = [j for j in np.argsort(-cosines, kind="stable") if j != i and cosines[j] > 0]
+        if not nearest:
+            found.append(camera)
+            continue
+        j = nearest[i % min(len(nearest), NEIGHBOURS)]
+        turn, _ = Rotation.align_vectors([directions[i] + directions[j]], [directions[i]])
+        scale = (1 + distances[j] / distances[i]) / 2
+        pose = np.column_stack([camera.pose[:, :3], scale * offsets[i]])
+        pose = turn.as_matrix() @ pose + np.pad(centre[:, None], ((0, 0), (3, 0)))
+        found.append(replace(camera, pose=pose))
+    return found
 
 
 def level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:

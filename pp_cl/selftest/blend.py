@@ -13,6 +13,7 @@ from pp_cl.raster.project import FOOTPRINTS
 from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense
 from pp_cl.reference.differences import numeric_gradient
+from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import (
     SIZES,
     Case,
@@ -28,6 +29,7 @@ from pp_cl.selftest.points import (
     AXIS,
     FAR,
     Blended,
+    PairedGaussians,
     PairedPoints,
     blend_on_axis,
     depth_at,
@@ -149,24 +151,53 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     features = rng.normal(size=(n, 16))
     grad = rng.normal(size=(camera.width * camera.height, 16))
     # 1e-3: of the least size
-    for kind, radius, stop in (
-        *(("soft", radius, stop) for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0))),
-        *(("gaussian", radius, stop) for radius, stop in ((0.1, 0.0), (0.1, 0.05), (1e-3, 0.0))),
-    ):
-        scene = PairedPoints(dev, camera, positions, radius, kind=kind)
+    for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0)):
+        scene = PairedPoints(dev, camera, positions, radius)
         scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
         gradients = scene.gradients(grad, edge=edge)["offset"]
         exact_geometry = scene.geometry()
         used = dense.alpha(exact_geometry, opacity, stop)["hit"]
 
-        def loss(offset, kind=kind, radius=radius, exact_geometry=exact_geometry, used=used):
+        def loss(offset, radius=radius, exact_geometry=exact_geometry, used=used):
             wide = radius * np.exp(offset[:, 3])
-            moved = dense.geometry(camera, positions + edge * offset[:, :3], wide, kind)
+            moved = dense.geometry(camera, positions + edge * offset[:, :3], wide, "soft")
             moved |= {"hit": used, "depth": exact_geometry["depth"]}
             return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
 
         numeric = numeric_gradient(loss, np.zeros((n, 4)), STEP)
         yield relative(gradients.ravel(), numeric, DIFFERENCES)
+
+
+def _gaussians(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Of all shapes: their pictures, and the gradients of places and shapes, against finite
+    differences of what the closeness changes. 1e-3: far below a pixel.
+    """
+    for n, radius, stop in ((33, 0.1, 0.0), (17, 0.1, 0.05), (17, 1e-3, 0.0), (1, 0.2, 0.0)):
+        yield from _check_gaussians(dev, rng, n, radius, stop)
+
+
+def _check_gaussians(dev, rng, n, radius, stop):
+    camera, grid = make_camera(), Grid((-1.5, -1.5, -1.5), 0.3, (11, 11, 11))
+    ids = np.sort(rng.choice(np.prod(grid.dims), n, replace=False))
+    learned = rng.uniform(-1, 1, (n, 9)).astype(np.float32)
+    opacity, features = rng.uniform(0.1, 1, n).astype(np.float32), rng.normal(size=(n, 16))
+    grad = rng.normal(size=(camera.width * camera.height, 16))
+    scene = PairedGaussians(dev, camera, grid, ids, np.pad(learned, ((0, 0), (0, 7))), radius)
+    picture = scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
+    gradients, measured = scene.gradients(grad, edge=grid.edge)["offset"], scene.geometry()
+    blend, hit = dense.alpha(measured, opacity, stop), measured["hit"]
+    yield relative(picture.reshape(-1, 16), dense.features(blend, features), WEIGHT["alpha"])
+    place = partial(dense.gaussians, camera, grid.positions(ids), grid.edge, radius=radius)
+    expected = place(learned)["closeness"]
+    yield absolute(measured["closeness"][hit], expected[hit], WEIGHT["alpha"])
+
+    def loss(offset):
+        moved = place(offset) | {"hit": blend["hit"], "depth": measured["depth"]}
+        return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
+
+    numeric = numeric_gradient(loss, learned.astype(np.float64), STEP)
+    yield relative(gradients[:, :9].ravel(), numeric, DIFFERENCES)
+    yield exact(gradients[:, 9:], np.zeros((n, 7)))
 
 
 def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -383,6 +414,7 @@ CASES = (
     Case("alpha: gradient of alpha", _gradient_of_alpha),
     Case("alpha: spread", _spread),
     Case("alpha: offsets of points", _offsets),
+    Case("alpha: shapes of Gaussians", _gaussians),
     Case("alpha: opacities of 1", _opaque),
     Case("alpha: equal depths", _equal_depths_alpha),
     Case("alpha: transmittance that underflows", _underflow),

@@ -4,6 +4,7 @@ hand. The tests use it too.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,11 @@ from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backwar
 from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.raster.blend import BlendGradients, blend_backward, blend_forward
+from pp_cl.raster.project import project_grid
 from pp_cl.raster.weights import blend_weights, listed_hits
 from pp_cl.reference import dense
 from pp_cl.scene.camera import Camera, look_at
+from pp_cl.scene.grid import Grid
 
 Gradients = dict[str, np.ndarray]
 
@@ -58,19 +61,28 @@ class PairedPoints:
         kind: str = "soft",
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
     ):
-        self.dev, self.camera, self.n = dev, camera, len(positions)
-        self._exact, self.depth_range = (positions, radius, kind), depth_range
+        exact = partial(dense.geometry, camera, positions, radius, kind, depth_range=depth_range)
+        self._begin(dev, camera, len(positions), exact, depth_range)
+        self._pair(
+            project_spheres(
+                dev,
+                self.buffers,
+                kind,
+                dev.upload(camera.packed(depth_range)),
+                dev.upload(positions, np.float32),
+                point_radius=dev.upload(np.broadcast_to(radius, self.n), np.float32),
+            )
+        )
+
+    def _begin(self, dev, camera, n, exact, depth_range):
+        self.dev, self.camera, self.n = dev, camera, n
+        self._exact, self.depth_range = exact, depth_range
         self.shape = (camera.height, camera.width)
         self.buffers = Buffers(dev)
-        self.projected = project_spheres(
-            dev,
-            self.buffers,
-            kind,
-            dev.upload(camera.packed(depth_range)),
-            dev.upload(positions, np.float32),
-            point_radius=dev.upload(np.broadcast_to(radius, self.n), np.float32),
-        )
-        self.pairs = find_all_pairs(dev, self.buffers, self.projected, self.shape)
+
+    def _pair(self, projected):
+        self.projected = projected
+        self.pairs = find_all_pairs(self.dev, self.buffers, projected, self.shape)
 
     @property
     def seen(self) -> np.ndarray:
@@ -101,7 +113,7 @@ class PairedPoints:
         closeness = self.pairs.pair_point_closeness.get()[:total, 1].view(np.float32)
         keys, depth = self.pairs.pair_key.get()[:total], np.empty(total, np.float32)
         depth[keys & 0xFFFFFFFF] = (keys >> 32).astype(np.uint32).view(np.float32)
-        geometry = dense.geometry(self.camera, *self._exact, depth_range=self.depth_range)
+        geometry = self._exact()
         for name, measured in (("closeness", closeness), ("depth", depth)):
             geometry[name] = np.where(hit, self.dense(measured), geometry[name])
         near, far = self.depth_range
@@ -212,6 +224,36 @@ class PairedPoints:
 
     def _uploaded(self, grad_features):
         return self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
+
+
+class PairedGaussians(PairedPoints):
+    """Gaussians in the cells of a grid. ids: (N,). offset: (N, 16), cl/cloud.h. radius: of one
+    without offsets, world units.
+    """
+
+    def __init__(
+        self,
+        dev: Device,
+        camera: Camera,
+        grid: Grid,
+        ids: np.ndarray,
+        offset: np.ndarray,
+        radius: float,
+    ):
+        exact = partial(dense.gaussians, camera, grid.positions(ids), grid.edge, offset, radius)
+        self._begin(dev, camera, len(ids), exact, dense.DEPTH_RANGE)
+        self._pair(
+            project_grid(
+                dev,
+                self.buffers,
+                "gaussian",
+                dev.upload(camera.packed(self.depth_range)),
+                dev.upload(grid.packed()),
+                point_id=dev.upload(ids, np.uint32),
+                cloud_offset=dev.upload(offset, np.float32),
+                radius=radius,
+            )
+        )
 
 
 NEAR, FAR = dense.DEPTH_RANGE

@@ -17,7 +17,7 @@ from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 from pp_cl.model import Model
 from pp_cl.raster.blend import BlendGradients
-from pp_cl.raster.points import MOST_OFFSET, PointCloud, four_blocks, stored_degree
+from pp_cl.raster.points import PointCloud, four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.training.schedule import Rates
 from pp_cl.training.state import PointState
@@ -201,9 +201,9 @@ def rmsprop_update(
     sh_eps: float,
 ) -> None:
     """One step of what the visible points learn, in place, by the gradients of their features (S,
-    16), opacities (S,) and offsets (S, 4), each or longer; None: offsets stay. The gradient of a SH
-    coefficient is the product of its harmonic in the direction from the eye to the point and the
-    gradient of the point's feature; it is never formed.
+    16), opacities (S,) and offsets (S, 4), of Gaussians (S, 16), each or longer; None: offsets
+    stay. The gradient of a SH coefficient is the product of its harmonic in the direction from the
+    eye to the point and the gradient of the point's feature; it is never formed.
 
     step: from 1 on. points, shaded and sh_eps: as Optimiser.update() takes them.
     """
@@ -217,7 +217,8 @@ def rmsprop_update(
         DECAY2=DECAY2,
         LOG_BETA2=f"{math.log2(BETA2):.9g}f",
         MOVES_OFFSET=int(grad_offset is not None),
-        MOST_OFFSET=f"{MOST_OFFSET}f",
+        MOST_OFFSET=f"{cloud.most_offset}f",
+        OFFSETS=cloud.offset.shape[1],
     )
     fits = program.kernels["rmsprop_move"].largest_group >= parts
     program.launch(

@@ -17,16 +17,17 @@ class PointState:
     """
 
     def __init__(self, dev: Device, cloud: PointCloud):
-        self._arrays = {name: dev.zeros(*row) for name, row in self.table(cloud.count).items()}
+        table = self.table(cloud.count, cloud.offset.shape[1])
+        self._arrays = {name: dev.zeros(*row) for name, row in table.items()}
         self.averages: dict[str, Array] = {}
 
     @staticmethod
-    def table(n: int) -> Table:
-        """The arrays of n points without the averages."""
+    def table(n: int, width: int = 4) -> Table:
+        """The arrays of n points without the averages. width: of PointCloud.offset."""
         return {
             "max_weight": ((n,), np.float32),
             "times_seen": ((n,), np.float32),
-            "v.offset": ((n, 4), np.float32),
+            "v.offset": ((n, width), np.float32),
             "v.opacity": ((n,), np.float32),
             "v.sh": ((n, 16), np.float32),
             "last_step": ((n,), np.uint32),

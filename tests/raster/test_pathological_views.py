@@ -22,7 +22,9 @@ def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=ora
     """A scene's hits, features and gradients against the oracle; returns the scene. Left out are
     pixels where rounding decides over a hit, or makes up most of a closeness.
     """
-    n = len(positions)
+    # a Gaussian's centre may lie hundreds of pixels beside the image, where float32 rounds it by
+    # 3e-5 of one, and its deviation is half a pixel
+    n, unit = len(positions), 10 if kind == "gaussian" else 1
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
     scene = PairedPoints(dev, camera, positions, radius, kind=kind, depth_range=depth_range)
     geometry = oracle.geometry(camera, positions, radius, kind, depth_range=depth_range)
@@ -32,12 +34,12 @@ def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=ora
     assert inner.mean() > 0.5
     blend = oracle.blend(geometry | {"hit": hits}, opacity, gamma)
     features = scene.blend(opacity, gamma, point_features).reshape(-1, 16)
-    assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-4
+    assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-4 * unit
     grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
     gradients = scene.gradients(grad)
     expected = oracle.gradients(geometry | {"hit": hits}, blend, point_features, grad)
-    assert relative_error(gradients["features"], expected[0]) < 1e-5
-    assert relative_error(gradients["opacity"], expected[1]) < 5e-5
+    assert relative_error(gradients["features"], expected[0]) < 1e-5 * unit
+    assert relative_error(gradients["opacity"], expected[1]) < 5e-5 * unit
     return scene
 
 

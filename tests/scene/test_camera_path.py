@@ -8,7 +8,7 @@ from support.ball_views import CENTRE, ball_camera
 from support.scenes import ring_cameras
 
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.camera_path import MARGIN, Surroundings, looked_at, through, up_of
+from pp_cl.scene.camera_path import MARGIN, Surroundings, between, looked_at, through, up_of
 
 
 def turned(cameras, rotation, shift):
@@ -88,6 +88,22 @@ def test_the_optical_axes_meet_where_the_cameras_look(rng):
     cameras = [ball_camera(CENTRE + 4 * d, CENTRE) for d in rng.normal(size=(7, 3))]
     np.testing.assert_allclose(looked_at(cameras), CENTRE, atol=1e-9)
     assert np.isfinite(looked_at(cameras[:1])).all()
+
+
+def test_cameras_between_others_see_the_same_from_half_way(tilted):
+    cameras, _, _ = tilted
+    centre = looked_at(cameras)
+    eyes = np.stack([camera.eye for camera in cameras])
+    for i, camera in enumerate(between(cameras)):
+        distance = np.linalg.norm(camera.eye - centre)
+        assert distance == pytest.approx(np.linalg.norm(eyes[i] - centre), rel=0.05)
+        apart = np.linalg.norm(eyes - camera.eye, axis=1)
+        assert apart.min() > 0.2  # a twelfth of the ring is 2
+        x, y, depth = camera.project(centre)
+        assert (x, y) == pytest.approx(cameras[i].project(centre)[:2]) and depth > 0
+        np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-9)
+    assert between(cameras[:1]) == cameras[:1]
+    assert between([cameras[0], cameras[6]]) == [cameras[0], cameras[6]]  # opposite ones
 
 
 def test_a_path_goes_smoothly_through_its_cameras():

@@ -59,21 +59,22 @@ def draw_splats(splats, camera):
         jacobian[:, axis, axis], jacobian[:, axis, 2] = focal / z, -focal * slope / z
     jacobian = jacobian @ axes
     flat = jacobian @ splats["covariance"][order] @ jacobian.transpose(0, 2, 1)
-    inverse = np.linalg.inv(flat + LOW_PASS * np.eye(2))
+    spread = flat + LOW_PASS * np.eye(2)
+    inverse = np.linalg.inv(spread)
     centre = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
-    first = np.floor(centre).astype(int)
-    reach = int(np.ceil(3.4 * np.sqrt(flat[:, [0, 1], [0, 1]].max() + LOW_PASS)))
-    parts = []
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            column, row = (first + (dx, dy)).T
-            away = np.stack([column, row], 1) + 0.5 - centre
-            falloff = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, inverse, away))
-            alpha = np.minimum(MOST, splats["opacity"][order] * falloff)
-            inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            hit = np.flatnonzero(inside & (alpha >= LEAST))
-            parts.append((row[hit] * camera.width + column[hit], hit, alpha[hit]))
-    pixel, rank, alpha = (np.concatenate(part) for part in zip(*parts, strict=True))
+    size = np.array([camera.width, camera.height])
+    reach = 3.4 * np.sqrt(spread[:, [0, 1], [0, 1]])
+    first = np.clip(np.floor(centre - reach), 0, size).astype(int)
+    sides = (np.clip(np.floor(centre + reach) + 1, 0, size).astype(int) - first).clip(0)
+    count = sides.prod(axis=1)
+    rank = np.repeat(np.arange(n), count)  # of each pixel of the boxes
+    place = np.arange(len(rank)) - np.repeat(np.cumsum(count) - count, count)
+    column, row = first[rank].T + np.stack([place % sides[rank, 0], place // sides[rank, 0]])
+    away = np.stack([column, row], 1) + 0.5 - centre[rank]
+    falloff = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, inverse[rank], away))
+    alpha = np.minimum(MOST, splats["opacity"][order][rank] * falloff)
+    hit = alpha >= LEAST
+    pixel, rank, alpha = (row * camera.width + column)[hit], rank[hit], alpha[hit]
     sort = np.lexsort((rank, pixel))
     pixel, rank, alpha = pixel[sort], rank[sort], alpha[sort]
     through = np.concatenate([[0], np.cumsum(np.log1p(-alpha))])  # of the light, logarithm
