@@ -107,7 +107,7 @@ def export(
             check_spz()
         table, origin = splats(run, turn, window, within)
         table["position"] *= metres
-        table["deviation"] *= metres
+        table["deviations"] *= metres
         _begin_default(name, path)
         if name == "splat":
             write_splat_ply(path, table)
