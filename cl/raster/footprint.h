@@ -81,25 +81,6 @@ ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
 }
 
 // Tests pixel (column, row) of each point's box: lanes that hit are not 0.
-#if FOOTPRINT == GAUSSIAN
-ALWAYS_INLINE ints footprints_hit(
-    const Camera *cam,
-    const Footprints *f,
-    const int column,
-    const int row,
-    floats *closeness,
-    floats *depth) {
-#pragma OPENCL FP_CONTRACT OFF
-    const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
-    const floats dx = LANED(convert_float)(x) + 0.5f - f->u;
-    const floats dy = LANED(convert_float)(y) + 0.5f - f->v;
-    const floats sx = f->white[0] * dx + f->white[1] * dy, sy = f->white[2] * dy;
-    const floats s2 = sx * sx + sy * sy;
-    *closeness = exp(-0.5f * s2);
-    *depth = f->z;
-    return x <= LANES_FROM(f->box[2]) && y <= LANES_FROM(f->box[3]) && s2 < DEVIATIONS * DEVIATIONS;
-}
-#else
 ALWAYS_INLINE ints footprints_hit(
     const Camera *cam,
     const Footprints *f,
@@ -112,10 +93,18 @@ ALWAYS_INLINE ints footprints_hit(
 #pragma OPENCL FP_CONTRACT OFF
     const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
     const floats px = LANED(convert_float)(x), py = LANED(convert_float)(y);
+    ints hit = x <= LANES_FROM(f->box[2]) && y <= LANES_FROM(f->box[3]);
+#if FOOTPRINT == GAUSSIAN
+    const floats dx = px + 0.5f - f->u, dy = py + 0.5f - f->v;
+    const floats sx = f->white[0] * dx + f->white[1] * dy, sy = f->white[2] * dy;
+    const floats s2 = sx * sx + sy * sy;
+    hit = hit && s2 < DEVIATIONS * DEVIATIONS;
+    *closeness = exp(-0.5f * s2);
+    *depth = f->z;
+#else
     const floats mx = (px + (0.5f - cam->cx)) * f->per_fx;
     const floats my = (py + (0.5f - cam->cy)) * f->per_fy;
     const floats m2 = mx * mx + my * my + 1.0f;  // of (mx, my, 1), along the ray
-    ints hit = x <= LANES_FROM(f->box[2]) && y <= LANES_FROM(f->box[3]);
 #if FOOTPRINT != SPHERE
     // Differs from Pulsar, whose distance from the ray is that at the centre's range, whose depth is
     // that of the sphere's front, up to a radius nearer, and whose d varies within every footprint of
@@ -141,8 +130,8 @@ ALWAYS_INLINE ints footprints_hit(
     const floats w = sqrt(square(wx, wy, wz));
     *depth = fmax(along - sqrt((f->radius + w) * fmax(f->radius - w, 0.0f)), 0.0f);
 #endif
+#endif
     return hit;
 }
-#endif
 
 #endif

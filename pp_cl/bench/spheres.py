@@ -10,8 +10,7 @@ from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
-from pp_cl.raster.points import offset_width
-from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints, projection_table
+from pp_cl.raster.project import ProjectedPoints, projection_program, projection_table
 from pp_cl.raster.weights import BlendWeights
 
 
@@ -27,12 +26,7 @@ def project_spheres(
     """Project points anywhere. positions: (N, 3) float32, world. point_radius: (N,)."""
     n = len(positions)
     b.require(projection_table(n, footprint))
-    program = dev.program(
-        "raster/project",
-        LANES=lanes(dev),
-        FOOTPRINT=FOOTPRINTS.index(footprint),
-        OFFSETS=offset_width(footprint),
-    )
+    program = projection_program(dev, footprint)
     program.launch(
         "project_spheres",
         -(-n // lanes(dev)),

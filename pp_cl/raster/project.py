@@ -10,7 +10,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
-from pp_cl.device.device import Device
+from pp_cl.device.device import Device, Program
 from pp_cl.device.launch import lanes
 from pp_cl.raster.points import offset_width
 
@@ -54,6 +54,16 @@ def projection_table(n: int, footprint: str = "soft") -> Table:
     }
 
 
+def projection_program(dev: Device, footprint: str) -> Program:
+    """The kernels that project points of one of FOOTPRINTS."""
+    return dev.program(
+        "raster/project",
+        LANES=lanes(dev),
+        FOOTPRINT=FOOTPRINTS.index(footprint),
+        OFFSETS=offset_width(footprint),
+    )
+
+
 def project_grid(
     dev: Device,
     b: Buffers,
@@ -72,12 +82,7 @@ def project_grid(
     """
     n = point_id.size
     b.require(projection_table(n, footprint))
-    program = dev.program(
-        "raster/project",
-        LANES=lanes(dev),
-        FOOTPRINT=FOOTPRINTS.index(footprint),
-        OFFSETS=offset_width(footprint),
-    )
+    program = projection_program(dev, footprint)
     program.launch(
         "project_grid",
         -(-n // lanes(dev)),
