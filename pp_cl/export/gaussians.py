@@ -29,7 +29,7 @@ from pp_cl.settings import TrainConfig
 from pp_cl.train import Trainer
 from pp_cl.training.crops import Crop, Crops
 
-STEPS = 3000
+STEPS = 4500
 CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of the window, of an image
 EARLY_STOP = 1e-4  # of viewers
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
