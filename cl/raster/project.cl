@@ -284,19 +284,19 @@ kernel void project_grid(
     const uints k = divide(&j, (uint)grid[5]);
     Footprints f;
 #if FOOTPRINT == GAUSSIAN
-    const floats of_all = radius;
+    const floats size = radius;  // of the culling alone
     floats lower[6];
     for (uint axis = 0; axis < 3; axis++) {
         lower[axis] = radius * exp(LANES_FROM(offset[3 + axis]));
         lower[3 + axis] = radius * LANES_FROM(offset[6 + axis]);
     }
 #else
-    const floats of_all = radius * exp(LANES_FROM(offset[3])), *lower = 0;
+    const floats size = radius * exp(LANES_FROM(offset[3])), *lower = 0;  // unread
 #endif
     const bool any_hit = project(
         &cam, grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0])),
         grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1])),
-        grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])), of_all, lower, &f);
+        grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])), size, lower, &f);
     store_points(
         &cam, &f, any_hit, first, count, point_camera, point_box, point_count, point_white);
     if (!any_hit) return;

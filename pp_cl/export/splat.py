@@ -30,7 +30,7 @@ from pp_cl.scene.camera_path import up_of
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
 # In a .spz: steps of a place in the widest deviation of the smallest Gaussian; of the harmonics of
 # degrees 1 and 2, whose bytes else hardly shrink: half of those of Niantic's own writer, with which
-# the demo loses 0.3 dB, not 0.1, for a tenth fewer bytes.
+# the demo loses 0.3 dB, not 0.2, for a tenth fewer bytes.
 STEPS_OF_PLACE = 32
 STEPS_OF_DEGREE = 1 / 32, 1 / 16
 STORED = 16  # functions in a .ply: many programs read no file but of degree 3

@@ -48,7 +48,7 @@ MOST_OF_GAUSSIANS = 2.0  # edges, logarithms and deviations
 
 
 def offset_width(footprint: str) -> int:
-    """Numbers in a row of PointCloud.offset: of Gaussians those of cl/raster/footprint.h."""
+    """Numbers in a row of PointCloud.offset: of Gaussians those of cl/cloud.h."""
     return 16 if footprint == "gaussian" else 4
 
 
@@ -76,7 +76,7 @@ class PointCloud:
     ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
     point in its cell, in edges of the grid, and the logarithm of its radius over
     point_radius() of the settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up
-    to MOST_OF_GAUSSIANS: see cl/raster/footprint.h. opacity: (N) float32 in [0, 1]. sh: the
+    to MOST_OF_GAUSSIANS: see cl/cloud.h. opacity: (N) float32 in [0, 1]. sh: the
     SH coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained
     any more.
     """
