@@ -22,7 +22,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static -DREAD_AHEAD=(void)" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results readme network dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results readme figures network dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -104,6 +104,9 @@ readme: $(READY) ## type README.md's commands in an empty folder, on each driver
 network: $(READY) ## train the demo and keep its network as what `--network demo` begins with
 	@$(BIN)/pp-cl train demo --iterations 1500 --seed 1 --out runs/network
 	@$(BIN)/python -m tools.keep_network runs/network
+
+figures: $(READY) ## fail if a figure in README.md or docs/ is older than the code that decides it: before a release
+	@$(BIN)/python -m tools.provenance
 
 dist: $(READY) ## build the wheel and the source archive into dist/, check both, train the demo with each from an empty folder
 	@rm -rf build dist

@@ -1,11 +1,16 @@
 """Of which code a figure in the documents is: a digest of all that decides a training, which is
-stored with each measurement, so that a page can say where the code has changed since.
+stored with each measurement, so that a page can say where the code has changed since, and that no
+release states such figures.
+
+    python -m tools.provenance      # or make figures; fails where figures are of older code
 """
 
 import hashlib
 import io
+import json
 import shutil
 import subprocess
+import sys
 import tarfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -61,3 +66,25 @@ def sentence(results: dict, now: str) -> str:
     said += f"; {results['how']}." if results.get("how") else "."
     later = " Later commits have changed what decides a training."
     return said + (later if results["decides"] != now else "")
+
+
+def older(folder: Path, now: str) -> list[str]:
+    """A line for each file of results in a folder that is of other code than now, a digest()."""
+    files = {path: json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.json"))}
+    return [
+        f"{path}: of commit {results['commit']}, before the last change to what decides a training;"
+        " measure it again with `make readme` or `make results`"
+        for path, results in files.items()
+        if results["decides"] != now
+    ]
+
+
+def main(root: Path = ROOT) -> int:
+    """Print what is older than the code; returns the exit status."""
+    found = older(root / "docs" / "results", digest(root))
+    print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

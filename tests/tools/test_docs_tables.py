@@ -56,6 +56,24 @@ def test_a_page_says_so_where_the_code_has_changed_since(tmp_path, monkeypatch):
         (tmp_path / name).write_text("one")
 
 
+def test_no_release_states_figures_of_older_code(tmp_path, capsys):
+    """Of two files one is of the code as it was before a kernel changed."""
+    results, kernel = tmp_path / "docs" / "results", tmp_path / "cl" / "a.cl"
+    results.mkdir(parents=True)
+    kernel.parent.mkdir()
+    kernel.write_text("before")
+    old = RESULTS | {"decides": provenance.digest(tmp_path)}
+    kernel.write_text("after")
+    new = RESULTS | {"decides": provenance.digest(tmp_path)}
+    for name, contents in {"old": old, "new": new}.items():
+        (results / f"{name}.json").write_text(json.dumps(contents))
+    assert provenance.main(tmp_path) == 1
+    told = capsys.readouterr().err
+    assert "old.json: of commit abc" in told and "new.json" not in told
+    (results / "old.json").unlink()
+    assert provenance.main(tmp_path) == 0 and not capsys.readouterr().err
+
+
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="an archive without its history")
 def test_the_digest_of_a_commit_is_that_of_its_checkout(tmp_path):
     words = ["git", "worktree", "add", "--detach", str(tmp_path / "tree"), "HEAD"]
