@@ -29,10 +29,10 @@
 
 // Asks for what lies at a global address before it is read, on CPUs, where walks over hits and
 // points wait mostly for what lies anywhere in memory. They look so many hits or points ahead. A
-// simulator that cannot defines it as (void), too.
+// simulator that cannot defines it as (void), too; NVIDIA's compiler takes no pointer for it.
 #define HITS_AHEAD 32
 #define POINTS_AHEAD 8
-#if LANES == 16 && !defined(READ_AHEAD) && defined(__has_builtin)
+#if LANES == 16 && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
 // through a number, since its argument is a pointer to private memory
 #define READ_AHEAD(address) __builtin_prefetch((const void *)(uintptr_t)(address))

@@ -26,6 +26,9 @@
 #ifndef MOVES
 #define MOVES 0  // 1: gradients of the offsets of soft points that are composited by alpha
 #endif
+#ifndef CLAMPED
+#define CLAMPED 0  // 1: features that shade.cl has clamped to 0 have no gradient
+#endif
 
 // The depth of a key, the weight of an entry.
 static inline float upper_float(const ulong word) {
@@ -185,8 +188,9 @@ kernel void blend_backward(
     global const uint *pair_pixel,             // (P)
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global const float2 *pair_gradient,        // (P, 2) b, s gain
+    global const float16 *shaded_features,     // (?, 16) a row for each, read with CLAMPED
     global const float16 *grad_features,       // (H, W, 16) G
-    global float16 *grad_shaded_features,      // (?, 16) a row for each
+    global float16 *grad_shaded_features,      // (?, 16) alike
     global float *grad_opacity,                // (?) alike
     global float *grad_offset)                 // (?, OFFSETS) alike, with MOVES
 {
@@ -213,6 +217,7 @@ kernel void blend_backward(
             if (d > 0.0f) offset_add(&moved, &cam, q, d, opacity[i] * of_hit.y / d);
         }
     }
+    if (CLAMPED) dL_df = load_part(shaded_features, g) == 0.0f ? 0.0f : dL_df;
     store_part(dL_df, grad_shaded_features, g);
     if (ROW_PART != 0) return;
     grad_opacity[g] = dL_do;

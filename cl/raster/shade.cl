@@ -8,6 +8,10 @@
 #define DEGREE 2  // of the highest harmonics in use: 0, 1 or 2
 #endif
 
+#ifndef CLAMPED
+#define CLAMPED 0  // 1: features below 0 become 0, as viewers of 3D Gaussian splatting draw colours
+#endif
+
 // Blends `features` of the coefficients of point i, read by LOAD(index, array), in the direction
 // from the eye to it.
 #define SHADE(LOAD, i, features)                                                                   \
@@ -22,7 +26,8 @@
             features += basis[4 + b] * LOAD(3 * i + b, sh_2a);                                     \
         for (uint b = 0; b < 2; b++)                                                               \
             features += basis[7 + b] * LOAD(2 * i + b, sh_2b);                                     \
-    }
+    }                                                                                              \
+    if (CLAMPED) features = features < 0.0f ? 0.0f : features; /* a NaN stays one */
 
 #define LOAD_FLOAT(index, array) load_part(array, index)
 #define LOAD_HALF(index, array) load_half_part(array, index)

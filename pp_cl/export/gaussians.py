@@ -1,6 +1,6 @@
-"""Gaussians of three axes fitted to a run's own renderings of its training views and of as many
-views between them, as viewers of 3D Gaussian splatting draw them: without a network, and each
-widened by a third of a pixel^2.
+"""Gaussians of three axes fitted to a run's photographs and to its own renderings of as many views
+between them, as viewers of 3D Gaussian splatting draw them: without a network, each widened by a
+third of a pixel^2, and colours below 0 taken for black.
 
 The trainer does it, with the footprint "gaussian" and means of features in place of the network.
 """
@@ -8,6 +8,7 @@ The trainer does it, with the footprint "gaussian" and means of features in plac
 from __future__ import annotations
 
 import copy
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -103,10 +104,11 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud, net = _cloud(run, coefficients), Means(dev)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)  # type: ignore[arg-type]
-    photographs = run.photographs("train")
-    more = between([one.camera for one in photographs])
-    photographs += [replace(one, camera=c) for one, c in zip(photographs, more, strict=True)]
-    views = run.rendered(photographs, opaque=True)
+    listed = run.photographs("train")
+    more = between([one.camera for one in listed])
+    more = [replace(one, camera=camera) for one, camera in zip(listed, more, strict=True)]
+    views = _photographs(run) or run.rendered(listed, opaque=True)
+    views += run.rendered(more, opaque=True)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     net.scale = min(max(1, round(window / longest)), CROP // LEAST_CROP)
     config = _config(run.config, CROP // net.scale)
@@ -127,6 +129,21 @@ def triangles(offset: np.ndarray) -> np.ndarray:
     lower[:, range(3), range(3)] = np.exp(offset[:, 3:6])
     lower[:, [1, 2, 2], [0, 0, 1]] = offset[:, 6:9]
     return lower
+
+
+def _photographs(run):
+    """The run's training views, none if their exposures differ, or with a warning if they are not
+    there.
+    """
+    if run.header.get("exposed"):
+        return []
+    try:
+        views = run.scene("train").splits["train"]
+    except UserError as error:
+        told = f"the Gaussians are fitted to renderings of the training views alone: {error}"
+        warnings.warn(told, stacklevel=2)
+        return []
+    return [view for view in views if view.name not in run.header.get("left_out", ())]
 
 
 def _cloud(run, coefficients):

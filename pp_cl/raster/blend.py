@@ -28,13 +28,14 @@ def shade_forward(
     *,
     shaded_features: Array,
 ) -> None:
-    """Write shaded_features, (S, 16) float32 or longer.
+    """Write shaded_features, (S, 16) float32 or longer, of Gaussians at least 0.
 
     The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32, the
     visible points. sh: of PointCloud.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
-    dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh)).launch(
+    defines = {"LANES": lanes(dev), "DEGREE": stored_degree(sh)} | _clamping(points)
+    dev.program("raster/shade", **defines).launch(
         "shade_forward_half" if sh_0.dtype == np.float16 else "shade_forward",
         shaded.size * row_parts(dev),
         s=shaded.size,
@@ -147,7 +148,7 @@ def blend_backward(
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    of_points: dict[str, int] = {"OFFSETS": offset_width(points.footprint)}
+    of_points = {"OFFSETS": offset_width(points.footprint)} | _clamping(points)
     if moves:
         of_points |= {"FOOTPRINT": FOOTPRINTS.index(points.footprint), "MOVES": 1}
     program = _program(dev, **of_points)
@@ -181,6 +182,7 @@ def blend_backward(
         pair_pixel=pairs.pair_pixel,
         pair_point_closeness=pairs.pair_point_closeness,
         pair_gradient=b.pair_gradient,
+        shaded_features=shaded_features,
         grad_features=grad_features,
         grad_shaded_features=b.grad_shaded_features,
         grad_opacity=b.grad_opacity,
@@ -193,6 +195,11 @@ def blend_backward(
         b.pixel_spread,
         b.pair_gradient,
     )
+
+
+def _clamping(points):
+    """The define of shade.cl and blend.cl for the kind of points."""
+    return {"CLAMPED": 1} if points.footprint == "gaussian" else {}
 
 
 def _program(dev, **defines):

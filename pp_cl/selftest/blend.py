@@ -170,7 +170,8 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _gaussians(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Of all shapes: their pictures, and the gradients of places and shapes, against finite
-    differences of what the closeness changes. 1e-3: far below a pixel.
+    differences of what the closeness changes; features that were clamped to 0 have none. 1e-3: far
+    below a pixel.
     """
     for n, radius, stop in ((33, 0.1, 0.0), (17, 0.1, 0.05), (17, 1e-3, 0.0), (1, 0.2, 0.0)):
         yield from _check_gaussians(dev, rng, n, radius, stop)
@@ -180,13 +181,16 @@ def _check_gaussians(dev, rng, n, radius, stop):
     camera, grid = make_camera(), Grid((-1.5, -1.5, -1.5), 0.3, (11, 11, 11))
     ids = np.sort(rng.choice(np.prod(grid.dims), n, replace=False))
     learned = rng.uniform(-1, 1, (n, 9)).astype(np.float32)
-    opacity, features = rng.uniform(0.1, 1, n).astype(np.float32), rng.normal(size=(n, 16))
+    opacity = rng.uniform(0.1, 1, n).astype(np.float32)
+    features = np.maximum(rng.normal(size=(n, 16)), 0)
     grad = rng.normal(size=(camera.width * camera.height, 16))
     scene = PairedGaussians(dev, camera, grid, ids, np.pad(learned, ((0, 0), (0, 7))), radius)
     picture = scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
-    gradients, measured = scene.gradients(grad, edge=grid.edge)["offset"], scene.geometry()
+    found, measured = scene.gradients(grad, edge=grid.edge), scene.geometry()
     blend, hit = dense.alpha(measured, opacity, stop), measured["hit"]
     yield relative(picture.reshape(-1, 16), dense.features(blend, features), WEIGHT["alpha"])
+    expected = np.where(features > 0, blend["weight"] @ grad, 0)
+    yield relative(found["features"], expected, WEIGHT["alpha"])
     place = partial(dense.gaussians, camera, grid.positions(ids), grid.edge, radius=radius)
     expected = place(learned)["closeness"]
     yield absolute(measured["closeness"][hit], expected[hit], WEIGHT["alpha"])
@@ -196,8 +200,8 @@ def _check_gaussians(dev, rng, n, radius, stop):
         return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
 
     numeric = numeric_gradient(loss, learned.astype(np.float64), STEP)
-    yield relative(gradients[:, :9].ravel(), numeric, DIFFERENCES)
-    yield exact(gradients[:, 9:], np.zeros((n, 7)))
+    yield relative(found["offset"][:, :9].ravel(), numeric, DIFFERENCES)
+    yield exact(found["offset"][:, 9:], np.zeros((n, 7)))
 
 
 def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

@@ -153,8 +153,8 @@ def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Harmonics of all degrees; those of 16 bits give what the same numbers in 32 bits give. No row
-    is written for points that are not listed.
+    """Harmonics of all degrees; those of 16 bits give what the same numbers in 32 bits give, of
+    Gaussians at least 0. No row is written for points that are not listed.
     """
     camera = make_camera()
     for n, degree in product(SIZES, SH_DEGREES):
@@ -162,11 +162,11 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         scene = PairedPoints(dev, camera, positions, 0.1)
         seen, sh = scene.seen[::2], [rng.normal(size=(n, b.count, 16)) for b in sh_blocks(degree)]
 
-        def shaded(sh, scene=scene, seen=seen):
+        def shaded(sh, points=scene.projected, seen=seen):
             features = dev.upload(np.full((len(seen) + 3, 16), 7.0), np.float32)
             shade_forward(
                 dev,
-                scene.projected,
+                points,
                 dev.upload(seen, np.uint32),
                 [dev.upload(block) for block in sh],
                 shaded_features=features,
@@ -178,6 +178,9 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         # nine products of a direction's squares: 5 roundings each, of values of up to 4
         yield relative(features[:-3], expected[seen], 1e-5)
         yield exact(features[-3:], np.full((3, 16), 7))
+        gaussians = replace(scene.projected, footprint="gaussian")
+        clamped = shaded([block.astype(np.float32) for block in sh], gaussians)
+        yield exact(clamped[:-3], np.maximum(features[:-3], 0))
         sh[0][:, 0, :4] = 0, -6e-8, 65504, 1e-5  # denormal halves and the largest
         half = [block.astype(np.float16) for block in sh]
         yield exact(shaded(half), shaded([block.astype(np.float32) for block in half]))

@@ -3,6 +3,7 @@
 import json
 import struct
 from dataclasses import replace
+from unittest.mock import Mock
 
 import gsply
 import numpy as np
@@ -14,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from support.splats import colours, draw_splats, read_splats
 
 from pp_cl.errors import UserError
-from pp_cl.export import splat
-from pp_cl.export.gaussians import DEVIATION
+from pp_cl.export import gaussians, splat
+from pp_cl.export.gaussians import DEVIATION, fit_gaussians
 from pp_cl.export.splat import (
     Y_DOWN,
     Y_UP,
@@ -95,6 +96,33 @@ def test_gaussians_look_like_the_run_in_the_window_that_they_are_for(run, ply, t
     write_splat_ply(small, splats(run, upright(run, Y_DOWN), 30)[0])
     assert likeness(run, ply, 3) > 37
     assert likeness(run, small, 1) > 37 and likeness(run, ply, 1) < 30
+
+
+def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monkeypatch):
+    """And to as many renderings between them; to renderings alone where exposures differ, or where
+    the scene is gone.
+    """
+    monkeypatch.setattr(gaussians, "Trainer", fitted := Mock(side_effect=InterruptedError))
+
+    def views():
+        with pytest.raises(InterruptedError):
+            fit_gaussians(run, 30)
+        return fitted.call_args[0][3]
+
+    photographs, found = run.scene("train").splits["train"], views()
+    assert len(found) == 2 * len(photographs)
+    for one, other in zip(photographs, found, strict=False):
+        assert one.name == other.name and (one.image == other.image).all()
+    rendered = [view.image.shape for view in run.rendered(run.photographs("train"), opaque=True)]
+    assert [view.image.shape for view in found[len(photographs) :]] == rendered
+    monkeypatch.setitem(run.header, "left_out", [found[0].name])
+    assert [view.name for view in views()][:2] == [found[1].name, found[2].name]
+    monkeypatch.setitem(run.header, "exposed", True)
+    assert [view.image.shape for view in views()] == 2 * rendered
+    monkeypatch.delitem(run.header, "exposed")
+    monkeypatch.setattr(run.config.scene, "path", "gone")
+    with pytest.warns(UserWarning, match="renderings of the training views alone: gone"):
+        assert [view.image.shape for view in views()] == 2 * rendered
 
 
 def test_the_spz_says_the_same_with_y_up(run, ply, tmp_path):
