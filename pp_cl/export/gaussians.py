@@ -105,8 +105,8 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     cloud, net = _cloud(run, coefficients), Means(dev)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)  # type: ignore[arg-type]
     listed = run.photographs("train")
-    more = between([one.camera for one in listed])
-    more = [replace(one, camera=camera) for one, camera in zip(listed, more, strict=True)]
+    cameras = between([one.camera for one in listed])
+    more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
     views = _photographs(run) or run.rendered(listed, opaque=True)
     views += run.rendered(more, opaque=True)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
