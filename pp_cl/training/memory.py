@@ -24,11 +24,12 @@ from pp_cl.training.state import PointState
 MIB, GIB = 2**20, 2**30
 
 # Bytes on the device beside what a point learns: of each point in a view (its projection, its
-# place in the lists of pairs and of visible points), of its neighbours, of a pair in an image and
-# in a step (with slope and gradient), of a visible point's features in either, and of a
-# step's pixel (target, loss and features with their gradients).
+# place in the lists of pairs and of visible points), of its neighbours, of a pair in an image, in
+# one whose weights are listed by point (for the last pruning) and in a step (with slope and
+# gradient), of a visible point's features in an image and in a step, and of a step's pixel
+# (target, loss and features with their gradients).
 VIEW_POINT, NEIGHBOURS = 45, 25
-PAIR, TRAINED_PAIR = 28, 40
+PAIR, LISTED_PAIR, TRAINED_PAIR = 28, 36, 40
 FEATURES, TRAINED_FEATURES = 64, 148
 TRAINED_PIXEL = 400
 GROWN = 1.25  # arrays of pairs have this much more room than is needed
@@ -167,13 +168,15 @@ class Room:
         raise UserError(f"{why}: {lower}, or choose another device (`pp-cl devices`)")
 
     def _needed(self, points, radius, step):
-        """The Need from a step on. radius: of the footprints, pixels of the largest photograph as
-        it is stored.
+        """The Need from a step on. radius: of the footprints then, pixels of the largest photograph
+        as it is stored.
         """
-        levels = [
-            (*self._bytes(n, left, is_averaged, radius), n, left)
-            for n, left, is_averaged in _levels(self._config.train, points, step)
-        ]
+        begun = sum(step < at for at in refine_steps(self._config.train))
+        levels = []
+        for n, left, is_averaged in _levels(self._config.train, points, step):
+            # of soft points as wide as points are apart, which refining halves
+            halved = begun - left if self._config.raster.footprint == "soft" else 0
+            levels.append((*self._bytes(n, left, is_averaged, radius / 2**halved), n, left))
         device, _, at_peak, _ = max(levels)
         refined = [n for _, _, n, left in levels if left]
         training = PIECES + REFINING * max(refined, default=0) + self.dev.is_cpu * device
@@ -188,8 +191,6 @@ class Room:
         """(bytes on the device, those of the largest buffer) with some refinements left."""
         config, downscale = self._config, self._config.scene.downscale
         raster, train, blocks = config.raster, config.train, sh_blocks(config.points.sh_degree)
-        if raster.footprint == "soft":  # as wide as points are apart, which refining halves
-            radius /= 2 ** (len(refine_steps(train)) - left)
         crop_size = _size_of(
             self._largest.downscaled(downscale << left), crop_side(train.crop, left)
         )
@@ -204,10 +205,12 @@ class Room:
             f"state.{name}": row for name, row in PointState.table(1).items()
         }
         point = table_bytes(learned) + VIEW_POINT + NEIGHBOURS * (train.sh_smoothing > 0)
-        if is_averaged:
-            point += table_bytes(PointState.ema_table(1))
-        step = share * (pairs * TRAINED_PAIR + shown * TRAINED_FEATURES)
-        preview = pairs * PAIR + shown * FEATURES  # takes turns with a step
+        averages = is_averaged * table_bytes(PointState.ema_table(1))
+        # these take turns
+        step = share * (pairs * TRAINED_PAIR + shown * TRAINED_FEATURES) + points * averages
+        preview = pairs * PAIR + shown * FEATURES + points * averages
+        is_end = left == 0 and is_averaged == train.ema
+        pruning = pairs * LISTED_PAIR if is_end and train.prune_weight > 0 else 0
         trained, rendered, widest = MAPS[config.network.blocks]
         channels = sum(width / 4**level for level, width in enumerate(config.network.widths))
         maps = 4 * channels * (crop * trained + image * rendered)
@@ -215,7 +218,7 @@ class Room:
         parameters += self._net.work_bytes(crop_size, True)
         parameters += self._net.work_bytes(image_size, False)
         photograph = self._photographs // len(self._sizes)
-        total = points * point + max(step, preview) + crop * TRAINED_PIXEL + maps
+        total = points * point + max(step, preview, pruning) + crop * TRAINED_PIXEL + maps
         total += parameters + photograph
         coefficients = 64 * points * max(block.count for block in blocks)
         largest = max(coefficients, 8 * pairs, 4 * image * config.network.widths[0] * widest)

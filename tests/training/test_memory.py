@@ -96,6 +96,15 @@ def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
     assert last.points == 600_000
 
 
+def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
+    """Its points are half as wide once, not twice."""
+    made = room(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
+    finer = Grid(GRID.origin, GRID.edge / 2, tuple(2 * n for n in GRID.dims))
+    planned, found = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 7000)
+    assert planned.points == found.points == 160_000
+    assert found.device == pytest.approx(planned.device, rel=0.01)
+
+
 def test_a_grid_is_not_refined_beyond_what_ids_can_number(dev):
     """Of a thin object, whose few points lie in the largest grid."""
     made = room(dev, "full", train__refine_at="0.3,0.6")
