@@ -30,7 +30,7 @@ from pp_cl.settings import TrainConfig
 from pp_cl.train import Trainer
 from pp_cl.training.crops import Crop, Crops
 
-STEPS = 4500
+STEPS = 4500  # of windows as large as the images; of larger ones, whose crops show a part, twice
 CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of the window, of an image
 EARLY_STOP = 1e-4  # of viewers
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
@@ -111,10 +111,11 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     views += run.rendered(more, opaque=True)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     net.scale = min(max(1, round(window / longest)), CROP // LEAST_CROP)
-    config = _config(run.config, CROP // net.scale)
+    steps = STEPS if net.scale == 1 else 2 * STEPS
+    config = _config(run.config, CROP // net.scale, steps)
     trainer = Trainer(dev, config, model, views)
     trainer.crops = LargeCrops(trainer.views, config.train, net.scale)
-    for _ in tqdm(range(STEPS), "fitting Gaussians", unit="step", leave=False, disable=None):
+    for _ in tqdm(range(steps), "fitting Gaussians", unit="step", leave=False, disable=None):
         trainer.train_step()
     trainer.check()
     trainer.finish()
@@ -166,17 +167,17 @@ def _cloud(run, coefficients):
     )
 
 
-def _config(given: Config, crop: int) -> Config:
+def _config(given: Config, crop: int, steps: int) -> Config:
     """What the trainer follows here. crop: its side, pixels of the run's images."""
     config = copy.deepcopy(given)
     raster, train = config.raster, config.train
     raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
     raster.radius *= DEVIATION
-    train.iterations, train.crop, train.refine_at, train.ema = STEPS, crop, (), True
+    train.iterations, train.crop, train.refine_at, train.ema = steps, crop, (), True
     train.mask_weight = train.spread_weight = train.sh_smoothing = train.prune_weight = 0.0
-    train.exposure = "off"
-    # of the defaults a seventeenth, two thirds and four times: colours, which begin nearly right,
-    # would diverge, and shapes have the longest way
-    train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (2e-2, 6e-3)
+    train.exposure, train.ssim_weight = "off", 0.0
+    # of the defaults a fortieth, twice and four times: colours, which begin nearly right, would
+    # diverge, and shapes have the longest way
+    train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (6e-2, 1.8e-2)
     train.offset_rate = (4e-2, 4e-3)
     return config
