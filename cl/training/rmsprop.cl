@@ -31,18 +31,26 @@
 #endif
 #define MEAN_SQUARE 0.07957747f  // 1 / (4 pi), of each harmonic over all directions
 
+// A value in [least, most]; clamp() would hide a NaN.
+#define BOUNDED(value, least, most)                                                                \
+    ((value) < (least) ? (least) : (value) > (most) ? (most) : (value))
+
+#ifdef MOST_SH  // of coefficients above degree 0; without it they have no bounds
+#define BOUNDED_SH(value, k)                                                                       \
+    ((k) == 0 ? (value) : BOUNDED(value, (floats)(-MOST_SH), (floats)(MOST_SH)))
+#else
+#define BOUNDED_SH(value, k) (value)
+#endif
+
 // Moves `count` coefficients of point i, from basis function `first` on.
 #define MOVE(sh, first, count, rate)                                                               \
     {                                                                                              \
         UNROLLED for (size_t k = 0; k < count; k++) {                                              \
             const size_t at = i * count + k;                                                       \
-            store_part(load_part(sh, at) - rate * basis[first + k] * scaled, sh, at);              \
+            const floats moved = load_part(sh, at) - rate * basis[first + k] * scaled;             \
+            store_part(BOUNDED_SH(moved, first + k), sh, at);                                      \
         }                                                                                          \
     }
-
-// A value in [least, most]; clamp() would hide a NaN.
-#define BOUNDED(value, least, most)                                                                \
-    ((value) < (least) ? (least) : (value) > (most) ? (most) : (value))
 
 // One work-item per part of a visible point: takes its gradients into the second moments, moves its
 // coefficients; the first one moves offset and opacity, and writes the step of the gradient.

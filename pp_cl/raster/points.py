@@ -45,6 +45,7 @@ SH_BLOCKS = (
 SH_DEGREES = (0, 1, 2)
 MOST_OFFSET = 0.5  # edges along each axis: a point stays in its cell; radii times 0.61 to 1.65
 MOST_OF_GAUSSIANS = 2.0  # edges, logarithms and deviations
+MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: what a .spz can hold
 
 
 def offset_width(footprint: str) -> int:
@@ -95,6 +96,11 @@ class PointCloud:
     def most_offset(self) -> float:
         """The bound of `offset`."""
         return MOST_OFFSET if self.offset.shape[1] == 4 else MOST_OF_GAUSSIANS
+
+    @property
+    def most_sh(self) -> float:
+        """The bound of SH coefficients above degree 0, infinity if they have none."""
+        return math.inf if self.offset.shape[1] == 4 else MOST_SH_OF_GAUSSIANS
 
     @property
     def blocks(self) -> tuple[ShBlock, ...]:

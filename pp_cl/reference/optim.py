@@ -29,20 +29,22 @@ class Adam:
 class RmsProp:
     """The step of cl/training/rmsprop.cl, written out for all points in every step.
 
-    basis: (N, count), harmonics of the coefficients sh, (N, count, 16). most: of an offset. offset:
-    (N, 4). opacity: (N,). v: {"sh": (N, 16), "offset", "opacity"}.
+    basis: (N, count), harmonics of the coefficients sh, (N, count, 16). most: of an offset;
+    most_sh: of coefficients above degree 0. offset: (N, 4), of Gaussians (N, 16). opacity: (N,). v:
+    {"sh": (N, 16), "offset", "opacity"}.
     """
 
     def __init__(
         self,
         basis: np.ndarray,
         most: float,
+        most_sh: float = np.inf,
         *,
         sh: np.ndarray,
         offset: np.ndarray,
         opacity: np.ndarray,
     ):
-        self.basis, self.most, self.t = basis, most, 0
+        self.basis, self.most, self.most_sh, self.t = basis, most, most_sh, 0
         self.sh, self.offset = np.array(sh, np.float64), np.array(offset, np.float64)
         self.opacity = np.array(opacity, np.float64)
         self.v = {name: np.zeros_like(getattr(self, name)) for name in ("offset", "opacity")}
@@ -64,6 +66,7 @@ class RmsProp:
         self.t = t
         by_basis = np.asarray(rates["sh"])[: self.basis.shape[1]] * self.basis
         self.sh -= by_basis[:, :, None] * moves["sh"][:, None, :]
+        self.sh[:, 1:] = np.clip(self.sh[:, 1:], -self.most_sh, self.most_sh)
         shifted = self.offset - rates["offset"] * moves["offset"]
         self.offset = np.clip(shifted, -self.most, self.most)
         self.opacity = np.clip(self.opacity - rates["opacity"] * moves["opacity"], 0, 1)

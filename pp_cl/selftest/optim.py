@@ -11,7 +11,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, PointCloud
+from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, PointCloud, offset_width
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.reference import optim
 from pp_cl.scene.camera import Camera
@@ -32,25 +32,36 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 class Cloud:
     """n points on the grid, with random offsets, opacities and coefficients up to a degree, and
-    their float64 twin. start, learned(): of "sh" (N, count, 16), "offset" (N, 4), "opacity" (N,).
+    their float64 twin. width: of an offset. start, learned(): of "sh" (N, count, 16), "offset" (N,
+    width), "opacity" (N,).
     """
 
-    def __init__(self, dev: Device, rng: np.random.Generator, n: int, degree: int = SH_DEGREES[-1]):
+    def __init__(
+        self,
+        dev: Device,
+        rng: np.random.Generator,
+        n: int,
+        degree: int = SH_DEGREES[-1],
+        width: int = 4,
+    ):
         self.dev, self.n, self.steps = dev, n, 0
         ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
         self.cloud = PointCloud.create(dev, ids, degree)
-        count = sum(block.count for block in self.cloud.blocks)
+        self.cloud.offset = dev.zeros((n, width))
+        most, count = self.cloud.most_offset, sum(block.count for block in self.cloud.blocks)
         self.start = {
             "sh": rng.standard_normal((n, count, 16)).astype(np.float32),
-            "offset": rng.uniform(-MOST_OFFSET, MOST_OFFSET, (n, 4)).astype(np.float32),
+            "offset": rng.uniform(-most, most, (n, width)).astype(np.float32),
             "opacity": rng.uniform(0, 1, n).astype(np.float32),
         }
+        most_sh = self.cloud.most_sh
+        np.clip(self.start["sh"][:, 1:], -most_sh, most_sh, out=self.start["sh"][:, 1:])
         for block, array in zip(self.cloud.blocks, self.cloud.sh, strict=True):
             array.set(self.start["sh"][:, block.first : block.first + block.count].copy())
         self.cloud.offset.set(self.start["offset"])
         self.cloud.opacity.set(self.start["opacity"])
         basis = optim.basis(GRID.positions(ids), EYE)[:, :count]
-        self.twin = optim.RmsProp(basis, MOST_OFFSET, **self.start)
+        self.twin = optim.RmsProp(basis, most, most_sh, **self.start)
         self.state = PointState(dev, self.cloud)
         self._points = seen_points(dev, GRID.positions(ids), CAMERA)
 
@@ -107,12 +118,12 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
-def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4) -> Gradients:
-    """{"sh": (n, 16) of the features, "offset": (n, 4), "opacity": (n,)} float32; every third
+def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int = 4) -> Gradients:
+    """{"sh": (n, 16) of the features, "offset": (n, width), "opacity": (n,)} float32; every third
     point's are 0.
     """
     grads = {}
-    for name, shape in (("sh", (n, 16)), ("offset", (n, 4)), ("opacity", (n,))):
+    for name, shape in (("sh", (n, 16)), ("offset", (n, width)), ("opacity", (n,))):
         grads[name] = (scale * rng.standard_normal(shape)).astype(np.float32)
         grads[name][::3] = 0
     return grads
@@ -217,15 +228,23 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Huge gradients keep opacities and offsets in their bounds, at the values of float64."""
-    cloud = Cloud(dev, rng, 257)
-    for _ in range(60):
-        cloud.step(gradients(rng, 257, 1e4), np.arange(257))
-    for name, bounds in (("offset", (-MOST_OFFSET, MOST_OFFSET)), ("opacity", (0.0, 1.0))):
-        moved = cloud.learned()[name]
-        yield finite(moved)
-        yield exact([moved.min(), moved.max()], bounds)
-        yield absolute(moved, getattr(cloud.twin, name), 1e-5)  # sixty moves
+    """Huge gradients keep opacities and offsets in their bounds, those of Gaussians and their SH
+    above degree 0, too, at the values of float64.
+    """
+    for footprint in ("soft", "gaussian"):
+        width = offset_width(footprint)
+        cloud = Cloud(dev, rng, 257, width=width)
+        for _ in range(60):
+            cloud.step(gradients(rng, 257, 1e4, width), np.arange(257))
+        most, learned = cloud.cloud.most_offset, cloud.learned()
+        for name, bounds in (("offset", (-most, most)), ("opacity", (0.0, 1.0))):
+            yield finite(learned[name])
+            yield exact([learned[name].min(), learned[name].max()], bounds)
+            yield absolute(learned[name], getattr(cloud.twin, name), 1e-5)  # sixty moves
+    sh = learned["sh"]
+    yield exact([sh[:, 1:].min(), sh[:, 1:].max()], [-cloud.cloud.most_sh, cloud.cloud.most_sh])
+    yield exact(abs(sh[:, 0]).max() > 1, True)
+    yield absolute(sh, cloud.twin.sh, 1e-5)
 
 
 def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

@@ -219,6 +219,7 @@ def rmsprop_update(
         MOVES_OFFSET=int(grad_offset is not None),
         MOST_OFFSET=f"{cloud.most_offset}f",
         OFFSETS=cloud.offset.shape[1],
+        **({"MOST_SH": f"{cloud.most_sh}f"} if cloud.most_sh < math.inf else {}),
     )
     fits = program.kernels["rmsprop_move"].largest_group >= parts
     program.launch(
