@@ -70,7 +70,7 @@ def small_exports():
     """Steps of fitting Gaussians, and texels: what a ball needs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gaussians, "STEPS", 200)
-        patch.setattr(gaussians, "STEPS_OF_LARGE", 400)
+        patch.setattr(gaussians, "STEPS_OF_PIXEL", 5)
         patch.setattr(texture, "SIDE", 256)
         yield
 

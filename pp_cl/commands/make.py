@@ -31,7 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--minutes",
         type=shared.number(0.1, 1e5),
         metavar="N",
-        help=f"minutes of training ({MINUTES:g}); finding the cameras and masks comes on top",
+        help=f"minutes of training ({MINUTES:g}); finding cameras and masks and fitting the splat"
+        " come on top",
     )
     add(
         "--preset",
