@@ -129,8 +129,8 @@ def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monke
 
 
 def test_the_spz_says_the_same_with_y_up(run, ply, tmp_path):
-    """To its bits: half a deviation of a place, 1/255 of an opacity, exp(1/32) of a deviation, 1/32
-    of a harmonic.
+    """To its bits: half a deviation of a place, 1/255 of an opacity, exp(1/32) of a deviation,
+    5/128 of a harmonic.
     """
     table, _ = splats(run, upright(run, Y_UP), 90)
     write_splat_spz(tmp_path / "a.spz", table)
@@ -143,7 +143,7 @@ def test_the_spz_says_the_same_with_y_up(run, ply, tmp_path):
     assert same.min() > 0.999  # the cosine of half an angle
     assert found.sh0 == pytest.approx(table["harmonics"][:, 0], abs=0.02)
     rest = table["harmonics"][:, 1:].clip(-127 / 128, 127 / 128)  # what 8 bits hold
-    assert np.abs(found.shN - rest).max() < 0.032
+    assert np.abs(found.shN - rest).max() < 0.0392
     assert (tmp_path / "a.spz").stat().st_size < ply.stat().st_size / 9
 
 
