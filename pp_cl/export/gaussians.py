@@ -31,7 +31,7 @@ from pp_cl.train import Trainer
 from pp_cl.training.crops import Crop, Crops
 
 # Of windows as large as the images; of larger ones, whose crops show a part of an image, for each
-# pixel on the longer side: half as many leave lego at 400x400 1.5 dB behind in a window of 1200.
+# pixel on the longer side: half as many cost lego at 400x400 1.2 dB in a window of 1200.
 STEPS, STEPS_OF_PIXEL = 7000, 15
 # Photographs that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
 # to the 66 of ethiopian_head.
