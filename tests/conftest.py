@@ -69,8 +69,8 @@ def cache_of_its_own(tmp_path_factory):
 def small_exports():
     """Steps of fitting Gaussians, and texels: what a ball needs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaussians, "STEPS", 200)
-        patch.setattr(gaussians, "STEPS_OF_PIXEL", 5)
+        patch.setattr(gaussians, "STEPS", 400)
+        patch.setattr(gaussians, "STEPS_OF_PIXEL", 0)
         patch.setattr(texture, "SIDE", 256)
         yield
 

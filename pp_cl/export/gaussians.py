@@ -34,7 +34,7 @@ from pp_cl.training.crops import Crop, Crops
 # pixel on the longer side: half as many cost lego at 400x400 1.2 dB in a window of 1200.
 STEPS, STEPS_OF_PIXEL = 7000, 15
 # Photographs that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
-# to the 66 of ethiopian_head.
+# to the 57 of ethiopian_head.
 ENOUGH = 200
 CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of the window, of an image
 EARLY_STOP = 1e-4  # of viewers

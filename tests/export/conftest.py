@@ -23,4 +23,3 @@ def run(session_device, run_folder):
 def quick_splats(monkeypatch):
     """Gaussians are fitted in a few steps, for tests of all else."""
     monkeypatch.setattr("pp_cl.export.gaussians.STEPS", 100)
-    monkeypatch.setattr("pp_cl.export.gaussians.STEPS_OF_PIXEL", 2)
