@@ -1,4 +1,4 @@
-// A pinhole camera read from one buffer of 20 floats (docs/conventions.md); pp_cl/scene/camera.py
+// A pinhole camera read from one buffer of 21 floats (docs/conventions.md); pp_cl/scene/camera.py
 // writes it. World coordinates count from a centre near the points, as in grid.h.
 #ifndef PP_CAMERA_H
 #define PP_CAMERA_H
@@ -9,6 +9,7 @@ typedef struct {
     float fx, fy, cx, cy;  // pixels; the centre of pixel (x, y) is (x + 0.5, y + 0.5)
     float near, far;       // Euclidean distance from the eye
     int width, height;
+    float samples;  // of Gaussians: pixels of a viewer's picture, each way, whose mean a pixel is
 } Camera;
 
 static inline Camera camera_load(global const float *c) {
@@ -25,6 +26,7 @@ static inline Camera camera_load(global const float *c) {
     cam.far = c[17];
     cam.width = (int)c[18];
     cam.height = (int)c[19];
+    cam.samples = c[20];
     return cam;
 }
 

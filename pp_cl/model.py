@@ -64,7 +64,7 @@ class Model:
         return vertices + self.grid.edge * self.dev.download(self.cloud.offset)[:, :3]
 
     def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
-        """(20,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the
+        """(21,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the
         model's.
         """
         return camera.packed(depth_range or self.depth_range, self.grid.centre)

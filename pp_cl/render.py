@@ -133,7 +133,7 @@ class Renderer:
             self._by_pair = by_pair
             self.release()
         b = self._buffers
-        b.require({"camera_buffer": ((20,), np.float32), "features": ((*size, 16), np.float32)})
+        b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
         dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
         with dev.stage("project"):
             points = project_grid(

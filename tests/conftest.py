@@ -70,7 +70,6 @@ def small_exports():
     """Steps of fitting Gaussians, and texels: what a ball needs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gaussians, "STEPS", 400)
-        patch.setattr(gaussians, "STEPS_OF_PIXEL", 0)
         patch.setattr(texture, "SIDE", 256)
         yield
 

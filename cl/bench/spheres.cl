@@ -8,7 +8,7 @@
 kernel void spheres_backward(
     const uint n,  // spheres
     const float gamma,
-    global const float *camera,                // (20) camera.h
+    global const float *camera,                // (21) camera.h
     global const float *point_radius,          // (N)
     global const float4 *point_camera,         // (N, 4) x, y, z, t
     global const float *opacity,               // (N)

@@ -178,7 +178,7 @@ kernel void blend_backward(
     const float edge,                          // of the grid, world units
     const float radius,                        // of a point without offsets, world units
     global const uint *shaded,                 // (S) their indices
-    global const float *camera,                // (20) camera.h
+    global const float *camera,                // (21) camera.h
     global const float *point_radius,          // (N) read with MOVES, as the next ones
     global const float4 *point_camera,         // (N, 4) x, y, z, distance
     global const float4 *point_white,          // (?, 4) (N, 4) read of Gaussians, as the next one

@@ -17,7 +17,7 @@ static inline float surface_range(const float range, const float radius, const f
 // ended is opaque: the dropped hits would let less than the stop pass.
 kernel void depth_forward(
     const uint hw,                             // pixels
-    global const float *camera,                // (20) camera.h
+    global const float *camera,                // (21) camera.h
     global const float *point_radius,          // (N)
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel

@@ -12,8 +12,9 @@
 // The Gaussian of 3D Gaussian splatting, as its viewers draw it: d = exp(-|s|^2 / 2) with s the
 // distance from the centre in deviations, on the screen, where its covariance is J C J^T + LOW_PASS I:
 // C in space, J the derivative of the projection in the centre. Its depth is along the camera's axis.
+// Of a pixel that is the mean of several of a viewer's, see widened().
 #define GAUSSIAN 3
-#define LOW_PASS 0.3f                // pixels^2
+#define LOW_PASS 0.3f                // of a viewer's pixels^2
 #define LEAST_ALPHA (1.0f / 255.0f)  // of a hit: below it viewers draw nothing
 #define MOST_ALPHA 0.99f
 #define DEVIATIONS 3.33f  // to the rim, where an opaque one falls below LEAST_ALPHA
@@ -33,6 +34,17 @@ static inline float least_focal(const Camera *cam) {
     return fmin(cam->fx, cam->fy);
 }
 
+// What viewers add to the variances of a Gaussian, in pixels^2, and what a mean of viewers' pixels
+// has besides: the variance of `samples` places in a row, 1 pixel in all. The mean over a pixel is
+// nearly a Gaussian as wide that keeps the integral, with a lower peak.
+static inline float low_pass(const Camera *cam) {
+    return LOW_PASS / (cam->samples * cam->samples);
+}
+
+static inline float widened(const Camera *cam) {
+    return low_pass(cam) + (1.0f - 1.0f / (cam->samples * cam->samples)) / 12.0f;
+}
+
 // The footprints of LANES neighbouring points, one lane each.
 typedef struct {
     floats x, y, z;     // centre, camera axes
@@ -48,8 +60,10 @@ typedef struct {
     floats per_reach;
     float per_fx, per_fy;
 #if FOOTPRINT == GAUSSIAN
-    floats u, v;      // centre, pixels
-    floats white[3];  // deviations at (x, y) pixels from it: (white[0] x + white[1] y, white[2] y)
+    floats u, v;  // centre, pixels
+    // deviations at (x, y) pixels from it, (white[0] x + white[1] y, white[2] y), and its closeness
+    // in the centre
+    floats white[4];
 #endif
 } Footprints;
 
@@ -99,7 +113,7 @@ ALWAYS_INLINE ints footprints_hit(
     const floats sx = f->white[0] * dx + f->white[1] * dy, sy = f->white[2] * dy;
     const floats s2 = sx * sx + sy * sy;
     hit = hit && s2 < DEVIATIONS * DEVIATIONS;
-    *closeness = exp(-0.5f * s2);
+    *closeness = f->white[3] * exp(-0.5f * s2);
     *depth = f->z;
 #else
     const floats mx = (px + (0.5f - cam->cx)) * f->per_fx;

@@ -12,8 +12,11 @@
 // on the screen. With w = W^T s = S^-1 e:
 // dd/du = d w,   dd/dS = d w w^T / 2
 //
-// S = A A^T + LOW_PASS I, A = M L, with the rows m of M as project.cl has them and G = sum dL/dd d w w^T:
+// S = A A^T + v I, A = M L, with the rows m of M as project.cl has them and G = sum dL/dd d w w^T:
 // dL/dA = G A,   dL/dL = M^T dL/dA,   dL/dM = dL/dA L^T
+//
+// Of pixels that are means, d is that times sqrt(|S_0| / |S|), S_0 = A A^T + low_pass() I, whose
+// logarithm's derivative by S is (S_0^-1 - S^-1) / 2: to G comes this difference times sum dL/dd d.
 // m_0 = fx/z (right - x/z forward):   dm_0/dx = -fx/z^2 forward,   dm_0/dz = -m_0/z + fx x/z^3 forward
 
 typedef struct {
@@ -21,7 +24,8 @@ typedef struct {
     float2 place;   // the same on the screen, pixels
     float3 white;
     float2 dL_du;
-    float3 G;  // xx, xy, yy
+    float3 G;      // xx, xy, yy
+    float dL_dln;  // sum dL/dd d
 } OffsetGradient;
 
 // Nothing is summed yet. centre: in camera axes, with the range. white: of Footprints.
@@ -34,6 +38,7 @@ offset_begin(const Camera *cam, const float4 centre, const float4 white) {
     sum.white = white.xyz;
     sum.dL_du = 0.0f;
     sum.G = 0.0f;
+    sum.dL_dln = 0.0f;
     return sum;
 }
 
@@ -47,6 +52,15 @@ offset_add(OffsetGradient *sum, const Camera *cam, const uint q, const float d, 
     const float dL = dL_dd * d;
     sum->dL_du += dL * w;
     sum->G += dL * (float3)(w.x * w.x, w.x * w.y, w.y * w.y);
+    sum->dL_dln += dL;
+}
+
+// (xx, xy, yy) of the inverse of A A^T + v I. a0, a1: the rows of A.
+static inline float3 inverse_spread(const float3 a0, const float3 a1, const float v) {
+    const float xx = dot(a0, a0), yy = dot(a1, a1);
+    const float3 normal = cross(a0, a1);
+    const float determinant = dot(normal, normal) + v * (xx + yy) + v * v;
+    return (float3)(yy + v, -dot(a0, a1), xx + v) / determinant;
 }
 
 // Of the offset from the vertex, in edges of the grid, and of the triangle. offset: the point's own.
@@ -65,7 +79,10 @@ static inline float16 offset_end(
     const float3 l1 = radius * (float3)(offset.s6, exp(offset.s4), 0.0f);
     const float3 l2 = radius * (float3)(offset.s7, offset.s8, exp(offset.s5));
     const float3 a0 = m0.x * l0 + m0.y * l1 + m0.z * l2, a1 = m1.x * l0 + m1.y * l1 + m1.z * l2;
-    const float3 b0 = sum->G.x * a0 + sum->G.y * a1, b1 = sum->G.y * a0 + sum->G.z * a1;
+    const float3 lowered =
+        inverse_spread(a0, a1, low_pass(cam)) - inverse_spread(a0, a1, widened(cam));
+    const float3 G = sum->G + sum->dL_dln * lowered;
+    const float3 b0 = G.x * a0 + G.y * a1, b1 = G.y * a0 + G.z * a1;
     const float3 dL_dm0 = (float3)(dot(l0, b0), dot(l1, b0), dot(l2, b0));
     const float3 dL_dm1 = (float3)(dot(l0, b1), dot(l1, b1), dot(l2, b1));
     const float ahead0 = dot(dL_dm0, cam->forward), ahead1 = dot(dL_dm1, cam->forward);

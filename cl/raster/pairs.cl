@@ -66,8 +66,9 @@ ALWAYS_INLINE Footprints footprints_load(
         place[0][j] = white.x;
         place[1][j] = white.y;
         place[2][j] = white.z;
+        place[3][j] = white.w;
     }
-    for (uint k = 0; k < 3; k++)
+    for (uint k = 0; k < 4; k++)
         f.white[k] = LANES_FROM(place[k]);
 #endif
     footprints_prepare(cam, &f);
@@ -82,7 +83,7 @@ ALWAYS_INLINE Footprints footprints_load(
 kernel void pairs_fill(
     const uint n,                        // points
     const uint p,                        // pairs for which there is room
-    global const float *camera,          // (20) camera.h
+    global const float *camera,          // (21) camera.h
     global const float *point_radius,    // (N)
     global const float4 *point_camera,   // (N, 4) x, y, z, t
     global const ushort4 *point_box,     // (N, 4) first x, first y, last x, last y

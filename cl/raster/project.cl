@@ -90,9 +90,10 @@ ALWAYS_INLINE void gaussian_pixels(
 // in world axes: its diagonal, then (1, 0), (2, 0), (2, 1). Writes the variances along x and y, and
 // Footprints.white.
 //
-// With the derivative J of the projection and A = J R L, the covariance S = A A^T + LOW_PASS I has
-// the determinant |a_0 x a_1|^2 + LOW_PASS (|a_0|^2 + |a_1|^2) + LOW_PASS^2, a sum without
-// cancellation. white is the inverse of a triangle U with S = U U^T.
+// With the derivative J of the projection and A = J R L, the covariance S = A A^T + v I has the
+// determinant |a_0 x a_1|^2 + v (|a_0|^2 + |a_1|^2) + v^2, a sum without cancellation. white is the
+// inverse of a triangle U with S = U U^T for v = widened(), and the root of the determinant for v =
+// low_pass() by that of S.
 ALWAYS_INLINE void gaussian_spread(
     const Camera *cam,
     const floats x,
@@ -101,7 +102,7 @@ ALWAYS_INLINE void gaussian_spread(
     const floats lower[6],
     floats *variance_x,
     floats *variance_y,
-    floats white[3]) {
+    floats white[4]) {
     const floats across[2] = {x / z, y / z}, scale[2] = {cam->fx / z, cam->fy / z};
     floats a[2][3];
     for (int row = 0; row < 2; row++) {
@@ -118,12 +119,14 @@ ALWAYS_INLINE void gaussian_spread(
     const floats wide = square(
         a[0][1] * a[1][2] - a[0][2] * a[1][1], a[0][2] * a[1][0] - a[0][0] * a[1][2],
         a[0][0] * a[1][1] - a[0][1] * a[1][0]);
-    const floats determinant = wide + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS;
-    *variance_x = xx + LOW_PASS;
-    *variance_y = yy + LOW_PASS;
+    const float least = low_pass(cam), v = widened(cam);
+    const floats root = sqrt(wide + v * (xx + yy) + v * v);
+    *variance_x = xx + v;
+    *variance_y = yy + v;
     white[2] = 1.0f / sqrt(*variance_y);
-    white[0] = 1.0f / (sqrt(determinant) * white[2]);
-    white[1] = -xy * white[2] / sqrt(determinant);
+    white[0] = 1.0f / (root * white[2]);
+    white[1] = -xy * white[2] / root;
+    white[3] = sqrt(wide + least * (xx + yy) + least * least) / root;
 }
 #endif
 
@@ -227,8 +230,9 @@ ALWAYS_INLINE void store_points(
     LANES_INTO(place[0], f->white[0]);
     LANES_INTO(place[1], f->white[1]);
     LANES_INTO(place[2], f->white[2]);
+    LANES_INTO(place[3], f->white[3]);
     for (uint j = 0; j < count; j++)
-        point_white[first + j] = (float4)(place[0][j], place[1][j], place[2][j], 0.0f);
+        point_white[first + j] = (float4)(place[0][j], place[1][j], place[2][j], place[3][j]);
 #endif
 }
 
@@ -245,7 +249,7 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
 // hits and, if any is above 0, their radii, camera-space positions and distances, and boxes.
 kernel void project_grid(
     const uint n,                      // points
-    global const float *camera,        // (20) camera.h
+    global const float *camera,        // (21) camera.h
     global const float *grid,          // (8) grid.h
     global const uint *point_id,       // (N)
     const float radius,                // of a point without offsets, world units
@@ -254,7 +258,7 @@ kernel void project_grid(
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
     global ushort4 *point_box,   // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count,    // (N)
-    global float4 *point_white)  // (?, 4) (N, 4) Footprints.white of Gaussians, 0; else untouched
+    global float4 *point_white)  // (?, 4) (N, 4) Footprints.white of Gaussians; else untouched
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
@@ -309,7 +313,7 @@ kernel void project_grid(
 // project_grid.
 kernel void project_spheres(
     const uint n,                      // spheres
-    global const float *camera,        // (20) camera.h
+    global const float *camera,        // (21) camera.h
     global const float *positions,     // (N, 3) world
     global const float *point_radius,  // (N)
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled

@@ -37,7 +37,7 @@
 kernel void shade_forward(
     const uint s,                       // shaded points
     global const uint *shaded,          // (S) their indices
-    global const float *camera,         // (20) camera.h
+    global const float *camera,         // (21) camera.h
     global const float4 *point_camera,  // (N, 4) x, y, z, distance
     global const float16 *sh_0,         // (N, 1, 16)
     global const float16 *sh_1,         // (?, ?, 16) (N, 3, 16), not read at degree 0
@@ -57,7 +57,7 @@ kernel void shade_forward(
 kernel void shade_forward_half(
     const uint s,                       // shaded points
     global const uint *shaded,          // (S) their indices
-    global const float *camera,         // (20) camera.h
+    global const float *camera,         // (21) camera.h
     global const float4 *point_camera,  // (N, 4) x, y, z, distance
     global const half *sh_0,            // (N, 1, 16)
     global const half *sh_1,            // (?, ?, 16) (N, 3, 16), not read at degree 0

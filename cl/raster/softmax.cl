@@ -66,7 +66,7 @@ kernel void softmax_weights(
     const uint hw,                             // pixels
     const float sharpness,                     // 1 / gamma
     const float early_stop,                    // 0: none
-    global const float *camera,                // (20) camera.h
+    global const float *camera,                // (21) camera.h
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d

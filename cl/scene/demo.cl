@@ -151,7 +151,7 @@ static inline Vectors shade(const Vectors p, const Vectors ray, const ints hit) 
 kernel void render_demo(
     const uint width,
     const uint height,
-    global const float *camera,  // (20) cl/camera.h
+    global const float *camera,  // (21) cl/camera.h
     global uchar4 *image)        // (height, width, 4) straight RGBA
 {
     const uint x = get_global_id(0), y = get_global_id(1);

@@ -65,7 +65,7 @@ kernel void rmsprop_move(
     const float rate_offset,
     const float rate_opacity,
     global const uint *shaded,                   // (S) their indices
-    global const float *camera,                  // (20) camera.h
+    global const float *camera,                  // (21) camera.h
     global const float4 *point_camera,           // (N, 4) x, y, z, distance
     global const float16 *grad_shaded_features,  // (?, 16) G, a row for each visible point
     global const float *grad_offset,             // (?, OFFSETS) alike, unread without MOVES_OFFSET

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=shared.integer(16, 16384),
         metavar="PIXELS",
         help="splats: fit the Gaussians for pictures of so many pixels on the longer side"
-        f" ({WINDOW}); up to 12 times those of the training images",
+        f" ({WINDOW})",
     )
     add(
         "--length",

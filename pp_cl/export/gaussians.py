@@ -30,13 +30,14 @@ from pp_cl.settings import TrainConfig
 from pp_cl.train import Trainer
 from pp_cl.training.crops import Crop, Crops
 
-# Of windows as large as the images; of larger ones, whose crops show a part of an image, for each
-# pixel on the longer side: half as many cost lego at 400x400 1.2 dB in a window of 1200.
-STEPS, STEPS_OF_PIXEL = 7000, 15
+STEPS = 7000
+# Of the steps of windows larger than the images, those that draw pictures as large as these, each
+# pixel as if it were the mean of a viewer's: nearly right, and they see as much more of an image.
+COARSE = 0.7
 # Photographs that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
 # to the 57 of ethiopian_head.
 ENOUGH = 200
-CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of the window, of an image
+CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of what is drawn, of an image
 EARLY_STOP = 1e-4  # of viewers
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
 # rim: the root of its second moment. With the disc's opacity it covers 0.91 of the disc.
@@ -88,17 +89,20 @@ class Means:
 
 
 class LargeCrops(Crops):
-    """Crops whose cameras have `scale` times the pixels each way."""
+    """Crops whose cameras have `scale` times the pixels each way, each the mean of as many of a
+    window's as make `samples` of them a pixel of the image.
+    """
 
-    def __init__(self, views: list[View], train: TrainConfig, scale: int):
-        super().__init__(views, train, 0)
-        self.scale = scale
+    def __init__(self, views: list[View], train: TrainConfig, scale: int, samples: float):
+        super().__init__(views, replace(train, crop=CROP // scale), 0)
+        self.scale, self.samples = scale, samples / scale
 
     def draw(self, step: int) -> Crop:
         """See Crops."""
         crop = super().draw(step)
         size = crop.camera.width * self.scale, crop.camera.height * self.scale
-        return crop._replace(camera=crop.camera.resized(*size))
+        camera = replace(crop.camera.resized(*size), samples=self.samples)
+        return crop._replace(camera=camera)
 
 
 def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
@@ -116,13 +120,17 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
         more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
-    net.scale = min(max(1, round(window / longest)), CROP // LEAST_CROP)
-    config = _config(run.config, net.scale, longest)
+    samples = max(1.0, window / longest)
+    scale = min(round(samples), CROP // LEAST_CROP)
+    config = _config(run.config, scale)
     trainer = Trainer(dev, config, model, views)
-    trainer.crops = LargeCrops(trainer.views, config.train, net.scale)
-    for _ in tqdm(
+    steps = tqdm(
         range(config.train.iterations), "fitting Gaussians", unit="step", leave=False, disable=None
-    ):
+    )
+    for step in steps:
+        if step in (0, round(COARSE * len(steps))):
+            net.scale = scale if step else 1
+            trainer.crops = LargeCrops(trainer.views, config.train, net.scale, samples)
         trainer.train_step()
     trainer.check()
     trainer.finish()
@@ -175,16 +183,14 @@ def _cloud(run, coefficients):
     )
 
 
-def _config(given: Config, scale: int, longest: int) -> Config:
-    """What the trainer follows here, for pictures of `scale` times the images each way, the longest
-    of whose sides has so many pixels.
-    """
+def _config(given: Config, scale: int) -> Config:
+    """What the trainer follows here, for pictures of about `scale` times the images each way."""
     config = copy.deepcopy(given)
     raster, train = config.raster, config.train
     raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
     raster.radius *= DEVIATION
-    train.iterations = STEPS if scale == 1 else max(STEPS, STEPS_OF_PIXEL * scale * longest)
-    train.crop, train.refine_at, train.ema = CROP // scale, (), True
+    train.iterations = STEPS
+    train.crop, train.refine_at, train.ema = CROP, (), True
     train.mask_weight = train.spread_weight = train.sh_smoothing = 0.0
     train.exposure, train.ssim_weight = "off", 0.0
     # Colours, which begin nearly right, would diverge with their default rates, seventeen times

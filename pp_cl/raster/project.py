@@ -23,7 +23,7 @@ MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in ed
 class ProjectedPoints:
     """N points in one view, valid until the next projection.
 
-    footprint: one of FOOTPRINTS. camera_buffer: (20,) float32, cl/camera.h. point_count: (N,)
+    footprint: one of FOOTPRINTS. camera_buffer: (21,) float32, cl/camera.h. point_count: (N,)
     uint32, pixels that are hit. The others are undefined in a run of LANES points without hits.
     point_camera: (N, 4) float32, x, y, z in camera axes and the distance from the eye; (0, 0, 0,
     -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels

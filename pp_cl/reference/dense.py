@@ -86,11 +86,12 @@ def geometry(
     radius, width = radius[:, None], pixel_width(camera, t)
     least = LEAST_RADIUS * width
     if kind == "gaussian":
-        away, inverse = screen_gaussians(
+        away, inverse, peak = screen_gaussians(
             camera, c, round_ones if covariance is None else covariance
         )
         deviations = np.sqrt(np.einsum("nqi,nij,nqj->nq", away, inverse, away).clip(0))
-        hit, closeness = deviations < DEVIATIONS, np.exp(-0.5 * deviations**2)
+        hit = deviations < DEVIATIONS
+        closeness = peak[:, None] * np.exp(-0.5 * deviations**2)
         depth = np.broadcast_to(c[:, 2:], hit.shape)
         with np.errstate(divide="ignore"):
             margin = np.linalg.norm(away, axis=2) * np.abs(1 - DEVIATIONS / deviations)
@@ -138,9 +139,10 @@ def gaussians(
 
 def screen_gaussians(
     camera: Any, c: np.ndarray, covariance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((N, HW, 2) from the centres of Gaussians to those of the pixels, (N, 2, 2) inverse of their
-    covariances on the screen). c: (N, 3) in camera axes. covariance: (N, 3, 3) in world axes.
+    covariances on the screen, (N,) closeness in the centre). c: (N, 3) in camera axes. covariance:
+    (N, 3, 3) in world axes.
     """
     (x, y, z), focal = c.T, (camera.fx, camera.fy)
     jacobian = np.zeros((len(c), 2, 3))
@@ -148,11 +150,14 @@ def screen_gaussians(
         jacobian[:, axis, axis] = focal[axis] / z
         jacobian[:, axis, 2] = -focal[axis] * place / z**2
     jacobian = jacobian @ camera.pose[:, :3].T
-    spread = jacobian @ covariance @ jacobian.transpose(0, 2, 1) + LOW_PASS * np.eye(2)
+    least = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    least += LOW_PASS / camera.samples**2 * np.eye(2)
+    spread = least + (1 - camera.samples**-2) / 12 * np.eye(2)
+    peak = np.sqrt(np.linalg.det(least) / np.linalg.det(spread))
     centre = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
     row, column = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack([column, row], -1).reshape(-1, 2) + 0.5
-    return pixels - centre[:, None], np.linalg.inv(spread)
+    return pixels - centre[:, None], np.linalg.inv(spread), peak
 
 
 def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:

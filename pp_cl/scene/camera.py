@@ -13,7 +13,8 @@ class Camera:
     """A pinhole camera with OpenCV axes: x right, y down, z forward.
 
     pose: (3, 4) float64 camera-to-world, orthonormal rotation. fx, fy, cx, cy: pixels; the centre
-    of pixel (x, y) is (x + 0.5, y + 0.5). The depth range is the model's, not the camera's.
+    of pixel (x, y) is (x + 0.5, y + 0.5). samples: pixels of a viewer's picture, each way, whose
+    mean a pixel is, for Gaussians alone. The depth range is the model's, not the camera's.
     """
 
     pose: np.ndarray
@@ -23,6 +24,7 @@ class Camera:
     cy: float
     width: int
     height: int
+    samples: float = 1.0
 
     @classmethod
     def look_at(
@@ -78,7 +80,7 @@ class Camera:
     def packed(
         self, depth_range: Sequence[float], centre: ArrayLike = (0.0, 0.0, 0.0)
     ) -> np.ndarray:
-        """(20,) float32, the layout of cl/camera.h.
+        """(21,) float32, the layout of cl/camera.h.
 
         depth_range: (near, far), Euclidean distances from the eye, world units. centre: world
         position that is the device's origin, which has to be near for float32.
@@ -87,7 +89,8 @@ class Camera:
             [
                 self.pose[:, :3].T.ravel(),
                 self.eye - np.asarray(centre),
-                [self.fx, self.fy, self.cx, self.cy, *depth_range, self.width, self.height],
+                [self.fx, self.fy, self.cx, self.cy, *depth_range],
+                [self.width, self.height, self.samples],
             ]
         ).astype(np.float32)
 

@@ -3,6 +3,7 @@ gradients, and where a naive formula overflows, divides by zero or hangs.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -174,11 +175,13 @@ def _gaussians(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     below a pixel.
     """
     for n, radius, stop in ((33, 0.1, 0.0), (17, 0.1, 0.05), (17, 1e-3, 0.0), (1, 0.2, 0.0)):
-        yield from _check_gaussians(dev, rng, n, radius, stop)
+        for samples in (1.0, 3.5):
+            yield from _check_gaussians(dev, rng, n, radius, stop, samples)
 
 
-def _check_gaussians(dev, rng, n, radius, stop):
-    camera, grid = make_camera(), Grid((-1.5, -1.5, -1.5), 0.3, (11, 11, 11))
+def _check_gaussians(dev, rng, n, radius, stop, samples):
+    camera = replace(make_camera(), samples=samples)
+    grid = Grid((-1.5, -1.5, -1.5), 0.3, (11, 11, 11))
     ids = np.sort(rng.choice(np.prod(grid.dims), n, replace=False))
     learned = rng.uniform(-1, 1, (n, 9)).astype(np.float32)
     opacity = rng.uniform(0.1, 1, n).astype(np.float32)

@@ -40,3 +40,17 @@ def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
         assert (first >= np.subtract(least, 3)).all() and (last <= np.add(most, 3)).all()
         compared += 1
     assert compared > 200
+
+
+@pytest.mark.parametrize("deviation, bound", [(0.02, 0.1), (0.1, 0.01), (0.4, 0.01)])
+def test_a_pixel_of_samples_is_nearly_the_mean_of_a_viewers(dev, rng, deviation, bound):
+    """Gaussians of a fifth of a pixel, less than a viewer's, of one and of four."""
+    camera = replace(make_camera(30, 30), samples=3.0)
+    viewer = replace(camera.resized(90, 90), samples=1.0)
+    for position in make_points(rng, 20)[:, None]:
+        scene = PairedPoints(dev, camera, position, deviation, kind="gaussian")
+        exact = dense.geometry(viewer, position, deviation, "gaussian")
+        drawn = np.where(exact["hit"], exact["closeness"], 0).reshape(30, 3, 30, 3)
+        found = scene.geometry()["closeness"].reshape(30, 30)
+        assert found.max() > 0.1
+        np.testing.assert_allclose(found, drawn.mean((1, 3)), atol=bound)

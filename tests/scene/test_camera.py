@@ -1,5 +1,7 @@
 """The camera and its device layout, poses, crops, shifts, downscaling and padding."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,12 +28,12 @@ def points_in_front(camera, rng, n=20):
 
 def test_packed_layout(rng):
     camera = make_camera(rng)
-    packed = camera.packed((1, 5))
-    assert packed.shape == (20,) and packed.dtype == np.float32
+    packed = replace(camera, samples=3.0).packed((1, 5))
+    assert packed.shape == (21,) and packed.dtype == np.float32
     point = points_in_front(camera, rng, 1)[0]
     in_camera = packed[:9].reshape(3, 3) @ (point - packed[9:12])
     np.testing.assert_allclose(in_camera, (point - camera.eye) @ camera.pose[:, :3], rtol=1e-5)
-    np.testing.assert_allclose(packed[12:], [50, 55, 19, 16.5, 1, 5, 40, 30])
+    np.testing.assert_allclose(packed[12:], [50, 55, 19, 16.5, 1, 5, 40, 30, 3])
 
 
 def test_places_in_the_image_and_rays_through_pixels(rng):
