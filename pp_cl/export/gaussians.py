@@ -121,7 +121,7 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     samples = max(1.0, window / longest)
-    scale = min(round(samples), CROP // LEAST_CROP)
+    scale = min(int(samples), CROP // LEAST_CROP)
     config = _config(run.config, scale)
     trainer = Trainer(dev, config, model, views)
     steps = tqdm(

@@ -20,6 +20,7 @@ FLIPS = [
     ("scene/hull", "counts & ~(in", "counts & (in", "scene: hull"),
     ("scene/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
     ("raster/project", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
+    ("raster/project", "(wide + least", "(wide - least", "alpha: shapes of Gaussians"),
     ("raster/pairs", "keys[a] < keys[b]", "keys[a] > keys[b]", "raster: thousands of equal depths"),
     ("raster/pairs", "sorted[middle] <", "sorted[middle] >", "raster: thousands of equal depths"),
     ("raster/shade", "features += basis[4 + b]", "features -= basis[4 + b]", "raster: shade"),
