@@ -17,7 +17,8 @@
 // b_i b_j |z_i - z_j| (the distortion loss of Mip-NeRF 360, Eq. 15), adds its derivative with
 // respect to b_i to G.f_i in the same way.
 //
-// A kernel of each blend writes (b, s gain) of the hits by pair, where each point finds its own.
+// A kernel of each blend writes (b, s gain) of the hits by pair, where each point finds its own; that
+// of the softmax (b, s), and the point adds the gain.
 #include "common.h"
 #include "lanes.h"
 #include "raster/offset.h"
@@ -28,6 +29,9 @@
 #endif
 #ifndef CLAMPED
 #define CLAMPED 0  // 1: features that shade.cl has clamped to 0 have no gradient
+#endif
+#ifndef GAINS
+#define GAINS 0  // 1: pair_gradient has no gains yet: softmax_gradient wrote it
 #endif
 
 // The depth of a key, the weight of an entry.
@@ -69,34 +73,27 @@ kernel void blend_forward(
     store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
 }
 
-// One work-item per pixel: reads its `tracked` nearest hits and their points' features, writes what
-// each adds to the gradients of its point, by softmax.
+// One work-item per pixel: reads its `tracked` nearest hits, writes the weight and the slope of each
+// by pair, and G.F. Each point has its own features at hand where it gathers its pairs, so that
+// they are read once a point and not once a hit.
 kernel void softmax_gradient(
-    const uint hw,                          // pixels
-    const uint tracked,                     // hits of a pixel that get gradients
-    global const uint *pixel_offset,        // (HW+1)
-    global const ulong *pair_key,           // (P) depth << 32 | pair
-    global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
-    global const float *pixel_slope,        // (P)
-    global const uint *point_slot,          // (N) row of a visible point
-    global const float16 *shaded_features,  // (?, 16) of the visible points
-    global const float16 *features,         // (H, W, 16) F
-    global const float16 *grad_features,    // (H, W, 16) G
-    global float2 *pair_gradient)           // (P, 2) b, s gain; cleared before
+    const uint hw,                        // pixels
+    const uint tracked,                   // hits of a pixel that get gradients
+    global const uint *pixel_offset,      // (HW+1)
+    global const ulong *pair_key,         // (P) depth << 32 | pair
+    global const ulong *pixel_entry,      // (P) weight << 32 | point; no point: the list ends
+    global const float *pixel_slope,      // (P)
+    global const float16 *features,       // (H, W, 16) F
+    global const float16 *grad_features,  // (H, W, 16) G
+    global float2 *pair_gradient,         // (P, 2) b, s; cleared before
+    global float *pixel_blend)            // (HW) G.F
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
-    const uint begin = pixel_offset[q], count = min(pixel_offset[q + 1] - begin, tracked);
-    uint end = begin;
-    for (; end < begin + count && (uint)pixel_entry[end] != NONE; end++)
-        READ_AHEAD(shaded_features + point_slot[(uint)pixel_entry[end]]);
-    const float16 G = grad_features[q];
-    const float rest = dot16(G, features[q]);
-    for (uint i = begin; i < end; i++) {
-        const float own = dot16(G, shaded_features[point_slot[(uint)pixel_entry[i]]]);
-        const float b = upper_float(pixel_entry[i]);
-        pair_gradient[(uint)pair_key[i]] = (float2)(b, pixel_slope[i] * (own - rest));
-    }
+    const uint begin = pixel_offset[q], end = begin + min(pixel_offset[q + 1] - begin, tracked);
+    for (uint i = begin; i < end && (uint)pixel_entry[i] != NONE; i++)
+        pair_gradient[(uint)pair_key[i]] = (float2)(upper_float(pixel_entry[i]), pixel_slope[i]);
+    pixel_blend[q] = dot16(grad_features[q], features[q]);
 }
 
 // One work-item per pixel: reads its hits, farthest first, and their points' features, writes what
@@ -172,7 +169,7 @@ kernel void alpha_gradient(
 }
 
 // One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes
-// the gradients of its features and, the first one, of its opacity and offset.
+// the gradients of its features and, the first one, of its opacity and offset, and gains where GAINS.
 kernel void blend_backward(
     const uint s,                              // visible points
     const float edge,                          // of the grid, world units
@@ -187,8 +184,9 @@ kernel void blend_backward(
     global const uint *point_offset,           // (N+1)
     global const uint *pair_pixel,             // (P)
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
-    global const float2 *pair_gradient,        // (P, 2) b, s gain
-    global const float16 *shaded_features,     // (?, 16) a row for each, read with CLAMPED
+    global float2 *pair_gradient,              // (P, 2) b, s gain; s is read with GAINS
+    global const float *pixel_blend,           // (?) (HW) G.F, read with GAINS
+    global const float16 *shaded_features,     // (?, 16) a row for each, read with CLAMPED, GAINS
     global const float16 *grad_features,       // (H, W, 16) G
     global float16 *grad_shaded_features,      // (?, 16) alike
     global float *grad_opacity,                // (?) alike
@@ -204,12 +202,17 @@ kernel void blend_backward(
 #elif MOVES
     moved = offset_begin(&cam, point_camera[i], point_radius[i]);
 #endif
+    const float16 feature = GAINS ? shaded_features[g] : 0.0f;
     floats dL_df = 0.0f;
     float dL_do = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
-        const float2 of_hit = pair_gradient[pair];
+        float2 of_hit = pair_gradient[pair];
         if (of_hit.x == 0.0f && of_hit.y == 0.0f) continue;  // mostly dropped
         const uint q = pair_pixel[pair];
+        if (GAINS && ROW_PART == 0) {
+            of_hit.y *= dot16(grad_features[q], feature) - pixel_blend[q];
+            pair_gradient[pair].y = of_hit.y;
+        }
         dL_df += of_hit.x * load_part(grad_features, q);
         dL_do += of_hit.y;
         if (MOVES && ROW_PART == 0) {

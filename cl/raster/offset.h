@@ -14,10 +14,10 @@
 //
 // S = A A^T + v I, A = M L, with the rows m of M as project.cl has them and G = sum dL/dd d w w^T:
 // dL/dA = G A,   dL/dL = M^T dL/dA,   dL/dM = dL/dA L^T
+// m_0 = fx/z (right - x/z forward):   dm_0/dx = -fx/z^2 forward,   dm_0/dz = -m_0/z + fx x/z^3 forward
 //
 // Of pixels that are means, d is that times sqrt(|S_0| / |S|), S_0 = A A^T + low_pass() I, whose
 // logarithm's derivative by S is (S_0^-1 - S^-1) / 2: to G comes this difference times sum dL/dd d.
-// m_0 = fx/z (right - x/z forward):   dm_0/dx = -fx/z^2 forward,   dm_0/dz = -m_0/z + fx x/z^3 forward
 
 typedef struct {
     float3 centre;  // of the point, camera axes

@@ -75,6 +75,7 @@ def blend_backward_table(
     return {
         "pair_gradient": ((pairs, 2), np.float32),
         "pixel_spread": ((pixels if blend == "alpha" else 1,), np.float32),
+        "pixel_blend": ((pixels if blend == "softmax" else 1,), np.float32),
         "grad_shaded_features": ((shaded, 16), np.float32),
         "grad_opacity": ((shaded,), np.float32),
         "grad_offset": ((shaded if blend == "alpha" else 1, offset_width(footprint)), np.float32),
@@ -143,12 +144,12 @@ def blend_backward(
         "pair_key": pairs.pair_key,
         "pixel_entry": weights.pixel_entry,
         "pixel_slope": weights.pixel_slope,
-        "point_slot": weights.point_slot,
-        "shaded_features": shaded_features,
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
     of_points = {"OFFSETS": offset_width(points.footprint)} | _clamping(points)
+    if not is_alpha:
+        of_points["GAINS"] = 1
     if moves:
         of_points |= {"FOOTPRINT": FOOTPRINTS.index(points.footprint), "MOVES": 1}
     program = _program(dev, **of_points)
@@ -159,12 +160,20 @@ def blend_backward(
             has_grad_alpha=int(grad_alpha is not None),
             spread_weight=spread_weight,
             transmittance=weights.transmittance,
+            point_slot=weights.point_slot,
+            shaded_features=shaded_features,
             grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
             pixel_spread=b.pixel_spread,
             **of_hits,
         )
     else:
-        program.launch("softmax_gradient", pairs.pixels, features=features, **of_hits)
+        program.launch(
+            "softmax_gradient",
+            pairs.pixels,
+            features=features,
+            pixel_blend=b.pixel_blend,
+            **of_hits,
+        )
     program.launch(
         "blend_backward",
         shaded.size * row_parts(dev, ON_GPU),
@@ -182,6 +191,7 @@ def blend_backward(
         pair_pixel=pairs.pair_pixel,
         pair_point_closeness=pairs.pair_point_closeness,
         pair_gradient=b.pair_gradient,
+        pixel_blend=b.pixel_blend,
         shaded_features=shaded_features,
         grad_features=grad_features,
         grad_shaded_features=b.grad_shaded_features,

@@ -33,6 +33,7 @@ FLIPS = [
     ("raster/blend", "b / T * gain", "T / b * gain", "alpha: backward, soft"),
     ("raster/blend", "+ g - B;", "- g - B;", "alpha: gradient of alpha"),
     ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
+    ("raster/blend", "feature) - pixel_blend", "feature) + pixel_blend", "softmax: backward, soft"),
     ("raster/blend", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
     ("raster/blend", "front.x - behind.x", "front.x + behind.x", "alpha: spread"),
     ("raster/blend", "d, opacity[i]", "d, -opacity[i]", "alpha: offsets of points"),
