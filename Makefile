@@ -93,7 +93,7 @@ site: $(MADE) ## build README.md and docs/ as a site in build/site; fails on a d
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -f packaging/mkdocs.yml
 
 results: $(READY) ## measure what README.md and docs/ state, and write it there: hours, with the scenes of PP_DATA
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,torch]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,torch,capture]'
 	@$(BIN)/python -m tools.results $(ARGS)
 	@$(BIN)/python -m tools.docs_tables
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pp_cl.scene.load import Scene, load_scene
     from pp_cl.session import train_scene
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Camera",

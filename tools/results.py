@@ -57,6 +57,7 @@ class Training:
     steps: int | None = None  # None: the preset's
     downscale: int | None = None
     test: str | None = None
+    is_captured: bool = False  # the scene is a folder of photographs, which `capture` makes one of
 
 
 def lego(preset: str, downscale: int, *steps: int) -> list[Training]:
@@ -74,6 +75,14 @@ TRAININGS = [
     Training("ethiopian_head, 57 photographs", HEAD, "small", 6000),
     Training("mary_rose, 60 photographs", "real/mary_rose", "tiny"),
     Training("DTU scan37, 42 photographs", "real/dtu_scan37", "tiny"),
+    *(
+        Training(f"{name} photographs alone", scene, "tiny", is_captured=True)
+        for name, scene in (
+            ("ethiopian_head, 66", "ethiopian_head_photos"),
+            ("mary_rose, 69", "real/mary_rose/images"),
+            ("DTU scan37, 49", "real/dtu_scan37/images"),
+        )
+    ),
 ]
 # of README.md
 SHOWN = ("lego_15000", "lego_6000", "lego_8000", "ethiopian_head_6000", "dtu_scan37", "demo_1500")
@@ -162,18 +171,23 @@ def read_found(name: str, *words: object) -> dict:
 def key_of(training: Training) -> str:
     """The name of a training's part, and of its run."""
     name = Path(training.scene).name
+    if training.is_captured:
+        name = "_".join(Path(training.scene).parts[-2:])
     return f"{name}_{training.steps}" if training.steps else name
 
 
 def train(training: Training) -> dict:
     """A row of QUALITY."""
-    run = KEPT / key_of(training)
+    run, scene = KEPT / key_of(training), scene_of(training.scene)
+    if training.is_captured:
+        scene, photographs = KEPT / f"{key_of(training)}_scene", scene
+        run_program(*PP_CL, "capture", photographs, "--out", scene)
     words = ["--preset", training.preset, "--out", run]
     if training.steps:
         words += ["--iterations", training.steps]
     if training.downscale:
         words += ["--downscale", training.downscale]
-    run_program(*PP_CL, "train", scene_of(training.scene), *words)
+    run_program(*PP_CL, "train", scene, *words)
     words = ["--scene", scene_of(training.test)] if training.test else []
     found = read_found("eval", *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
     about = read_found("info", *PP_CL, "info", run)
