@@ -40,6 +40,8 @@ from pp_cl.scene.views import evenly, fitting_downscale, shrink
 
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
 SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
+# decimals of what the scene states: the last digits depend on how COLMAP's threads share a sum
+DECIMALS = 9
 # stages that keep what was done when they are stopped
 RESUMED = ("features", "matches", "images", "masks")
 # what each stage leaves beside its JSON and its picture, in the scene's folder
@@ -344,7 +346,7 @@ class Capture:
             {
                 "file_path": one.name,
                 "mask_path": masks.mask_file(Path(), one.name).as_posix(),
-                **frame_keys(one.camera),
+                **_rounded(frame_keys(one.camera)),
             }
             for one in found
         ]
@@ -359,7 +361,7 @@ class Capture:
             {
                 "camera_model": "OPENCV",
                 "ply_file_path": "points.ply",
-                "aabb": corners.tolist(),
+                "aabb": _rounded(corners.tolist()),
                 "frames": places,
             },
         )
@@ -382,6 +384,13 @@ class Capture:
 def _option(name):
     """What an option is called on the command line."""
     return "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
+
+
+def _rounded(found):
+    """Lists and values of dictionaries with DECIMALS."""
+    if isinstance(found, dict):
+        return {key: _rounded(value) for key, value in found.items()}
+    return np.round(found, DECIMALS).tolist()
 
 
 def _move(model, scale, rotation, shift):
