@@ -6,7 +6,7 @@ A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end t
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
 parsers of pp_cl/commands/), `api` (from pp_cl's docstrings), `trained` and `evaluated` (what the
 commands of README.md print, of docs/results/readme.json), or that of another file
-docs/results/NAME.json, which holds
+docs/results/NAME.json (NAME may be KIND/TABLE), which holds
 
     commit, date, machine, how    of what code it is, where and how it was measured
     decides    digest of what decides a training in that code (tools/provenance.py)
@@ -165,9 +165,10 @@ def _written(action: argparse.Action) -> str:
 
 
 def read_results(folder: Path) -> dict[str, dict]:
-    """{name: contents} of the files of results in a folder."""
+    """{name: contents} of the files of results in a folder and in those of its kinds."""
     return {
-        path.stem: json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.json"))
+        path.relative_to(folder).with_suffix("").as_posix(): json.loads(path.read_text("utf-8"))
+        for path in sorted(folder.rglob("*.json"))
     }
 
 

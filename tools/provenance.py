@@ -70,7 +70,7 @@ def sentence(results: dict, now: str) -> str:
 
 def older(folder: Path, now: str) -> list[str]:
     """A line for each file of results in a folder that is of other code than now, a digest()."""
-    files = {path: json.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.json"))}
+    files = {path: json.loads(path.read_text("utf-8")) for path in sorted(folder.rglob("*.json"))}
     return [
         f"{path}: of commit {results['commit']}, before the last change to what decides a training;"
         " measure it again with `make readme` or `make results`"

@@ -17,11 +17,10 @@ from pathlib import Path
 from pp_cl.device.discover import list_devices
 from pp_cl.files.atomic import write_json
 from tools.provenance import ROOT, digest
-from tools.results import git
+from tools.results import RESULTS, WIDTHS, git
 
-FILE = ROOT / "docs" / "results" / "readme.json"
+FILE = RESULTS / "readme.json"
 COMMANDS = re.compile(r"(?m)^    (pp-cl train demo [^\n]*)$|`(pp-cl eval runs/demo --metrics)`")
-WIDTHS = {16: "AVX-512", 8: "AVX2", 4: "vectors of 128 bits"}  # floats in a vector of the device
 TRAINED = re.compile(
     r"^trained (?P<steps>\d+) steps in (?P<seconds>[\d.]+) s; (?P<points>\d+) points"
     r" \((?P<initial>\d+) at the start\); wrote runs/demo/checkpoint.npz$"

@@ -4,6 +4,10 @@ Every part is a process: a training with its evaluation, a bench, a tool. What i
 runs/results/, so that the same command goes on where it was stopped; for other code everything is
 measured anew. Then docs/results/ and the plots are written; `make docs` puts them into the pages.
 Scenes are looked for in PP_DATA (../shared/data). It takes hours in which nothing else should run.
+
+`--kind NAME` measures for another processor or driver (PP_DEVICE) than README's. What it finds is
+kept in runs/results-NAME/, and the tables of those parts that were measured go to
+docs/results/NAME/, for the marker `table: NAME/trainings`.
 """
 
 import argparse
@@ -29,9 +33,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ROOT = Path(__file__).parents[1]
-KEPT = ROOT / "runs" / "results"
+RESULTS = ROOT / "docs" / "results"
 DATA = Path(os.environ.get("PP_DATA", ROOT.parent / "shared" / "data"))
 CODE = ("pp_cl", "cl")  # what decides the numbers
+WIDTHS = {16: "AVX-512", 8: "AVX2", 4: "vectors of 128 bits"}  # floats in a vector of the device
 
 LEGO, ALL_VIEWS = "nerf_synthetic/lego", "nerf_synthetic/lego_all"
 HEAD = "ethiopian_head"
@@ -161,9 +166,9 @@ def run_program(*words: object) -> None:
         raise UserError(f"{' '.join(map(str, words[1:]))}: {done.stderr[-2000:].strip()}")
 
 
-def read_found(name: str, *words: object) -> dict:
+def read_found(kept: Path, *words: object) -> dict:
     """What a program writes with --json."""
-    file = KEPT / f"{name}.found"
+    file = kept / "found"
     run_program(*words, "--json", file)
     return json.loads(file.read_text("utf-8"))
 
@@ -176,11 +181,11 @@ def key_of(training: Training) -> str:
     return f"{name}_{training.steps}" if training.steps else name
 
 
-def train(training: Training) -> dict:
+def train(training: Training, kept: Path) -> dict:
     """A row of QUALITY."""
-    run, scene = KEPT / key_of(training), scene_of(training.scene)
+    run, scene = kept / key_of(training), scene_of(training.scene)
     if training.is_captured:
-        scene, photographs = KEPT / f"{key_of(training)}_scene", scene
+        scene, photographs = kept / f"{key_of(training)}_scene", scene
         run_program(*PP_CL, "capture", photographs, "--out", scene)
     words = ["--preset", training.preset, "--out", run]
     if training.steps:
@@ -189,8 +194,8 @@ def train(training: Training) -> dict:
         words += ["--downscale", training.downscale]
     run_program(*PP_CL, "train", scene, *words)
     words = ["--scene", scene_of(training.test)] if training.test else []
-    found = read_found("eval", *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
-    about = read_found("info", *PP_CL, "info", run)
+    found = read_found(kept, *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
+    about = read_found(kept, *PP_CL, "info", run)
     (size,) = about["views"]["images"]
     width, height = (int(side) // about["downscale"] for side in size.split("x"))
     return {
@@ -207,7 +212,7 @@ def train(training: Training) -> dict:
     }
 
 
-def rasteriser() -> list[dict]:
+def rasteriser(kept: Path) -> list[dict]:
     """Rows of RASTERISER."""
     rows = []
     for scene, points, sizes in (
@@ -215,7 +220,7 @@ def rasteriser() -> list[dict]:
         ("pulsar", "100000", "400,800"),
     ):
         words = ["--scene", scene, "--points", points, "--size", sizes]
-        rows += read_found("raster", *PP_CL, "bench", "raster", *words)["rows"]
+        rows += read_found(kept, *PP_CL, "bench", "raster", *words)["rows"]
     return [by_stage(row) for row in rows]
 
 
@@ -224,35 +229,35 @@ def by_stage(row: dict) -> dict:
     return row | {f"{stage}_ms": row["stages_ms"].get(stage, 0) for stage in FORWARD}
 
 
-def network() -> list[dict]:
+def network(kept: Path) -> list[dict]:
     """Rows of NETWORK: the paper's network, and that of the other presets."""
     rows = []
     for (widths, side), blocks in zip(NETWORKS, ("double", "single"), strict=True):
         words = ["--widths", widths, "--size", side, "--blocks", blocks]
-        found = read_found("unet", *PP_CL, "bench", "unet", *words)["rows"]
+        found = read_found(kept, *PP_CL, "bench", "unet", *words)["rows"]
         # auto is one of the others, and which are fast depends on the device
         found = [row for row in found if row["variant"] in ("direct", "auto")]
         rows += [row | {"widths": widths, "side": side} for row in found]
     return rows
 
 
-def pytorch() -> list[dict]:
+def pytorch(kept: Path) -> list[dict]:
     """Rows of PYTORCH: the paper's network and a narrow one, both of double blocks."""
     rows = []
     for widths, side in NETWORKS:
         for variant in ("direct", "auto"):
             words = ("--widths", widths, "--size", side, "--variant", variant)
-            found = read_found("torch", *TOOL, "tools.compare_torch", *words)
+            found = read_found(kept, *TOOL, "tools.compare_torch", *words)
             times = {f"{p}_{key}": found[p][key] for p in ("forward", "train") for key in found[p]}
             rows.append(found | times | {"widths": widths})
     return rows
 
 
-def stages() -> dict[str, dict]:
+def stages(kept: Path) -> dict[str, dict]:
     """{preset: what tools/stages.py says}."""
-    words = {name: (scene_of(LEGO), "--out", KEPT / run) for name, run in STEPS.items()}
+    words = {name: (scene_of(LEGO), "--out", kept / run) for name, run in STEPS.items()}
     words["paper"] += ("--preset", "paper")
-    return {name: read_found("stages", *TOOL, "tools.stages", *w) for name, w in words.items()}
+    return {name: read_found(kept, *TOOL, "tools.stages", *w) for name, w in words.items()}
 
 
 def by_preset(found: dict) -> list[dict]:
@@ -266,34 +271,34 @@ def by_preset(found: dict) -> list[dict]:
     return list(rows.values())
 
 
-def memory() -> list[dict]:
+def memory(kept: Path) -> list[dict]:
     """Rows of MEMORY."""
-    return read_found("memory", *TOOL, "tools.memory_peaks")
+    return read_found(kept, *TOOL, "tools.memory_peaks")
 
 
-def demo() -> list[dict]:
+def demo(kept: Path) -> list[dict]:
     """Rows of DEMO: depth, mesh, page and compression of the demo's runs."""
     rows = []
-    short, long = (KEPT / key_of(training) for training in TRAININGS[:2])
+    short, long = (kept / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
-        found = read_found("depth", *TOOL, "tools.depth_error", run)
+        found = read_found(kept, *TOOL, "tools.depth_error", run)
         shares = f"median {found['median']:.1%}, mean {found['mean']:.1%}"
         rows.append({"what": f"depths within 1.5 spacings, {steps} steps", "result": shares})
         rows.append({"what": f"IoU of alpha, {steps} steps", "result": f"{found['overlap']:.3f}"})
-    found = read_found("export", *TOOL, "tools.export_quality", short)
+    found = read_found(kept, *TOOL, "tools.export_quality", short)
     mesh = next(row for row in found["mesh"] if "as exported" in row["field"])
     page = next(row for row in found["page"] if "as exported" in row["what"])
     near = f"{mesh['mean']} on average, median {mesh['median']}"
     rows.append({"what": "exported mesh, spacings from the surface", "result": near})
     rows.append({"what": "exported page against the run's images", "result": f"{page['run']} dB"})
-    run_program(*PP_CL, "compress", short, "--max-loss", "0.1dB", "--out", KEPT / "smaller")
-    before, after = (read_found("info", *PP_CL, "info", r) for r in (short, KEPT / "smaller"))
+    run_program(*PP_CL, "compress", short, "--max-loss", "0.1dB", "--out", kept / "smaller")
+    before, after = (read_found(kept, *PP_CL, "info", r) for r in (short, kept / "smaller"))
     mib = [about["files"]["checkpoint.npz"] / 2**20 for about in (before, after)]
     rows.append({"what": "compressed by 0.1 dB", "result": f"{mib[0]:.1f} to {mib[1]:.1f} MiB"})
     return rows
 
 
-PARTS: dict[str, Callable[[], Found]] = {
+PARTS: dict[str, Callable[[Path], Found]] = {
     **{key_of(training): partial(train, training) for training in TRAININGS},
     "demo": demo,
     "rasteriser": rasteriser,
@@ -333,34 +338,36 @@ def origin() -> dict[str, str]:
     # PoCL's: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
     processor = dev.name.replace("(R)", "").removeprefix("pthread-")
     driver = f"{dev.info['platform']} {dev.info['driver']}"
+    vectors = WIDTHS.get(dev.queue.device.native_vector_width_float)
+    kind = ", ".join(filter(None, (processor, vectors)))
     return {
         "commit": git("log", "-1", "--format=%h", "--", *CODE),
         "date": date.today().isoformat(),
-        "machine": f"{os.cpu_count()} cores ({processor}), {driver}",
+        "machine": f"{os.cpu_count()} cores ({kind}), {driver}",
         "decides": digest(),
     }
 
 
-def begin(commit: str) -> None:
+def begin(kept: Path, commit: str) -> None:
     """Make the folder of what is kept, empty if what is in it is of another commit."""
-    mark = KEPT / "commit"
+    mark = kept / "commit"
     if not (mark.exists() and mark.read_text("utf-8") == commit):
-        shutil.rmtree(KEPT, ignore_errors=True)
-        KEPT.mkdir(parents=True)
+        shutil.rmtree(kept, ignore_errors=True)
+        kept.mkdir(parents=True)
         mark.write_text(commit, "utf-8")
 
 
-def measure(name: str) -> Found:
+def measure(kept: Path, name: str) -> Found:
     """What a part found, now or before."""
-    file = KEPT / f"{name}.json"
+    file = kept / f"{name}.json"
     if not file.exists():
-        write_json(file, PARTS[name]())
+        write_json(file, PARTS[name](kept))
     return json.loads(file.read_text("utf-8"))
 
 
 def trained(found: dict[str, Found]) -> list[dict]:
-    """The rows of all trainings."""
-    return [found[key_of(t)] for t in TRAININGS]
+    """The rows of the trainings that were measured."""
+    return [found[key_of(t)] for t in TRAININGS if key_of(t) in found]
 
 
 def timed(found: dict[str, Found]) -> list[dict]:
@@ -383,32 +390,39 @@ def timed(found: dict[str, Found]) -> list[dict]:
 
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
-    """{name: contents} of docs/results/, but for origin()."""
+    """{name: contents} of the tables of which all was found, but for origin()."""
     quality = (
         "means over the held-out views, 8-bit images composited on white; minutes of training alone"
     )
     blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
-    steps = "; ".join(
-        f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['copy_gbs']:.1f} GB/s,"
-        f" {run['gflops']:.0f} GFLOP/s"
-        for preset, run in found["stages"].items()
-    )
     passes = (
         "medians of interleaved runs; GFLOP/s count the multiplications of the direct convolution"
     )
+    rows = found | {"trainings": trained(found)}
+    if {*SHOWN} <= found.keys():
+        rows["scenes"] = [found[name] for name in SHOWN]
+    steps = ""
+    if "stages" in found:
+        rows["stages"] = by_preset(found["stages"])
+        steps = "; ".join(
+            f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['copy_gbs']:.1f} GB/s,"
+            f" {run['gflops']:.0f} GFLOP/s"
+            for preset, run in found["stages"].items()
+        )
     parts = {
-        "scenes": (quality, QUALITY[:-2], [found[name] for name in SHOWN]),
-        "trainings": (quality, QUALITY, trained(found)),
-        "rasteriser": (blended, RASTERISER, found["rasteriser"]),
-        "network": (passes, NETWORK, found["network"]),
-        "pytorch": ("ours and PyTorch's, medians of interleaved runs", PYTORCH, found["pytorch"]),
-        "stages": (f"medians of a step on lego ({steps})", STAGES, by_preset(found["stages"])),
-        "memory": ("the most memory that a few steps take", MEMORY, found["memory"]),
-        "demo": ("runs of the demo", DEMO, found["demo"]),
+        "scenes": (quality, QUALITY[:-2]),
+        "trainings": (quality, QUALITY),
+        "rasteriser": (blended, RASTERISER),
+        "network": (passes, NETWORK),
+        "pytorch": ("ours and PyTorch's, medians of interleaved runs", PYTORCH),
+        "stages": (f"medians of a step on lego ({steps})", STAGES),
+        "memory": ("the most memory that a few steps take", MEMORY),
+        "demo": ("runs of the demo", DEMO),
     }
     return {
-        name: {"measured": measured, "columns": columns, "rows": rows}
-        for name, (measured, columns, rows) in parts.items()
+        name: {"measured": measured, "columns": columns, "rows": rows[name]}
+        for name, (measured, columns) in parts.items()
+        if rows.get(name)
     }
 
 
@@ -461,30 +475,36 @@ def plot_speed(axes: "Axes", timed: list[dict]) -> None:
     axes.minorticks_off()
 
 
-def films(folder: Path) -> None:
+def films(kept: Path, folder: Path) -> None:
     """Films around the demo and around a real object, for README.md."""
     for name, run in (("demo", "demo_1500"), ("film", "ethiopian_head_6000")):
         look = ("--size", "320x320", "--seconds", 5, "--fps", 12, "--out", folder / f"{name}.webp")
-        run_program(*PP_CL, "render", KEPT / run, *look)
+        run_program(*PP_CL, "render", kept / run, *look)
 
 
 def main() -> int:
     """Measure what is missing, write the documents; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    parser.add_argument("--kind", default="", metavar="NAME")
     options = parser.parse_args()
+    kept = ROOT / "runs" / "-".join(filter(None, ("results", options.kind)))
     try:
         about = origin()
-        begin(about["commit"])
-        found = {name: measure(name) for name in options.only}
+        begin(kept, about["commit"])
+        found = {name: measure(kept, name) for name in options.only}
     except UserError as error:
         print(f"results: {error}", file=sys.stderr)
         return 2
-    if found.keys() == PARTS.keys():
+    is_whole = found.keys() == PARTS.keys()
+    if is_whole or options.kind:
+        folder = RESULTS / options.kind
+        folder.mkdir(parents=True, exist_ok=True)
         for name, contents in tables(found).items():
-            write_json(ROOT / "docs" / "results" / f"{name}.json", about | contents)
+            write_json(folder / f"{name}.json", about | contents)
+    if is_whole and not options.kind:
         draw(trained(found), timed(found), ROOT / "docs")
-        films(ROOT / "docs")
+        films(kept, ROOT / "docs")
     return 0
 
 
