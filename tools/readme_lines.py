@@ -6,18 +6,16 @@ they print in docs/results/readme.json, from which `make docs` writes the lines 
 
 import json
 import os
-import platform
 import re
 import subprocess
 import sys
 import tempfile
 from datetime import date
-from pathlib import Path
 
 from pp_cl.device.discover import list_devices
 from pp_cl.files.atomic import write_json
 from tools.provenance import ROOT, digest
-from tools.results import RESULTS, WIDTHS, git
+from tools.results import RESULTS, WIDTHS, git, processor
 
 FILE = RESULTS / "readme.json"
 COMMANDS = re.compile(r"(?m)^    (pp-cl train demo [^\n]*)$|`(pp-cl eval runs/demo --metrics)`")
@@ -67,16 +65,6 @@ def row(driver: str, width: int) -> dict:
     shown = [head, next(line for line in lines if EVALUATED.match(line))]
     trained = next(line for line in lines if TRAINED.match(line))
     return {"driver": driver, "kind": WIDTHS[width], **numbers, "trained": trained, "table": shown}
-
-
-def processor() -> str:
-    """The name of the processor."""
-    try:
-        text = Path("/proc/cpuinfo").read_text("utf-8")
-        name = re.search(r"(?m)^model name\s*: (.*)$", text)
-    except OSError:
-        name = None
-    return name[1].strip() if name else platform.processor() or platform.machine()
 
 
 def main() -> int:

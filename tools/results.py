@@ -13,6 +13,8 @@ docs/results/NAME/, for the marker `table: NAME/trainings`.
 import argparse
 import json
 import os
+import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -330,20 +332,30 @@ def git(*words: str) -> str:
     ).stdout.strip()
 
 
+def processor() -> str:
+    """The name of the processor."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8")
+        name = re.search(r"(?m)^model name\s*: (.*)$", text)
+    except OSError:
+        name = None
+    return name[1].strip() if name else platform.processor() or platform.machine()
+
+
 def origin() -> dict[str, str]:
     """Where, when and of which code. Raises UserError for code that is not committed."""
     if git("status", "--porcelain", "--", *CODE):
         raise UserError("pp_cl/ or cl/ differ from the last commit: commit first")
     dev = open_device()
-    # PoCL's: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
-    processor = dev.name.replace("(R)", "").removeprefix("pthread-")
+    # PoCL's name is longer than the processor's: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
+    name = processor() if dev.is_cpu else dev.name
     driver = f"{dev.info['platform']} {dev.info['driver']}"
     vectors = WIDTHS.get(dev.queue.device.native_vector_width_float)
-    kind = ", ".join(filter(None, (processor, vectors)))
+    what = ", ".join(filter(None, (name.replace("(R)", ""), vectors)))
     return {
         "commit": git("log", "-1", "--format=%h", "--", *CODE),
         "date": date.today().isoformat(),
-        "machine": f"{os.cpu_count()} cores ({kind}), {driver}",
+        "machine": f"{os.cpu_count()} cores ({what}), {driver}",
         "decides": digest(),
     }
 
@@ -492,7 +504,9 @@ def main() -> int:
     try:
         about = origin()
         begin(kept, about["commit"])
-        found = {name: measure(kept, name) for name in options.only}
+        for name in options.only:
+            measure(kept, name)
+        found = {name: measure(kept, name) for name in PARTS if (kept / f"{name}.json").exists()}
     except UserError as error:
         print(f"results: {error}", file=sys.stderr)
         return 2
