@@ -93,8 +93,8 @@ site: $(MADE) ## build README.md and docs/ as a site in build/site; fails on a d
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -f packaging/mkdocs.yml
 
 results: $(READY) ## measure what README.md and docs/ state, and write it there: hours, with the scenes of PP_DATA
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,torch,capture]'
-	@$(BIN)/python -m tools.results $(ARGS)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[cpu,plot,torch,capture]'
+	@PP_DEVICE="$${PP_DEVICE:-Intel(R) OpenCL}" $(BIN)/python -m tools.results $(ARGS)
 	@$(BIN)/python -m tools.docs_tables
 
 readme: $(READY) ## type README.md's commands in an empty folder, on each driver that is here, and write their lines there: minutes
