@@ -209,11 +209,12 @@ kernel void blend_backward(
         float2 of_hit = pair_gradient[pair];
         if (of_hit.x == 0.0f && of_hit.y == 0.0f) continue;  // mostly dropped
         const uint q = pair_pixel[pair];
+        const floats G = load_part(grad_features, q);
         if (GAINS && ROW_PART == 0) {
             of_hit.y *= dot16(grad_features[q], feature) - pixel_blend[q];
             pair_gradient[pair].y = of_hit.y;
         }
-        dL_df += of_hit.x * load_part(grad_features, q);
+        dL_df += of_hit.x * G;
         dL_do += of_hit.y;
         if (MOVES && ROW_PART == 0) {
             const float d = as_float(pair_point_closeness[pair].y);  // 0 at the very rim
