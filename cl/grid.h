@@ -1,14 +1,31 @@
 // The regular grid of the points, read from one buffer of 8 floats: origin x, y, z; edge; nx, ny,
-// nz; 0. pp_cl/scene/grid.py writes it. World coordinates count from a centre near the points.
+// nz; 0. pp_cl/scene/grid.py writes it, and numbers the vertices alike: brick by brick, bricks and
+// the vertices in each x first. World coordinates count from a centre near the points.
 #ifndef PP_GRID_H
 #define PP_GRID_H
 
-// World position of the grid's vertex (i, j, k), whose id is i + nx*(j + ny*k).
-static inline float3 grid_position(global const float *grid, const uint id) {
-    const uint nx = (uint)grid[4], ny = (uint)grid[5];
-    const uint row = id / nx;
-    const float3 ijk = (float3)((float)(id - row * nx), (float)(row % ny), (float)(row / ny));
-    return (float3)(grid[0], grid[1], grid[2]) + grid[3] * ijk;
+#define BRICK_BITS 3  // of an id, along each axis
+#define BRICK (1u << BRICK_BITS)
+
+// Bricks along an axis of n vertices.
+static inline uint bricks(const float n) {
+    return ((uint)n + BRICK - 1) / BRICK;
+}
+
+// The vertex (i, j, k) with an id.
+static inline uint3 grid_vertex(global const float *grid, const uint id) {
+    const uint nx = bricks(grid[4]), ny = bricks(grid[5]);
+    const uint brick = id >> 3 * BRICK_BITS, row = brick / nx;
+    const uint3 inside = (uint3)(id, id >> BRICK_BITS, id >> 2 * BRICK_BITS) & (BRICK - 1);
+    return BRICK * (uint3)(brick - row * nx, row % ny, row / ny) + inside;
+}
+
+// The id of a vertex (i, j, k).
+static inline uint grid_id(global const float *grid, const uint3 vertex) {
+    const uint nx = bricks(grid[4]), ny = bricks(grid[5]);
+    const uint3 brick = vertex / BRICK, inside = vertex % BRICK;
+    return (brick.x + nx * (brick.y + ny * brick.z)) << 3 * BRICK_BITS |
+           (inside.x | inside.y << BRICK_BITS | inside.z << 2 * BRICK_BITS);
 }
 
 #endif

@@ -281,8 +281,8 @@ def test_a_checkpoint(world, data):
 
 
 def check_state(header, arrays):
-    ids = arrays["points.ids"].astype(np.int64)
-    assert (np.diff(ids) > 0).all() and ids[-1] < math.prod(header["grid"]["dims"])
+    ids, grid = arrays["points.ids"].astype(np.int64), Grid.of_header(header["grid"])
+    assert (np.diff(ids) > 0).all() and (grid.coordinates(ids) < grid.dims).all()
     assert len(ids) == len(arrays["points.opacity"]) > 0
     near, far = header["depth_range"]
     assert 0 <= near < far < math.inf and 0 < header["grid"]["edge"] < math.inf

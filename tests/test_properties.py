@@ -12,7 +12,7 @@ from support.checkpoints import load_checkpoint
 
 from pp_cl.config import Config, assign, load_config, preset, sections, text_of
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
-from pp_cl.files.checkpoint import save_checkpoint
+from pp_cl.files.checkpoint import FORMAT, save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid
@@ -109,7 +109,7 @@ def test_a_checkpoint_comes_back(tmp_path, stored):
     stored = {f"x.{name}": array for name, array in stored.items()}
     save_checkpoint(tmp_path / "a.npz", {"step": 1}, stored)
     header, found = load_checkpoint(tmp_path / "a.npz")
-    assert header == {"format": 1, "step": 1} and found.keys() == stored.keys()
+    assert header == {"format": FORMAT, "step": 1} and found.keys() == stored.keys()
     for name, array in stored.items():
         assert found[name].dtype == array.dtype and np.array_equal(found[name], array)
 

@@ -7,6 +7,10 @@
 #include "cloud.h"
 #include "raster/footprint.h"
 
+#ifndef MOST_OFFSET
+#define MOST_OFFSET 0.5f  // PointCloud.most_offset of points that are no Gaussians
+#endif
+
 // Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside
 // the eye.
 #define LEAST_COSINE 1e-6f
@@ -236,6 +240,24 @@ ALWAYS_INLINE void store_points(
 #endif
 }
 
+// Whether all points of a brick miss the image, wherever they are in their cells. id: of one of them.
+// radius: of a point without offsets.
+ALWAYS_INLINE bool
+brick_misses(const Camera *cam, global const float *grid, const uint id, const float radius) {
+    const float half_side = 0.5f * (BRICK - 1), edge = grid[3];
+    const uint first = id >> 3 * BRICK_BITS << 3 * BRICK_BITS;
+    const float3 corner = (float3)(grid[0], grid[1], grid[2]) - cam->eye;
+    const float3 centre = corner + edge * (convert_float3(grid_vertex(grid, first)) + half_side);
+    const float reach = 1.7321f * edge * (half_side + MOST_OFFSET);  // to a corner
+    const float pixels = LEAST_RADIUS * (length(centre) + reach) / least_focal(cam);
+    const floats wide = reach + fmax(radius * exp(MOST_OFFSET), pixels);
+    const floats x = dot(cam->right, centre), y = dot(cam->down, centre);
+    const floats z = dot(cam->forward, centre);
+    return !ANY_LANE(
+        reaches_image(x, z, wide, cam->fx, cam->cx, cam->width) &
+        reaches_image(y, z, wide, cam->fy, cam->cy, cam->height));
+}
+
 // id / n lane by lane, which no vector instruction does; *id becomes the remainder.
 ALWAYS_INLINE uints divide(uints *id, const uint n) {
     const uints low = mul_hi(*id, (uints)(UINT_MAX / n));  // at most 1 too small
@@ -264,6 +286,15 @@ kernel void project_grid(
     if (first >= n) return;
     const uint count = min((uint)LANES, n - first);
     const Camera cam = camera_load(camera);
+#if LANES > 1 && FOOTPRINT != GAUSSIAN
+    // most points of a crop lie beside it
+    const uint one = point_id[first], other = point_id[first + count - 1];
+    if ((one ^ other) >> 3 * BRICK_BITS == 0 && brick_misses(&cam, grid, one, radius)) {
+        for (uint j = 0; j < count; j++)
+            point_count[first + j] = 0;
+        return;
+    }
+#endif
     uint id[LANES];
     float offset[9][LANES], radii[LANES];
     for (uint j = 0; j < LANES; j++) {
@@ -282,10 +313,14 @@ kernel void project_grid(
         offset[8][j] = o.s8;
 #endif
     }
-    // as grid_position() has it
-    uints i = LANES_FROM(id);
-    uints j = divide(&i, (uint)grid[4]);
-    const uints k = divide(&j, (uint)grid[5]);
+    // as grid_vertex() has it
+    const uints ids = LANES_FROM(id);
+    uints x = ids >> 3 * BRICK_BITS;
+    uints y = divide(&x, bricks(grid[4]));
+    const uints z = divide(&y, bricks(grid[5]));
+    const uints i = BRICK * x + (ids & (BRICK - 1));
+    const uints j = BRICK * y + (ids >> BRICK_BITS & (BRICK - 1));
+    const uints k = BRICK * z + (ids >> 2 * BRICK_BITS & (BRICK - 1));
     Footprints f;
 #if FOOTPRINT == GAUSSIAN
     const floats size = radius;  // of the culling alone

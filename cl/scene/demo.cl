@@ -4,7 +4,6 @@
 #include "camera.h"
 #include "common.h"
 #include "scene/demo_object.h"
-#include "grid.h"
 #include "lanes.h"
 
 #define MARCH_STEPS 96
@@ -195,21 +194,21 @@ kernel void render_demo(
                      : convert_uchar4_sat_rte(255.0f * (float4)(sum / hits, hits / 16.0f));
 }
 
-// One work-item per LANES vertices of a grid: writes their distances to the object, which are
-// negative inside.
+// One work-item per LANES vertices of a grid, x first: writes their distances to the object, which
+// are negative inside.
 kernel void demo_distances(
     const uint n,              // vertices
     global const float *grid,  // (8) cl/grid.h
     global float *distances)   // (n)
 {
-    const uint first = LANES * get_global_id(0);
+    const uint first = LANES * get_global_id(0), nx = grid[4], ny = grid[5];
     if (first >= n) return;
     float x[LANES], y[LANES], z[LANES];
     for (uint lane = 0; lane < LANES; lane++) {
-        const float3 p = grid_position(grid, first + lane);
-        x[lane] = p.x;
-        y[lane] = p.y;
-        z[lane] = p.z;
+        const uint vertex = first + lane, row = vertex / nx;
+        x[lane] = grid[0] + grid[3] * (vertex - row * nx);
+        y[lane] = grid[1] + grid[3] * (row % ny);
+        z[lane] = grid[2] + grid[3] * (row / ny);
     }
     const Vectors p = {LANES_FROM(x), LANES_FROM(y), LANES_FROM(z)};
     store_lanes(scene_distance(p), distances + first, n - first);

@@ -2,6 +2,7 @@
 // in place: of the points whose grid indices add up to an even number, then of the others. All
 // neighbours of a point are of the other colour.
 #include "common.h"
+#include "grid.h"
 #include "lanes.h"
 
 // Index of `id` in ids[first, last), ascending; NONE where it is missing.
@@ -28,16 +29,18 @@ kernel void neighbour_table(
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
-    const uint nx = grid[4], ny = grid[5], plane = nx * ny;
-    const uint id = ids[i], x = id % nx, y = id / nx % ny;
-    colour[i] = (x + y + id / plane) & 1;
+    const uint3 at = grid_vertex(grid, ids[i]);
+    const uint3 steps[3] = {(uint3)(1, 0, 0), (uint3)(0, 1, 0), (uint3)(0, 0, 1)};
+    const uint place[3] = {at.x, at.y, at.z};
+    colour[i] = (at.x + at.y + at.z) & 1;
     global uint *row = neighbours + 6 * (size_t)i;
-    row[0] = x > 0 ? find(ids, id - 1, 0, i) : NONE;
-    row[1] = x + 1 < nx ? find(ids, id + 1, i + 1, n) : NONE;
-    row[2] = y > 0 ? find(ids, id - nx, 0, i) : NONE;
-    row[3] = y + 1 < ny ? find(ids, id + nx, i + 1, n) : NONE;
-    row[4] = id >= plane ? find(ids, id - plane, 0, i) : NONE;
-    row[5] = find(ids, id + plane, i + 1, n);
+    for (uint axis = 0; axis < 3; axis++) {  // along each, ids ascend
+        const uint before = grid_id(grid, at - steps[axis]);
+        const uint behind = grid_id(grid, at + steps[axis]);
+        row[2 * axis] = place[axis] > 0 ? find(ids, before, 0, i) : NONE;
+        row[2 * axis + 1] =
+            place[axis] + 1 < (uint)grid[4 + axis] ? find(ids, behind, i + 1, n) : NONE;
+    }
 }
 
 // One work-item per part of a point: moves its coefficients if it is of this colour.

@@ -197,7 +197,7 @@ def forgiving_hull(
     that see them, (N,) how many do, the positions' spacing).
     """
     grid = Grid.centred_in(box, smallest_edge(box, CELLS))
-    positions = grid.positions(np.arange(np.prod(grid.dims)))
+    positions = grid.lattice()
     seen, rejected = np.zeros((2, len(positions)), np.int32)
     most, left = int(FORGIVEN * len(windows)), np.arange(len(positions))
     for one in windows:

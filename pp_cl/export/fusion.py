@@ -23,9 +23,7 @@ SLAB = 1 << 20  # vertices that are projected at once: 50 MB of temporary arrays
 
 def box_around(grid: Grid, ids: np.ndarray) -> Grid:
     """The part of a grid around its vertices ids (N,), MARGIN wider on every side."""
-    nx, ny, _ = grid.dims
-    ids = np.asarray(ids, np.int64)
-    ijk = np.stack([ids % nx, ids // nx % ny, ids // (nx * ny)], 1)
+    ijk = grid.coordinates(ids)
     first, last = ijk.min(0) - MARGIN, ijk.max(0) + MARGIN
     origin = np.asarray(grid.origin) + grid.edge * first
     dims = tuple(int(n) for n in last - first + 1)

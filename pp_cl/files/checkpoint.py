@@ -17,7 +17,7 @@ from pp_cl.errors import Diverged, UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.untrusted import opened_zip, strict_json
 
-FORMAT = 1  # raised when the arrays change meaning
+FORMAT = 2  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
 MEND = "delete it to train again, or restore a copy"
 

@@ -79,10 +79,8 @@ class Surface:
 
     def holds(self, grid: Grid, ids: np.ndarray) -> np.ndarray:
         """(N,) bool: which vertices of the grid asked for, by their ids (N,), are among them."""
-        nx, ny, _ = grid.dims
-        ids = np.asarray(ids, np.int64)
         steps = np.rint(np.subtract(grid.origin, self.grid.origin) / grid.edge).astype(np.int64)
-        i, j, k = ids % nx + steps[0], ids // nx % ny + steps[1], ids // (nx * ny) + steps[2]
+        i, j, k = (grid.coordinates(ids) + steps).T
         words = self.bits[k * self.grid.dims[1] + j, i // 32]
         return (words >> (i % 32).astype(np.uint32) & 1).astype(bool)
 

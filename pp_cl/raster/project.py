@@ -12,7 +12,7 @@ from pyopencl.array import Array
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device, Program
 from pp_cl.device.launch import lanes
-from pp_cl.raster.points import offset_width
+from pp_cl.raster.points import MOST_OFFSET, offset_width
 
 # numbered as in cl/raster/footprint.h, which explains them
 FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
@@ -61,6 +61,7 @@ def projection_program(dev: Device, footprint: str) -> Program:
         LANES=lanes(dev),
         FOOTPRINT=FOOTPRINTS.index(footprint),
         OFFSETS=offset_width(footprint),
+        MOST_OFFSET=f"{MOST_OFFSET}f",
     )
 
 

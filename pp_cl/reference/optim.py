@@ -78,23 +78,21 @@ def basis(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
     return sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
 
 
-def neighbours(ids: np.ndarray, dims: tuple[int, int, int]) -> list[list[int | None]]:
-    """Per point the indices of its neighbours -x, +x, -y, +y, -z, +z, None where there is none."""
-    nx, ny, _ = dims
-    index = {(int(i) % nx, int(i) // nx % ny, int(i) // (nx * ny)): n for n, i in enumerate(ids)}
+def neighbours(vertices: np.ndarray) -> list[list[int | None]]:
+    """Per vertex (i, j, k) of (N, 3) the indices of its neighbours -x, +x, -y, +y, -z, +z, None
+    where there is none.
+    """
+    index = {tuple(map(int, vertex)): n for n, vertex in enumerate(vertices)}
     offsets = [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)]
     return [[index.get((x + a, y + b, z + c)) for a, b, c in offsets] for x, y, z in index]
 
 
-def smoothed(
-    values: np.ndarray, ids: np.ndarray, dims: tuple[int, int, int], amount: float
-) -> np.ndarray:
-    """Array (N, ...) moved by `amount` towards the mean of their neighbours: first the points whose
-    grid indices have an even sum, then the others.
+def smoothed(values: np.ndarray, vertices: np.ndarray, amount: float) -> np.ndarray:
+    """Array (N, ...) moved by `amount` towards the mean of the neighbours on the vertices (N, 3):
+    first the points whose grid indices have an even sum, then the others.
     """
-    new, (nx, ny, _) = np.array(values, np.float64), dims
-    around = neighbours(ids, dims)
-    colours = [(int(i) % nx + int(i) // nx % ny + int(i) // (nx * ny)) % 2 for i in ids]
+    new = np.array(values, np.float64)
+    around, colours = neighbours(vertices), vertices.sum(1) % 2
     for i in np.argsort(colours, kind="stable"):
         known = [j for j in around[i] if j is not None]
         if known:

@@ -1,6 +1,5 @@
 """Finds masks that contradict those of the other views, and words the warning."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -45,7 +44,8 @@ def disagreements(views: Sequence[View], box: np.ndarray) -> list[Disagreement]:
     shares = alone.sum(1) / np.maximum(inside + alone.sum(1), 1)
     least = max(LEAST_SHARE, TIMES_MEDIAN * float(np.median(shares)), TIMES_EVEN / len(views))
     worst = [i for i in np.argsort(-shares, kind="stable") if shares[i] > least]
-    return [Disagreement(views[i], float(shares[i]), grid, np.flatnonzero(alone[i])) for i in worst]
+    alone = alone.reshape(-1, *grid.dims[::-1])
+    return [Disagreement(views[i], float(shares[i]), grid, grid.ids_of(alone[i])) for i in worst]
 
 
 def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
@@ -77,11 +77,11 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
 
 
 def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray, np.ndarray]:
-    """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its vertices fall onto
+    """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its lattice() fall onto
     each view's mask, and which into its image beside the mask), neither where it is ignored.
     """
     grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
-    vertices = grid.positions(np.arange(math.prod(grid.dims)))
+    vertices = grid.lattice()
     on_mask, beside = [], []
     for view in views:
         column, row, is_shown = view.stored_camera.pixels(vertices)

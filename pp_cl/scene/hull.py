@@ -174,7 +174,7 @@ def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     carver = Carver(dev, _farthest_point_order(near, grid.centre - corner))
-    return np.flatnonzero(carver.carve(grid.moved(-corner), forgiven))
+    return grid.ids_of(carver.carve(grid.moved(-corner), forgiven))
 
 
 def _box(views, given, forgiven):
@@ -238,7 +238,7 @@ def _tight(grid, inside):
     part = inside[tuple(slice(places[0], places[-1] + 1) for places in reversed(used))]
     origin = np.asarray(grid.origin) + grid.edge * low
     tight = Grid(tuple(float(x) for x in origin), grid.edge, part.shape[::-1])
-    return Hull(tight, np.flatnonzero(part).astype(np.uint32))
+    return Hull(tight, tight.ids_of(part))
 
 
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:

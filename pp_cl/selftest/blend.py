@@ -36,6 +36,7 @@ from pp_cl.selftest.points import (
     depth_at,
     make_camera,
     make_points,
+    some_ids,
 )
 
 # alpha: a closeness is off by 1e-6, as the places are (project); the product of some ten 1 - alpha
@@ -182,7 +183,7 @@ def _gaussians(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _check_gaussians(dev, rng, n, radius, stop, samples):
     camera = replace(make_camera(), samples=samples)
     grid = Grid((-1.5, -1.5, -1.5), 0.3, (11, 11, 11))
-    ids = np.sort(rng.choice(np.prod(grid.dims), n, replace=False))
+    ids = some_ids(rng, grid, n)
     learned = rng.uniform(-1, 1, (n, 9)).astype(np.float32)
     opacity = rng.uniform(0.1, 1, n).astype(np.float32)
     features = np.maximum(rng.normal(size=(n, 16)), 0)

@@ -62,7 +62,8 @@ def _box(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     expected = np.zeros((6, 8, 10), bool)
     expected[1:5, 1:7, 1:9] = True
     expected[2:4, 2:6, 2:8] = False
-    yield exact(surface.holds(grid, np.arange(10 * 8 * 6)), expected.ravel())
+    ids = grid.ids_of(np.ones(expected.shape, bool))
+    yield exact(ids[surface.holds(grid, ids)], grid.ids_of(expected))
     yield exact(surface.count, expected.sum())
 
 

@@ -17,6 +17,7 @@ from pp_cl.reference import optim
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
+from pp_cl.selftest.points import some_ids
 from pp_cl.training.optim import POINT_EPS, adam_update, ema_update, rmsprop_update
 from pp_cl.training.schedule import Rates
 from pp_cl.training.smooth import Smoother
@@ -45,7 +46,7 @@ class Cloud:
         width: int = 4,
     ):
         self.dev, self.n, self.steps = dev, n, 0
-        ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
+        ids = some_ids(rng, GRID, n)
         self.cloud = PointCloud.create(dev, ids, degree)
         self.cloud.offset = dev.zeros((n, width))
         most, count = self.cloud.most_offset, sum(block.count for block in self.cloud.blocks)
@@ -258,19 +259,18 @@ def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Neighbours on the grid, and the step towards their mean."""
-    dims = (7, 8, 9)
+    grid = Grid((0, 0, 0), 1, (7, 17, 9))
     for n in SIZES:
-        ids = np.sort(rng.choice(np.prod(dims), n, replace=False)).astype(np.uint32)
-        smoother = Smoother(dev, dev.upload(Grid((0, 0, 0), 1, dims).packed()), dev.upload(ids))
-        table = [
-            [2**32 - 1 if j is None else j for j in row] for row in optim.neighbours(ids, dims)
-        ]
+        ids = some_ids(rng, grid, n)
+        vertices = grid.coordinates(ids)
+        smoother = Smoother(dev, dev.upload(grid.packed()), dev.upload(ids))
+        table = [[2**32 - 1 if j is None else j for j in row] for row in optim.neighbours(vertices)]
         yield exact(smoother.neighbours.get(), table)
         values = rng.standard_normal((n, 3, 16)).astype(np.float32)
         for amount in (0.06, 1.0):
             sh = dev.upload(values)
             smoother.smooth(sh, amount)
-            expected = optim.smoothed(values, ids, dims, amount)
+            expected = optim.smoothed(values, vertices, amount)
             yield relative(sh.get(), expected, 4 * EPS)  # a mean of up to six
 
 

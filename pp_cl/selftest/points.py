@@ -43,6 +43,11 @@ def make_points(rng: np.random.Generator, n: int) -> np.ndarray:
     return rng.normal(size=(n, 3)) * [0.9, 0.9, 0.8]
 
 
+def some_ids(rng: np.random.Generator, grid: Grid, n: int) -> np.ndarray:
+    """(n,) uint32 ascending ids of n vertices of a grid."""
+    return np.sort(rng.choice(grid.ids_of(np.ones(grid.dims[::-1], bool)), n, replace=False))
+
+
 class PairedPoints:
     """Points projected and paired with the pixels of a camera; arrays are float64 or float32 numpy.
 

@@ -28,6 +28,7 @@ from pp_cl.selftest.points import (
     depth_at,
     make_camera,
     make_points,
+    some_ids,
 )
 
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
@@ -44,8 +45,8 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """
     camera, depth_range = make_camera(), (3.5, 4.8)
     for n in SIZES:
-        ids = rng.choice(np.prod(GRID.dims), n, replace=False)
-        ids[0] = np.prod(GRID.dims) - 1
+        ids = some_ids(rng, GRID, n)
+        ids[-1] = GRID.ids(np.array(GRID.dims) - 1)
         offset = rng.uniform(-0.5, 0.5, (n, 4)).astype(np.float32)
         positions = GRID.positions(ids) + GRID.edge * offset[:, :3]
         points = project_grid(

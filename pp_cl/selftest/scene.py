@@ -66,7 +66,7 @@ def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for nx, forgiven in itertools.product(SIZES, (0, 1, 2)):
         edge, ny, nz = 2 / nx, 7, 5
         grid = Grid((-edge * nx / 2, -edge * ny / 2, -edge * nz / 2 + 0.1), edge, (nx, ny, nz))
-        positions = grid.positions(np.arange(nx * ny * nz))
+        positions = grid.lattice()
         expected, border = kept(
             views, positions, MASK_THRESHOLD, least=carver.least, forgiven=forgiven
         )
@@ -110,7 +110,7 @@ def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
             grid = Grid(start, 1.6 / n, (n, 1, 1))
-            expected = distance(grid.positions(np.arange(n)))
+            expected = distance(grid.lattice())
             yield absolute(distances(dev, grid).ravel(), expected, DEMO)
 
 

@@ -13,7 +13,7 @@ from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.points import SH_DEGREES
-from pp_cl.scene.grid import MOST_VERTICES, Grid
+from pp_cl.scene.grid import MOST_IDS, Grid
 from pp_cl.scene.identity import kept_views
 from pp_cl.training.exposure import decided_at
 from pp_cl.training.schedule import ema_start
@@ -79,8 +79,8 @@ def _problem_of_header(header, steps):
             and grid.edge > 0 <= near < far
             and [type(n) for n in grid.dims] == [int, int, int]
             and min(grid.dims) > 0
-            and math.prod(grid.dims) <= MOST_VERTICES
-            and 0 < header["initial_points"] <= MOST_VERTICES
+            and grid.id_count <= MOST_IDS
+            and 0 < header["initial_points"] <= MOST_IDS
             and 0 <= header.get("extended_from", 0) <= header["step"]
             and left_out < names
         )
@@ -115,7 +115,8 @@ def _problem_of_forms(stored, config):
 
 def _are_ids(ids, grid):
     """Whether they are what kernels may index a grid with."""
-    return bool((ids[1:] > ids[:-1]).all() and ids[-1] < math.prod(grid["dims"]))
+    is_ascending = bool((ids[1:] > ids[:-1]).all())
+    return is_ascending and bool((Grid.of_header(grid).coordinates(ids) < grid["dims"]).all())
 
 
 def _views_with_gains(header, config):

@@ -4,6 +4,7 @@ will allocate; a training that does not fit is refused before anything is alloca
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import reduce
 from typing import NamedTuple
 
 from pp_cl.config import Config
@@ -15,7 +16,7 @@ from pp_cl.network.unet import UNet
 from pp_cl.raster.points import PointCloud, sh_blocks
 from pp_cl.render import point_radius
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import MOST_VERTICES, Grid
+from pp_cl.scene.grid import MOST_IDS, Grid
 from pp_cl.scene.load import DEMO, mask_rule, reading
 from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
 from pp_cl.training.schedule import crop_side, ema_start, prunings, refine_steps
@@ -111,9 +112,10 @@ class Room:
         grid does not fit from a step on, or would refine the grid beyond what ids can number.
         """
         to_come = sum(step < at for at in refine_steps(self._config.train))
-        if math.prod(grid.dims) * 8**to_come > MOST_VERTICES:
+        last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
+        if last.id_count > MOST_IDS:
             raise UserError(
-                f"refined {to_come} times, the grid has more than {MOST_VERTICES} vertices:"
+                f"refined {to_come} times, the grid has more than {MOST_IDS} vertices:"
                 " refine less often (train.refine_at), or lower --points"
             )
         self._check(self.need_of(grid, points, depth_range, step))

@@ -30,9 +30,7 @@ def views():
 
 
 def radii():
-    return np.linalg.norm(GRID.positions(np.arange(np.prod(GRID.dims))), axis=1).reshape(
-        GRID.dims[::-1]
-    )
+    return np.linalg.norm(GRID.lattice(), axis=1).reshape(GRID.dims[::-1])
 
 
 def test_the_sign_is_that_of_the_ball(views):
@@ -61,8 +59,7 @@ def test_a_ray_that_slips_through_hollows_nothing(views):
 
 
 def test_the_box_holds_the_points_and_a_margin():
-    nx, ny, _ = GRID.dims
-    box = box_around(GRID, np.array([3 + nx * (5 + ny * 7), 10 + nx * (5 + ny * 9)]))
+    box = box_around(GRID, GRID.ids(np.array([[3, 5, 7], [10, 5, 9]])))
     assert box.dims == (8 + 4, 1 + 4, 3 + 4)
     first = np.asarray(GRID.origin) + GRID.edge * (np.array([3, 5, 7]) - 2)
     assert np.asarray(box.origin) == pytest.approx(first)

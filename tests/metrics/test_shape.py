@@ -79,15 +79,16 @@ def test_the_grid_grows_around_the_mesh_in_step(dev):
 
 
 def test_overlap_by_hand():
-    """Vertices 1, 3, 4 of a 3x2x1 grid; points 0, 1, 4, 5."""
+    """Vertices (1, 0), (0, 1), (1, 1) of a 3x2x1 grid, and four points, two of them there."""
     grid = Grid((0.0, 0, 0), 1.0, (3, 2, 1))
+    ids = grid.ids(np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (2, 1, 0)]))
     surface = Surface(grid, np.array([[0b010], [0b011]], np.uint32), 3)
-    found = overlap(surface, grid, np.array([0, 1, 4, 5], np.uint32))
+    found = overlap(surface, grid, ids)
     assert (found.points, found.iou, found.recall, found.precision) == (4, 2 / 5, 2 / 3, 2 / 4)
     larger = Surface(
         Grid((-1.0, -1, 0), 1.0, (4, 3, 1)), np.array([[0], [0b100], [0b110]], np.uint32), 3
     )
-    assert overlap(larger, grid, np.array([0, 1, 4, 5], np.uint32)).recall == 2 / 3
+    assert overlap(larger, grid, ids).recall == 2 / 3
 
 
 # --------------------------------------------------------------------------------------------------

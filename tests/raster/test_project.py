@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pp_cl.raster.project import FOOTPRINTS
+from pp_cl.device.buffers import Buffers
+from pp_cl.raster import project
+from pp_cl.raster.project import FOOTPRINTS, project_grid
 from pp_cl.reference import dense
-from pp_cl.selftest.points import PairedPoints, make_camera, make_points
+from pp_cl.scene.grid import Grid
+from pp_cl.selftest.points import PairedPoints, make_camera, make_points, some_ids
 
 
 def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
@@ -40,6 +43,41 @@ def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
         assert (first >= np.subtract(least, 3)).all() and (last <= np.add(most, 3)).all()
         compared += 1
     assert compared > 200
+
+
+@pytest.mark.parametrize("kind", ["disc", "soft"])
+def test_what_whole_bricks_miss_no_point_of_them_hits(dev, rng, monkeypatch, kind):
+    """Crops at all borders of the points; offsets that move them towards these."""
+    grid = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
+    ids = some_ids(rng, grid, 12_000)
+    offset = rng.choice([-0.5, 0.5], (len(ids), 4)).astype(np.float32)
+    whole = make_camera(320, 240, 400.0)
+
+    def counts(camera):
+        return project_grid(
+            dev,
+            Buffers(dev),
+            kind,
+            dev.upload(camera.packed(dense.DEPTH_RANGE)),
+            dev.upload(grid.packed()),
+            point_id=dev.upload(ids),
+            cloud_offset=dev.upload(offset),
+            radius=0.04,
+        ).point_count.get()
+
+    crops = [whole.crop(x, y, 32, 32) for x in range(0, 320, 32) for y in range(0, 240, 24)]
+    found = [counts(crop) for crop in crops]
+    assert 0.01 < np.mean([(count > 0).mean() for count in found]) < 0.2
+    monkeypatch.setattr(project, "MOST_OFFSET", 1e6)  # bricks reach everywhere
+    assert all(
+        np.array_equal(count, counts(crop)) for count, crop in zip(found, crops, strict=True)
+    )
+    monkeypatch.setattr(project, "MOST_OFFSET", -3.5)  # nowhere beyond their middle
+    culls = dev.is_cpu  # GPUs judge each point alone
+    assert (
+        any((count != counts(crop)).any() for count, crop in zip(found, crops, strict=True))
+        == culls
+    )
 
 
 @pytest.mark.parametrize("deviation, bound", [(0.02, 0.1), (0.1, 0.01), (0.4, 0.01)])

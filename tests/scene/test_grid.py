@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from pp_cl.scene.grid import Grid, smallest_edge
+from pp_cl.scene.grid import MOST_IDS, Grid, smallest_edge
 
 FAR = np.array([1e6, -1e6, 1e6])
 
@@ -28,7 +28,7 @@ def test_a_rounded_grid_is_the_same_to_float32(grid):
 @pytest.mark.parametrize("by", [FAR, -FAR], ids=["far", "other way"])
 def test_vertices_of_a_rounded_grid_move_exactly(grid, by):
     near = grid.rounded()
-    far, ids = near.moved(by), np.arange(0, 45 * 37 * 30, 7)
+    far, ids = near.moved(by), near.ids_of(np.ones(near.dims[::-1], bool))[::7]
     assert (far.positions(ids) - by == near.positions(ids)).all()
     assert (far.centre - by == near.centre).all()
     assert (far.packed(far.centre) == near.packed(near.centre)).all()
@@ -69,13 +69,31 @@ def test_a_header_of_huge_integers_is_one_of_floats():
     assert grid.centre.dtype == np.float64 and grid.packed(grid.centre).dtype == np.float32
 
 
+@pytest.mark.parametrize("dims", [(1, 1, 1), (8, 8, 8), (9, 7, 17), (31, 33, 2), (1, 257, 1)])
+def test_ids_number_the_vertices_brick_by_brick(dims):
+    grid = Grid((0.5, 1.0, -2.0), 0.25, dims)
+    ids = grid.ids_of(np.ones(dims[::-1], bool))
+    assert len(ids) == np.prod(dims) and (np.diff(ids.astype(np.int64)) > 0).all()
+    assert ids[-1] < grid.id_count <= MOST_IDS
+    places = grid.coordinates(ids)
+    assert (places >= 0).all() and (places < dims).all()
+    assert np.array_equal(grid.ids(places), ids)
+    bricks = [tuple(place[::-1] // 8) + tuple(place[::-1] % 8) for place in places]
+    assert bricks == sorted(set(bricks)), "bricks, and the vertices in each, x first"
+    lattice = grid.lattice()
+    assert np.array_equal(lattice[np.lexsort(lattice.T)], lattice), "x first"
+    order = np.lexsort(grid.positions(ids).T)
+    np.testing.assert_allclose(grid.positions(ids)[order], lattice, rtol=0, atol=1e-12)
+
+
 def test_small_parts_are_told_from_large_ones():
     grid = Grid((0.0, 0.0, 0.0), 1.0, (9, 8, 7))
     cells = np.zeros((7, 8, 9), bool)
-    cells[0, :3, 0] = cells[1, 3, 1] = True  # four, the last across a corner
-    cells[1, 6, 1:4] = cells[6, 7, 8] = True  # three, one
-    ids = np.flatnonzero(cells)
-    parts = np.array([4, 4, 4, 4, 3, 3, 3, 1])
+    four, three = [(0, 0, 0), (0, 1, 0), (0, 2, 0), (1, 3, 1)], [(1, 6, 1), (2, 6, 1), (3, 6, 1)]
+    for i, j, k in [*four, *three, (8, 7, 6)]:  # the fourth across a corner, the last across bricks
+        cells[k, j, i] = True
+    ids = grid.ids_of(cells)
+    parts = np.select([np.isin(ids, grid.ids(np.array(part))) for part in (four, three)], [4, 3], 1)
     for least, smallest in ((1, 1), (2, 3), (4, 4), (5, 4)):
         assert (grid.in_large_parts(ids, least) == (parts >= smallest)).all()
 
@@ -83,8 +101,10 @@ def test_small_parts_are_told_from_large_ones():
 def test_parts_of_a_wide_box_take_the_memory_of_their_vertices():
     """A thin wide object: 10^9 vertices in its box, of which a row and some specks are taken."""
     grid = Grid((0, 0, 0), 1.0, (1000, 1000, 1000))
-    ids = np.append(np.arange(500), [10**6 - 1, 5 * 10**8, 10**9 - 1])
+    row, specks = [(i, 0, 0) for i in range(500)], [(999, 999, 0), (0, 0, 500), (999, 999, 999)]
+    ids = np.sort(grid.ids(np.array(row + specks)))
+    of_row = np.isin(ids, grid.ids(np.array(row)))
     tracemalloc.start()
-    assert np.array_equal(grid.in_large_parts(ids, 10), ids < 500)
+    assert np.array_equal(grid.in_large_parts(ids, 10), of_row)
     assert tracemalloc.get_traced_memory()[1] < 2**20
     tracemalloc.stop()

@@ -102,9 +102,8 @@ def test_the_edge_is_found(dev, points, carvings):
     assert points <= len(found.ids) <= hull.TOLERANCE * points and not found.capped
     assert carvings[-1][1] == len(found.ids) and len(carvings) <= 1 + hull.ROUNDS
     assert found.ids.dtype == np.uint32 and (np.diff(found.ids.astype(np.int64)) > 0).all()
-    lattice = positions_of(replace(found, ids=np.arange(np.prod(found.grid.dims))))
-    kept_here = np.zeros(len(lattice), bool)
-    kept_here[found.ids] = True
+    ids = found.grid.ids_of(np.ones(found.grid.dims[::-1], bool))
+    lattice, kept_here = found.grid.positions(ids), np.isin(ids, found.ids)
     from_centre = np.linalg.norm(lattice - CENTRE, axis=1)
     assert kept_here[from_centre < RADIUS].all(), "a vertex inside the ball is lost"
     pixel = 4 / 96

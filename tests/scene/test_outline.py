@@ -15,9 +15,9 @@ def ball_points(per_radius, shell=False):
     edge = RADIUS / per_radius
     n = 2 * per_radius + 3
     grid = Grid(tuple(CENTRE - edge * (n - 1) / 2), edge, (n, n, n))
-    distance = np.linalg.norm(grid.positions(np.arange(n**3)) - CENTRE, axis=1)
+    distance = np.linalg.norm(grid.lattice() - CENTRE, axis=1).reshape(n, n, n)
     inside = (distance <= RADIUS) & (distance > (RADIUS - 2 * edge if shell else 0))
-    return grid, np.flatnonzero(inside).astype(np.uint32)
+    return grid, grid.ids_of(inside)
 
 
 @pytest.mark.parametrize("per_radius, shell", [(40, False), (12, False), (12, True), (6, False)])

@@ -13,7 +13,7 @@ KERNELS = device_module.kernel_folder()
 FLIPS = [
     ("device/rows", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
     ("device/scan", "sum += total", "sum -= total", "device: scan"),
-    ("scene/demo", "y[lane] = p.y", "y[lane] = -p.y", "scene: demo"),
+    ("scene/demo", "y[lane] = grid[1]", "y[lane] = -grid[1]", "scene: demo"),
     ("scene/distortion", "c - out[x]", "c + out[x]", "scene: distortion"),
     ("scene/distortion", "c - *at", "c + *at", "scene: distortion"),
     ("scene/distortion", "2.0f * p2 * xy", "-2.0f * p2 * xy", "scene: distortion"),

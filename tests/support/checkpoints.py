@@ -11,7 +11,9 @@ from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import opened_checkpoint, save_checkpoint
 from pp_cl.scene.demo import demo_frames
+from pp_cl.scene.grid import Grid
 from pp_cl.scene.identity import kept_camera
+from pp_cl.selftest.points import some_ids
 from pp_cl.training.checkpoint import load_run_state, stored_forms
 from pp_cl.training.exposure import decided_at
 
@@ -53,7 +55,7 @@ def contents(config, step=STEP, n=POINTS):
     gains = 0 if finished or step >= decided_at(0, views) else views
     for name, form in stored_forms(config, n, None if finished else step, gains=gains).items():
         arrays[name] = rng.random(form.shape).astype(form.dtype)
-    arrays["points.ids"] = np.sort(rng.choice(9 * 8 * 7, n, replace=False)).astype(np.uint32)
+    arrays["points.ids"] = some_ids(rng, Grid.of_header(HEADER["grid"]), n)
     for name in {"points.offset", "state.a.offset"} & arrays.keys():
         arrays[name] -= np.float32(0.5)
     if "state.last_step" in arrays:

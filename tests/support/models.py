@@ -9,6 +9,7 @@ from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.raster.weights import listed_hits
 from pp_cl.scene.grid import Grid
+from pp_cl.selftest.points import some_ids
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
 
@@ -18,7 +19,7 @@ WIDTHS = (16, 16, 16)
 
 def make_model(dev, rng, n=90):
     """A model with random parameters and some opacities of 0 and 1."""
-    ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
+    ids = some_ids(rng, GRID, n)
     model = Model.create(dev, GRID, ids, (2.0, 6.0), net=UNet(dev, widths=WIDTHS, seed=3))
     opacity = rng.uniform(0.2, 1, n).astype(np.float32)
     opacity[::9], opacity[4::9] = 0, 1

@@ -27,7 +27,7 @@ from support.runs import arguments, train_and_interrupt
 
 from pp_cl.config import load_config
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import save_checkpoint
+from pp_cl.files.checkpoint import FORMAT, save_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
 from pp_cl.training.checkpoint import load_run_state, stored_forms
@@ -69,7 +69,7 @@ def test_what_fits_is_read_as_it_was_written(folder, config, step):
     header, arrays = contents(config, step)
     write_run(folder, config, header, arrays)
     found_header, found = load_run_state(folder, load_config(folder.config))
-    assert found_header == {"format": 1, **header} and found.keys() == arrays.keys()
+    assert found_header == {"format": FORMAT, **header} and found.keys() == arrays.keys()
     for name, array in arrays.items():
         assert found[name].dtype == array.dtype
         np.testing.assert_array_equal(found[name], array)
@@ -122,7 +122,7 @@ HEADERS = {
     "views of nothing": {"views": []},
     "a camera of zeros": {"views": [["r_0.png", "A" * 192]]},
     "an unknown key": {"col\nour\x1b[31m": 1},
-    "another format": {"format": 2},
+    "another format": {"format": FORMAT - 1},
 }
 
 

@@ -126,7 +126,7 @@ def test_one_judged_point_always_survives(dev):
 
 def test_children_are_centred_on_their_parent():
     grid = Grid((0.3, -1.0, 2.0), 0.5, (3, 4, 5))
-    ids = np.array([0, 7, 30, 59], np.uint32)
+    ids = np.sort(grid.ids(np.array([(0, 0, 0), (1, 2, 0), (0, 2, 2), (2, 3, 4)])))
     children, parents = grid.children(ids)
     assert (np.diff(children.astype(np.int64)) > 0).all()
     assert np.bincount(parents).tolist() == [8] * 4
