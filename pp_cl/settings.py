@@ -143,7 +143,9 @@ class TrainConfig:
         128, "side in pixels of the square crop of a step (0: whole images)", 0, 2**14
     )
     pixel_jitter: bool = setting(
-        True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
+        True,
+        "shift the pixel grid of the image by a random sub-pixel offset each step: by a number of"
+        " the stored pixels that it is reduced from, else by up to an eighth of a pixel",
     )
     ssim_weight: float = setting(0.2, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
     smooth_l1: float = setting(0.05, "errors below this count by their square (0: L1)", 0, 1)
@@ -193,10 +195,10 @@ class TrainConfig:
         0,
         1,
     )
-    opacity_rate_steps: int = setting(
+    rate_steps: int = setting(
         1000,
-        "steps that opacity_rate is meant for: longer trainings multiply it by the square root"
-        " of this over their iterations (0: never)",
+        "steps that opacity_rate, and sh_rate above degree 0, are meant for: longer trainings"
+        " multiply them by the square root of this over their iterations (0: never)",
         0,
         10**8,
     )

@@ -197,10 +197,11 @@ def _config(given: Config, scale: int) -> Config:
     # these and more; shapes have the longest way. In pictures as large as the images colours must
     # be fast, since they sharpen what viewers widen; in larger ones slower colours and faster
     # opacities are better (0.4 dB on lego by the colours alone).
+    train.rate_steps = 0
     if scale == 1:
-        train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (2e-2, 6e-3)
+        train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (7.6e-3, 2.3e-3)
     else:
-        train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (6e-2, 1.8e-2)
+        train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
         train.prune_weight = 0.0  # points are judged in images, where larger pictures show more
     train.offset_rate = (4e-2, 4e-3)
     return config

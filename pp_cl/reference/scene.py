@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.interpolate import BarycentricInterpolator
 from scipy.ndimage import map_coordinates
 
 CENTRE = np.array([0, 0, 0.15])  # of the globe
@@ -99,6 +100,30 @@ def target_forward(
             if block.size:
                 target[y, x] = block.mean((0, 1))
     return target
+
+
+def target_between(
+    image: np.ndarray, left: float, top: float, *, width: int, height: int
+) -> np.ndarray:
+    """(height, width, 4): colour over white and alpha of an (H, W, 4) uint8 image at pixels from
+    the place (left, top) on, by the polynomial through the five nearest pixels each way; white and
+    0 where the nearest is outside of the image.
+    """
+    alpha = image[..., 3:] / 255.0
+    planes = np.concatenate([image[..., :3] / 255.0 * alpha + 1 - alpha, alpha], axis=2)
+    found = np.empty((height, width, 4))
+    for y, x in np.ndindex(height, width):
+        column, row = round(left) + x, round(top) + y
+        if not (0 <= column < image.shape[1] and 0 <= row < image.shape[0]):
+            found[y, x] = 1, 1, 1, 0
+            continue
+        rows, columns = (np.arange(middle - 2, middle + 3) for middle in (row, column))
+        near = planes[
+            np.clip(rows, 0, image.shape[0] - 1)[:, None], np.clip(columns, 0, image.shape[1] - 1)
+        ]
+        lines = BarycentricInterpolator(rows, near)(top + y)
+        found[y, x] = BarycentricInterpolator(columns, lines)(left + x)
+    return np.clip(found, 0, 1)
 
 
 def _segment(p, a, b):

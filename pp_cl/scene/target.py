@@ -9,6 +9,8 @@ from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.scene.views import View
 
+AROUND = 2  # pixels on either side of a place that interpolation reads
+
 
 class Target:
     """Makes targets from views.
@@ -22,31 +24,37 @@ class Target:
         self._buffers = Buffers(dev)
 
     def crop(
-        self, view: View, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
+        self, view: View, box: tuple[int, int, int, int], jitter: tuple[float, float] = (0, 0)
     ) -> tuple[Array, Array]:
         """(colour (height, width, 3), alpha (height, width)), float32: a part of a view's reduced
         image, and the mean alpha of its pixels, 0 outside of the image; valid until the next call.
 
         box: (x0, y0, width, height), reduced pixels; may reach outside of the image. jitter: stored
-        pixels by which all blocks lie further right and down. View.crop_camera gives the camera.
+        pixels by which all blocks lie further right and down: whole numbers, or at most half a
+        pixel of a view that is not reduced, which is then interpolated. View.crop_camera gives the
+        camera.
         """
         x0, y0, width, height = box
         shapes = {"target": (height, width, 3), "alpha": (height, width)}
         self._buffers.require({name: (shape, np.float32) for name, shape in shapes.items()})
-        left, top = (view.downscale * c + d for c, d in zip((x0, y0), jitter, strict=True))
+        whole = [round(stored) for stored in jitter]
+        left, top = (view.downscale * c + d for c, d in zip((x0, y0), whole, strict=True))
         stored_height, stored_width, _ = view.image.shape
         # only rows that the crop reads go to the device, at least one
-        first = min(max(top, 0), stored_height - 1)
-        rows = view.image[first : max(top + view.downscale * height, first + 1)]
-        most = min(view.downscale * height, stored_height) * stored_width * 4
+        first = min(max(top - AROUND, 0), stored_height - 1)
+        last = top + view.downscale * height + AROUND
+        rows = view.image[first : max(last, first + 1)]
+        most = min(view.downscale * height + 2 * AROUND, stored_height) * stored_width * 4
         image = self.dev.scratch("photograph", most, np.uint8)[: rows.size].reshape(rows.shape)
         self.dev.send(image, rows)
+        across, down = (stored - d for stored, d in zip(jitter, whole, strict=True))
+        between = {"across": across, "down": down}
         self.dev.program("scene/target").launch(
-            "target_forward",
+            "target_between" if across or down else "target_forward",
             (width, height),
             width=width,
             height=height,
-            downscale=view.downscale,
+            **(between if across or down else {"downscale": view.downscale}),
             left=left,
             top=top - first,
             image_width=stored_width,

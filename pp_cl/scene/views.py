@@ -101,7 +101,7 @@ class View:
         return alpha if self.ignored is None else np.where(self.ignored, np.uint8(255), alpha)
 
     def ignored_crop(
-        self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
+        self, box: tuple[int, int, int, int], jitter: tuple[float, float] = (0, 0)
     ) -> np.ndarray | None:
         """(height, width) bool: the pixels of Target.crop(box, jitter) whose blocks have one that
         is ignored; None where there are none.
@@ -109,7 +109,7 @@ class View:
         if self.ignored is None:
             return None
         (x0, y0, width, height), k = box, self.downscale
-        left, top = k * x0 + jitter[0], k * y0 + jitter[1]
+        left, top = (k * c + round(d) for c, d in zip((x0, y0), jitter, strict=True))
         there = self.ignored[max(top, 0) : top + height * k, max(left, 0) : left + width * k]
         before = max(-top, 0), max(-left, 0)
         after = np.subtract((height * k, width * k), np.add(before, there.shape))
@@ -145,7 +145,7 @@ class View:
         return replace(self, downscale=fitting_downscale(size, side))
 
     def crop_camera(
-        self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
+        self, box: tuple[int, int, int, int], jitter: tuple[float, float] = (0, 0)
     ) -> Camera:
         """The camera of Target.crop(box, jitter) of this view."""
         dx, dy = (stored / self.downscale for stored in jitter)

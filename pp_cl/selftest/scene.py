@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.reference.scene import dilated_mask, distance, kept, target_forward, undistorted
+from pp_cl.reference.scene import (
+    dilated_mask,
+    distance,
+    kept,
+    target_between,
+    target_forward,
+    undistorted,
+)
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import distances
 from pp_cl.scene.distortion import Distortion, undistort
@@ -92,6 +99,21 @@ def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield absolute(alpha.get(), hidden, TARGET)
 
 
+def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Shifted by parts of a pixel, also where the crop reaches outside of the image."""
+    image = rng.integers(0, 256, (40, 97, 4), np.uint8)
+    view = View("noise", Camera(np.eye(3, 4), 90.0, 95.0, 45.6, 20.2, 97, 40), image)
+    target = Target(dev)
+    for (width, height), (across, down) in itertools.product(
+        ((1, 5), (31, 5), (33, 5), (5, 31), (257, 5)), ((0.125, -0.1), (-0.45, 0.3), (0.0, 0.4))
+    ):
+        for x0, y0 in ((1, 2), (-3, 33)):
+            found = target.crop(view, (x0, y0, width, height), (across, down))
+            expected = target_between(image, x0 + across, y0 + down, width=width, height=height)
+            yield absolute(found[0].get(), expected[..., :3], TARGET)
+            yield absolute(found[1].get(), expected[..., 3], TARGET)
+
+
 def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Noise without distortion, at its size and at a half and a third; a tall image takes several
     bands.
@@ -118,6 +140,7 @@ CASES = (
     Case("scene: masks", _masks),
     Case("scene: hull", _hull),
     Case("scene: target", _target),
+    Case("scene: target between pixels", _target_between),
     Case("scene: distortion", _distortion),
     Case("scene: demo", _demo),
 )

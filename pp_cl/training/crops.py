@@ -13,6 +13,8 @@ from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
 from pp_cl.training.schedule import BOX_MARGIN, crop_side, draw_start
 
+BETWEEN = 0.125  # pixels by which images at their own size are shifted: farther would blur them
+
 
 class Crop(NamedTuple):
     """A part of a view. box: (x0, y0, width, height), pixels of its reduced
@@ -23,7 +25,7 @@ class Crop(NamedTuple):
     view_index: int
     view: View
     box: tuple[int, int, int, int]
-    jitter: tuple[int, int]
+    jitter: tuple[float, float]
     camera: Camera
 
 
@@ -52,8 +54,7 @@ class Crops:
         epoch, place = divmod(step, n)
         index = int(np.random.default_rng((self._seed, epoch, n)).permutation(n)[place])
         view = self.views[index]
-        across, down = rng.integers(view.downscale if self._jitters else 1, size=2)
-        jitter = int(across), int(down)
+        jitter = self._jitter(view, rng) if self._jitters else (0, 0)
         box = (0, 0, view.camera.width, view.camera.height)
         if self.side:
             x0, y0, x1, y1 = self._boxes[index]
@@ -62,3 +63,15 @@ class Crops:
             top = draw_start(rng, y0, y1, height, limit=view.camera.height)
             box = (left, top, width, height)
         return Crop(index, view, box, jitter, view.crop_camera(box, jitter))
+
+    def _jitter(self, view, rng):
+        """Any block of stored pixels for a reduced view. Others are shifted between their pixels
+        unless some of these say nothing, which would spread into others.
+        """
+        if view.downscale > 1:
+            across, down = (int(stored) for stored in rng.integers(view.downscale, size=2))
+        elif view.ignored is None:
+            across, down = (float(shift) for shift in rng.uniform(-BETWEEN, BETWEEN, 2))
+        else:
+            across, down = 0, 0
+        return across, down

@@ -38,14 +38,18 @@ class Rates:
     def at(cls, step: int, network: NetworkConfig, train: TrainConfig) -> Rates:
         """The rates of a step from 0 on."""
         steps = train.iterations
+        # these travel about as far in a long training as in a short one: what depends on the
+        # direction would learn the training views by heart
+        scale = math.sqrt(min(1.0, train.rate_steps / steps or 1.0))
         sh = tuple(
-            learning_rate(step, steps, first, first * SH_DECAY, delay_steps=round(delay * steps))
+            slower
+            * learning_rate(step, steps, first, first * SH_DECAY, delay_steps=round(delay * steps))
             if first
             else 0.0
-            for first, delay in zip(train.sh_rate, SH_DELAY, strict=True)
+            for first, delay, slower in zip(
+                train.sh_rate, SH_DELAY, (1.0, scale, scale), strict=True
+            )
         )
-        # opacities travel about as far in a long training as in a short one
-        scale = math.sqrt(min(1.0, train.opacity_rate_steps / steps or 1.0))
         return cls(
             sh,
             learning_rate(step, steps, *train.offset_rate) if train.offset_rate[0] else 0.0,

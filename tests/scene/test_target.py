@@ -47,14 +47,20 @@ def test_transparent_is_exactly_white_whatever_its_colour(dev, rng):
     assert (Target(dev).whole(make_view(image).reduced(4)) == 1).all()
 
 
-@pytest.mark.parametrize("jitter", ((0, 0), (1, 0), (0, 3), (3, 2)))
-def test_camera_sees_what_the_target_shows(dev, jitter):
+@pytest.mark.parametrize(
+    ("downscale", "jitter"),
+    (
+        *((4, jitter) for jitter in ((0, 0), (1, 0), (0, 3), (3, 2))),
+        *((1, jitter) for jitter in ((0.125, 0), (-0.1, -0.125), (0.4, 0.5))),
+    ),
+)
+def test_camera_sees_what_the_target_shows(dev, downscale, jitter):
     """Colours that are linear in the stored pixel's position come back where the target's camera
     says they are.
     """
     x, y = np.meshgrid(np.arange(80), np.arange(64))
     image = np.stack([3 * x, 4 * y, x + y, np.full_like(x, 255)], -1).astype(np.uint8)
-    view, box = make_view(image).reduced(4), (2, 1, 12, 9)
+    view, box = make_view(image).reduced(downscale), (2, 2, 12, 9)
     stored = view.stored_camera
     camera = view.crop_camera(box, jitter)
     result = Target(dev).crop(view, box, jitter)[0].get()

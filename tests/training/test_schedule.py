@@ -102,10 +102,11 @@ def test_short_trainings_average_too(steps):
 @pytest.mark.parametrize(
     "steps, meant_for, scale", [(100, 1000, 1), (1000, 1000, 1), (9000, 1000, 1 / 3), (9000, 0, 1)]
 )
-def test_opacities_are_slower_in_longer_trainings(steps, meant_for, scale):
-    settings = TrainConfig(iterations=steps, opacity_rate_steps=meant_for)
+def test_what_is_slower_in_longer_trainings(steps, meant_for, scale):
+    settings = TrainConfig(iterations=steps, rate_steps=meant_for)
     first, last = (Rates.at(step, NetworkConfig(), settings) for step in (0, steps))
     assert (first.opacity, last.opacity) == pytest.approx((0.03 * scale, 0.01 * scale))
+    assert last.sh == pytest.approx((0.05, 0.025 * scale, 0.0125 * scale))
     assert (first.network, last.network) == pytest.approx((1e-3, 1e-4))
 
 
