@@ -38,8 +38,7 @@ class Rates:
     def at(cls, step: int, network: NetworkConfig, train: TrainConfig) -> Rates:
         """The rates of a step from 0 on."""
         steps = train.iterations
-        # these travel about as far in a long training as in a short one: what depends on the
-        # direction would learn the training views by heart
+        # these travel about as far in a long training as in a short one: faster, they end noisier
         scale = math.sqrt(min(1.0, train.rate_steps / steps or 1.0))
         sh = tuple(
             slower
