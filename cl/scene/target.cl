@@ -54,7 +54,7 @@ static inline void lagrange(const float t, float weights[5]) {
 kernel void target_between(
     const int width,
     const int height,
-    const float across,  // pixels from target to photograph, at most half a one
+    const float across,  // pixels by which the target lies further right, at most half a one
     const float down,
     const int left,  // photograph's column and row of target pixel (0, 0)
     const int top,

@@ -152,10 +152,9 @@ def _images_line(training, chosen):
     if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
-    kept = (
-        f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter"
-        f" {view.downscale}x{view.downscale} offsets"
-    )
+    k = view.downscale
+    jitter = f"{k}x{k} offsets" if k > 1 else "an eighth of a pixel"
+    kept = f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter {jitter}"
     return (
         f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
         f"{kept if view.shrunk > 1 else ''}"

@@ -2,6 +2,8 @@
 white.
 """
 
+from typing import Any
+
 import numpy as np
 from pyopencl.array import Array
 
@@ -48,13 +50,15 @@ class Target:
         image = self.dev.scratch("photograph", most, np.uint8)[: rows.size].reshape(rows.shape)
         self.dev.send(image, rows)
         across, down = (stored - d for stored, d in zip(jitter, whole, strict=True))
-        between = {"across": across, "down": down}
+        name, own = "target_forward", dict[str, Any](downscale=view.downscale)
+        if across or down:
+            name, own = "target_between", {"across": across, "down": down}
         self.dev.program("scene/target").launch(
-            "target_between" if across or down else "target_forward",
+            name,
             (width, height),
             width=width,
             height=height,
-            **(between if across or down else {"downscale": view.downscale}),
+            **own,
             left=left,
             top=top - first,
             image_width=stored_width,

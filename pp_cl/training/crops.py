@@ -65,13 +65,11 @@ class Crops:
         return Crop(index, view, box, jitter, view.crop_camera(box, jitter))
 
     def _jitter(self, view, rng):
-        """Any block of stored pixels for a reduced view. Others are shifted between their pixels
-        unless some of these say nothing, which would spread into others.
+        """Crop.jitter: of a reduced view any stored pixels of a block. Others are shifted between
+        their pixels, unless some of these say nothing, which would spread.
         """
         if view.downscale > 1:
-            across, down = (int(stored) for stored in rng.integers(view.downscale, size=2))
-        elif view.ignored is None:
-            across, down = (float(shift) for shift in rng.uniform(-BETWEEN, BETWEEN, 2))
-        else:
-            across, down = 0, 0
-        return across, down
+            return tuple(rng.integers(view.downscale, size=2).tolist())
+        if view.ignored is None:
+            return tuple(rng.uniform(-BETWEEN, BETWEEN, 2).tolist())
+        return 0, 0
