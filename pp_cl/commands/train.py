@@ -153,7 +153,7 @@ def _images_line(training, chosen):
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
     k = view.downscale
-    jitter = f"{k}x{k} offsets" if k > 1 else "an eighth of a pixel"
+    jitter = f"{k}x{k} offsets" if k > 1 else "at most an eighth of a pixel"
     kept = f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter {jitter}"
     return (
         f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
