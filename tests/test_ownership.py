@@ -17,6 +17,11 @@ from pp_cl.export import FORMATS
 FILM = ["render", "run", "--seconds", "0.2", "--fps", "10"]
 OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
 RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--blend", "alpha"]
+# of a small window, for which splats are fitted faster
+EXPORT = {
+    name: ["export", "run", "--format", name, *(("--window", "100") if "splat" in name else ())]
+    for name in FORMATS
+}
 # {name: (words, BALL stands for a scene; files that the words name, which may be replaced)}
 COMMANDS = {
     "train": (None, ()),
@@ -29,9 +34,9 @@ COMMANDS = {
     "mp4 elsewhere": ([*FILM, "--out", "a.mp4"], ("a.mp4",)),
     "frames": ([*FILM, "--format", "png"], ()),
     "frames elsewhere": ([*FILM, "--format", "exr", "--out", "there"], ()),
-    **{f"export {name}": (["export", "run", "--format", name], ()) for name in FORMATS},
+    **{f"export {name}": (words, ()) for name, words in EXPORT.items()},
     **{
-        f"export {name} elsewhere": (["export", "run", "--format", name, "--out", f"a{end}"], named)
+        f"export {name} elsewhere": ([*EXPORT[name], "--out", f"a{end}"], named)
         for name, (_, ends, _) in FORMATS.items()
         for end in (ends or ("",))[:1]
         for named in ((f"a{end}",) if end else (),)
