@@ -67,9 +67,11 @@ def cache_of_its_own(tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def small_exports():
-    """Steps of fitting Gaussians, and texels: what a ball needs."""
+    """Texels: what a ball needs; steps of fitting Gaussians: few, as one file sees to how good
+    these are (export/test_splat.py).
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaussians, "STEPS", 400)
+        patch.setattr(gaussians, "STEPS", 40)
         patch.setattr(texture, "SIDE", 256)
         yield
 

@@ -251,22 +251,18 @@ def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
     alpha_ = np.asarray(opacity, np.float64)[:, None] * geometry_["closeness"]
     shows = alpha_ >= least_alpha
     alpha_ = np.where(shows, np.minimum(alpha_, most_alpha), 0)
-    weight, through, used = np.zeros(hit.shape), np.zeros(hit.shape), np.zeros_like(hit)
-    background = np.ones(hit.shape[1])
-    for q in np.flatnonzero(hit.any(axis=0)):
-        points = np.flatnonzero(hit[:, q])
-        for i in points[np.argsort(ranks[points, q])]:
-            if background[q] < least:
-                break
-            used[i, q], through[i, q] = True, background[q]
-            weight[i, q] = background[q] * alpha_[i, q]
-            background[q] *= 1 - alpha_[i, q]
+    factors = np.ones((len(hit) + 1, hit.shape[1]))  # by the places of the hits, from 1
+    np.put_along_axis(factors, ranks + 1, np.where(hit, 1 - alpha_, 1), axis=0)
+    passed = np.cumprod(factors, axis=0)  # T in front of each
+    through = np.take_along_axis(passed, ranks, axis=0)
+    used = hit & ~(through < least)
+    through = np.where(used, through, 0)
     return {
         "alpha": alpha_,
         "shows": shows,
-        "weight": weight,
+        "weight": through * alpha_,
         "through": through,
-        "background": background,
+        "background": passed[used.sum(axis=0), np.arange(hit.shape[1])],
         "hit": used,
     }
 

@@ -159,15 +159,17 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         gradients = scene.gradients(grad, edge=edge)["offset"]
         exact_geometry = scene.geometry()
         used = dense.alpha(exact_geometry, opacity, stop)["hit"]
+        start = dense.geometry(camera, positions, radius, "soft")["closeness"]
 
-        def loss(offset, radius=radius, exact_geometry=exact_geometry, used=used):
-            wide = radius * np.exp(offset[:, 3])
-            moved = dense.geometry(camera, positions + edge * offset[:, :3], wide, "soft")
-            moved |= {"hit": used, "depth": exact_geometry["depth"]}
+        def loss(offset, i, radius=radius, exact_geometry=exact_geometry, used=used, start=start):
+            place, wide = positions[i] + edge * offset[:3], radius * np.exp(offset[3])
+            closeness = start.copy()
+            closeness[i] = dense.geometry(camera, place[None], wide, "soft")["closeness"][0]
+            moved = exact_geometry | {"hit": used, "closeness": closeness}
             return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
 
-        numeric = numeric_gradient(loss, np.zeros((n, 4)), STEP)
-        yield relative(gradients.ravel(), numeric, DIFFERENCES)
+        numeric = [numeric_gradient(partial(loss, i=i), np.zeros(4), STEP) for i in range(n)]
+        yield relative(gradients, np.array(numeric), DIFFERENCES)
 
 
 def _gaussians(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -195,16 +197,20 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
     yield relative(picture.reshape(-1, 16), dense.features(blend, features), WEIGHT["alpha"])
     expected = np.where(features > 0, blend["weight"] @ grad, 0)
     yield relative(found["features"], expected, WEIGHT["alpha"])
-    place = partial(dense.gaussians, camera, grid.positions(ids), grid.edge, radius=radius)
-    expected = place(learned)["closeness"]
+    vertices = grid.positions(ids)
+    expected = dense.gaussians(camera, vertices, grid.edge, learned, radius)["closeness"]
     yield absolute(measured["closeness"][hit], expected[hit], WEIGHT["alpha"])
 
-    def loss(offset):
-        moved = place(offset) | {"hit": blend["hit"], "depth": measured["depth"]}
-        return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
+    def loss(offset, i):
+        moved = dense.gaussians(camera, vertices[i : i + 1], grid.edge, offset[None], radius)
+        closeness = expected.copy()
+        closeness[i] = moved["closeness"][0]
+        geometry = measured | {"hit": blend["hit"], "closeness": closeness}
+        return (dense.features(dense.alpha(geometry, opacity), features) * grad).sum()
 
-    numeric = numeric_gradient(loss, learned.astype(np.float64), STEP)
-    yield relative(found["offset"][:, :9].ravel(), numeric, DIFFERENCES)
+    rows = enumerate(learned)
+    numeric = [numeric_gradient(partial(loss, i=i), offset, STEP) for i, offset in rows]
+    yield relative(found["offset"][:, :9], np.array(numeric), DIFFERENCES)
     yield exact(found["offset"][:, 9:], np.zeros((n, 7)))
 
 

@@ -34,10 +34,7 @@ def copied(unfinished, tmp_path):
 
 # so little training shows no surface; tests/export/test_formats.py writes a mesh
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "mesh"])
-def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(
-    name, copied, capsys, monkeypatch
-):
-    monkeypatch.setattr("pp_cl.export.gaussians.STEPS", 100)
+def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(name, copied, capsys):
     assert main(["export", str(copied), "--format", name]) == 0
     written, said = copied / "export" / FORMATS[name][0], capsys.readouterr()
     shown = ascii(str(written)).strip("'")

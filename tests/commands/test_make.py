@@ -1,10 +1,10 @@
 """`pp-cl make`: what is left is done, and a folder tells of it."""
 
 import re
+import shutil
 
 import pytest
 from support.runs import spoken
-from support.scenes import write_ball_scene
 
 from pp_cl.capture import STAGES
 from pp_cl.cli import main
@@ -15,17 +15,20 @@ from pp_cl.files.manifest import begin_manifest
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """(scene, folder, lines) of a ball."""
-    folder = tmp_path_factory.mktemp("make")
-    scene = write_ball_scene(folder / "ball", views=12, size=32)
-    status, lines = spoken(["make", scene, "--out", folder / "out", "--minutes", "0.1"])
-    assert status == 0, lines
-    return scene, folder / "out", lines
+def made(runs, tmp_path_factory):
+    """(scene, what was made of it) of a ball."""
+    scene = runs.ball(views=12, size=32)
+
+    def make(folder):
+        status, lines = spoken(["make", scene, "--out", folder / "out", "--minutes", "0.1"])
+        assert status == 0, lines
+
+    folder = tmp_path_factory.mktemp("make") / "out"
+    return scene, shutil.copytree(runs.made("make", make) / "out", folder)
 
 
 def test_the_page_links_what_is_there(made):
-    _, folder, _ = made
+    _, folder = made
     page = (folder / "index.html").read_text("utf-8")
     named = set(re.findall(r'(?:src|href|content)="([\w.]+\.\w+)"', page))
     assert named == {"model.html", "film.mp4", "splat.ply", "views.png", "thumbnail.png"}
@@ -36,10 +39,10 @@ def test_the_page_links_what_is_there(made):
 
 
 def test_the_same_command_does_only_what_is_left(made, capsys):
-    scene, folder, _ = made
+    scene, folder = made
     checkpoint = (folder / "run/checkpoint.npz").read_bytes()
     (folder / "index.html").unlink()
-    assert main(["make", str(scene), "--out", str(folder)]) == 0
+    assert main(["make", scene, "--out", str(folder)]) == 0
     assert "is finished" in capsys.readouterr().out
     assert (folder / "index.html").exists()
     assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
@@ -48,7 +51,7 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
 
 
 def test_what_is_not_its_own_stays(made, tmp_path):
-    scene, folder, _ = made
+    scene, folder = made
     (tmp_path / "mine.txt").write_text("mine")
     status, lines = spoken(["make", scene, "--out", tmp_path])
     assert status == 2 and "holds other files" in lines[-1]
@@ -103,7 +106,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
 
 
 def test_hints_of_photographs_are_refused_for_a_scene(made, tmp_path):
-    scene, *_ = made
+    scene, _ = made
     status, lines = spoken(["make", scene, "--out", tmp_path / "new", "--turntable"])
     assert status == 2 and "--turntable" in lines[-1] and not (tmp_path / "new").exists()
     status, lines = spoken(["make", tmp_path / "none", "--out", tmp_path / "new"])

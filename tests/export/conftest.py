@@ -17,9 +17,3 @@ def run_folder(runs, tmp_path_factory):
 def run(session_device, run_folder):
     """The run, loaded."""
     return load_run(session_device, run_folder)
-
-
-@pytest.fixture
-def quick_splats(monkeypatch):
-    """Gaussians are fitted in a few steps, for tests of all else."""
-    monkeypatch.setattr("pp_cl.export.gaussians.STEPS", 100)

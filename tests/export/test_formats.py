@@ -14,8 +14,6 @@ from pp_cl.run import load_run
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.transforms import write_scene
 
-pytestmark = pytest.mark.usefixtures("quick_splats")
-
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_it_is_written_where_it_belongs_and_twice_alike(name, run, tmp_path):

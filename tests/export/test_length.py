@@ -13,7 +13,6 @@ from pp_cl.export.formats import export
 from pp_cl.export.length import metres_per_unit, set_length, surface_point
 from pp_cl.run import load_run
 
-pytestmark = pytest.mark.usefixtures("quick_splats")
 RADIUS = 0.8  # of the ball, scene units
 
 

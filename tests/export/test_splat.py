@@ -38,8 +38,22 @@ LAYOUT += [*(f"f_rest_{i}" for i in range(45)), "opacity", *(f"scale_{i}" for i 
 LAYOUT += [f"rot_{i}" for i in range(4)]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def steps():
+    """As many as make them look like the run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gaussians, "STEPS", 400)
+        yield
+
+
 @pytest.fixture(scope="module")
-def ply(run, tmp_path_factory):
+def y_up(run, steps):
+    """(table, origin)."""
+    return splats(run, upright(run, Y_UP), 90)
+
+
+@pytest.fixture(scope="module")
+def ply(run, steps, tmp_path_factory):
     path = tmp_path_factory.mktemp("splat") / "a.ply"
     write_splat_ply(path, splats(run, upright(run, Y_DOWN), 90)[0])
     return path
@@ -128,11 +142,11 @@ def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monke
         assert [view.image.shape for view in views()] == 2 * rendered
 
 
-def test_the_spz_says_the_same_with_y_up(run, ply, tmp_path):
+def test_the_spz_says_the_same_with_y_up(y_up, ply, tmp_path):
     """To its bits: half a deviation of a place, 1/255 of an opacity, exp(1/32) of a deviation,
     5/128 of a harmonic.
     """
-    table, _ = splats(run, upright(run, Y_UP), 90)
+    table, _ = y_up
     write_splat_spz(tmp_path / "a.spz", table)
     found = gsply.read_spz(tmp_path / "a.spz")
     smallest = float(table["deviations"].max(1).min())
@@ -177,8 +191,8 @@ def glb(path):
     return gltf, arrays
 
 
-def test_the_glb_says_the_same_with_y_up(run, ply, tmp_path, rng):
-    table, origin = splats(run, upright(run, Y_UP), 90)
+def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
+    table, origin = y_up
     write_splat_glb(tmp_path / "a.glb", table, origin)
     gltf, arrays = glb(tmp_path / "a.glb")
     (primitive,) = gltf["meshes"][0]["primitives"]
@@ -205,8 +219,8 @@ def test_the_glb_says_the_same_with_y_up(run, ply, tmp_path, rng):
     assert ours == pytest.approx(theirs, abs=1e-4)
 
 
-def test_programs_that_draw_points_read_the_glb(run, tmp_path):
-    table, origin = splats(run, upright(run, Y_UP), 90)
+def test_programs_that_draw_points_read_the_glb(y_up, tmp_path):
+    table, origin = y_up
     write_splat_glb(tmp_path / "a.glb", table, origin)
     (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(cloud, trimesh.PointCloud) and len(cloud.vertices) == len(table)

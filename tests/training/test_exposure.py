@@ -3,6 +3,7 @@ found, and a training that stops goes on with them.
 """
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -36,14 +37,17 @@ def write_demo(dev, folder, gains):
 
 
 @pytest.fixture(scope="module")
-def exposed(tmp_path_factory):
+def exposed(runs, tmp_path_factory):
     """(scene, finished run)."""
-    dev = open_device()
-    folder = tmp_path_factory.mktemp("exposed")
-    scene = write_demo(dev, folder / "scene", GAINS)
-    assert main(arguments(scene, folder / "run", **SETTINGS)) == 0
-    assert load_checkpoint(folder / "run" / "checkpoint.npz")[0]["exposed"]
-    return scene, folder / "run"
+
+    def make(folder):
+        scene = write_demo(open_device(), folder / "scene", GAINS)
+        assert main(arguments(scene, folder / "run", **SETTINGS)) == 0
+
+    folder = runs.made("exposed", make)
+    run = shutil.copytree(folder / "run", tmp_path_factory.mktemp("exposed") / "run")
+    assert load_checkpoint(run / "checkpoint.npz")[0]["exposed"]
+    return str(folder / "scene"), run
 
 
 def test_gains_are_found_and_a_training_goes_on_with_them(exposed, tmp_path, monkeypatch):

@@ -7,23 +7,22 @@ from support.scenes import write_ball_scene
 from pp_cl.config import load_config
 
 
-@pytest.mark.parametrize("points, radius", [(4000, 0.85), (250_000, 1.15)], ids=["coarse", "dense"])
+@pytest.mark.parametrize(
+    "points, radius",
+    [(4000, 0.85), (25_000, 0.92), (250_000, 1.15)],
+    ids=["coarse", "between", "dense"],
+)
 def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
     """It is kept, so that the run and its resume have it."""
     scene, out = write_ball_scene(tmp_path / "ball", views=8, size=64), tmp_path / "run"
     words = ["train", scene, "--out", out, "--points", str(points), "--iterations", "1"]
     assert spoken(words)[0] == 0
-    assert load_config(out / "config.json").raster.radius == radius
-
-
-def test_between_the_bounds_it_is_one_pixel(tmp_path):
-    out = tmp_path / "run"
-    words = ["train", "demo", "--out", out, "--points", "200000", "--iterations", "1"]
-    assert spoken(words)[0] == 0
-    assert load_config(out / "config.json").raster.radius == pytest.approx(0.92, abs=0.02)
+    found = load_config(out / "config.json").raster.radius
+    assert found == (pytest.approx(radius, abs=0.01) if points == 25_000 else radius)
 
 
 def test_other_footprints_are_given_a_radius(tmp_path):
-    words = ["train", "demo", "--out", tmp_path / "run", "--set", "raster.footprint=disc"]
+    scene = write_ball_scene(tmp_path / "ball")
+    words = ["train", scene, "--out", tmp_path / "run", "--set", "raster.footprint=disc"]
     status, lines = spoken(words)
     assert status == 2 and "raster.radius: is open" in lines[-1] and "0.0015" in lines[-1]
