@@ -2,6 +2,7 @@
 in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes on after these.
 """
 
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ from pp_cl.files.manifest import (
 )
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.edits import read_edits
+from pp_cl.scene.masks import named_mask
 from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.overview import overview
 from pp_cl.scene.readers.common import read_json
@@ -90,7 +92,8 @@ class Capture:
     def run(self, begin: str | None = None, *, replace_masks: bool = False) -> None:
         """Do all stages that are not done, or one of them and all after it, and those that depend
         on an option that has changed. Masks that the user has changed are kept, or replaced, too.
-        Raises UserError, before anything is removed, where a file of the user's would be lost.
+        Raises UserError, before anything is removed, where a file of the user's would be lost or
+        what an option names is not there.
         """
         with self._locked():
             changed = self._take_options(begin)
@@ -99,6 +102,7 @@ class Capture:
             done = list(takewhile(lambda one: one not in anew and self._is_done(one), STAGES))
             left = list(STAGES)[len(done) :]
             mended = self._mended() if "masks" in left else []
+            self._check_options(left, [] if replace_masks else mended)
             if mended and "images" in left and not replace_masks:
                 raise UserError(
                     f"{mended[0]}: was made or changed by hand, for images that are made again;"
@@ -175,6 +179,30 @@ class Capture:
                 " again with --from frames"
             )
         return changed
+
+    def _check_options(self, left, mended):
+        """Raise UserError where what the options of the stages that are left name is not there.
+        mended: masks that are kept.
+        """
+        if "frames" in left and self._is_done("frames") and self.source.is_dir():
+            count = len(frames.listed(self.source))
+            if count < frames.LEAST:
+                raise UserError(
+                    f"{self.source}: {count} photographs in it, at least {frames.LEAST} are needed"
+                )
+        command, given = self.options["mask_command"], self.options["masks"]
+        if "masks" not in left:
+            return
+        if command is not None and shutil.which(masks.program_words(command)[0]) is None:
+            raise UserError(f"--mask-command {command}: no such program; install it, or fix it")
+        if given is not None and not Path(given).is_dir():
+            raise UserError(f"--masks {given}: no such folder; auto makes them")
+        if given is not None and self.source.is_dir() and not {"frames", "poses"} & {*left}:
+            unplaced = self._found("poses")["unplaced"]
+            for one in self._found("frames")["images"]:
+                is_kept = masks.mask_file(self.scene, one["name"]) in mended
+                if one["name"] not in unplaced and not is_kept:
+                    named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
         """What a stage has left, and what else lies in its folders, but for masks of others. Its

@@ -217,6 +217,30 @@ def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys)
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == box
 
 
+@pytest.mark.parametrize(
+    "source, words, named",
+    [
+        (None, ("--masks", "mask"), "mask"),
+        (None, ("--masks", "few"), "no mask for 001.png"),
+        (None, ("--mask-command", "no-such-program {image} {mask}"), "no-such-program"),
+        (None, ("--mask-command", "python"), "python"),
+        ("few", ("--from", "frames"), "1 photographs"),
+    ],
+    ids=["no folder", "too few", "no program", "no words", "too few photographs"],
+)
+def test_an_option_that_cannot_do_changes_nothing(
+    captured, shot, tmp_path, monkeypatch, source, words, named
+):
+    """Neither the scene nor the options that are kept for the next capture."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    (tmp_path / "few").mkdir()
+    shutil.copy(shot[0] / "000.png", tmp_path / "few")
+    monkeypatch.chdir(tmp_path)
+    before = changed(scene)
+    refused(source or shot[0], scene, *words, named=named)
+    assert changed(scene) == before
+
+
 def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
     """Also where its photographs are called like our own folder."""
     mug = tmp_path / "mug"
