@@ -59,7 +59,9 @@ class Run:
     @property
     def gamma(self) -> float:
         """Depth sharpness of the blend at the run's last step."""
-        return gamma_at(self.header["step"], self.config.train.iterations)
+        # the settings of a finished run that is extended say where it goes, not where it is
+        steps = self.config.train.iterations
+        return gamma_at(steps if self.header["finished"] else self.header["step"], steps)
 
     def scene(self, split: str) -> Scene:
         """The run's scene with one split. Raises UserError where it is missing, broken or another
@@ -82,13 +84,14 @@ class Run:
         path, header = self.config.scene.path, self.header
         try:
             listed, views = scene_frames(path), read()
+            unedited = scene_frames(path, edited=False)
         except UserError as error:
             warnings.warn(
                 f"{path}: cannot be compared with the scene of {self.folder} ({error})",
                 stacklevel=3,
             )
             return
-        if told := difference(header, listed, views):
+        if told := difference(header, listed, views, unedited):
             raise UserError(
                 f"{self.folder.checkpoint}: belongs to another scene than {path} ({told}); say"
                 " where its own is with --scene"

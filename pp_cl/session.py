@@ -36,6 +36,7 @@ from pp_cl.scene.load import (
     open_scene,
     preset_downscale,
     scene_box,
+    scene_frames,
 )
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
@@ -304,6 +305,8 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     room.check_points(grid, points, header["depth_range"], header["step"])
     views, info, kept = _read_views(dev, folder, config, listing)
     if mismatch := difference(header, listing.photographs, views):
+        if not difference(header, (), views, scene_frames(config.scene.path, edited=False)):
+            mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
         raise UserError(
             f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
             " use another --out"

@@ -21,6 +21,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session import open_training, run_config
+from pp_cl.training.schedule import GAMMA
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,14 @@ def test_a_run_renders_what_the_evaluation_saves(trained, capsys):
         saved = read_rgba(trained[1] / "eval" / "images" / f"r_{i}.png")[..., :3]
         np.testing.assert_array_equal(saved, to_8bit(image))
         np.testing.assert_array_equal(trained[0].render(trained[0].cameras()[i]).colour, image)
+
+
+def test_a_finished_run_that_is_extended_looks_as_it_did(trained, monkeypatch):
+    """Until its next checkpoint: the settings have the new steps at once."""
+    run = pp_cl.load(trained[1])
+    assert run.header["finished"] and run.gamma == GAMMA[1]
+    monkeypatch.setattr(run.config.train, "iterations", 10 * run.config.train.iterations)
+    assert run.gamma == GAMMA[1]
 
 
 def test_a_finished_run_is_left_alone_and_steps_are_told(scene, trained, tmp_path):

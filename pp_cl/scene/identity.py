@@ -86,14 +86,21 @@ def fingerprint(views: Sequence[View | Photograph]) -> str:
 
 
 def difference(
-    header: dict[str, Any], listed: Sequence[View | Photograph], views: Sequence[View]
+    header: dict[str, Any],
+    listed: Sequence[View | Photograph],
+    views: Sequence[View],
+    unedited: Sequence[Photograph] = (),
 ) -> str:
     """How training views differ from those of a checkpoint's header, in words; "" where they are
     the same.
 
     listed: all of them; views: those whose pixels are compared, where the header has their digests.
+    unedited: the listed ones and those that the user has dropped, where it makes no difference
+    which these are.
     """
-    if fingerprint(listed) != header["scene"]:
+    names = {name for name, _ in header["views"]}
+    learned = [one for one in unedited if one.name in names]
+    if header["scene"] not in (fingerprint(listed), fingerprint(learned)):
         return "its training views have other names or cameras"
     known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]

@@ -39,7 +39,9 @@ class ScenePage:
             split: scene_frames(folder, split, edited=False)
             for split in sorted(scene_splits(folder), key=lambda split: split != "train")
         }
-        views = [view for views in self.splits.values() for view in views]
+        # one that lies in two splits is one view, which the page's list takes but once
+        listed = {view.name: view for views in self.splits.values() for view in views}
+        views = list(listed.values())
         self._cameras = {view.name: view.camera for view in views}
         cameras = list(self._cameras.values())
         self._points, colours = sparse_points(folder)

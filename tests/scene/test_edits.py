@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.checkpoints import load_checkpoint
 from support.refused import failure
-from support.runs import arguments
+from support.runs import arguments, train_and_interrupt
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
@@ -42,6 +42,19 @@ def test_training_and_info_obey_the_box_and_leave_out_what_was_dropped(folder, t
     assert found["dropped"] == ["test/r_0.png", "train/r_2.png"]
     given = configure(preset("tiny"), folder, [("scene.box", "-2,-2,-2,2,2,2", "--set")])
     assert scene_box(given)[1, 2] == 2, "a setting goes before"
+
+
+def test_a_run_knows_its_scene_after_views_were_dropped(folder, tmp_path, capsys, monkeypatch):
+    """It is measured; a training would have other bits, and says why it does not go on."""
+    run, half = tmp_path / "run", tmp_path / "half"
+    assert main(arguments(str(folder), run, train__iterations=2)) == 0
+    train_and_interrupt(str(folder), half, 11, monkeypatch)
+    write_edits(folder, Edits(None, frozenset({"train/r_2.png"})))
+    capsys.readouterr()
+    assert main(["eval", str(run)]) == 0
+    assert "views were dropped or taken back" in failure("train", folder, "--out", half)
+    write_edits(folder, Edits())
+    assert main(["train", str(folder), "--out", str(half)]) == 0
 
 
 def test_no_edits_leave_no_file(folder):
