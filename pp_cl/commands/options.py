@@ -148,6 +148,8 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
     def target(text):
         if text in known:
             raise argparse.ArgumentTypeError(f"{text}: is a word of the command; write ./{text}")
+        if _holds_else_than_json(text):
+            raise argparse.ArgumentTypeError(f"{text}: is there, and no JSON; name another file")
         return sys.stdout if text == "-" else output_file()(text)
 
     parser.add_argument(
@@ -158,6 +160,16 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
         metavar="FILE",
         help="write the result to FILE as JSON; without FILE (or -) print it in place of the text",
     )
+
+
+def _holds_else_than_json(text):
+    """Whether a file of this name would be lost if JSON took its place."""
+    try:
+        with open(text, "rb") as file:
+            start = file.read(1)
+    except OSError:
+        return False
+    return start not in (b"", b"{", b"[")
 
 
 def write_json_option(target: str | TextIO | None, value: Any) -> None:

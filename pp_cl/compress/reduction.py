@@ -4,6 +4,7 @@ run.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl.export.length import FILE as LENGTH
 from pp_cl.export.observe import observe
 from pp_cl.files.atomic import atomic_folder, write_json, write_text
 from pp_cl.files.run_folder import RunFolder
@@ -71,6 +73,9 @@ class Original:
             write_text(folder.config, self.run.config.to_json() + "\n")
             folder.save(self.run.header, self.reduced_arrays(keep, half))
             write_json(unfinished / REPORT, report)
+            known = self.run.folder.path / LENGTH
+            if known.exists():
+                shutil.copyfile(known, unfinished / LENGTH)
 
 
 def point_weights(run: Run, cameras: list[Camera]) -> np.ndarray:

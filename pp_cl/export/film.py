@@ -20,11 +20,12 @@ from pp_cl.files.image import read_rgba, write_png
 from pp_cl.files.manifest import NAME, begin_manifest, check_ours, remove_ours
 from pp_cl.files.picture import WHITE
 from pp_cl.files.untrusted import read_regular
-from pp_cl.files.video import write_video
+from pp_cl.files.video import LOOPED, write_video
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 
 MOST_IDENTITY = 1000  # bytes of it
+MOST_KEPT = 2**31  # bytes of the frames of a looped film, which Pillow keeps until it is written
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
 LOCK = ".pp-cl.lock"
 OnFrame = Callable[[float | None], None]
@@ -95,9 +96,16 @@ def render_film(
     run: Run, cameras: Sequence[Camera], film: Path, fps: float, style: Style, on_frame: OnFrame
 ) -> None:
     """Render a film, whose frames are in a hidden folder beside it until it is written, for a later
-    call to go on with. Raises UserError as render_frames and write_video do.
+    call to go on with. Raises UserError as render_frames and write_video do, and for a film whose
+    frames would fill the memory.
     """
     check_file(film)
+    kept = 4 * sum(camera.width * camera.height for camera in cameras)
+    if film.suffix.lower()[1:] in LOOPED and kept > MOST_KEPT:
+        raise UserError(
+            f"{film}: in this format all frames are in memory at once, {kept / 2**30:.1f} GiB; make"
+            " it shorter or smaller, or write --format mp4"
+        )
     folder = film.with_name(f".{film.name}.frames")
     paths = render_frames(run, cameras, folder, style, on_frame, replace=True)
     images = (read_rgba(path) for path in paths)

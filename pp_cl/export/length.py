@@ -6,11 +6,13 @@ import json
 import re
 
 import numpy as np
+from scipy.optimize import root
 
 from pp_cl.errors import UserError, quoted, shown, suggestion
 from pp_cl.files.atomic import write_json
 from pp_cl.files.untrusted import read_json_text
 from pp_cl.run import Run
+from pp_cl.scene.load import scene_frames
 
 FILE = "length.json"  # in the folder of a run
 MOST_BYTES = 2**16
@@ -53,6 +55,25 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
     return found
 
 
+def _straight(run, photograph, x, y):
+    """The pixel that shows without distortion what (x, y) shows of the photograph; (x, y) itself
+    where the scene, which knows the lens, is not there.
+    """
+    try:
+        listed = scene_frames(run.config.scene.path, edited=False)
+    except UserError:
+        return x, y
+    lens = next((one.distortion for one in listed if one.name == photograph.name), None)
+    if not lens:
+        return x, y
+    camera = photograph.camera
+    there = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+    found = root(lambda place: np.subtract(lens.apply(*place), there), there)
+    if not found.success:  # NaN is beyond every photograph
+        return np.nan, np.nan
+    return found.x[0] * camera.fx + camera.cx, found.x[1] * camera.fy + camera.cy
+
+
 def surface_point(run: Run, text: str) -> np.ndarray:
     """(3,) world: what a pixel of a training photograph shows of the object. text: PHOTO:X,Y, the
     photograph's path in the scene or the end of it, and pixels from its upper left corner. Raises
@@ -78,6 +99,9 @@ def surface_point(run: Run, text: str) -> np.ndarray:
         raise UserError(
             f"--length {shown(text)}: the photograph has {stored.width}x{stored.height} pixels"
         )
+    x, y = _straight(run, matches[0], x, y)
+    if not (0 <= x < stored.width and 0 <= y < stored.height):
+        raise UserError(f"--length {shown(text)}: lies beyond what is left of the photograph")
     camera = stored.downscaled(run.config.scene.downscale)
     picture = run.render(camera)
     column = min(int(x * camera.fx / stored.fx), camera.width - 1)

@@ -52,6 +52,11 @@ def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.nda
     vertices, faces, _, _ = marching_cubes(outside, 0, gradient_direction="ascent")
     positions = np.asarray(grid.origin) + grid.edge * (vertices[:, ::-1] - 1)
     faces = faces[inside(positions, box)[faces].all(1)]
+    if not len(faces):
+        raise UserError(
+            f"--box: holds no whole face of the mesh, whose sides are about {grid.edge:.3g};"
+            " make it larger"
+        )
     used, faces = np.unique(faces, return_inverse=True)
     return in_world(positions[used], grid.edge), faces.reshape(-1, 3).astype(np.int32)
 

@@ -200,9 +200,9 @@ def _sync_folder(folder):
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a text file atomically."""
+    """Write a text file atomically; names that are no UTF-8 are escaped."""
     with atomic_file(path) as file:
-        file.write(text.encode())
+        file.write(text.encode(errors="backslashreplace"))
 
 
 def write_json(path: Path | str, value: Any) -> None:

@@ -4,10 +4,13 @@ import argparse
 import json
 import sys
 
+import numpy as np
 import pytest
+from support.refused import failure
 
 from pp_cl.cli import _parse, main
 from pp_cl.commands import options
+from pp_cl.files.image import write_png
 
 REFUSED = [
     (options.integer(1, 16), ("16.5", "0", "17", "x", "nan", "1,2", "9" * 5000)),
@@ -46,6 +49,17 @@ def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypat
         assert main(["devices", *words]) == 2  # none works
         assert capsys.readouterr().out == ("\n" if str(file) in words else "[]\n")
     assert json.loads(file.read_text()) == []
+
+
+def test_no_other_file_becomes_json(tmp_path, capsys):
+    """The word after --json is what the command works on if it is such a file."""
+    for name in "ab":
+        write_png(tmp_path / f"{name}.png", np.zeros((16, 16, 3)))
+    pictures, before = [str(tmp_path / f"{n}.png") for n in "ab"], (tmp_path / "a.png").read_bytes()
+    assert main(["compare", "--json", *pictures, "--metrics", "psnr"]) == 0
+    assert "psnr" in json.loads(capsys.readouterr().out)["mean"]
+    assert "no JSON" in failure("compare", *pictures, "--json", pictures[0])
+    assert (tmp_path / "a.png").read_bytes() == before
 
 
 def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):

@@ -35,6 +35,15 @@ def test_a_film_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp_
     assert len(frames) == 6 and np.abs(frames[0] - frames[3]).max() > 20
 
 
+@pytest.mark.parametrize("suffix", ["gif", "webp"])
+def test_a_film_whose_frames_would_fill_the_memory_is_not_begun(trained, tmp_path, suffix):
+    """Pillow keeps them all: 200 of 960x540 took 450 MB as WebP, with imageio 46 as MP4."""
+    out = tmp_path / f"film.{suffix}"
+    words = ("render", trained, "--out", out, "--seconds", "60", "--size", "1920x1080")
+    assert "--format mp4" in failure(*words)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypatch):
     words = ["render", trained, "--out", str(tmp_path / "film.gif"), "--seconds", "1", "--fps", "4"]
     write, done = film.write_png, []

@@ -10,6 +10,7 @@ from support.runs import train_and_interrupt
 from pp_cl.cli import main
 from pp_cl.compress.search import validation_views
 from pp_cl.config import load_config
+from pp_cl.export.length import metres_per_unit
 from pp_cl.run import load_run
 
 
@@ -30,7 +31,13 @@ def test_validation_views_are_never_those_of_the_test(dev, ball_run, tmp_path):
 def test_the_command_writes_a_run(ball_run, tmp_path, capsys, dev):
     """What is written is what was measured, and a run like any other."""
     out = tmp_path / "small"
-    assert main(["compress", str(ball_run), "--max-loss", "3dB", "--out", str(out), "-v"]) == 0
+    length = ball_run / "length.json"
+    length.write_text('{"metres_per_unit": 0.05}')
+    try:
+        assert main(["compress", str(ball_run), "--max-loss", "3dB", "--out", str(out), "-v"]) == 0
+    finally:
+        length.unlink()
+    assert metres_per_unit(load_run(dev, out)) == 0.05
     printed = capsys.readouterr().out
     report = json.loads((out / "compress.json").read_text())
     assert all(f"{trial['psnr']:.3f} dB" in printed for trial in report["trials"])

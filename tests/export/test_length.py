@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import plyfile
@@ -12,6 +13,7 @@ from support.refused import refusing
 from pp_cl.export.formats import export
 from pp_cl.export.length import metres_per_unit, set_length, surface_point
 from pp_cl.run import load_run
+from pp_cl.scene.distortion import Distortion
 
 RADIUS = 0.8  # of the ball, scene units
 
@@ -43,6 +45,17 @@ def test_pixels_tell_where_the_surface_is(mine):
     found = [surface_point(mine, text_of(one, end)) for end in ends]
     assert np.linalg.norm(found[0] - found[1]) == pytest.approx(length, rel=0.08)
     assert metres_per_unit(mine) == 1
+
+
+def test_pixels_are_those_of_the_photograph_as_the_lens_has_it(mine, monkeypatch):
+    lens, one = Distortion(k1=-0.25, p1=0.01), mine.photographs("train")[2]
+    camera, x, y = one.camera, 20.4, 35.6
+    straight = surface_point(mine, f"{one.name}:{x},{y}")
+    listed = [replace(each, distortion=lens) for each in mine.photographs("train")]
+    monkeypatch.setattr("pp_cl.export.length.scene_frames", lambda *_, **__: listed)
+    x, y = lens.apply((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    bent = f"{one.name}:{x * camera.fx + camera.cx:.3f},{y * camera.fy + camera.cy:.3f}"
+    assert surface_point(mine, bent) == pytest.approx(straight, abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["mesh", "splat", "ply"])

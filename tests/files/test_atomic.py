@@ -60,6 +60,11 @@ def test_a_temporary_file_that_stays_hides_no_error(tmp_path, monkeypatch):
     assert all(path.name.startswith(".") for path in tmp_path.iterdir())
 
 
+def test_a_name_that_is_no_utf_8_is_written_escaped(tmp_path):
+    write_text(tmp_path / "a.md", "a scene \udcff")
+    assert (tmp_path / "a.md").read_text("utf-8") == "a scene \\udcff"
+
+
 def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
     own = "pp-cl.tmp"
     gone = [f".a.png.{DEAD}.{own}", f"x/y/.b.{DEAD}.{own}", f"x/.film.{DEAD}.{own}.mp4"]
