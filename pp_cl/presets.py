@@ -57,7 +57,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 # Pixels of the longer side of the images that a preset is made for: it reduces larger ones. None:
 # as they are.
-IMAGE_SIZES = {"tiny": 200, "small": 400, "full": None, "paper": None}
+IMAGE_SIZES = {"tiny": 200, "small": 400, "full": 800, "paper": None}
 
 # Settings with a short name on the command line and in session.train_scene().
 SHORT = {

@@ -112,9 +112,9 @@ class NetworkConfig:
     residual: bool = setting(True, "add a quarter of the first three features to the colours")
     start: str = setting(
         "demo",
-        "what the network begins with. demo: what one has learned of the demo, if the scene is"
-        " another and the network has the default shape; random: numbers; a folder: the network of"
-        " that run",
+        "what the network begins with. demo: weights that were trained on the demo, if the scene is"
+        " another and the network has the default shape; random: random numbers; a folder: the"
+        " weights of that run",
     )
     rate: tuple = setting(
         (1e-3, 1e-4), "learning rate of the network, first and last step", 1e-12, 100
@@ -144,8 +144,8 @@ class TrainConfig:
     )
     pixel_jitter: bool = setting(
         True,
-        "shift the pixel grid of the image by a random sub-pixel offset each step: by a number of"
-        " the stored pixels that it is reduced from, else by up to an eighth of a pixel",
+        "shift the image by a random part of a pixel each step: where it is reduced by whole stored"
+        " pixels, else by up to an eighth of a pixel",
     )
     ssim_weight: float = setting(0.2, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
     smooth_l1: float = setting(0.05, "errors below this count by their square (0: L1)", 0, 1)
@@ -213,7 +213,7 @@ class TrainConfig:
         0.05,
         "prune points whose blend weight, summed over a step's pixels, has not reached this in any"
         " step, or whose opacity is below 0.01; after the last step, those that reach it in no"
-        " training view (0: off)",
+        " training view, or of 24 and more in only one (0: off)",
         0,
         1e6,
     )
