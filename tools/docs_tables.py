@@ -134,6 +134,9 @@ def api() -> str:
         "Run.cameras",
         "Run.render",
         "Picture",
+        "Picture.save",
+        "Picture.over",
+        "Picture.rgba",
         "evaluate_run",
         "export_run",
     ]

@@ -464,7 +464,7 @@ def plot_quality(axes: "Axes", trained: list[dict]) -> None:
         minutes, psnr = [row["minutes"] for row in some], [row["psnr"] for row in some]
         axes.plot(minutes, psnr, "o-", label=f"pp-cl, {size}")
     axes.plot(
-        *zip(*OPENSPLAT, strict=True), "x--", color="grey", label="OpenSplat on a CPU, 200x200"
+        *zip(*OPENSPLAT, strict=True), "x--", color="grey", label="OpenSplat on one core, 200x200"
     )
     table = published()["synthetic"]
     lego_column = table["scenes"].index("lego")

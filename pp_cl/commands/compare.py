@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PRED|RUN|MESH",
         help="image, or folder of images; folder of a run, or a file with a triangle mesh",
     )
-    add("truth", nargs="?", metavar="TRUTH", help="of PRED: the same of what it should be")
+    add("truth", nargs="?", metavar="TRUTH", help="with PRED: the true image, or folder of images")
     shared.add_metrics(parser)
     parser.set_defaults(metrics=None)
     add(
@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="E",
         help="of a mesh: voxel size of the grid in its units (default: 2^27 cells)",
     )
-    add("--samples", type=shared.integer(1, SAMPLES), metavar="N", help="on the mesh (1024^3)")
+    samples = shared.integer(1, SAMPLES)
+    add("--samples", type=samples, metavar="N", help="points on the mesh (1024^3)")
     shared.add_run_scene(parser)
     shared.add_json(parser)
     shared.add_device(parser)

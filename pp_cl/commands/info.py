@@ -86,7 +86,8 @@ def _grid_text(grid):
 def _run_lines(facts):
     state = "finished" if facts["finished"] else "not finished"
     reduced = f", images reduced {facts['downscale']} times" * (facts["downscale"] > 1)
-    gone = "" if facts["scene_is_there"] else " (not there; only train and eval need it)"
+    needing = "train, eval, compare and render --path test or val"
+    gone = "" if facts["scene_is_there"] else f" (not there; {needing} need it)"
     lines = [
         _line("run", f"{facts['run']}, preset {facts['preset']}"),
         _line("scene", f"{facts['scene']}{gone}{reduced}"),

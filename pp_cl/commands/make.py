@@ -37,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--preset",
         choices=list(PRESET_FROM)[::-1],
-        help="of the training (tiny; from 8 minutes on small, from 30 full)",
+        help="of the training (by the minutes: tiny below 8, small below 30, so also without"
+        " --minutes, then full)",
     )
     add_hints(parser)
     shared.add_device(parser)
