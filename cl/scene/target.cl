@@ -77,11 +77,12 @@ kernel void target_between(
         float4 row = 0.0f;
         for (int i = 0; i < 5; i++) {
             const float4 c = convert_float4(line[clamp(u + i - 2, 0, image_width - 1)]) / 255.0f;
-            row += columns[i] * (float4)(c.xyz * c.w + (1.0f - c.w), c.w);
+            // what differs from white: where nothing does, the target is exactly 1 (tiles_find)
+            row += columns[i] * (float4)((c.xyz - 1.0f) * c.w, c.w);
         }
         sum += rows[j] * row;
     }
-    sum = clamp(sum, 0.0f, 1.0f);  // what overshoots beside an edge
+    sum = clamp(sum + (float4)(1.0f, 1.0f, 1.0f, 0.0f), 0.0f, 1.0f);  // overshoots beside an edge
     vstore3(outside ? (float3)(1.0f) : sum.xyz, y * width + x, target);
     alpha[y * width + x] = outside ? 0.0f : sum.w;
 }

@@ -112,6 +112,10 @@ def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             expected = target_between(image, x0 + across, y0 + down, width=width, height=height)
             yield absolute(found[0].get(), expected[..., :3], TARGET)
             yield absolute(found[1].get(), expected[..., 3], TARGET)
+    nothing = replace(view, image=image * np.array([1, 1, 1, 0], np.uint8))
+    for jitter in rng.uniform(-0.125, 0.125, (20, 2)):
+        found = target.crop(nothing, (-3, -3, 60, 33), tuple(jitter))
+        yield exact(found[0].get(), np.ones((33, 60, 3)))
 
 
 def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
