@@ -10,7 +10,7 @@ from pyopencl.array import Array
 from pp_cl.config import Config
 from pp_cl.device.buffers import DeviceRows, Reading
 from pp_cl.device.device import Device
-from pp_cl.layers.tiles import tiles_find
+from pp_cl.layers.tiles import tiles_find, tiles_with
 from pp_cl.model import Model
 from pp_cl.network.tile_plan import gradient_tiles
 from pp_cl.render import Renderer, RenderResult
@@ -101,7 +101,8 @@ class Trainer:
             target = photograph
             if self.exposure and self.exposure.is_applied:
                 target = self.exposure.target(crop.view_index, photograph, alpha)
-            tiles = self._gradient_tiles(target, crop)
+            says_nothing = crop.view.ignored_crop(crop.box, crop.jitter)
+            tiles = self._gradient_tiles(target, crop, says_nothing)
 
         rendered = self.renderer.forward(
             crop.camera, self.gamma, training=True, gradient_tiles=tiles
@@ -110,7 +111,7 @@ class Trainer:
             if self.exposure:
                 offset = rendered.offset
                 self.exposure.fit(crop.view_index, rendered.image, photograph, alpha, offset)
-            grad_image, grad_alpha = self._losses(crop, rendered, target, alpha)
+            grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, says_nothing)
         # the spread is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * self.model.grid.diagonal
         spread_weight = self._rising(train.spread_weight if self._composited else 0.0)
@@ -147,13 +148,18 @@ class Trainer:
         return self._terms
 
     def _losses(
-        self, crop: Crop, rendered: RenderResult, target: Array, alpha: Array
+        self,
+        crop: Crop,
+        rendered: RenderResult,
+        target: Array,
+        alpha: Array,
+        says_nothing: np.ndarray | None,
     ) -> tuple[Array, Array | None]:
         """(dL/dimage, dL/dalpha or None) of all terms but the spread; their values go to self.loss,
-        which stays on the device.
+        which stays on the device. says_nothing: the crop's ignored pixels.
         """
         train, image, offset, grad_alpha = self.config.train, rendered.image, rendered.offset, None
-        says_nothing, ignored = crop.view.ignored_crop(crop.box, crop.jitter), None
+        ignored = None
         if says_nothing is not None:
             ignored = self.dev.upload(says_nothing, np.uint8)
             ignore_target(self.dev, ignored, image, target, alpha, offset)
@@ -176,16 +182,18 @@ class Trainer:
         """A weight of the loss that rises from 0 during the training."""
         return rising_weight(self.step, self.config.train.iterations, weight)
 
-    def _gradient_tiles(self, target, crop):
+    def _gradient_tiles(self, target, crop, says_nothing):
         """A function that returns gradient_tiles of UNet.plan_tiles(); called once the device has
-        been waited for anyway, so that looking at the target costs no wait of its own.
+        been waited for anyway, so that looking at the target costs no wait of its own. Ignored
+        pixels are white there, but have another gradient than the background.
         """
         padded, *offset = crop.camera.padded(self.model.net.multiple)
         size = padded.height, padded.width
         if not self.model.net.is_planned(size):
             return lambda: None
         found = tiles_find(self.dev, target, WHITE)
-        return lambda: gradient_tiles(found.get(), size, offset)
+        ignored = False if says_nothing is None else tiles_with(says_nothing)
+        return lambda: gradient_tiles(found.get() | ignored, size, offset)
 
     def check(self) -> None:
         """Raise Diverged if a term of the loss of the last step is not finite."""

@@ -93,6 +93,13 @@ def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Readin
     return _flags(dev, "tiles_hit", size, pixel_offset=pixel_offset)
 
 
+def tiles_with(pixels: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the tiles in which any of the pixels (H, W) bool is set."""
+    (height, width), (rows, columns) = pixels.shape, grid_shape(*pixels.shape)
+    whole = np.pad(pixels, ((0, rows * SIDE - height), (0, columns * SIDE - width)))
+    return whole.reshape(rows, SIDE, columns, SIDE).any((1, 3))
+
+
 def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """(n, 2) int32: for tiles_copy(), the tiles whose numbers `source` gives for the n chosen ones,
     and these.

@@ -7,10 +7,15 @@ import pytest
 from PIL import Image
 from support.checkpoints import load_checkpoint
 from support.runs import SETTINGS, set_words, spoken
-from support.scenes import write_ball_scene
+from support.scenes import ball_image, ring_cameras, write_ball_scene
 
+from pp_cl.config import preset
+from pp_cl.model import Model
+from pp_cl.network.unet import UNet
+from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.views import View
+from pp_cl.train import Trainer
 
 HAND = np.s_[14:31, 20:29]  # rows, columns that cut the ball's outline
 SPLITS = ("train", "test")
@@ -92,6 +97,30 @@ def test_ignored_pixels_have_no_effect_on_a_bit(tmp_path, expected, way):
     """Whether they are opaque, which adds to the hull, or transparent, which takes from it."""
     scene = with_hand(tmp_path / "scene", (0, 200, 0, 0))
     assert same(trained(scene, tmp_path / "run", way(scene)), expected)
+
+
+@pytest.mark.parametrize("ignores", [False, True])
+def test_the_network_learns_the_same_where_tiles_are_left_out(dev, monkeypatch, ignores):
+    """Ignored pixels are white, but have another gradient than the white around them."""
+    ignored = np.zeros((128, 128), bool)
+    ignored[:40, :36] = ignores
+    views = []
+    for camera in ring_cameras(4, 128, field_of_view=1.2):
+        image = ball_image(camera) * np.where(ignored, 0, 1).astype(np.uint8)[..., None]
+        views.append(View("a", camera, image, ignored=ignored if ignores else None))
+    hull, config = build_grid(dev, views, 2000), preset("full")
+    config.train.crop, config.train.refine_at, config.train.pixel_jitter = 0, (1.0, 1.0), False
+
+    def gradient(least):
+        monkeypatch.setattr("pp_cl.network.unet.LEAST_PIXELS", least)
+        net = UNet.of_settings(dev, config.network, seed=0)
+        model = Model.create(dev, hull.grid, hull.ids, depth_range(views, hull), net=net)
+        trainer = Trainer(dev, config, model, views)
+        trainer.train_step()
+        return net.all_gradients.get()
+
+    whole, planned = gradient(2**30), gradient(1)
+    assert np.linalg.norm(whole - planned) < 1e-5 * np.linalg.norm(whole)
 
 
 def test_without_masks_they_have(tmp_path, expected):
