@@ -184,6 +184,10 @@ class DirectConv:
         self.lay_out(self.dev, weight.reshape(-1), [(self.shape, 0, 0)], array)
         return array
 
+    def scratch_floats(self) -> int:
+        """Floats of the memory that the convolutions share."""
+        return 0
+
     @staticmethod
     def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
         """Lay out weights in one launch: those of input gradients with the kernel mirrored and the

@@ -403,3 +403,9 @@ class UNet:
         weights as kernels read them, and the parts of the gradients.
         """
         return table_bytes(_work_table(self.work(size, training)))
+
+    def scratch_bytes(self, size: Size, training: bool) -> int:
+        """Of the memory that the convolutions of images of a size share, which grows with the
+        device's compute units.
+        """
+        return 4 * max(conv.scratch_floats() for conv in self.work(size, training).values())

@@ -219,6 +219,8 @@ class Room:
         parameters = self._net.all_parameters.nbytes * (COPIES + is_averaged)
         parameters += self._net.work_bytes(crop_size, True)
         parameters += self._net.work_bytes(image_size, False)
+        shared = self._net.scratch_bytes(crop_size, True)
+        parameters += max(shared, self._net.scratch_bytes(image_size, False))
         photograph = self._photographs // len(self._sizes)
         total = points * point + max(step, preview, pruning) + crop * TRAINED_PIXEL + maps
         total += parameters + photograph

@@ -73,6 +73,24 @@ def room(dev, base="tiny", images=3, size=(800, 600), **changes):
     return Room(config, net, [Photograph(f"{i}.png", camera) for i in range(images)])
 
 
+def test_each_compute_unit_has_memory_of_its_own(dev, plain, monkeypatch):
+    """Where convolutions transform their tiles; as on a server with 128 cores."""
+    planned, shared, taken = [], [], []
+    for units in (2, 256):
+        made = Device(dev.device)
+        for device in (made, plain):
+            monkeypatch.setitem(device.info, "compute_units", units)
+        net = UNet(made, widths=(32, 64, 128))
+        image = net.forward(made.zeros((128, 128, 16)))
+        net.backward(made.zeros(image.shape))
+        taken.append(made.peak_bytes)
+        shared.append(net.scratch_bytes((128, 128), True))
+        planned.append(needed(plain, size=(128, 128), network__widths="32,64,128").device)
+    assert np.ptp(taken) > 2**28
+    assert np.ptp(shared) == pytest.approx(np.ptp(taken), rel=0.01)
+    assert np.ptp(planned) == pytest.approx(np.ptp(taken), rel=0.01)
+
+
 def needed(dev, base="tiny", points=171_262, step=0, **changes):
     return room(dev, base, **changes).need_of(GRID, points, (2, 6), step)
 
