@@ -153,6 +153,7 @@ class Kernel:
         self.kernel = kernel
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
         self.largest_group: Any = kernel.get_work_group_info(limit, device)  # work-items
+        self.most_items = tuple(device.max_work_item_sizes)  # of a group, along each dimension
         self.parameters = parameters
         self.names = {p.name for p in parameters}
         self.label = label
@@ -247,6 +248,8 @@ class Kernel:
             local = (local,) if np.isscalar(local) else tuple(local)
         if 0 in size:
             return None
+        if len(local) > 1:  # Apple's driver for CPUs has groups of one dimension alone
+            local = tuple(map(min, local, self.most_items))
         if math.prod(local) > self.largest_group:
             raise UserError(
                 f"{self.label}: a work-group of {math.prod(local)} work-items, but"

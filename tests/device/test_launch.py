@@ -288,6 +288,14 @@ def test_a_default_work_group_fits_the_device(program, monkeypatch, limit):
         assert rounded == tuple(-(-5 // side) * side for side in group)
 
 
+@pytest.mark.parametrize("given", [None, (1, 16, 4)])
+def test_work_groups_may_have_one_dimension_alone(program, monkeypatch, given):
+    kernel = program.kernels["rows"]
+    monkeypatch.setattr(kernel, "most_items", (1024, 1, 1))
+    monkeypatch.setattr(kernel, "_ranges", {})
+    assert kernel.ranges((5, 5, 5), given)[1] == ((16, 1, 1) if given is None else (1, 1, 1))
+
+
 # ---- signatures
 
 
