@@ -33,12 +33,6 @@ def test_a_preset_reduces_large_images_and_says_so(tmp_path, capsys):
     assert "images: 400x400" in trained_lines(capsys, scene, "--out", tmp_path / "b", *given)
 
 
-def test_full_reduces_photographs_of_phones(tmp_path):
-    scene = write_ball_scene(tmp_path / "ball", views=1, size=1600, splits=("train",))
-    config = run_config(RunFolder(tmp_path / "run"), scene, "full")
-    assert config.scene.downscale == 2
-
-
 def test_a_run_keeps_the_size_of_its_images(tmp_path, capsys, monkeypatch):
     """Also one of before, whose images were not reduced unless it was told to."""
     scene, out = write_ball_scene(tmp_path / "ball", size=300), tmp_path / "run"

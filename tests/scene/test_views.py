@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pp_cl.errors import UserError
+from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
 
@@ -82,7 +83,9 @@ def test_object_bounds_without_object(view):
         ((4032, 3024), 200, 20),
         ((1000, 40), 200, 2),  # no side below 16 pixels
         ((10, 10), 200, 1),
-        ((4032, 3024), None, 1),
+        ((4032, 3024), IMAGE_SIZES["full"], 3),
+        ((1600, 1200), IMAGE_SIZES["full"], 1),
+        ((4032, 3024), IMAGE_SIZES["paper"], 1),
     ],
 )
 def test_a_preset_takes_the_whole_number_nearest_to_its_size(size, side, expected):
