@@ -97,7 +97,7 @@ def tiles_with(pixels: np.ndarray) -> np.ndarray:
     """(rows, columns) bool: the tiles in which any of the pixels (H, W) bool is set."""
     (height, width), (rows, columns) = pixels.shape, grid_shape(*pixels.shape)
     whole = np.pad(pixels, ((0, rows * SIDE - height), (0, columns * SIDE - width)))
-    return whole.reshape(rows, SIDE, columns, SIDE).any((1, 3))
+    return np.logical_or.reduce(whole.reshape(rows, SIDE, columns, SIDE), (1, 3))
 
 
 def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
