@@ -29,7 +29,7 @@ from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.identity import difference, kept_views
+from pp_cl.scene.identity import difference, kept_views, learned
 from pp_cl.scene.load import DEMO, Scene, open_scene, scene_frames
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import Photograph, View
@@ -83,15 +83,18 @@ class Run:
         """
         path, header = self.config.scene.path, self.header
         try:
-            listed, views = scene_frames(path), read()
-            unedited = scene_frames(path, edited=False)
+            views = read()
+            told = difference(header, scene_frames(path), views)
+            if told:  # else views were dropped or taken back since, which changes no result
+                listed = learned(header, scene_frames(path, edited=False))
+                told = difference(header, listed, views)
         except UserError as error:
             warnings.warn(
                 f"{path}: cannot be compared with the scene of {self.folder} ({error})",
                 stacklevel=3,
             )
             return
-        if told := difference(header, listed, views, unedited):
+        if told:
             raise UserError(
                 f"{self.folder.checkpoint}: belongs to another scene than {path} ({told}); say"
                 " where its own is with --scene"

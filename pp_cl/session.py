@@ -27,7 +27,7 @@ from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import agreeing
-from pp_cl.scene.identity import difference, identity
+from pp_cl.scene.identity import difference, identity, learned
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.load import (
     Listing,
@@ -305,7 +305,8 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     room.check_points(grid, points, header["depth_range"], header["step"])
     views, info, kept = _read_views(dev, folder, config, listing)
     if mismatch := difference(header, listing.photographs, views):
-        if not difference(header, (), views, scene_frames(config.scene.path, edited=False)):
+        unedited = scene_frames(config.scene.path, edited=False)
+        if not difference(header, learned(header, unedited), views):
             mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
         raise UserError(
             f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"

@@ -144,8 +144,8 @@ class TrainConfig:
     )
     pixel_jitter: bool = setting(
         True,
-        "shift the image by a random part of a pixel each step: where it is reduced by whole stored"
-        " pixels, else by up to an eighth of a pixel",
+        "shift the image by a random part of a pixel each step: where it is reduced, by whole"
+        " stored pixels; else by up to an eighth of a pixel",
     )
     ssim_weight: float = setting(0.2, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
     smooth_l1: float = setting(0.05, "errors below this count by their square (0: L1)", 0, 1)
@@ -213,7 +213,7 @@ class TrainConfig:
         0.05,
         "prune points whose blend weight, summed over a step's pixels, has not reached this in any"
         " step, or whose opacity is below 0.01; after the last step, those that reach it in no"
-        " training view, or of 24 and more in only one (0: off)",
+        " training view, of 24 and more in at most one (0: off)",
         0,
         1e6,
     )

@@ -148,9 +148,12 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
     def target(text):
         if text in known:
             raise argparse.ArgumentTypeError(f"{text}: is a word of the command; write ./{text}")
-        if _holds_else_than_json(text):
+        if text == "-":
+            return sys.stdout
+        file = output_file()(text)  # which refuses pipes, that reading would wait for
+        if _holds_else_than_json(file):
             raise argparse.ArgumentTypeError(f"{text}: is there, and no JSON; name another file")
-        return sys.stdout if text == "-" else output_file()(text)
+        return file
 
     parser.add_argument(
         "--json",
@@ -162,14 +165,13 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
     )
 
 
-def _holds_else_than_json(text):
+def _holds_else_than_json(name):
     """Whether a file of this name would be lost if JSON took its place."""
     try:
-        with open(text, "rb") as file:
-            start = file.read(1)
+        with open(name, "rb") as file:
+            return file.read(1) not in (b"", b"{", b"[")
     except OSError:
         return False
-    return start not in (b"", b"{", b"[")
 
 
 def write_json_option(target: str | TextIO | None, value: Any) -> None:

@@ -20,12 +20,13 @@ from pp_cl.files.image import read_rgba, write_png
 from pp_cl.files.manifest import NAME, begin_manifest, check_ours, remove_ours
 from pp_cl.files.picture import WHITE
 from pp_cl.files.untrusted import read_regular
-from pp_cl.files.video import LOOPED, write_video
+from pp_cl.files.video import write_video
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 
 MOST_IDENTITY = 1000  # bytes of it
-MOST_KEPT = 2**31  # bytes of the frames of a looped film, which Pillow keeps until it is written
+# bytes of a frame's pixel that Pillow keeps until the film is written, and of all that it may
+KEPT, MOST_KEPT = {".webp": 4, ".gif": 1}, 2**31
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
 LOCK = ".pp-cl.lock"
 OnFrame = Callable[[float | None], None]
@@ -100,8 +101,8 @@ def render_film(
     frames would fill the memory.
     """
     check_file(film)
-    kept = 4 * sum(camera.width * camera.height for camera in cameras)
-    if film.suffix.lower()[1:] in LOOPED and kept > MOST_KEPT:
+    kept = KEPT.get(film.suffix.lower(), 0) * sum(c.width * c.height for c in cameras)
+    if kept > MOST_KEPT:
         raise UserError(
             f"{film}: in this format all frames are in memory at once, {kept / 2**30:.1f} GiB; make"
             " it shorter or smaller, or write --format mp4"

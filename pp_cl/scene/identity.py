@@ -85,22 +85,23 @@ def fingerprint(views: Sequence[View | Photograph]) -> str:
     return digest.hexdigest()
 
 
+def learned(header: dict[str, Any], listed: Sequence[Photograph]) -> list[Photograph]:
+    """Those of the training views that a scene lists without the user's edits that a checkpoint's
+    header has: what the scene listed then, if some were dropped or taken back since.
+    """
+    names = {name for name, _ in header["views"]}
+    return [one for one in listed if one.name in names]
+
+
 def difference(
-    header: dict[str, Any],
-    listed: Sequence[View | Photograph],
-    views: Sequence[View],
-    unedited: Sequence[Photograph] = (),
+    header: dict[str, Any], listed: Sequence[View | Photograph], views: Sequence[View]
 ) -> str:
     """How training views differ from those of a checkpoint's header, in words; "" where they are
     the same.
 
     listed: all of them; views: those whose pixels are compared, where the header has their digests.
-    unedited: the listed ones and those that the user has dropped, where it makes no difference
-    which these are.
     """
-    names = {name for name, _ in header["views"]}
-    learned = [one for one in unedited if one.name in names]
-    if header["scene"] not in (fingerprint(listed), fingerprint(learned)):
+    if fingerprint(listed) != header["scene"]:
         return "its training views have other names or cameras"
     known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]
