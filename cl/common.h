@@ -15,6 +15,10 @@
 #define ALWAYS_INLINE __attribute__((always_inline)) static inline
 #endif
 
+// A value in [least, most]; clamp() would hide a NaN.
+#define BOUNDED(value, least, most)                                                                \
+    ((value) < (least) ? (least) : (value) > (most) ? (most) : (value))
+
 // 16 channels of one pixel or point
 #define CHANNELS 16
 

@@ -90,17 +90,8 @@ ALWAYS_INLINE floats load_half_part(global const half *rows, const size_t row) {
 #define load_lanes load16
 #define store_lanes store16
 #elif LANES == 4
-static inline float4 load_lanes(global const float *p, const int count) {
-    if (count >= 4) return vload4(0, p);
-    return (float4)(p[0], count > 1 ? p[1] : 0.0f, count > 2 ? p[2] : 0.0f, 0.0f);
-}
-
-static inline void store_lanes(const float4 value, global float *p, const int count) {
-    p[0] = value.x;
-    if (count > 1) p[1] = value.y;
-    if (count > 2) p[2] = value.z;
-    if (count > 3) p[3] = value.w;
-}
+#define load_lanes load4
+#define store_lanes store4
 #else
 #define load_lanes(p, count) (*(p))
 #define store_lanes(value, p, count) (*(p) = (value))

@@ -12,8 +12,12 @@
 #define SH_2C 0.31539157f  // 1/4 sqrt(5 / pi)
 #define SH_2D 0.54627422f  // 1/4 sqrt(15 / pi)
 
-// basis[0..8] of the unit direction d
-static inline void sh_basis(const float3 d, float *basis) {
+// basis[0..8] of the direction from the eye to a point. point: x, y, z in the camera's axes,
+// distance.
+static inline void sh_basis_of_point(global const float *camera, const float4 point, float *basis) {
+    const Camera cam = camera_load(camera);
+    const float3 c = point.xyz / point.w;
+    const float3 d = c.x * cam.right + c.y * cam.down + c.z * cam.forward;
     basis[0] = SH_0;
     basis[1] = -SH_1 * d.y;
     basis[2] = SH_1 * d.z;
@@ -23,13 +27,6 @@ static inline void sh_basis(const float3 d, float *basis) {
     basis[6] = SH_2B * d.z * d.z - SH_2C;
     basis[7] = -SH_2A * d.x * d.z;
     basis[8] = SH_2D * (d.x * d.x - d.y * d.y);
-}
-
-// The same of the direction from the eye to a point. point: x, y, z in the camera's axes, distance.
-static inline void sh_basis_of_point(global const float *camera, const float4 point, float *basis) {
-    const Camera cam = camera_load(camera);
-    const float3 c = point.xyz / point.w;
-    sh_basis(c.x * cam.right + c.y * cam.down + c.z * cam.forward, basis);
 }
 
 // READ_AHEAD() of all coefficients of point i in sh_0, sh_1, sh_2a and sh_2b, up to DEGREE. width:

@@ -10,7 +10,7 @@ from pyopencl.array import Array
 from pp_cl.device.buffers import DeviceRows
 from pp_cl.device.device import Device
 from pp_cl.network.unet import UNet
-from pp_cl.raster.points import SH_DEGREES, PointCloud
+from pp_cl.raster.points import PointCloud
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 
@@ -38,25 +38,6 @@ class Model:
         self.depth_range = depth_range
         self.cloud = cloud
         self.net = net
-
-    @classmethod
-    def create(
-        cls,
-        dev: Device,
-        grid: Grid,
-        ids: np.ndarray,
-        depth_range: tuple[float, float],
-        *,
-        net: UNet,
-        degree: int = SH_DEGREES[-1],
-        opacity: float = 1.0,
-    ) -> Model:
-        """Fresh model: points of one opacity on their vertices with SH coefficients of 0, and a
-        network.
-
-        ids: (N) ascending grid vertices. degree: of the SH, 0 to 2.
-        """
-        return cls(dev, grid, depth_range, PointCloud.create(dev, ids, degree, opacity), net=net)
 
     def positions(self) -> np.ndarray:
         """(N, 3) float64 world positions of the points."""

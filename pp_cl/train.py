@@ -8,7 +8,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.config import Config
-from pp_cl.device.buffers import DeviceRows, Reading
+from pp_cl.device.buffers import Buffers, DeviceRows, Reading
 from pp_cl.device.device import Device
 from pp_cl.layers.tiles import tiles_find, tiles_with
 from pp_cl.model import Model
@@ -61,6 +61,7 @@ class Trainer:
         self.optimiser = Optimiser(dev, model, self.state)
         self._composited = config.raster.blend == "alpha"
         self._target = Target(dev)
+        self._buffers = Buffers(dev)
         self._terms: Reading[dict[str, float]] | None = None  # of the loss of the last step
         self._smoother: Smoother | None = None  # made when it is due, anew when the points change
         self._refine_steps = refine_steps(train)
@@ -103,6 +104,7 @@ class Trainer:
                 target = self.exposure.target(crop.view_index, photograph, alpha)
             says_nothing = crop.view.ignored_crop(crop.box, crop.jitter)
             tiles = self._gradient_tiles(target, crop, says_nothing)
+            ignored = None if says_nothing is None else self._sent(says_nothing)
 
         rendered = self.renderer.forward(
             crop.camera, self.gamma, training=True, gradient_tiles=tiles
@@ -111,7 +113,7 @@ class Trainer:
             if self.exposure:
                 offset = rendered.offset
                 self.exposure.fit(crop.view_index, rendered.image, photograph, alpha, offset)
-            grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, says_nothing)
+            grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
         # the spread is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * self.model.grid.diagonal
         spread_weight = self._rising(train.spread_weight if self._composited else 0.0)
@@ -153,15 +155,13 @@ class Trainer:
         rendered: RenderResult,
         target: Array,
         alpha: Array,
-        says_nothing: np.ndarray | None,
+        ignored: Array | None,
     ) -> tuple[Array, Array | None]:
         """(dL/dimage, dL/dalpha or None) of all terms but the spread; their values go to self.loss,
-        which stays on the device. says_nothing: the crop's ignored pixels.
+        which stays on the device. ignored: (H, W) uint8, 1 where a pixel of the crop is.
         """
         train, image, offset, grad_alpha = self.config.train, rendered.image, rendered.offset, None
-        ignored = None
-        if says_nothing is not None:
-            ignored = self.dev.upload(says_nothing, np.uint8)
+        if ignored is not None:
             ignore_target(self.dev, ignored, image, target, alpha, offset)
         grad_image = self.loss.forward_backward(image, target, *offset)
         transmittance = rendered.weights.transmittance  # None of a softmax
@@ -177,6 +177,12 @@ class Trainer:
         if ignored is not None:
             ignore_gradient(self.dev, ignored, grad_image, offset)
         return grad_image, grad_alpha
+
+    def _sent(self, says_nothing):
+        """The crop's ignored pixels on the device."""
+        self._buffers.require({"ignored": (says_nothing.shape, np.uint8)})
+        self.dev.send(self._buffers.ignored, says_nothing.astype(np.uint8))
+        return self._buffers.ignored
 
     def _rising(self, weight):
         """A weight of the loss that rises from 0 during the training."""

@@ -1,6 +1,7 @@
 """A training step in its steady state: the device is waited for once, and nothing is allocated."""
 
 import collections
+from dataclasses import replace
 
 import numpy as np
 import pyopencl as cl
@@ -24,6 +25,7 @@ EVERY_STEP = {  # so that a step of any number does what most do
 }
 SETTINGS = {
     "tiny": {},
+    "tiny, ignored pixels": {},
     "paper": {"network.widths": (16, 16, 16)},
     "paper, crops": {"network.widths": (16, 16, 16), "train.crop": 24},
 }
@@ -35,7 +37,12 @@ def make_trainer(dev, scene, folder, name):
     config = configure(
         preset(name.partition(",")[0]), str(scene), [(k, v, "test") for k, v in settings.items()]
     )
-    return open_training(dev, RunFolder(folder), config, None).trainer
+    trainer = open_training(dev, RunFolder(folder), config, None).trainer
+    if "ignored" in name:
+        hand = np.zeros(trainer.views[0].image.shape[:2], bool)
+        hand[:9, :9] = True
+        trainer.views[:] = [replace(view, ignored=hand) for view in trainer.views]
+    return trainer
 
 
 class Recorder:
@@ -76,6 +83,7 @@ class Recorder:
         ("tiny", False),
         ("paper", True),
         ("tiny", True),
+        ("tiny, ignored pixels", False),
         ("paper", False),
         ("paper, crops", True),
     ],

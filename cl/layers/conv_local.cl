@@ -166,7 +166,7 @@ kernel void conv_local_forward(
         // max(., 0) would hide a NaN
         const float4 value = relu ? select(acc[p], (float4)(0.0f), acc[p] < 0.0f) : acc[p];
         if (px < width && py < height)
-            store4(value, out + ((size_t)py * width + px) * co + channel, co - channel);
+            store_quad(value, out + ((size_t)py * width + px) * co + channel, co - channel);
     }
 }
 
@@ -206,7 +206,7 @@ kernel void conv_local_backward_input(
         if (px >= width || py >= height) continue;
         const size_t to = ((size_t)py * width + px) * c + channel;
         const float4 dL_dx =
-            masked ? select((float4)(0.0f), acc[p], load4(x + to, c - channel) > 0.0f) : acc[p];
-        store4(dL_dx, grad_x + to, c - channel);
+            masked ? select((float4)(0.0f), acc[p], load_quad(x + to, c - channel) > 0.0f) : acc[p];
+        store_quad(dL_dx, grad_x + to, c - channel);
     }
 }

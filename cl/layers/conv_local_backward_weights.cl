@@ -68,7 +68,7 @@ kernel void conv_local_backward_weights(
     const int item = get_local_id(0), lane = item % CI_QUADS, quad = item / CI_QUADS % QUADS,
               ky = item / (CI_QUADS * QUADS);
     const int c0 = get_global_id(0) / ITEMS * CI_QUADS * 4, o0 = get_group_id(1) * QUADS * 4,
-              part = get_group_id(2);
+              part = get_global_id(2);
     const int block = o0 / 16 + quad / 4, blocks = (co + 15) / 16;
     const int begin = part * run, end = min(begin + run, tile_list[2]);
     global float4 *out = partial +

@@ -4,6 +4,7 @@
 #define PP_LOCAL_H
 
 #include "layers/tiles.h"
+#include "vector.h"
 
 #ifndef KERNEL_SIZE
 #define KERNEL_SIZE 3  // side of the kernel: 1 or 3
@@ -18,31 +19,14 @@
 #define PAD (KERNEL_SIZE / 2)
 #define SPAN (SIDE + KERNEL_SIZE - 1)  // side of what a tile of outputs sees
 
-// The 4 values at p, of which `count` exist; the others read as 0.
-static inline float4 load4(global const float *p, const int count) {
+// The 4 values at p, of which `count` exist: all where the channels are multiples of 4.
 #if ALIGNED
-    return *(global const float4 *)p;
+#define load_quad(p, count) (*(global const float4 *)(p))
+#define store_quad(value, p, count) (*(global float4 *)(p) = (value))
 #else
-    float4 few = 0.0f;
-    few.x = p[0];
-    few.y = count > 1 ? p[1] : 0.0f;
-    few.z = count > 2 ? p[2] : 0.0f;
-    few.w = count > 3 ? p[3] : 0.0f;
-    return few;
+#define load_quad load4
+#define store_quad store4
 #endif
-}
-
-// Write the first `count` of 4 values to p.
-static inline void store4(const float4 value, global float *p, const int count) {
-#if ALIGNED
-    *(global float4 *)p = value;
-#else
-    p[0] = value.x;
-    if (count > 1) p[1] = value.y;
-    if (count > 2) p[2] = value.z;
-    if (count > 3) p[3] = value.w;
-#endif
-}
 
 // 4 channels, of which `count` exist, of a pixel from `c` on; 0 outside of the image.
 static inline float4 pixel4(
@@ -54,7 +38,7 @@ static inline float4 pixel4(
     const int height,
     const int width) {
     if (x < 0 || x >= width || y < 0 || y >= height || c >= channels) return (float4)(0.0f);
-    return load4(image + ((size_t)y * width + x) * channels + c, channels - c);
+    return load_quad(image + ((size_t)y * width + x) * channels + c, channels - c);
 }
 
 #endif

@@ -52,6 +52,11 @@ kernel void avgpool2_backward(
     store_lanes(dL_dx, grad_x + at, count);
 }
 
+// The larger of two values in each lane, NaN where one of them is; fmax() would hide it.
+static inline floats larger(const floats a, const floats b) {
+    return select(b, a, (a >= b) | (a != a));
+}
+
 // One work-item per (LANES channels, x, y) of out: reads the 2x2 pixels it covers, writes their
 // largest; an odd last row or column of x is left out, as PyTorch does.
 kernel void maxpool2_forward(
@@ -67,9 +72,9 @@ kernel void maxpool2_forward(
     if (first >= c || column >= w || row >= h) return;
     global const float *upper = x + ((size_t)row * 2 * x_width + column * 2) * c + first,
                        *lower = upper + x_width * c;
-    const floats largest = fmax(
-        fmax(load_lanes(upper, count), load_lanes(upper + c, count)),
-        fmax(load_lanes(lower, count), load_lanes(lower + c, count)));
+    const floats largest = larger(
+        larger(load_lanes(upper, count), load_lanes(upper + c, count)),
+        larger(load_lanes(lower, count), load_lanes(lower + c, count)));
     store_lanes(largest, out + ((size_t)row * w + column) * c + first, count);
 }
 

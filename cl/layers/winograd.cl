@@ -149,16 +149,16 @@ kernel void winograd_forward(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
     const int co,
-    const int relu,                     // negative results become 0
-    global const float *x,              // (height, width, c1)
-    global const float *x2,             // (height, width, ?)
-    global const float16 *transformed,  // (...) weights, laid out as winograd.h says
-    global const float16 *bias,         // (?)
-    global const int *tile_list,        // (?)
-    global float *out,                  // (height, width, co)
-    global float16 *scratch)            // (...) COUNTERS + work-items * SLICE(c1 + c2, co)
+    const int relu,                // negative results become 0
+    global const float *x,         // (height, width, c1)
+    global const float *x2,        // (height, width, ?)
+    global const float16 *weight,  // (...) transformed, laid out as winograd.h says
+    global const float16 *bias,    // (?)
+    global const int *tile_list,   // (?)
+    global float *out,             // (height, width, co)
+    global float16 *scratch)       // (...) COUNTERS + work-items * SLICE(c1 + c2, co)
 {
-    convolve(x, x2, c1, c2, transformed, bias, relu, 0, out, co, tile_list, scratch);
+    convolve(x, x2, c1, c2, weight, bias, relu, 0, out, co, tile_list, scratch);
 }
 
 // One work-item per compute unit: takes tiles, reads their neighbourhood in grad_out, and writes

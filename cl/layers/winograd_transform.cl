@@ -2,21 +2,6 @@
 // that winograd.cl reads.
 #include "layers/winograd.h"
 
-// Three rows of three weights in t -> their values at all positions, of one input channel and 16
-// output channels.
-ALWAYS_INLINE void store_kernel(
-    float16 *t,
-    global float16 *transformed,
-    const int channel,
-    const int channels,
-    const int block,
-    const int blocks) {
-    transform_kernel_tile(t);
-#pragma unroll
-    for (int i = 0; i < POSITIONS; i++)
-        transformed[WEIGHT_AT(i, block, blocks, channels) + channel] = t[i];
-}
-
 // One work-item per (weights, 16 channels of the result, channel that it is computed from): reads 3
 // x 3 weights, writes their values at all positions; for an input gradient those of the mirrored
 // kernels with the roles of input and output channels exchanged. Rows of `table`: first work-item,
@@ -48,5 +33,8 @@ kernel void winograd_transform(
                                tap[224], tap[240])
                    : vload16((block * 9 + i) * ci + c, weight);
     }
-    store_kernel(t, transformed + row[4], c, channels, block, blocks);
+    transform_kernel_tile(t);
+#pragma unroll
+    for (int i = 0; i < POSITIONS; i++)
+        transformed[row[4] + WEIGHT_AT(i, block, blocks, channels) + c] = t[i];
 }

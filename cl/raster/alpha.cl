@@ -54,12 +54,13 @@ kernel void alpha_weights(
             bool shows = true;
             if (FOOTPRINT == GAUSSIAN) {
                 shows = !(alpha < LEAST_ALPHA);
-                alpha = shows ? fmin(alpha, MOST_ALPHA) : 0.0f;
+                alpha = !shows ? 0.0f : alpha > MOST_ALPHA ? MOST_ALPHA : alpha;
             }
             pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
             if (SLOPES) pixel_slope[i] = shows ? T * d : 0.0f;
             point_is_shaded[hit.x] = 1;
-            T *= fmax(1.0f - alpha, LEAST_THROUGH);
+            const float through = 1.0f - alpha;
+            T *= through < LEAST_THROUGH ? LEAST_THROUGH : through;  // fmax() would hide a NaN
         }
     }
     if (i < end) pixel_entry[i] = NONE;

@@ -24,8 +24,8 @@ kernel void depth_forward(
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global const ulong *pixel_entry,           // (P) weight << 32 | point; no point: the list ends
     global float *pixel_alpha,                 // (H, W)
-    global float *pixel_depth,                 // (H, W) infinite where nothing is hit, as the next
-    global float *pixel_median)                // (H, W)
+    global float *pixel_depth,                 // (H, W) infinite where nothing is hit
+    global float *pixel_median)                // (H, W) infinite where nothing is hit
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
@@ -52,6 +52,7 @@ kernel void depth_forward(
     }
     const bool stopped = end < pixel_offset[q + 1] && alpha > 0.0f;
     pixel_alpha[q] = alpha > 1.0f || stopped ? 1.0f : alpha;  // fmin() would hide a NaN
-    pixel_depth[q] = alpha > 0.0f ? depth / alpha : INFINITY;
-    pixel_median[q] = alpha > 0.0f ? median : INFINITY;
+    const float none = alpha == 0.0f ? INFINITY : alpha;      // a NaN stays one
+    pixel_depth[q] = alpha > 0.0f ? depth / alpha : none;
+    pixel_median[q] = alpha > 0.0f ? median : none;
 }

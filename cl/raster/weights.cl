@@ -53,7 +53,7 @@ kernel void record_weights(
     if (point_is_shaded[i]) {
         for (uint pair = begin; pair < end; pair++)
             sum += pair_gradient[pair].x;
-        max_weight[i] = fmax(max_weight[i], sum);
+        if (sum > max_weight[i] || isnan(sum)) max_weight[i] = sum;  // fmax() would hide a NaN
     }
     if (sum >= least) times_seen[i] += 1.0f;
 }

@@ -82,8 +82,8 @@ kernel void exposure_fit(
         global float4 *channel = exposure + 3 * v + c;
         float4 known = *channel;
         if (v == view) known.xyz = kept * known.xyz + products;
-        const float gain = (known.x + prior) / (known.y + prior);  // clamp() would hide a NaN
-        known.w = gain > MOST ? MOST : gain < 1.0f / MOST ? 1.0f / MOST : gain;
+        const float gain = (known.x + prior) / (known.y + prior);
+        known.w = BOUNDED(gain, 1.0f / MOST, MOST);
         sum += log(known.w);
         *channel = known;
     }

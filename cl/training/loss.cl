@@ -31,11 +31,6 @@ constant float WINDOW[TAPS] = {// exp(-x^2 / (2 * 1.5^2)), normalised
 // s is kept 1 lower: the moments of numbers around 0 lose the least
 #define SUM_SHIFT 1.0f
 
-// All ones in the lanes below `count`, for select().
-static inline ints lanes_below(const int count) {
-    return LANED(convert_int)(LANE) < count;
-}
-
 // One work-item per LANES values of a row of windows: writes the moments of d, s, d^2, s^2 over 11
 // image rows.
 kernel void loss_moments(
@@ -109,7 +104,7 @@ kernel void loss_similarity(
         const floats a = m_d * m_d / P, b = var_d / Q;
 
         const float scale = 1.0f / ((float)windows * v);
-        const ints inside = lanes_below(windows - i);
+        const ints inside = LANED(convert_int)(LANE) < windows - i;  // for select()
         dissimilarity = scale * SUM_LANES(select((floats)0.0f, a + b - a * b, inside));
 
         const floats dL_dvar_d = weight * scale * (1.0f - a) / Q * (1.0f - 0.5f * b);
@@ -142,11 +137,6 @@ kernel void loss_row_slopes(
         ((global floats *)row_slopes)[row + b] =
             blur_along_x((global const floats *)slopes + row, LANES * (b + MARGIN), -3);
     }
-}
-
-// clamp(x, -1, 1), but a NaN remains one.
-static inline floats clamp_slope(const floats x) {
-    return x > 1.0f ? (floats)(1.0f) : x < -1.0f ? (floats)(-1.0f) : x;
 }
 
 // One work-item per LANES values of a target row: sums the slopes of the 11 rows of windows that
@@ -184,7 +174,8 @@ kernel void loss_gradient(
             slope_s += WINDOW[k] * row[2 * blocks];
         }
         const float scale = 1.0f / (3.0f * h * w);
-        const floats slope = beta > 0.0f ? clamp_slope(d / beta) : sign(d);
+        const floats slope =
+            beta > 0.0f ? BOUNDED(d / beta, (floats)(-1.0f), (floats)(1.0f)) : sign(d);
         store_lanes(
             scale * slope + slope_0 + slope_d * d + slope_s * s, grad_prediction + at, count);
         smooth = scale * SUM_LANES(slope * (d - 0.5f * beta * slope));

@@ -31,10 +31,6 @@
 #endif
 #define MEAN_SQUARE 0.07957747f  // 1 / (4 pi), of each harmonic over all directions
 
-// A value in [least, most]; clamp() would hide a NaN.
-#define BOUNDED(value, least, most)                                                                \
-    ((value) < (least) ? (least) : (value) > (most) ? (most) : (value))
-
 #ifdef MOST_SH  // of coefficients above degree 0; without it they have no bounds
 #define BOUNDED_SH(value, k)                                                                       \
     ((k) == 0 ? (value) : BOUNDED(value, (floats)(-MOST_SH), (floats)(MOST_SH)))

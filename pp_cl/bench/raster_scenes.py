@@ -16,6 +16,7 @@ from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import blend_backward, blend_forward
+from pp_cl.raster.points import PointCloud
 from pp_cl.raster.weights import BLENDS, blend_weights
 from pp_cl.reference import dense
 from pp_cl.render import Renderer, RenderResult
@@ -126,7 +127,7 @@ class GridScene(BenchScene):
         self.camera = Camera(pose, focal, focal, size / 2, size / 2, size, size)
 
         net = UNet(dev, widths=(CHANNELS,) * 3)
-        model = Model.create(dev, grid, ids, self.depth_range, net=net)
+        model = Model(dev, grid, self.depth_range, PointCloud.create(dev, ids), net=net)
         self.opacity = rng.uniform(0.7, 1, self.count).astype(np.float32)
         self.sh_0 = rng.standard_normal((self.count, 1, CHANNELS), np.float32)
         model.cloud.opacity.set(self.opacity)

@@ -11,6 +11,7 @@ from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
+from pp_cl.raster.points import PointCloud
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import open_scene, scene_box
 from pp_cl.train import Trainer
@@ -27,8 +28,8 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, config.points.count, scene_box(config))
     net, near_far = UNet.of_settings(dev, config.network), depth_range(views, hull)
-    degree = config.points.sh_degree
-    model = Model.create(dev, hull.grid, hull.ids, near_far, net=net, degree=degree)
+    cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree)
+    model = Model(dev, hull.grid, near_far, cloud, net=net)
     count = model.cloud.count
     model.cloud.opacity.set(np.random.default_rng(0).uniform(0.3, 1, count).astype(np.float32))
     trainer = Trainer(dev, config, model, views)

@@ -109,8 +109,9 @@ class PackedArrays:
         ones is undefined.
         """
         if rows != self._rows:
-            self._rows, self._whole, self._arrays = rows, None, []  # frees the old ones first
+            self._rows, self._whole, self._arrays = [], None, []  # frees the old ones first
             self._whole, self._arrays = packed_arrays(self._dev, rows)
+            self._rows = rows
         packed = np.empty(self._whole.shape, np.uint8)
         for array, value in zip(self._arrays, values, strict=True):
             octets = np.ascontiguousarray(value).reshape(-1).view(np.uint8)

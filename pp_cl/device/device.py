@@ -425,8 +425,11 @@ class Device:
         if self.debug < 3:
             return
         for p in kernel.parameters:
-            if p.space == "global" and not p.const and p.dtype is np.float32:
-                bad = np.flatnonzero(~np.isfinite(arguments[p.name].get()))
+            if p.is_buffer and not p.const and p.dtype is np.float32:
+                values = arguments[p.name].get()
+                bad = np.flatnonzero(
+                    np.isnan(values) if p.may_be_infinite else ~np.isfinite(values)
+                )
                 if bad.size:
                     raise FloatingPointError(
                         f"{kernel.label}: {p.name} has {bad.size} NaN or Inf, first at {bad[0]}"

@@ -30,22 +30,18 @@ REMEMBERED = 64
 
 
 SCALARS = {
-    "char": np.int8,
     "uchar": np.uint8,
-    "short": np.int16,
     "ushort": np.uint16,
     "int": np.int32,
     "uint": np.uint32,
-    "long": np.int64,
     "ulong": np.uint64,
     "half": np.float16,
     "float": np.float32,
-    "double": np.float64,
 }
 
 _KERNEL = re.compile(r"^kernel\s+void\s+(\w+)\s*\(", re.MULTILINE)
 _PARAMETER = re.compile(
-    r"^(?:(global|constant|local)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
+    r"^(?:(global)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
     r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$"
 )
 _SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
@@ -55,15 +51,16 @@ _FORMULA = re.compile(r"\(*\w+\)*(?: ?[-+*/] ?\(*\w+\)*)*")
 @dataclass(frozen=True)
 class Parameter:
     """One kernel parameter. shape: the dimensions of its comment as text, such as "N+1"; None for
-    a scalar or for `(...)`.
+    a scalar or for `(...)`. may_be_infinite: its comment says "infinite".
     """
 
     name: str
-    space: str  # "global", "constant", "local", or "" for a scalar
+    is_buffer: bool  # a global pointer
     dtype: type
     width: int  # of the OpenCL vector
     const: bool  # what it points at
     shape: tuple | None
+    may_be_infinite: bool
 
     @cached_property
     def limits(self) -> tuple[int, int] | None:
@@ -102,9 +99,7 @@ def _parse_parameter(code, comment, where):
         raise ValueError(f"{where}: cannot read parameter {code!r}; one parameter per line")
     space, qualifiers, base, width, star, name = found.groups()
     if bool(space) != bool(star) or (width and not star):
-        raise ValueError(
-            f"{where}: {code!r} is neither a global, constant or local pointer nor a scalar"
-        )
+        raise ValueError(f"{where}: {code!r} is neither a global pointer nor a scalar")
     shape = None
     if star:
         words = _SHAPE.match(comment)
@@ -116,9 +111,8 @@ def _parse_parameter(code, comment, where):
             [compile_formula(word) for word in shape or () if word != "?"]
         except ValueError as error:
             raise ValueError(f"{where}: {name}: {error}") from None
-    return Parameter(
-        name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape
-    )
+    kind = SCALARS[base], int(width or 1), "const" in qualifiers
+    return Parameter(name, bool(space), *kind, shape, "infinite" in comment)
 
 
 @functools.cache
@@ -149,7 +143,7 @@ class Kernel:
         label: str,
     ):
         # with their types pyopencl packs scalars itself; without, ten of them take it 40 us
-        kernel.set_scalar_arg_dtypes([None if p.space else p.dtype for p in parameters])
+        kernel.set_scalar_arg_dtypes([None if p.is_buffer else p.dtype for p in parameters])
         self.kernel = kernel
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
         self.largest_group: Any = kernel.get_work_group_info(limit, device)  # work-items
@@ -168,9 +162,9 @@ class Kernel:
             (
                 p,
                 p.name,
-                np.dtype(p.dtype) if p.space in ("global", "constant") else None,
+                np.dtype(p.dtype) if p.is_buffer else None,
                 *(p.limits or (1, 0)),
-                p.name.lower() if not p.space and p.name.lower() in letters else None,
+                p.name.lower() if not p.is_buffer and p.name.lower() in letters else None,
             )
             for p in parameters
         ]
@@ -180,14 +174,14 @@ class Kernel:
             (p, axis, word, compile_formula(word))
             for p in parameters
             for axis, word in enumerate(p.shape or ())
-            if word != "?" and p.space in ("global", "constant")
+            if word != "?"
         ]
         self._dimensions = sorted(dimensions, key=lambda d: not d[2].isidentifier())
         self._checked: set[Any] = set()  # shapes and sizes already found right
         self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 
     def arguments(self, values: dict[str, Any]) -> list[Any]:
-        """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises
+        """OpenCL arguments in order, from {name: pyopencl Array or number}. Raises
         TypeError, ValueError.
         """
         if values.keys() != self.names:
@@ -211,8 +205,6 @@ class Kernel:
                 arguments.append(value)
                 if letter:
                     sizes[letter] = value
-            elif p.space == "local":
-                arguments.append(value)
             else:
                 number = self._scalar(p, value)
                 arguments.append(number)

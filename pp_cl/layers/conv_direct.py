@@ -221,16 +221,12 @@ class DirectConv:
         out to compute.
         """
         self._check(weights, tiles, bias)
-        (height, width), (c1, *others) = self.shape.size, self.shape.sources
-        program, size, work_group = self._program(self.shape.co)
-        program.launch(
-            "conv_forward",
-            size,
-            local=work_group,
-            multiply_adds=self._multiply_adds(tiles),
-            along=1,
-            height=height,
-            width=width,
+        c1, *others = self.shape.sources
+        self._launch(
+            "forward",
+            tiles,
+            self.shape.co,
+            self.shape.sources,
             c1=c1,
             c2=sum(others),
             co=self.shape.co,
@@ -240,7 +236,6 @@ class DirectConv:
             weight=weights,
             bias=bias,
             out=out,
-            tile_count=tiles.count,
         )
 
     def backward_input(
@@ -253,16 +248,11 @@ class DirectConv:
         the ReLU's input, or None; tiles: those of grad_x to compute.
         """
         self._check(weights, tiles)
-        height, width = self.shape.size
-        program, size, work_group = self._program(self.shape.ci)
-        program.launch(
-            "conv_backward_input",
-            size,
-            local=work_group,
-            multiply_adds=self._multiply_adds(tiles),
-            along=1,
-            height=height,
-            width=width,
+        self._launch(
+            "backward_input",
+            tiles,
+            self.shape.ci,
+            (self.shape.co,),
             c=self.shape.ci,
             co=self.shape.co,
             masked=mask is not None,
@@ -270,7 +260,21 @@ class DirectConv:
             flipped=weights,
             grad_out=grad_out,
             grad_x=grad_x,
+        )
+
+    def _launch(self, kernel, tiles, channels, inputs, **arguments):
+        """Compute the tiles of a result of so many channels, of inputs of so many each."""
+        program, size, work_group = self._program(channels)
+        program.launch(
+            f"conv_{kernel}",
+            size,
+            local=work_group,
+            multiply_adds=self._multiply_adds(tiles),
+            along=1,
+            height=self.shape.size[0],
+            width=self.shape.size[1],
             tile_count=tiles.count,
+            **arguments,
         )
 
     def backward_weights(

@@ -30,54 +30,28 @@ MOST_GROUPS = 512
 class LocalConv(DirectConv):
     """Its kernels are conv_local.cl and conv_local_backward_weights.cl."""
 
-    def forward(
-        self, sources: Sources, weights: Array, bias: Array, out: Array, *, relu: bool, tiles: Tiles
-    ) -> None:
-        """See DirectConv."""
-        self._check(weights, tiles, bias)
-        co, (c1, *others) = self.shape.co, self.shape.sources
-        program, size, work_group = self._local_program(
-            "conv_local_forward", tiles, co, self.shape.sources
-        )
+    def _launch(self, kernel, tiles, channels, inputs, **arguments):
+        """See DirectConv; in the largest groups that the device runs."""
+        kernel, aligned = f"conv_local_{kernel}", _is_aligned(channels, *inputs)
+        in_group = _quads(channels, aligned)
+        for items in (n for n in GROUPS if n >= TILE_PARTS * in_group):
+            program = self.dev.program(
+                "layers/conv_local",
+                ITEMS=items,
+                KERNEL_SIZE=self.shape.k,
+                ALIGNED=int(aligned),
+                QUADS=in_group,
+            )
+            if program.kernels[kernel].largest_group >= items:
+                break
+        groups = -(-tiles.number * TILE_PARTS * in_group // items)
         program.launch(
-            "conv_local_forward",
-            size,
-            local=work_group,
+            kernel,
+            (groups * items, -(-channels // (QUAD * in_group))),
+            local=(items, 1),
             multiply_adds=self._multiply_adds(tiles),
-            c1=c1,
-            c2=sum(others),
-            co=co,
-            relu=relu,
-            x=sources[0],
-            x2=sources[-1],
-            weight=weights,
-            bias=bias,
             tile_list=tiles.list,
-            out=out,
-        )
-
-    def backward_input(
-        self, weights: Array, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
-    ) -> None:
-        """See DirectConv."""
-        self._check(weights, tiles)
-        c, co = self.shape.ci, self.shape.co
-        program, size, work_group = self._local_program(
-            "conv_local_backward_input", tiles, c, (co,)
-        )
-        program.launch(
-            "conv_local_backward_input",
-            size,
-            local=work_group,
-            multiply_adds=self._multiply_adds(tiles),
-            c=c,
-            co=co,
-            masked=mask is not None,
-            x=grad_x if mask is None else mask,
-            flipped=weights,
-            grad_out=grad_out,
-            tile_list=tiles.list,
-            grad_x=grad_x,
+            **arguments,
         )
 
     def backward_weights(
@@ -95,6 +69,7 @@ class LocalConv(DirectConv):
                 (-(-c // (QUAD * CI_QUADS[k])) * items, -(-co // (QUAD * in_group)), parts),
                 local=(items, 1, 1),
                 multiply_adds=tiles.number * SIDE**2 * k**2 * c * co,
+                along=2,
                 c=c,
                 first=first,
                 ci=ci,
@@ -129,25 +104,6 @@ class LocalConv(DirectConv):
         tiles = math.prod(grid_shape(*self.shape.size))
         wanted = min(-(-tiles // PART_TILES), -(-MOST_GROUPS // groups))
         return min(wanted, most_parts(self.shape))
-
-    def _local_program(self, kernel, tiles, channels, inputs):
-        """(program, work-items, work-group) of a kernel for `channels` of `inputs` (channels), in
-        the largest groups that the device runs.
-        """
-        aligned = _is_aligned(channels, *inputs)
-        in_group = _quads(channels, aligned)
-        for items in (n for n in GROUPS if n >= TILE_PARTS * in_group):
-            program = self.dev.program(
-                "layers/conv_local",
-                ITEMS=items,
-                KERNEL_SIZE=self.shape.k,
-                ALIGNED=int(aligned),
-                QUADS=in_group,
-            )
-            if program.kernels[kernel].largest_group >= items:
-                break
-        groups = -(-tiles.number * TILE_PARTS * in_group // items)
-        return program, (groups * items, -(-channels // (QUAD * in_group))), (items, 1)
 
     def _weights_program(self, c):
         """(program, groups of four output channels and work-items of a work-group)."""

@@ -93,47 +93,8 @@ class WinogradConv(DirectConv):
             transformed=laid_out,
         )
 
-    def forward(
-        self, sources: Sources, weights: Array, bias: Array, out: Array, *, relu: bool, tiles: Tiles
-    ) -> None:
+    def _launch(self, kernel, tiles, channels, inputs, **arguments):
         """See DirectConv."""
-        self._check(weights, tiles, bias)
-        c1, *others = self.shape.sources
-        self._launch(
-            "winograd_forward",
-            tiles,
-            self.shape.co,
-            c1=c1,
-            c2=sum(others),
-            co=self.shape.co,
-            relu=relu,
-            x=sources[0],
-            x2=sources[-1],
-            transformed=weights,
-            bias=bias,
-            out=out,
-        )
-
-    def backward_input(
-        self, weights: Array, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
-    ) -> None:
-        """See DirectConv."""
-        self._check(weights, tiles)
-        self._launch(
-            "winograd_backward_input",
-            tiles,
-            self.shape.ci,
-            c=self.shape.ci,
-            co=self.shape.co,
-            masked=mask is not None,
-            x=grad_x if mask is None else mask,
-            flipped=weights,
-            grad_out=grad_out,
-            grad_x=grad_x,
-        )
-
-    def _launch(self, kernel, tiles, channels, **arguments):
-        """Compute the tiles of a result of so many channels."""
         program = self.dev.program(
             "layers/winograd",
             TILES=self._at_once,
@@ -141,7 +102,7 @@ class WinogradConv(DirectConv):
             BLOCKS=self._groups(channels),
         )
         program.launch(
-            kernel,
+            f"winograd_{kernel}",
             min(self.dev.info["compute_units"], tiles.number),
             local=1,
             tile_list=tiles.list,

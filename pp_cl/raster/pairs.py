@@ -128,21 +128,8 @@ def find_pairs(
         b.pair_point_closeness,
         b.pair_key,
     )
-    if dev.is_cpu:
-        _list_by_bucket(dev, program, b, n, pixels, room)
-        return pairs
-    exclusive_scan(dev, b.pixel_count, b.pixel_offset)
-    program.launch(
-        "pairs_scatter",
-        room,
-        p=room,
-        hw=pixels,
-        pair_pixel=b.pair_pixel,
-        pair_place=pair_place,
-        pixel_offset=b.pixel_offset,
-        pair_key=b.pair_key,
-    )
-    _sort_in_parallel(program, pairs, b.pair_scratch)
+    make_lists = _list_by_bucket if dev.is_cpu else _list_in_parallel
+    make_lists(dev, program, b, n, pixels, room)
     return pairs
 
 
@@ -175,6 +162,24 @@ def _list_by_bucket(dev, program, b, n, pixels, room):
     )
 
 
+def _list_in_parallel(dev, program, b, _, pixels, room):
+    """Write the keys, sorted, and pixel_offset: one work-item per key."""
+    exclusive_scan(dev, b.pixel_count, b.pixel_offset)
+    shared = {"p": room, "hw": pixels, "pair_pixel": b.pair_pixel, "pixel_offset": b.pixel_offset}
+    keys, other = b.pair_key, b.pair_scratch
+    program.launch("pairs_scatter", room, pair_place=other, pair_key=keys, **shared)
+    program.launch("pairs_sort_runs", room, pair_key=keys, sorted=other, **shared)
+
+    def merge(source, target, width, group, least):
+        sizes = {"width": width, "group": group, "least": least}
+        program.launch("pairs_merge_runs", room, sorted=source, pair_key=target, **sizes, **shared)
+
+    merge(other, keys, RUN, LONG_LIST, 0)
+    if room > LONG_LIST:  # there and back, for the lists that are longer
+        merge(keys, other, LONG_LIST, LONG_LIST * RUN, LONG_LIST)
+        merge(other, keys, LONG_LIST * RUN, MOST_PAIRS, LONG_LIST)
+
+
 def room_needed(pairs: Pairs) -> int:
     """The capacity of these pairs if all fitted, else a larger one with which they fit. Waits until
     their number is known. Raises UserError for more pairs than uint32 can number.
@@ -185,39 +190,4 @@ def room_needed(pairs: Pairs) -> int:
             f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
             "lower --points, raise --downscale, or lower raster.radius"
         )
-    return grown(pairs.capacity, total)
-
-
-def _sort_in_parallel(program, pairs, scratch):
-    """Sort the keys of each pixel in place, one work-item per key."""
-    capacity, pixels = pairs.capacity, pairs.pixels
-    program.launch(
-        "pairs_sort_runs",
-        capacity,
-        p=capacity,
-        hw=pixels,
-        pair_pixel=pairs.pair_pixel,
-        pixel_offset=pairs.pixel_offset,
-        pair_key=pairs.pair_key,
-        sorted=scratch,
-    )
-
-    def merge(source, target, width, group, least):
-        program.launch(
-            "pairs_merge_runs",
-            capacity,
-            p=capacity,
-            hw=pixels,
-            width=width,
-            group=group,
-            least=least,
-            pair_pixel=pairs.pair_pixel,
-            pixel_offset=pairs.pixel_offset,
-            sorted=source,
-            pair_key=target,
-        )
-
-    merge(scratch, pairs.pair_key, RUN, LONG_LIST, 0)
-    if capacity > LONG_LIST:  # there and back, for the lists that are longer
-        merge(pairs.pair_key, scratch, LONG_LIST, LONG_LIST * RUN, LONG_LIST)
-        merge(scratch, pairs.pair_key, LONG_LIST * RUN, MOST_PAIRS, LONG_LIST)
+    return min(grown(pairs.capacity, total), MOST_PAIRS)

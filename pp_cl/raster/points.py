@@ -115,8 +115,12 @@ class PointCloud:
         return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
 
     @classmethod
-    def create(cls, dev: Device, ids: np.ndarray, degree: int, opacity: float = 1.0) -> PointCloud:
-        """Points of one opacity on their vertices, SH coefficients of 0. ids: (N), ascending."""
+    def create(
+        cls, dev: Device, ids: np.ndarray, degree: int = SH_DEGREES[-1], opacity: float = 1.0
+    ) -> PointCloud:
+        """Points of one opacity on their vertices, SH coefficients of 0 of a degree, 0 to 2. ids:
+        (N), ascending.
+        """
         n = len(ids)
         opacities = dev.upload(np.full(n, opacity, np.float32))
         sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]

@@ -5,6 +5,7 @@ list of visible points, and each point's highest weight for pruning.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -86,10 +87,28 @@ def blend_weights(
     """
     b.require(weights_table(pairs.points, pairs.pixels, pairs.capacity if slopes else 1))
     dev.fill(b.point_is_shaded, 0)
+    defines: dict[str, Any] = {"LANES": lanes(dev), "SLOPES": int(slopes)}
+    shared: dict[str, Any] = {
+        "hw": pairs.pixels,
+        "early_stop": early_stop,
+        "pixel_offset": pairs.pixel_offset,
+        "pair_key": pairs.pair_key,
+        "pair_point_closeness": pairs.pair_point_closeness,
+        "opacity": opacity,
+        "pixel_entry": b.pair_scratch,
+        "pixel_slope": b.pixel_slope,
+        "point_is_shaded": b.point_is_shaded,
+    }
     if blend == "alpha":
-        _alpha_weights(dev, b, pairs, opacity, early_stop, slopes)
+        program = dev.program(
+            "raster/alpha", FOOTPRINT=FOOTPRINTS.index(pairs.footprint), **defines
+        )
+        program.launch("alpha_weights", pairs.pixels, transmittance=b.transmittance, **shared)
     else:
-        _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, slopes)
+        program = dev.program("raster/softmax", DROPS=int(early_stop > 0), **defines)
+        program.launch(
+            "softmax_weights", pairs.pixels, sharpness=1 / gamma, camera=camera_buffer, **shared
+        )
     shaded_list = nonzero(dev, b.point_is_shaded, b.shaded, b.point_slot)
     return BlendWeights(
         blend,
@@ -100,53 +119,6 @@ def blend_weights(
         shaded_list,
         b.point_slot,
         b.transmittance if blend == "alpha" else None,
-    )
-
-
-def _alpha_weights(dev, b, pairs, opacity, early_stop, slopes):
-    """Front to back, weight = transmittance * opacity * closeness; early_stop is the transmittance
-    below which the hits behind are dropped.
-    """
-    dev.program(
-        "raster/alpha",
-        LANES=lanes(dev),
-        FOOTPRINT=FOOTPRINTS.index(pairs.footprint),
-        SLOPES=int(slopes),
-    ).launch(
-        "alpha_weights",
-        pairs.pixels,
-        hw=pairs.pixels,
-        early_stop=early_stop,
-        pixel_offset=pairs.pixel_offset,
-        pair_key=pairs.pair_key,
-        pair_point_closeness=pairs.pair_point_closeness,
-        opacity=opacity,
-        pixel_entry=b.pair_scratch,
-        pixel_slope=b.pixel_slope,
-        transmittance=b.transmittance,
-        point_is_shaded=b.point_is_shaded,
-    )
-
-
-def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, slopes):
-    """Eq. (1) of the supplemental; early_stop is Pulsar's percent_allowed_difference."""
-    program = dev.program(
-        "raster/softmax", LANES=lanes(dev), SLOPES=int(slopes), DROPS=int(early_stop > 0)
-    )
-    program.launch(
-        "softmax_weights",
-        pairs.pixels,
-        hw=pairs.pixels,
-        sharpness=1 / gamma,
-        early_stop=early_stop,
-        camera=camera_buffer,
-        pixel_offset=pairs.pixel_offset,
-        pair_key=pairs.pair_key,
-        pair_point_closeness=pairs.pair_point_closeness,
-        opacity=opacity,
-        pixel_entry=b.pair_scratch,
-        pixel_slope=b.pixel_slope,
-        point_is_shaded=b.point_is_shaded,
     )
 
 

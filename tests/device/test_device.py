@@ -281,6 +281,17 @@ def test_debug_3_finds_a_nan(debugged, guarded):
         debugged("3", [1, 0, 2, 0], guarded)
 
 
+@pytest.mark.exact
+def test_debug_3_takes_infinity_where_the_kernel_says_so(debugged, tiny):
+    may = TINY.replace("0.0f /", "1.0f /").replace(
+        "y)           // (N)", "y)  // (N) infinite at 0"
+    )
+    (tiny / "tiny.cl").write_text(may)
+    debugged("3", [1, 0])
+    with pytest.raises(FloatingPointError, match="y has 1 NaN or Inf, first at 0"):
+        debugged("3", [np.nan, 0])
+
+
 # ---- stages
 
 

@@ -58,7 +58,7 @@ def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
 @pytest.mark.parametrize("variant, k", ALL[:4])
 def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, variant, k):
     """As for a watchdog."""
-    layer = Layer.random(rng, (17, 30), (36,), 64, k)
+    layer = Layer.random(rng, (17, 30), (13,), 64, k)
     prefix = "conv" if variant is DIRECT else "conv_local"
     for direction in ("forward", "backward_input", "backward_weights"):
         launched = check_parts(

@@ -47,6 +47,18 @@ def test_nan_comes_through(dev, place):
     assert np.isnan(grad_x[0, 1]).any() and np.isfinite(grad_x[0, ::2]).all()
 
 
+@pytest.mark.exact
+def test_a_nan_is_the_largest_of_its_pool(dev, rng):
+    x = rng.random((4, 4, 17)).astype(np.float32)
+    for i in range(4):  # each place of a 2x2 block
+        x[i // 2, 2 + i % 2, i] = np.nan
+    pooled = dev.zeros((2, 2, 17))
+    simple.maxpool2_forward(dev, dev.upload(x), pooled)
+    expected = x.reshape(2, 2, 2, 2, 17).max((1, 3))
+    np.testing.assert_array_equal(pooled.get(), expected)
+    assert np.isnan(expected).sum() == 4
+
+
 def test_gates_of_other_shapes_are_refused(dev):
     x = dev.zeros((2, 3, 32))
     with pytest.raises(ValueError, match="expected \\(2, 3, 64\\)"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.raster.weights import BLENDS
+from pp_cl.raster.weights import BLENDS, list_weights, record_weights
 from pp_cl.reference import dense as oracle
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.points import (
@@ -63,6 +63,22 @@ def test_hits_at_one_depth_and_single_hits_have_no_spread(dev):
         scene, _ = blend_on_axis(dev, z, [0.5] * len(z), 0.1, rule="alpha")
         gradients = scene.gradients(np.zeros((1, 1, 16)), spread_weight=1e6)
         assert (gradients["opacity"] == 0).all()
+
+
+@pytest.mark.exact
+@pytest.mark.parametrize("kind", ["soft", "gaussian"])
+def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
+    """To the pixels that see the point, and to the weight by which it is pruned."""
+    scene = Blended(dev, rng, 31, kind=kind, rule="alpha").scene
+    point = scene.seen[0]
+    opacity = np.where(np.arange(31) == point, np.nan, 0.1)
+    scene.blend(opacity, 0.1, np.zeros((31, 16)), rule="alpha")
+    through = scene.weights.transmittance.get().ravel()
+    np.testing.assert_array_equal(np.isnan(through), scene.hits()[point])
+    highest, seen = dev.zeros((31,)), dev.zeros((31,))
+    listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
+    record_weights(dev, scene.pairs, scene.weights, listed, highest, seen)
+    assert np.isnan(highest.get()[point])
 
 
 def test_a_softmax_has_no_spread(dev, rng):

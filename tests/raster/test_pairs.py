@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from support.guarded import large
 
 from pp_cl.bench.spheres import find_all_pairs
 from pp_cl.device.buffers import Buffers
-from pp_cl.raster.pairs import find_pairs
+from pp_cl.raster.pairs import MOST_PAIRS, find_pairs, room_needed
 from pp_cl.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
@@ -74,6 +75,12 @@ def bits(pairs):
     names = ("pair_pixel", "pair_point_closeness", "pair_key")
     arrays = [getattr(pairs, name).get()[: pairs.total] for name in names]
     return [*arrays, pairs.point_offset.get(), pairs.pixel_offset.get()]
+
+
+def test_more_room_is_a_number_of_the_kernels():
+    """A quarter more than needed, but no more than uint32 can number."""
+    for total, expected in ((900, 1000), (1001, 1251), (3_500_000_000, MOST_PAIRS)):
+        assert room_needed(SimpleNamespace(capacity=1000, total=total)) == expected
 
 
 def test_buffers_serve_views_of_any_size(dev, rng):

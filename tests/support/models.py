@@ -7,6 +7,7 @@ from scipy.sparse import csr_array
 
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
+from pp_cl.raster.points import PointCloud
 from pp_cl.raster.weights import listed_hits
 from pp_cl.scene.grid import Grid
 from pp_cl.selftest.points import some_ids
@@ -20,7 +21,8 @@ WIDTHS = (16, 16, 16)
 def make_model(dev, rng, n=90):
     """A model with random parameters and some opacities of 0 and 1."""
     ids = some_ids(rng, GRID, n)
-    model = Model.create(dev, GRID, ids, (2.0, 6.0), net=UNet(dev, widths=WIDTHS, seed=3))
+    net = UNet(dev, widths=WIDTHS, seed=3)
+    model = Model(dev, GRID, (2.0, 6.0), PointCloud.create(dev, ids), net=net)
     opacity = rng.uniform(0.2, 1, n).astype(np.float32)
     opacity[::9], opacity[4::9] = 0, 1
     model.cloud.opacity.set(opacity)

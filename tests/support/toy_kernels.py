@@ -10,23 +10,13 @@ kernel void rows(
     const uint n,                  // rows
     const float scale,
     global const float4 *x,        // (N, WIDTH)
-    constant uint *k,              // (3)
+    global const uint *k,          // (3)
     global float *y)               // (N, 1) result
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
     const float4 v = x[i];
     y[i] = scale * (v.x + v.y + v.z + v.w) + k[i % 3];
-}
-
-// One work-item per element, with local memory: copies x to y.
-kernel void copied(
-    global const float *x,         // (M)
-    local float *scratch,          // (64)
-    global float *y)               // (...) any shape
-{
-    scratch[get_local_id(0)] = x[get_global_id(0)];
-    y[get_global_id(0)] = scratch[get_local_id(0)];
 }
 
 // One work-item: writes one float behind y.
