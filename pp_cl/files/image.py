@@ -84,12 +84,11 @@ def _tell(path, what):
     warnings.warn(f"{Path(path).parent}: {what}", stacklevel=1)
 
 
-def has_alpha(path: Path | str) -> bool:
-    """Whether an image file has an alpha channel, or a colour that is transparent."""
-    if _is_exr(path):
-        return True
+def is_transparent(path: Path | str) -> bool:
+    """Whether an image file has pixels that are not opaque. Raises Unusable as read_rgba does."""
     with _opened(path, checked=False) as image:
-        return image.has_transparency_data
+        has_alpha = image.has_transparency_data
+        return has_alpha and image.convert("RGBA").getchannel("A").getextrema()[0] < 255
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -128,7 +127,7 @@ def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> t
     UserError as read_rgba does.
     """
     if _is_exr(path):
-        return exr_size(path)
+        return _exr(exr_size, path)
     with _opened(path, checked=False) as image:
         size = image.size
         if stated and not same_shape(size, stated) and same_shape(size[::-1], stated):
@@ -146,13 +145,21 @@ def _is_exr(path):
     return Path(path).suffix.lower() == ".exr"
 
 
+def _exr(read, path):
+    """What read() gives of an OpenEXR file. Raises Unusable where it refuses it."""
+    try:
+        return read(path)
+    except UserError as error:
+        raise Unusable(error, UNREADABLE) from error
+
+
 @contextmanager
 def _opened(path, checked=True):
     """The image file, opened; what goes wrong with it inside the block becomes a UserError.
     checked: by the checksums of a PNG, at which its decoder does not look.
     """
     if _is_exr(path):
-        yield Image.fromarray(read_exr_rgba(path))
+        yield Image.fromarray(_exr(read_exr_rgba, path))
         return
     try:
         with opened_regular(path) as file:

@@ -38,7 +38,7 @@ def demo_views(dev: Device, split: str, most: int | None = None, size: int = SIZ
 def demo_frames(split: str, size: int = SIZE) -> list[Photograph]:
     """A split's views, without their images. Raises UserError for a split that there is not."""
     if split not in SPLITS:
-        raise UserError(f"--split {split}: demo has {', '.join(SPLITS)}")
+        raise UserError(f"demo has no split {split}; its splits are {', '.join(SPLITS)}")
     if split == "train":  # on a spiral whose steps have equal areas of the sphere
         heights = np.linspace(0.95, -0.15, TRAIN_VIEWS)
         angles = [(i * math.pi * (3 - math.sqrt(5)), math.asin(h)) for i, h in enumerate(heights)]

@@ -1,6 +1,7 @@
 """The visual hull: the grid vertices inside all training masks, where the points start."""
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -244,10 +245,10 @@ def _tight(grid, inside):
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
     """(near, far) for all views, as Euclidean distances in world units (docs/scenes.md).
 
-    The ball around the hull, DEPTH_MARGIN times enlarged, lies between them for every view. Where a
-    camera is closer than that, near is half its distance from the hull's box, and inside the box
-    one grid edge. A range stated by the dataset is kept, but widened to the ball itself, since
-    points outside of it would be missing.
+    The hull lies between them for every view: near is the distance to the ball around it,
+    DEPTH_MARGIN times enlarged, but at least half the distance to its box and one grid edge. A
+    range stated by the dataset is kept, but widened to the ball itself, since points outside of it
+    would be missing.
     """
     stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
     half = grid.edge * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
@@ -311,10 +312,13 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
         if shares[worst] <= max(MOST_BESIDE, TIMES_USUAL * np.median(shares)):
             break
         left_out[kept.pop(worst).name] = float(shares[worst])
-    for forgiven in range(int(MOST_FORGIVEN * len(kept)) + 1):
-        if _shares_beside(dev, kept, box, forgiven).mean() <= MOST_MISSED:
-            break
-    return Agreement(kept, left_out, forgiven)
+    # the more masks are forgiven, the less of them lies beside the hull
+    least = bisect_left(
+        range(int(MOST_FORGIVEN * len(kept))),
+        True,
+        key=lambda forgiven: _shares_beside(dev, kept, box, forgiven).mean() <= MOST_MISSED,
+    )
+    return Agreement(kept, left_out, least)
 
 
 def _shares_beside(dev, views, box, forgiven):

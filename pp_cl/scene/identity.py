@@ -17,6 +17,7 @@ from pp_cl.scene.views import Photograph, View
 STRAIGHT = Distortion()  # of a lens without distortion
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
 POSE, LENS, RANGE = 12, 6, 2  # numbers of a kept view; it may have no depth range
+CLOSE = 1e-6  # world units or pixels: cameras are the same
 MOST_SIDE = 2**24  # what float32 holds as whole numbers
 
 
@@ -85,6 +86,17 @@ def fingerprint(views: Sequence[View | Photograph]) -> str:
     return digest.hexdigest()
 
 
+def _are_alike(kept, listed):
+    """Whether listed views have the names and, but for rounding, the cameras of kept ones: another
+    processor rounds otherwise.
+    """
+    cameras = {o.name: o.camera if isinstance(o, Photograph) else o.file_camera for o in listed}
+    return cameras.keys() == {name for name, _ in kept} and all(
+        np.allclose(kept_camera(cameras[name]), numbers[: POSE + LENS], rtol=0, atol=CLOSE)
+        for name, numbers in kept
+    )
+
+
 def learned(header: dict[str, Any], listed: Sequence[Photograph]) -> list[Photograph]:
     """Those of the training views that a scene lists without the user's edits that a checkpoint's
     header has: what the scene listed then, if some were dropped or taken back since.
@@ -101,7 +113,7 @@ def difference(
 
     listed: all of them; views: those whose pixels are compared, where the header has their digests.
     """
-    if fingerprint(listed) != header["scene"]:
+    if fingerprint(listed) != header["scene"] and not _are_alike(header["views"], listed):
         return "its training views have other names or cameras"
     known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from threading import Lock
 from types import ModuleType
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, listing, quoted
-from pp_cl.files.image import has_alpha, read_mask, read_rgba
+from pp_cl.files.image import is_transparent, read_mask, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
@@ -32,7 +32,7 @@ from pp_cl.scene.edits import FILE as EDITS
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.kept import KeptViews
-from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, named_mask, of_size
+from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import read_json
 from pp_cl.scene.readers.found import (
@@ -222,14 +222,14 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     lensed = notes.usable(photographs, lambda one: _checked(folder, one), lambda one: one.name)
     photographs = list(lensed)
     notes.check(len(photographs), LEAST_VIEWS if split == "train" else 1)
-    photographs = _masked(folder, reader, photographs, notes)
+    photographs = _masked(folder, reader, photographs, split, notes)
     photographs = _ignoring(folder, IGNORE_FOLDERS, photographs, split)
     if ignoring := [one.name for one in photographs if one.ignore and not one.ignores_black]:
         notes.done["pixels are ignored where the masks in ignore are white"] = ignoring
     return Listing(photographs, notes.lines(len(photographs)))
 
 
-def _masked(folder, reader, photographs, notes):
+def _masked(folder, reader, photographs, split, notes):
     """The photographs, with the masks of a folder of masks where the format names none; images of a
     transforms.json have their own alpha, if they have one. Where masks are of the object, what a
     transforms.json names besides says where images are of use, as nerfstudio takes it.
@@ -243,13 +243,33 @@ def _masked(folder, reader, photographs, notes):
         photographs = [
             replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in photographs
         ]
-    if reader is transforms and has_alpha(folder / photographs[0].name):
+    place = folder_named(folder, MASK_FOLDERS)
+    if place and reader is transforms and _are_cut_out(folder, photographs):
         return photographs
-    masks = find_masks(folder, [one.name for one in photographs]) or {}
+    masks = _masks_in(folder, photographs, split)
     if masks and reader is transforms:
-        place = PurePosixPath(next(iter(masks.values()))).parts[0]
         notes.done[f"masks are taken from {folder / place}, which no frame names"] = list(masks)
     return [replace(one, mask=masks.get(one.name)) for one in photographs]
+
+
+def _are_cut_out(folder, photographs):
+    """Whether the first image that can be read has transparent pixels."""
+    for one in photographs:
+        with suppress(Unusable):
+            return is_transparent(folder / one.name)
+    return False
+
+
+def _masks_in(folder, photographs, split, places=MASK_FOLDERS):
+    """{photograph: its mask} of those that have one in one of the places in a folder. Raises
+    UserError where a place has none for any training photograph.
+    """
+    try:
+        return find_masks(folder, [one.name for one in photographs], places) or {}
+    except UserError:
+        if split == "train":
+            raise
+        return {}
 
 
 def _are_besides(folder, photograph):
@@ -260,7 +280,7 @@ def _are_besides(folder, photograph):
     if place and not photograph.mask.startswith(f"{place}/"):
         return True
     with suppress(UserError):
-        if has_alpha(image):
+        if is_transparent(image):
             outside = read_rgba(image)[..., 3] < OPAQUE // 2
             mask = of_size(read_mask(folder / photograph.mask), outside.shape[::-1], folder)
             return bool(outside.any() and (mask[outside] > OPAQUE // 2).mean() > BESIDE)
@@ -269,15 +289,10 @@ def _are_besides(folder, photograph):
 
 def _ignoring(folder, places, photographs, split):
     """The photographs, with the masks of what says nothing that lie in one of the places in a
-    folder. Raises UserError where a place has none for any training photograph.
+    folder.
     """
-    try:
-        found = find_masks(folder, [one.name for one in photographs], places) or {}
-    except UserError:
-        if split == "train":
-            raise
-        return photographs
-    files = {name: str(folder.absolute() / mask) for name, mask in found.items()}
+    masks = _masks_in(folder, photographs, split, places)
+    files = {name: str(folder.absolute() / mask) for name, mask in masks.items()}
     return [
         replace(one, ignore=files[one.name], ignores_black=False) if one.name in files else one
         for one in photographs
@@ -401,13 +416,19 @@ def load_scene(
     """
     folder, listed, lines = Path(path), listed or {}, []
     chosen = {}
+    for option, given in (("--masks", masks.folder), ("--ignore", masks.ignore)):
+        if given and not os.path.isdir(given):
+            raise UserError(f"{given}: no such folder; {option} takes one of masks")
     for split in splits:
         frames, notes = listed.get(split) or list_split(folder, split)
         chosen[split] = evenly(frames, most)
         lines += [f"{split}: {line}" for line in notes]
+        if masks.folder:
+            own = Path(masks.folder).absolute()
+            files = _masks_in(own, chosen[split], split, ["."])
+            masked = {name: str(own / mask) for name, mask in files.items()}
+            chosen[split] = [replace(one, mask=masked.get(one.name)) for one in chosen[split]]
         if masks.ignore:
-            if not os.path.isdir(masks.ignore):
-                raise UserError(f"{masks.ignore}: no such folder; --ignore takes one of masks")
             chosen[split] = _ignoring(Path(masks.ignore), ["."], chosen[split], split)
     photographs = [one for some in chosen.values() for one in some]
     _check_alike(folder, photographs, downscale)
@@ -421,8 +442,6 @@ def load_scene(
         found = list(bar)
     views: dict[str, list[View]] = {}
     is_some = any(isinstance(view, View) and view.is_masked for view in found)
-    if masks.folder and not is_some:
-        named_mask(Path(masks.folder), photographs[0].name)
     left = iter(zip(photographs, found, strict=True))
     for split, some in chosen.items():
         told, is_whole = Notes(), split == "train" and most is None
@@ -430,10 +449,11 @@ def load_scene(
 
         def used(pair, bare=bare):
             photograph, view = pair
-            if isinstance(view, Unusable) or view.is_masked or not is_some:
+            if isinstance(view, Unusable) or not is_some or view.is_masked or view.has_mask:
                 return view
             bare.append(view)
-            return _lacks_mask(folder, photograph.name, masks)
+            file = folder / photograph.name
+            return Unusable(f"{file}: has no mask, as others have; add it, or remove all", NO_MASK)
 
         pairs = [next(left) for _ in some]
         usable = list(told.usable(pairs, used, lambda pair: pair[0].name))
@@ -487,16 +507,6 @@ def _check_alike(folder, photographs, downscale):
             check_downscale(one.name, one.camera, downscale)
 
 
-def _lacks_mask(folder, name, masks):
-    """The Unusable of a view that has no mask, where others have one."""
-    try:
-        if masks.folder:
-            named_mask(Path(masks.folder), name)
-        raise UserError(f"{folder / name}: has no mask, as others have; add it, or remove all")
-    except UserError as error:
-        return Unusable(error, NO_MASK)
-
-
 @contextmanager
 def _unusable(why):
     """A UserError in the block becomes an Unusable."""
@@ -526,8 +536,8 @@ def _read_view(reduced, folder, masks, kept, photograph):
     """
     camera, factor = photograph.camera, reduced.factor
     file, mask = folder / photograph.name, None
-    with suppress(UserError):  # of a folder that lacks it
-        mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
+    if photograph.mask and masks.is_of_files:
+        mask = folder / photograph.mask
     ignore = photograph.ignore and folder / photograph.ignore
     found = kept and kept.find(photograph, [file, mask, ignore], (masks, factor))
     try:

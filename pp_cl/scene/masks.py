@@ -36,14 +36,10 @@ class MaskRule:
     tolerance: float = 10.0
     ignore: str = ""
 
-    def file(self, name: str, mask: Path | None) -> Path | None:
-        """The file of a photograph's mask, None where its mask is none of its own. name: of the
-        photograph, relative to its scene. mask: the file that the format names for it, if it does.
-        Raises UserError where it is missing.
-        """
-        if self.folder:
-            return named_mask(Path(self.folder), name)
-        return mask if self.source == "given" else None
+    @property
+    def is_of_files(self) -> bool:
+        """Whether masks are files, of the folder or named by the scene."""
+        return bool(self.folder) or self.source == "given"
 
     @property
     def is_by_colour(self) -> bool:
@@ -53,8 +49,8 @@ class MaskRule:
         return self.source == "color" and not self.folder
 
     def apply(self, image: np.ndarray, mask: Path | None) -> np.ndarray:
-        """The image (H, W, 4) uint8, its alpha overwritten by the mask that file() gives, or by
-        what the rule says without one. Raises UserError naming a mask that cannot be read or has
+        """The image (H, W, 4) uint8, its alpha overwritten by the file of its mask, or by what the
+        rule says without one. Raises UserError naming a mask that cannot be read or has
         another size.
         """
         if mask is not None:
@@ -122,17 +118,13 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
     if within.any():
         away, nearest = distance_transform_edt(~within, return_indices=True)
         mixed = ~outside & ~within & (away < 2 * EDGE)
-        alpha[mixed] = _share_of(colour, colour[tuple(nearest)], behind)[mixed]
+        step = colour[tuple(nearest)] - behind  # from the background to the nearest colour within
+        length = np.maximum((step**2).sum(-1), 1e-6)
+        share = np.clip(((colour - behind) * step).sum(-1) / length, 0, 1)
+        alpha[mixed] = share[mixed]
     straight = (colour - (1 - alpha[..., None]) * behind) / np.maximum(alpha, 1 / 255)[..., None]
     rgba = np.dstack([np.clip(straight, 0, 1), alpha])
     return (255 * rgba + 0.5).astype(np.uint8)
-
-
-def _share_of(mixture, front, behind):
-    """The share in [0, 1] of the front in mixtures of two colours, (H, W)."""
-    step = front - behind
-    length = np.maximum((step**2).sum(-1), 1e-6)
-    return np.clip(((mixture - behind) * step).sum(-1) / length, 0, 1)
 
 
 def _regions(places, with_holes):

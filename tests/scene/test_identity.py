@@ -48,6 +48,16 @@ def test_the_same_scene_elsewhere_and_in_other_files(folder):
     assert difference(header, scene_frames(str(moved)), views_of(moved)) == ""
 
 
+@pytest.mark.parametrize("far, said", [(1e-9, False), (1e-4, True)])
+def test_cameras_that_another_processor_rounds_otherwise_are_the_same(folder, far, said):
+    """Also where that changes the last digit, or the sign of a zero."""
+    views, listed = views_of(folder), scene_frames(str(folder))
+    header = identity(views, listed)
+    listed = [replace(o, camera=replace(o.camera, pose=o.camera.pose - far)) for o in listed]
+    header["scene"] = "of another processor"
+    assert bool(difference(header, listed, views)) == said
+
+
 def test_names_cameras_and_depth_ranges_come_back_to_the_bit(folder):
     listed = [replace(one, depth_range=None) for one in scene_frames(str(folder))]
     views = [replace(view, depth_range=None) for view in views_of(folder)]

@@ -12,6 +12,7 @@ from support.scenes import ball_image, ring_cameras, write_ball_scene
 from pp_cl.config import preset
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
+from pp_cl.raster.points import PointCloud
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.views import View
@@ -114,7 +115,8 @@ def test_the_network_learns_the_same_where_tiles_are_left_out(dev, monkeypatch, 
     def gradient(least):
         monkeypatch.setattr("pp_cl.network.unet.LEAST_PIXELS", least)
         net = UNet.of_settings(dev, config.network, seed=0)
-        model = Model.create(dev, hull.grid, hull.ids, depth_range(views, hull), net=net)
+        cloud = PointCloud.create(dev, hull.ids)
+        model = Model(dev, hull.grid, depth_range(views, hull), cloud, net=net)
         trainer = Trainer(dev, config, model, views)
         trainer.train_step()
         return net.all_gradients.get()

@@ -9,7 +9,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import BAND_BYTES, Distortion
-from pp_cl.scene.load import BAND_COPIES, load_scene, reading, scene_frames
+from pp_cl.scene.load import BAND_COPIES, load_scene, reading, scene_frames, scene_splits
 from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.views import Photograph
 from tools.scene_formats import nerfstudio
@@ -41,6 +41,16 @@ def test_a_split_without_photographs(tmp_path):
     file.write_text(file.read_text().replace("train_filenames", "names"))
     assert len(load_scene(tmp_path, ("test",)).splits["test"]) == 1
     refused(tmp_path, tmp_path, "split train has no photographs")
+
+
+@pytest.mark.parametrize("left", [0, 3])
+def test_cameras_of_a_test_without_images_are_no_split(tmp_path, left):
+    """As add-ons of Blender write them: frames without images, or none."""
+    write_scene(tmp_path)
+    write_scene(tmp_path, "test", edit=lambda data: data.update(frames=data["frames"][:left]))
+    for image in tmp_path.glob("test_*.png"):
+        image.unlink()
+    assert scene_splits(tmp_path) == ["train"]
 
 
 def test_some_views_of_a_split_are_read_and_no_others(tmp_path):

@@ -22,6 +22,7 @@ from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import agreeing, build_grid
 from pp_cl.scene.load import load_scene, open_scene, scene_box
 from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.views import MASK_THRESHOLD
 
 TOLERANCE = 10.0
@@ -118,6 +119,22 @@ def test_a_folder_of_masks(tmp_path, rng, named):
         assert (view.image[..., :3] == stored[..., :3]).all()
 
 
+def test_a_folder_of_masks_is_one_like_that_of_the_scene(tmp_path):
+    """In the same tree as the images, or by number where names are there once."""
+    scene, masks, frames = tmp_path / "scene", tmp_path / "masks", []
+    for i, camera in enumerate(ring_cameras(10, 24)):
+        image = f"{'ab'[i % 2]}/{i // 2}.png" if i < 8 else f"c/{i:06d}.png"
+        mask = masks / (image if i < 9 else "9.png")
+        for file, pixels in ((scene / image, slice(3)), (mask, 3)):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_png(file, ball_image(camera)[..., pixels])
+        frames.append({"file_path": image, **frame_keys(camera)})
+    (scene / "transforms_train.json").write_text(json.dumps({"frames": frames}))
+    rule = MaskRule(folder=str(masks))
+    views = load_scene(scene, masks=rule).splits["train"]
+    assert len(views) == 10 and all(view.is_masked and view.has_mask for view in views)
+
+
 @pytest.mark.parametrize(
     "source, opaque", [("given", False), ("alpha", False), ("none", True), ("box", True)]
 )
@@ -129,20 +146,22 @@ def test_alpha_is_taken_or_left(tmp_path, source, opaque):
 
 @pytest.fixture
 def masked(tmp_path):
-    """(folder of a scene, folder of its masks)."""
+    """(folder of a scene without alpha, folder of its masks)."""
     write_scene(tmp_path)
     masks = tmp_path / "masks"
     masks.mkdir()
     for i in range(3):
+        image = tmp_path / f"train_{i}.png"
+        write_png(image, read_rgba(image)[..., :3])
         write_png(masks / f"train_{i}.png", np.ones((SIZE[1], SIZE[0])))
     return tmp_path, masks
 
 
 BAD = {
-    "missing": (lambda m: (m / "train_1.png").unlink(), "no mask for train_1.png"),
+    "missing": (lambda m: (m / "train_1.png").unlink(), "train_1.png: has no mask, as others have"),
     "a folder": (
         lambda m: ((m / "train_1.png").unlink(), (m / "train_1.png").mkdir()),
-        "no mask for train_1.png",
+        "train_1.png: has no mask, as others have",
     ),
 }
 
@@ -152,7 +171,7 @@ def test_bad_masks(masked, case):
     scene, masks = masked
     change, words = BAD[case]
     change(masks)
-    with refusing(masks, words):
+    with refusing(scene, words):
         load_scene(scene, masks=MaskRule(folder=str(masks)))
 
 

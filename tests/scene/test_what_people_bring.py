@@ -14,6 +14,7 @@ from support.runs import SETTINGS, set_words, spoken
 from support.same_scene import held_out
 from support.scenes import ball_image, ring_cameras
 
+from pp_cl.files.exr import write_exr
 from pp_cl.files.image import ORIENTATION
 from pp_cl.scene.convention import GL_FROM_CV
 from pp_cl.scene.views import View
@@ -108,6 +109,48 @@ def two_models(folder):
     (folder / "sparse/0/images.bin").write_bytes((1).to_bytes(8, "little") + content[8:one])
 
 
+def workspace(folder):
+    """What COLMAP's automatic reconstruction leaves where the photographs lie elsewhere: a model of
+    distorted images, and an undistorted one of as many beside its images, a few pixels larger.
+    """
+    moved(("images", "dense/0/images"))(folder)
+    shutil.copytree(folder / "sparse/0", folder / "dense/0/sparse")
+    for file in (folder / "sparse/0").glob("cameras.*"):
+        file.write_bytes(
+            file.read_bytes().replace((48).to_bytes(8, "little"), (44).to_bytes(8, "little"))
+        )
+
+
+def undistorted(folder):
+    """A model of undistorted images, which lie beside it, in the folder of the photographs."""
+    moved(("sparse/0", "dense/0/sparse"))(folder)
+    shutil.copytree(folder / "images", folder / "dense/0/images")
+    images(lambda image: image.resize((44, 42)))(folder)
+
+
+def cut_out(folder):
+    """Images are cut-outs, of which some have masks beside them."""
+    for file in sorted((folder / "images").iterdir()):
+        mask = folder / f"masks/{file.name}.png"
+        image = Image.open(file).convert("RGB")
+        image.putalpha(Image.open(mask).convert("L"))
+        image.save(file)
+        if int(file.stem) % 3:
+            mask.unlink()
+
+
+def light(folder):
+    """OpenEXR, of which one image has a NaN."""
+    for i, file in enumerate(sorted((folder / "images").iterdir())):
+        colours = np.array(Image.open(file).convert("RGB"), np.float32) / 255
+        colours[0, 0] = np.nan if i == 3 else 1
+        write_exr(
+            file.with_suffix(".exr"),
+            dict(zip("RGB", np.moveaxis(colours, 2, 0).copy(), strict=True)),
+        )
+        file.unlink()
+
+
 def flat(folder):
     for place in ("images", "sparse/0"):
         for file in (folder / place).iterdir():
@@ -187,7 +230,20 @@ TRAINS = {
         gone("images/000003.png"),
         "1 of 12 views left out: no image",
     ),
-    "two models": ("colmap", two_models, "of 2 models the largest is read"),
+    "an image of OpenEXR that is broken": (
+        "nerfstudio",
+        light,
+        "1 of 12 views left out: an image that cannot be read",
+    ),
+    "a workspace of COLMAP": (
+        "colmap",
+        workspace,
+        "of 2 models the largest beside images is read",
+    ),
+    "undistorted images beside photographs": ("colmap", undistorted, ""),
+    "cut-outs, masks for some": ("colmap", cut_out, ""),
+    "images in a folder of another case": ("colmap", moved(("images", "Images")), ""),
+    "two models": ("colmap", two_models, "of 2 models the largest beside images is read"),
     "transform.json": ("nerfstudio", moved(("transforms.json", "transform.json")), ""),
     "flat, as RealityScan has it": ("colmap", flat, ""),
     "masks for some images": (
@@ -228,6 +284,19 @@ TRAINS = {
     "masks in a folder of another case": ("colmap", moved(("masks", "Masks")), ""),
     "LLFF, reduced images alone": ("llff", moved(("images", "images_4")), ""),
     "masks that no frame names": ("nerfstudio", without_masks_named, "masks are taken from"),
+    "masks that no frame names, images with a useless alpha": (
+        "nerfstudio",
+        lambda folder: [
+            without_masks_named(folder),
+            images(lambda image: image.convert("RGBA"))(folder),
+        ],
+        "masks are taken from",
+    ),
+    "masks of training images alone": (
+        "colmap",
+        gone("masks/000000.png.png", "masks/000008.png.png"),
+        "",
+    ),
     "paths of another machine": (
         "nerfstudio",
         frame_by_frame("file_path", lambda _, name: WINDOWS + name.replace("/", "\\")),

@@ -4,10 +4,10 @@ for the intrinsics.
 
 from pathlib import Path
 
-from pp_cl.scene.readers.transforms import write_splits
+from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.scene.views import View
 
 
 def write(folder: Path, splits: dict[str, list[View]]) -> None:
     """Write the views, under their names with the ending .png."""
-    write_splits(splits, folder)
+    write_scene(splits, folder)

@@ -29,7 +29,7 @@ from pp_cl.scene.readers.common import (
     progress,
     two_splits,
 )
-from pp_cl.scene.readers.found import Notes, find_image, holds_images
+from pp_cl.scene.readers.found import Notes, find_image, folder_named, holds_images
 from pp_cl.scene.views import Photograph
 
 FILES = "a sparse model of COLMAP beside images"
@@ -108,17 +108,33 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """
     model = model_folder(folder) or folder
     if (count := len(_models(folder))) > 1:
-        notes.done[f"of {count} models the largest is read"] = [str(model)]
+        notes.done[f"of {count} models the largest beside images is read"] = [str(model)]
     lenses, images = read_model(model)
     chosen = hold_out(sorted(images, key=lambda image: image.name), split)
-    read = partial(_photograph, folder, model, lenses)
+    near = _images_of(folder, model) or folder / IMAGES
+    read = partial(_photograph, folder, near.relative_to(folder).as_posix(), model, lenses)
     return list(notes.usable(progress(chosen), read, lambda image: image.name))
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Where a scene's model lies, of several that with most images; None where it has none."""
+    """Where a scene's model lies, of several that with most images, those first that have a folder
+    of images beside or above them; None where it has none.
+    """
     models = _models(folder)
-    return max(models, key=_count) if len(models) > 1 else next(iter(models), None)
+    if len(models) < 2:
+        return next(iter(models), None)
+    return max(models, key=lambda model: (_images_of(folder, model) is not None, _count(model)))
+
+
+def _images_of(folder, model):
+    """The folder of images nearest to a model, up to the scene's folder: an undistorted model has
+    other images than the one that it was made of. None where there is none.
+    """
+    places = [model, *model.parents]
+    for place in places[: places.index(folder) + 1]:
+        if found := folder_named(place, [IMAGES]):
+            return place / found
+    return None
 
 
 def _models(folder):
@@ -145,9 +161,9 @@ def _suffix(folder):
     return None
 
 
-def _photograph(folder, model, lenses, image):
+def _photograph(folder, near, model, lenses, image):
     fail = fail_at(model, image.name)
-    name, lens = find_image(folder, f"{IMAGES}/{image.name}", fail), lenses[image.camera]
+    name, lens = find_image(folder, f"{near}/{image.name}", fail), lenses[image.camera]
     if isinstance(lens, Unusable):
         return lens
     if lens.model not in ONE_FOCAL + TWO_FOCALS:

@@ -112,7 +112,7 @@ def find_image(
     except (OSError, ValueError) as error:  # a name too long, a zero byte
         raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
     bare = ", with or without the ending of an image" * (len(endings) > 1)
-    text = f"no {kind} at {given[:80]!r}{bare}; copy it there or remove the frame"
+    text = f"no {kind} at {given[:80]!r} in {folder}{bare}; copy it there or remove the frame"
     raise Unusable(fail(text), f"no {kind}")
 
 
@@ -141,13 +141,16 @@ def _inside(root, path):
 
 
 def _image_folders(root):
-    """IMAGE_FOLDERS that there are, and images_N, the largest images first."""
+    """IMAGE_FOLDERS that there are, in any case, and images_N, the largest images first."""
+    entries = _entries(root, os.stat(root).st_mtime_ns)
     reduced = {
         entry: int(number)
-        for entry in _entries(root, os.stat(root).st_mtime_ns)
+        for entry in entries
         if (number := entry.removeprefix("images_")).isdecimal() and number != entry
     }
-    places = (*IMAGE_FOLDERS, *sorted(reduced, key=reduced.__getitem__))
+    inside = {entry.lower(): entry for entry in reversed(entries)}
+    usual = (inside.get(place, place) for place in IMAGE_FOLDERS)
+    places = (*usual, *sorted(reduced, key=reduced.__getitem__))
     return [place for place in places if os.path.isdir(os.path.join(root, place))]
 
 
@@ -220,11 +223,11 @@ def find_masks(
         if mask:
             found[image] = f"{place}/{mask}"
     if not found:
-        first = trees[images[0]]
-        usual = PurePosixPath(first).with_suffix(".png")
+        first = PurePosixPath(place) / f"{trees[images[0]]}.png"
+        usual = first.with_suffix("").with_suffix(".png")
         raise UserError(
-            f"{folder / place}: no mask {place}/{first}.png or {place}/{usual}, nor one of another"
-            f" image; add them, or remove {place}"
+            f"{folder / place}: no mask {first} or {usual}, nor one of another image; add them,"
+            " or do without the folder"
         )
     return found
 
@@ -246,15 +249,15 @@ def image_folder(folder: Path, names: Sequence[str] = IMAGE_FOLDERS) -> str:
     """Where the images of a format lie that does not name them: the first of the names that is a
     folder there, else images_N with the largest images; where none is, the first name.
     """
-    reduced = [place for place in _image_folders(folder) if place not in IMAGE_FOLDERS]
+    reduced = [place for place in _image_folders(folder) if place.lower() not in IMAGE_FOLDERS]
     return folder_named(folder, names) or next(iter(reduced), names[0])
 
 
 def _in_tree(image):
     """Its path in the folder of images."""
     for place in sorted(IMAGE_FOLDERS, key=len, reverse=True):
-        if image.startswith(f"{place}/"):
-            return image.removeprefix(f"{place}/")
+        if image.lower().startswith(f"{place}/"):
+            return image[len(place) + 1 :]
     first, _, rest = image.partition("/")
     return rest if first.startswith("images_") and rest else image
 

@@ -39,9 +39,11 @@ def recognises(folder: Path) -> bool:
 
 
 def splits(folder: Path) -> list[str]:
-    """The names of the splits that the folder holds."""
+    """The names of the splits that the folder holds. Add-ons of Blender write the cameras of a test
+    without its images: these are none.
+    """
     if files := _split_files(folder):
-        return sorted(files)
+        return sorted(s for s, file in files.items() if s == "train" or _has_image(folder, file))
     listed = [split for split in NAMED if f"{split}_filenames" in _read(_single(folder))]
     return sorted(listed) or SPLITS
 
@@ -108,6 +110,25 @@ def _read(file):
     return data
 
 
+def _has_image(folder, file):
+    """Whether one of the frames of a file has its image, or what is wrong with the file is to be
+    told when it is read.
+    """
+    data = read_json(file)
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list):
+        return True
+    for index, own in enumerate(frames):
+        try:
+            Frame(file, data, own, index).image("file_path", folder, ["", *CASED_ENDINGS])
+            return True
+        except Unusable:
+            continue
+        except UserError:
+            return True
+    return False
+
+
 def _plain(path):
     return PurePosixPath(path.replace("\\", "/")).as_posix()
 
@@ -150,27 +171,21 @@ def _read_frame(folder, frame):
 
 def write_scene(splits: dict[str, list[View]], folder: Path | str) -> None:
     """Write the stored images of views as a scene of NeRF-synthetic; the folder appears when it is
-    complete. Raises UserError if it exists and is not empty, or cannot be written.
+    complete. Every frame has nerfstudio's fl_x, fl_y, cx, cy, w, h, and near and far if the views
+    state them. Raises UserError if the folder exists and is not empty, or cannot be written.
     """
     with atomic_folder(Path(folder)) as unfinished:
-        write_splits(splits, unfinished)
-
-
-def write_splits(splits: dict[str, list[View]], folder: Path) -> None:
-    """The same into a folder that exists. Every frame has nerfstudio's fl_x, fl_y, cx, cy, w, h,
-    and near and far if the views state them.
-    """
-    for split, views in splits.items():
-        frames = []
-        for view in views:
-            path = Path(view.name).with_suffix("")
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            write_png(folder / f"{path}.png", view.image)
-            frame = {"file_path": f"./{path.as_posix()}", **frame_keys(view.stored_camera)}
-            if view.depth_range:
-                frame["near"], frame["far"] = view.depth_range
-            frames.append(frame)
-        camera = views[0].stored_camera
-        angle = 2 * math.atan(0.5 * camera.width / camera.fx)
-        data = {"camera_angle_x": angle, "frames": frames}
-        write_json(folder / f"transforms_{split}.json", data)
+        for split, views in splits.items():
+            frames = []
+            for view in views:
+                path = Path(view.name).with_suffix("")
+                (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
+                write_png(unfinished / f"{path}.png", view.image)
+                frame = {"file_path": f"./{path.as_posix()}", **frame_keys(view.stored_camera)}
+                if view.depth_range:
+                    frame["near"], frame["far"] = view.depth_range
+                frames.append(frame)
+            camera = views[0].stored_camera
+            angle = 2 * math.atan(0.5 * camera.width / camera.fx)
+            data = {"camera_angle_x": angle, "frames": frames}
+            write_json(unfinished / f"transforms_{split}.json", data)

@@ -226,7 +226,7 @@ def test_of_several_models_the_largest_is_read(written):
             elif file.name == "images.bin":
                 content = (1).to_bytes(8, "little") + content[8 : 8 + 64 + len("000000.png") + 9]
             (folder / "sparse/0" / file.name).write_bytes(content)
-    with pytest.warns(UserWarning, match="of 2 models the largest is read"):
+    with pytest.warns(UserWarning, match="of 2 models the largest beside images is read"):
         assert len(scene_frames(folder)) == 9
     for file in (*(folder / "images").iterdir(), *(folder / "sparse/3").iterdir()):
         file.rename(folder / file.name)  # as RealityScan has it
