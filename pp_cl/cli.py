@@ -171,7 +171,9 @@ def _parse(argv):
             return parser.parse_args(words)
         except _UsageError as error:
             errors.append(error)
-    raise errors[0]
+    # with these words in their places, only an option is wrong
+    unknown = [error for error in errors if "unrecognized arguments: -" in str(error)]
+    raise (unknown or errors)[0]
 
 
 def _parser():

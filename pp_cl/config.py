@@ -22,14 +22,16 @@ MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
+OPEN = ("train.refine_at", "raster.radius")  # that a training decides where they are 0
 MEND_SETTINGS = "restore it or start a new run"
 
 
 @dataclass
 class Config:
-    """All settings of a run."""
+    """All settings of a run. decided: those of OPEN that nobody has set."""
 
     preset: str = "tiny"
+    decided: list[str] = field(default_factory=list)
     scene: SceneConfig = field(default_factory=SceneConfig)
     points: PointsConfig = field(default_factory=PointsConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
@@ -37,7 +39,9 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def to_json(self) -> str:
-        """The settings as JSON text: {"format": FORMAT, "preset": name, section: {name: value}}."""
+        """The settings as JSON text: {"format": FORMAT, "preset": name, "decided": keys,
+        section: {name: value}}.
+        """
         return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)
 
 
@@ -140,6 +144,11 @@ def validate(config: Config, origin: str, origins: Mapping[str, str] | None = No
             f"{where('train.crop')} = {config.train.crop}; it must be a multiple of 4"
             " (0: whole images)"
         )
+    first, last = config.train.offset_rate
+    if (first > 0) != (last > 0):
+        raise UserError(
+            f"{where('train.offset_rate')} = {first:g},{last:g}; both must be above 0, or neither"
+        )
 
 
 def _check(value, where, *, least, most, choices, **_):
@@ -157,9 +166,17 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
 
     Raises UserError naming the first that makes no sense, and for scene.path among them.
     """
-    given = list(given)
-    for origin in (origin for key, _, origin in given if key == "scene.path"):
-        raise UserError(f"{origin}: scene.path is what SCENE or --scene says; leave it out")
+    given, origins = list(given), dict[str, str]()
+    for key, _, origin in given:
+        if key == "scene.path":
+            raise UserError(f"{origin}: scene.path is what SCENE or --scene says; leave it out")
+        if key in origins:
+            raise UserError(f"{origin}: {key} is set by {origins[key]}, too; leave one out")
+        origins[key] = origin
+    if origins.keys() >= {*LENGTH}:
+        raise UserError(
+            f"{origins['train.minutes']}: the iterations follow from the minutes; leave one out"
+        )
     path, before = scene if scene == "demo" else str(Path(scene).resolve()), config.scene.path
     for name in ("masks", "ignore"):
         folder = getattr(config.scene, name)
@@ -175,7 +192,7 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
     for owner, name in folders:
         if getattr(owner, name) not in ("", RANDOM, "demo"):
             setattr(owner, name, str(Path(getattr(owner, name)).resolve()))
-    validate(config, "settings", {key: origin for key, _, origin in given})
+    validate(config, "settings", origins)
     return config
 
 
@@ -189,6 +206,7 @@ def begin_with(
     length = "train.minutes" if config.train.minutes else "train.iterations"
     asked = {key for key, _, _ in given}
     left_out = set(LENGTH) if asked & set(LENGTH) else set(LENGTH) - {length}
+    left_out |= {*config.decided}
     settings = [
         (f"{section}.{name}", value, f"--config {path}")
         for section, values in sections(config)
@@ -211,6 +229,7 @@ def load_config(path: Path | str) -> Config:
     if not isinstance(stored, dict):
         raise UserError(f"{path}: not settings but {quoted(stored, 40)}; {MEND_SETTINGS}")
     number, name = stored.pop("format", None), stored.pop("preset", None)
+    decided = stored.pop("decided", [])
     if type(number) is not int or number != FORMAT:
         raise UserError(
             f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
@@ -219,7 +238,13 @@ def load_config(path: Path | str) -> Config:
         raise UserError(
             f"{path}: key preset is missing or none of {', '.join(PRESETS)}; {MEND_SETTINGS}"
         )
+    if not isinstance(decided, list) or not all(key in OPEN for key in decided):
+        raise UserError(
+            f"{path}: decided is {quoted(decided, 40)}, no list of {', '.join(OPEN)};"
+            f" {MEND_SETTINGS}"
+        )
     config = preset(name)
+    config.decided = decided
     ours = dict(sections(config))
     for section, values in stored.items():
         where = f"{path}: {shown(section, 40)}"

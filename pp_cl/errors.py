@@ -1,7 +1,10 @@
 """The exceptions that a user sees as one line, and the quoting of text from files in that line."""
 
 import difflib
+import os
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
 
 MOST_LINE = 1000  # characters of a message: two long paths and a reason
 NAMES_SHOWN = 3  # of many, in a message
@@ -59,6 +62,18 @@ class Stopped(Exception):
     def __init__(self, message: str, status: int) -> None:
         super().__init__(one_line(message))
         self.status = status
+
+
+def require(what: str, *packages: str) -> None:
+    """Raise UserError where one of the packages that something needs is not installed."""
+    if any(find_spec(package.replace("-", "_")) is None for package in packages):
+        install = f"`pip install {' '.join(packages)}`"
+        raise UserError(f"{what} needs {' and '.join(packages)}; install with {install}")
+
+
+def name_of(folder: Path) -> str:
+    """The name of a folder, which may be no UTF-8, as others can take it."""
+    return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def shown(text: str, most: int = 100) -> str:

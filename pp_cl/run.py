@@ -17,7 +17,7 @@ from pp_cl.config import Config, configure, load_config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import check_writable, remove_leftovers, write_json
+from pp_cl.files.atomic import check_target, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest, remove_ours
@@ -324,7 +324,7 @@ def _check_target(target, *, is_new):
     """
     if target.exists() and not target.is_dir():
         raise UserError(f"{target}: is not a folder; choose another --out")
-    check_writable(target)
+    check_target(target / "metrics.json")
     if is_new and target.exists() and not has_manifest(target) and any(target.iterdir()):
         raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
     check_ours([target / "metrics.json", target / "comparison.png"], MOVE)

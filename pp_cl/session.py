@@ -11,11 +11,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import Config, assign, configure, load_config, preset, sections
+from pp_cl.config import (
+    Config,
+    assign,
+    configure,
+    field_of,
+    load_config,
+    preset,
+    sections,
+)
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import Diverged, UserError
-from pp_cl.files.atomic import check_writable
+from pp_cl.files.atomic import check_target
 from pp_cl.files.checkpoint import check_finite
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
@@ -24,6 +32,7 @@ from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
+from pp_cl.raster.points import PointCloud
 from pp_cl.run import Run, load_run
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import agreeing
@@ -48,7 +57,12 @@ from pp_cl.training.start import NEVER, begin_network, fitting_hull, picture_of_
 PREVIEWS = 4  # of a training, besides an early one
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
-PLACES = (("scene", "path"), ("scene", "masks"), ("scene", "ignore"))
+# settings that a checkpoint may go on with others of: places, which it knows by more than that, and
+# what the model does not depend on
+FREE = (
+    *("scene.path", "scene.masks", "scene.ignore", "train.memory_gib", "train.eval_every"),
+    *("train.log_every", "train.checkpoint_every", "train.checkpoint_minutes"),
+)
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 OnStep = Callable[[int, dict[str, Any] | None], None]
@@ -252,7 +266,7 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
     written, and for pictures in it that would be lost.
     """
-    check_writable(folder.path)
+    check_target(folder.config)
     folder.check_pictures(0)
     net = UNet.of_settings(dev, config.network, seed=config.train.seed)
     begin_network(net, config)
@@ -267,16 +281,8 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     seconds = time.perf_counter() - start
     picture = picture_of_masks(dev, views, hull, agreement.left_out)
 
-    points = config.points
-    model = Model.create(
-        dev,
-        hull.grid,
-        hull.ids,
-        depth_range,
-        net=net,
-        degree=points.sh_degree,
-        opacity=points.opacity,
-    )
+    cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
+    model = Model(dev, hull.grid, depth_range, cloud, net=net)
     trainer = Trainer(dev, config, model, agreement.views)
     info["initial_points"] = model.cloud.count
     if agreement.left_out:
@@ -293,7 +299,7 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     Raises UserError as begin_training() does, and for a checkpoint of another scene.
     """
     header, arrays = stored
-    check_writable(folder.path)
+    check_target(folder.config)
     folder.check_pictures(header["step"])
     begun = header["step"] if header["finished"] else header.get("extended_from", 0)
     extended = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
@@ -398,11 +404,6 @@ def run_config(
     first setting that differs or makes no sense, or what is wrong with the scene's files.
     """
     given = list(given)
-    origins = {key: origin for key, _, origin in given}
-    if "train.iterations" in origins and "train.minutes" in origins:
-        raise UserError(
-            f"{origins['train.minutes']}: the iterations follow from the minutes; leave one out"
-        )
     if folder.config.exists() and folder.checkpoint.exists():
         return _config_to_resume(folder, scene, preset_name, given, extends)
     return _config_to_begin(folder, scene, preset_name, given)
@@ -415,6 +416,10 @@ def _config_to_begin(folder, scene, preset_name, given):
     if folder.config.exists():
         stored = load_config(folder.config)
         if preset_name in (None, stored.preset):
+            for key in stored.decided:  # of other images, maybe
+                assign(stored, key, field_of(key).default, "preset")
+            if "train.iterations" in [key for key, _, _ in given]:
+                stored.train.minutes = 0
             return configure(stored, scene, given)
     config = configure(preset(preset_name or "tiny"), scene, given)
     if "scene.downscale" not in [key for key, _, _ in given]:
@@ -446,13 +451,11 @@ def _config_to_resume(folder, scene, preset_name, given, extends):
 
 
 def _check_same(asked, stored, folder):
-    """Raise UserError naming the first setting that differs, the places of the scene and of its
-    masks aside: a checkpoint knows them by more than that.
-    """
+    """Raise UserError naming the first setting that differs, but for those of FREE."""
     for (section, ours), (_, theirs) in zip(sections(asked), sections(stored), strict=True):
         for name, value in vars(ours).items():
             there = getattr(theirs, name)
-            if value != there and (section, name) not in PLACES:
+            if value != there and f"{section}.{name}" not in FREE:
                 _refuse_setting(folder, f"{section}.{name}", there, value)
 
 
@@ -464,15 +467,18 @@ def _refuse_setting(folder, key, there, asked):
 
 
 def stored_state(folder: RunFolder, config: Config) -> Stored | None:
-    """(header, arrays) of the folder's checkpoint, None where there is none. Raises UserError for a
-    folder or checkpoint that does not fit.
+    """(header, arrays) of the folder's checkpoint, None where there is none. A finished run takes
+    note of where its scene is now. Raises UserError for a folder or checkpoint that does not fit.
     """
     folder.check_usable()
     stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
     if folder.config.exists() and (stored is None or is_finished(stored, config)):
-        path = load_config(folder.config).scene.path
-        if path != config.scene.path:
-            _refuse_setting(folder, "scene.path", path, config.scene.path)
+        path, now = load_config(folder.config).scene.path, config.scene.path
+        if path != now:
+            listed = [] if stored is None else scene_frames(now, edited=False)
+            if stored is None or difference(stored[0], learned(stored[0], listed), []):
+                _refuse_setting(folder, "scene.path", path, now)
+            folder.configure(config.to_json())
     return stored
 
 

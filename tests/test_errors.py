@@ -2,7 +2,7 @@
 
 import pytest
 
-from pp_cl.errors import MOST_LINE, Stopped, UserError, one_line, quoted, shown
+from pp_cl.errors import MOST_LINE, Stopped, UserError, one_line, quoted, require, shown
 
 
 @pytest.mark.parametrize(
@@ -19,6 +19,12 @@ from pp_cl.errors import MOST_LINE, Stopped, UserError, one_line, quoted, shown
 )
 def test_foreign_text_is_one_short_line(foreign, line):
     assert shown(foreign) == line
+
+
+def test_packages_that_are_missing_are_named_with_what_installs_them():
+    require("a test", "numpy")
+    with pytest.raises(UserError, match="a test needs numpy and no-such; .*install numpy no-such`"):
+        require("a test", "numpy", "no-such")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """A run's points against the surface of its object: a row of Table 4."""
 
 import json
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -48,11 +47,11 @@ def test_a_run_before_and_after(dev, scene, mesh, trained):
     surface = sample_surface(dev, mesh, hull.grid, 40_000)
     before, after = facts["before"], facts["after"]
     assert facts["surface"] == surface.count
-    assert before == asdict(overlap(surface, hull.grid, hull.ids))
+    assert before == overlap(surface, hull.grid, hull.ids)
     assert before["recall"] > 0.8  # not those just outside of the ball
     assert 0 < after["points"] < before["points"]
     with np.load(trained / "checkpoint.npz") as stored:
-        assert after == asdict(overlap(surface, hull.grid, stored["points.ids"]))
+        assert after == overlap(surface, hull.grid, stored["points.ids"])
 
 
 def test_a_refined_run_is_compared_on_its_last_grid(dev, scene, mesh, tmp_path):
@@ -62,6 +61,15 @@ def test_a_refined_run_is_compared_on_its_last_grid(dev, scene, mesh, tmp_path):
     assert facts["grid"] == {"dims": [2 * n for n in hull.grid.dims], "edge": hull.grid.edge / 2}
     assert facts["before"]["points"] == 8 * len(hull.ids) > facts["after"]["points"]
     assert facts["before"]["recall"] > 0.8
+
+
+def test_a_run_that_was_extended_is_compared_as_before(dev, scene, mesh, tmp_path):
+    """In so many steps from the start, its grid would have been refined."""
+    changes = {"train__refine_at": "0.3,1", "points__count": 300, "train__prune_every": 15}
+    out = train(scene, tmp_path / "run", **changes)
+    before = run_shape(dev, RunFolder(out), mesh, 1000)["before"]
+    assert main(["train", "--out", str(out), "--iterations", "80"]) == 0
+    assert run_shape(dev, RunFolder(out), mesh, 1000)["before"] == before
 
 
 def test_a_mesh_alone(dev, mesh):

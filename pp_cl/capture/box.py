@@ -71,12 +71,7 @@ def _seen_radius(camera, centre):
 
 def _seen_share(cameras, points):
     """(N,) share of the cameras whose image has room for each point."""
-    seen = np.zeros(len(points))
-    for camera in cameras:
-        x, y, depth = camera.project(points)
-        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        seen += inside & (depth > 0)
-    return seen / len(cameras)
+    return np.mean([camera.pixels(points)[2] for camera in cameras], axis=0)
 
 
 def _on_object(points, seen):

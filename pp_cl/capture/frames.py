@@ -110,8 +110,9 @@ def _photographs(folder, images):
         stems = [re.sub(r"\d+", lambda digits: digits[0].zfill(DIGITS), stem) for stem in stems]
     targets, taken = [], set()
     for stem in stems:
-        # COLMAP's lists of pairs know no spaces, and take lines that begin with # for comments
-        name = re.sub(r"\s+|^#|/", "_", stem)
+        # COLMAP's lists of pairs know no spaces, and take lines that begin with # for comments; its
+        # names are UTF-8, and Python stands for bytes that are not by these
+        name = re.sub(r"[\s\udc80-\udcff]+|^#|/", "_", stem)
         while name.lower() in taken:
             name += "_"
         taken.add(name.lower())

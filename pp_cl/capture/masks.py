@@ -169,11 +169,19 @@ def program_words(command: str) -> list[str]:
     return words
 
 
+def _kept(scene, photograph):
+    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written. Raises
+    UserError for one of another shape.
+    """
+    file = mask_file(scene, photograph.name)
+    return of_size(read_mask(file), (photograph.camera.width, photograph.camera.height), file)
+
+
 def _window(scene, photograph, box):
     """The Window of a photograph, with its mask if that is written."""
     found = window(read_rgba(scene / photograph.name)[..., :3], photograph, box)
     if mask_file(scene, photograph.name).is_file():
-        found.mask = found.reduced(read_mask(mask_file(scene, photograph.name))) > 127
+        found.mask = found.reduced(_kept(scene, photograph)) > 127
     return found
 
 
@@ -289,7 +297,7 @@ def picture(
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
     for one in chosen:
-        photograph, mask = read_rgba(scene / one.name), read_mask(mask_file(scene, one.name))
+        photograph, mask = read_rgba(scene / one.name), _kept(scene, one)
         factor = fitting_downscale(mask.shape, SHOWN_SIZE)
         image = shrink(photograph, factor)[..., :3]
         held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
@@ -303,7 +311,7 @@ def _contradicting(scene, photographs, box):
     """{name: share of the object that its mask alone rejects} of those that contradict others."""
     views = []
     for one in photographs:
-        mask = read_mask(mask_file(scene, one.name))
+        mask = _kept(scene, one)
         factor = fitting_downscale(mask.shape, CHECKED_SIDE)
         image = shrink(np.dstack([mask] * 4), factor)
         views.append(View(one.name, one.camera.downscaled(factor), image))

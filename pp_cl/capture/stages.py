@@ -174,11 +174,26 @@ class Capture:
         self.options = before | self.given
         changed = [name for name in OPTIONS if self.options[name] != before[name]]
         if "source" in changed and begin != "frames" and self._is_done("frames"):
-            raise UserError(
-                f"{self.scene}: was made from {before['source']}; choose another --out, or begin"
-                " again with --from frames"
-            )
+            if not self._has_moved(Path(before["source"])):
+                raise UserError(
+                    f"{self.scene}: was made from {before['source']}; choose another --out, or"
+                    " begin again with --from frames"
+                )
+            write_json(self.kept, before | {"source": self.options["source"]})
+            changed.remove("source")
         return changed
+
+    def _has_moved(self, before):
+        """Whether the source is what was at another place before, where nothing is now: photographs
+        of the same names, or a video of the same name.
+        """
+        if before.exists():
+            return False
+        if not self.source.is_dir():
+            return self.source.name == before.name
+        taken = {one["source"] for one in self._found("frames")["images"]}
+        names = {file.relative_to(self.source).as_posix() for file in frames.listed(self.source)}
+        return taken <= names
 
     def _check_options(self, left, mended):
         """Raise UserError where what the options of the stages that are left name is not there.
@@ -263,8 +278,8 @@ class Capture:
         still, or where there are none.
         """
         folder = self.work / "inside"
-        if folder.is_dir():  # the stage was stopped, and goes on
-            return folder if any(folder.iterdir()) else None
+        if folder.is_dir() and any(folder.iterdir()):  # the stage was stopped, and goes on
+            return folder
         try:
             with atomic_folder(folder) as unfinished:
                 for name in names:

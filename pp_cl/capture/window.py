@@ -57,11 +57,8 @@ class Window:
 
     def inside(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """((M,) indices of the positions that lie in the image, their rows, their columns)."""
-        x, y = np.floor(np.nan_to_num(self.pixels(positions), nan=-1)).T
-        found = np.flatnonzero(
-            (x >= 0) & (y >= 0) & (x < self.camera.width) & (y < self.camera.height)
-        )
-        return found, y[found].astype(int), x[found].astype(int)
+        column, row, is_shown = self.camera.pixels(positions)
+        return np.flatnonzero(is_shown), row[is_shown], column[is_shown]
 
     def marked(self, positions: np.ndarray) -> np.ndarray:
         """(H, W) bool: the pixels that show world positions (N, 3)."""

@@ -40,11 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--size",
-        type=shared.several(shared.side),
+        type=shared.several(shared.integer(4, 4096, 4)),
         metavar="S",
         help="side of the image in pixels, a multiple of 4 (256; raster: 200,400,800)",
     )
-    shared.add_widths(parser, "conv, unet: channels of the levels (128,256,512: the paper's)")
+    add(
+        "--widths",
+        type=shared.widths,
+        metavar="A,B,C",
+        help="conv, unet: channels of the levels (128,256,512: the paper's)",
+    )
     add("--blocks", choices=BLOCKS, help="conv, unet: of a level (double)")
     add(
         "--scene",

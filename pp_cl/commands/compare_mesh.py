@@ -2,23 +2,22 @@
 of the PlenopticPoints supplemental.
 """
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.config import Config, configure, load_config
+from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
+from pp_cl.run import check_scene, stored_config
 from pp_cl.scene.demo import demo_mesh
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.hull import CELL_CAP, agreeing, hull_on
 from pp_cl.scene.load import DEMO, open_scene, scene_box
 from pp_cl.training.checkpoint import opened_run
-from pp_cl.training.schedule import refine_steps
 
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 
@@ -47,14 +46,14 @@ def _facts(grid, surface, samples):
 def run_shape(
     dev: Device, folder: RunFolder, mesh: Mesh | None, samples: int, *, scene: str | None = None
 ) -> dict[str, Any]:
-    """{"grid", "surface", "before": Overlap, "after": Overlap} of a run: the hull's points before
+    """{"grid", "surface", "before", "after": as overlap()} of a run: the hull's points before
     training, on the run's last grid, and those that are left.
 
     mesh: in the world of the scene; None: the demo's own. scene: where the run's scene is now, if
     it has moved. Raises UserError for a run without checkpoint, a scene or a mesh that is missing.
     """
-    config = load_config(folder.config)
-    configure(config, scene or config.scene.path)
+    config = stored_config(folder, scene)
+    check_scene(config.scene.path)
     if mesh is None:
         if config.scene.path != DEMO:
             raise UserError(f"{folder}: which mesh? give it with --mesh FILE, in the scene's world")
@@ -65,8 +64,8 @@ def run_shape(
     before = _points_before(dev, config, grid, count)
     surface = _sampled(dev, mesh, grid, samples)
     return _facts(grid, surface, samples) | {
-        "before": asdict(overlap(surface, grid, before)),
-        "after": asdict(overlap(surface, grid, after)),
+        "before": overlap(surface, grid, before),
+        "after": overlap(surface, grid, after),
     }
 
 
@@ -74,18 +73,21 @@ def _points_before(dev, config: Config, grid, count):
     """Ids on a run's last grid of the `count` points that it began with; of a refined run, of what
     they would be refined to without pruning.
     """
-    times, first = len(refine_steps(config.train)), grid
-    for _ in range(times):
-        first = first.coarsened()
     views = open_scene(dev, config, ("train",)).splits["train"]
     agreement = agreeing(dev, views, scene_box(config))
-    ids = hull_on(dev, agreement.views, first, agreement.forgiven)
-    if len(ids) != count:
-        raise UserError(
-            f"{config.scene.path}: its hull is not the one that the run began with; say where the"
-            " scene is with --scene"
-        )
-    for _ in range(times):
-        ids, _ = first.children(ids)
-        first = first.refined()
-    return ids
+    grids = [grid]
+    for _ in config.train.refine_at:
+        if not any(n % 2 for n in grids[-1].dims):  # else it is not refined
+            grids.append(grids[-1].coarsened())
+    while grids:  # the coarsest first, which is the quickest; one has the hull that it began with
+        first = grids.pop()
+        ids = hull_on(dev, agreement.views, first, agreement.forgiven)
+        if len(ids) == count:
+            for _ in grids:
+                ids, _ = first.children(ids)
+                first = first.refined()
+            return ids
+    raise UserError(
+        f"{config.scene.path}: its hull is not the one that the run began with; say where the"
+        " scene is with --scene"
+    )

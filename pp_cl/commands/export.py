@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from pp_cl.commands import options as shared
+from pp_cl.config import load_config
 from pp_cl.errors import UserError
 from pp_cl.export import AXES, AXES_OF, FORMATS, WINDOW
 
@@ -71,6 +72,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.device.discover import open_device
     from pp_cl.export.formats import check_target, export
     from pp_cl.export.length import set_length
+    from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import load_run
 
     name, folder = options.format, Path(options.run_folders[0])
@@ -84,6 +86,8 @@ def run(options: argparse.Namespace) -> None:
         raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
     ends = (*options.length[:2], _metres(options.length[2])) if options.length else None
     path = check_target(name, folder, Path(options.out) if options.out else None)
+    for one in options.run_folders:
+        load_config(RunFolder(one).config)  # that all are there is seen before any work
     device = open_device(options.device)
 
     def loaded(folder):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.commands.capture import add_hints
+from pp_cl.config import field_of
 from pp_cl.errors import UserError
 
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
@@ -17,7 +18,7 @@ EPILOG = """FOLDER then holds
   thumbnail.png        a picture of it
   scene, run           what was captured of photographs; the training, which all other commands take
 Its parts are capture, train, eval, render and export. The same command goes on where it stopped."""
-MINUTES = 20.0
+MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
 # the preset of so many minutes: on two cores with AVX-512 the steps of `small` take 7, of `full` 25
 PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
 
@@ -29,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, metavar="FOLDER", help="folder of the result")
     add(
         "--minutes",
-        type=shared.number(0.1, 1e5),
+        type=shared.number(0.1, MOST_MINUTES),
         metavar="N",
         help=f"minutes of training ({MINUTES:g}); finding cameras and masks and fitting the splat"
         " come on top",
@@ -73,8 +74,9 @@ def run(options: argparse.Namespace) -> None:
     split = _held_out(scene)
     _step("eval", str(folder), "--split", split, *device)
     film = _film()
-    _step("render", str(folder), "--out", str(out / film), *device)
-    _step("export", str(folder), "--format", "splat", "--out", str(out / SPLAT), *device)
+    for name, file, words in (("render", film, []), ("export", SPLAT, ["--format", "splat"])):
+        if not _is_newer(out / file, folder.checkpoint):
+            _step(name, str(folder), "--out", str(out / file), *words, *device)
     write_result(load(folder.path, options.device), split, out, film, told)
     print(f"wrote {out / INDEX}: open it in a browser; `pp-cl view {folder}` shows the exact model")
 
@@ -134,6 +136,11 @@ def _held_out(scene):
     from pp_cl.scene.load import scene_splits
 
     return "test" if "test" in scene_splits(scene) else "train"
+
+
+def _is_newer(file, other):
+    """Whether a file is there, and was written after another one."""
+    return file.exists() and file.stat().st_mtime_ns > other.stat().st_mtime_ns
 
 
 def _step(name, *words):

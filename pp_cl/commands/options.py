@@ -71,10 +71,6 @@ def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
     return read
 
 
-# side of an image that the network takes
-side = integer(4, 4096, 4)
-
-
 def widths(text: str) -> tuple[int, ...]:
     """The type of the channels of the network's three levels."""
     found = tuple(map(integer(1, 4096), text.split(",")))
@@ -201,11 +197,6 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device", metavar="D", help="index or part of a name, as `pp-cl devices` prints them"
     )
-
-
-def add_widths(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add --widths. text: its help."""
-    parser.add_argument("--widths", type=widths, metavar="A,B,C", help=text)
 
 
 def add_metrics(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pp_cl.commands import options as shared
 from pp_cl.commands.view import open_browser
 from pp_cl.config import begin_with, help_lines, load_config
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, require
 from pp_cl.presets import PRESETS, SHORT
 
 HELP = "learn a scene; the same command resumes an unfinished run"
@@ -50,10 +50,9 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.files.scalars import writer_class
     from pp_cl.session import is_finished, open_training, run_config, stored_state
     from pp_cl.training.memory import memory_line
-    from pp_cl.view.server import check_installed
 
     if options.view:
-        check_installed()
+        require("the viewer", "viser")
     if options.tensorboard:
         writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)

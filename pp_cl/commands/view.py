@@ -44,17 +44,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
-    from pp_cl.config import load_config
     from pp_cl.device.discover import open_device
-    from pp_cl.errors import UserError
+    from pp_cl.errors import UserError, name_of, require
     from pp_cl.files.run_folder import RunFolder
-    from pp_cl.run import check_scene
+    from pp_cl.run import stored_config
     from pp_cl.scene.load import scene_splits
     from pp_cl.view.run_view import RunView
     from pp_cl.view.scene_page import ScenePage
-    from pp_cl.view.server import check_installed, started
+    from pp_cl.view.server import started
 
-    check_installed()
+    require("the viewer", "viser")
     folder, scene = Path(options.run_folder), options.scene
     is_scene = folder.is_dir() and not RunFolder(folder).config.exists()
     if is_scene and scene is not None:
@@ -62,9 +61,7 @@ def run(options: argparse.Namespace) -> None:
     if is_scene:
         scene_splits(folder)
     else:
-        load_config(RunFolder(folder).config)
-    if scene is not None:
-        check_scene(scene)
+        stored_config(RunFolder(folder), scene)
     if options.host not in LOOPBACKS:
         print(
             f"pp-cl: --host {options.host}: whoever can reach this address sees the viewer and"
@@ -76,7 +73,7 @@ def run(options: argparse.Namespace) -> None:
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     with (
         suppress(KeyboardInterrupt),
-        started(folder.resolve().name, options.host, options.port) as (server, address),
+        started(name_of(folder), options.host, options.port) as (server, address),
     ):
         view: ScenePage | RunView
         if is_scene:

@@ -20,7 +20,11 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         "the same in a tenth of the bytes, for Scaniverse, Spark, PlayCanvas and Babylon.js",
     ),
     "splat-glb": ("splat.glb", (".glb",), "the same as glTF (KHR_gaussian_splatting)"),
-    "ply": ("cloud.ply", (".ply",), "all points with colour, opacity and everything learned"),
+    "ply": (
+        "cloud.ply",
+        (".ply",),
+        "the visible points with colour and everything learned",
+    ),
     "glb": ("cloud.glb", (".glb",), "the coloured points"),
     "mesh": (
         "mesh.ply",

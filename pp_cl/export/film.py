@@ -73,8 +73,8 @@ def render_frames(
         if _identity_of(folder) not in (None, identity):
             if not replace:
                 raise UserError(
-                    f"{folder}: holds frames of another model or path; choose another --out, or"
-                    " delete it"
+                    f"{folder}: holds frames of another model, path or style; choose another --out,"
+                    " or delete it"
                 )
             check_ours([*paths, folder / IDENTITY])
             remove_ours(folder.iterdir())

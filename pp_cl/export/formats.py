@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, require
 from pp_cl.export import AXES_OF, FORMATS, VIEWER, WINDOW
 from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.length import metres_per_unit
@@ -20,7 +20,6 @@ from pp_cl.export.points import coloured_points, in_world, inside, write_ply
 from pp_cl.export.splat import (
     Y_DOWN,
     Y_UP,
-    check_spz,
     splats,
     upright,
     write_splat_glb,
@@ -56,7 +55,7 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
 def export(
     run: Run,
     name: str,
-    path: Path,
+    path: Path | str,
     *,
     min_weight: float = 0.0,
     window: int = WINDOW,
@@ -68,7 +67,9 @@ def export(
     min_weight, window, box, axes: as the options. others: further runs of a gallery. Raises
     UserError for what cannot be written, before which nothing is.
     """
-    count, metres = run.model.cloud.count, metres_per_unit(run)
+    if name not in FORMATS:
+        raise UserError(f"no format {name}; choose from {', '.join(FORMATS)}")
+    path, count, metres = Path(path), run.model.cloud.count, metres_per_unit(run)
     unit = "" if metres == 1 else ", in metres"
     within, turn = None, np.eye(3)
     if box is not None:
@@ -104,7 +105,7 @@ def export(
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
     if name in ("splat", "splat-spz", "splat-glb"):
         if name == "splat-spz":
-            check_spz()
+            require("splat-spz", "gsply")
         table, origin = splats(run, turn, window, within)
         table["position"] *= metres
         table["deviations"] *= metres
@@ -115,12 +116,16 @@ def export(
             write_splat_spz(path, table)
         else:
             write_splat_glb(path, table, metres * origin)
-        return f"{len(table)} Gaussians{unit}"
+        moved = f", less {', '.join(f'{x:g}' for x in metres * origin)}" if origin.any() else ""
+        return f"{len(table)} Gaussians{unit}{moved if name != 'splat-glb' else ''}"
     points = coloured_points(run, min_weight, within)
-    points = replace(points, positions=placed(points.positions))
+    points = replace(
+        points, positions=placed(points.positions), radius=np.float32(metres) * points.radius
+    )
     _begin_default(name, path)
     if name == "ply":
-        write_ply(path, points, run.model.cloud)
+        axes = "turned upright, y up" if axes == VIEWER else "its scene's"
+        write_ply(path, points, run.model.cloud, f"{axes}{unit}")
     else:
         colours = gltf_colours(points.colours)
         write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})

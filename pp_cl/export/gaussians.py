@@ -25,7 +25,7 @@ from pp_cl.model import Model
 from pp_cl.raster.points import MOST_SH_OF_GAUSSIANS, PointCloud, offset_width, sh_blocks
 from pp_cl.run import Run
 from pp_cl.scene.camera_path import between
-from pp_cl.scene.views import View
+from pp_cl.scene.views import MIN_SIDE, View
 from pp_cl.settings import TrainConfig
 from pp_cl.train import Trainer
 from pp_cl.training.crops import Crop, Crops
@@ -119,7 +119,10 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
         cameras = between([one.camera for one in listed])
         more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
-    longest = max(max(view.camera.width, view.camera.height) for view in views)
+    sides = [side for view in views for side in (view.camera.width, view.camera.height)]
+    factor = max(1, min(round(max(sides) / window), min(sides) // MIN_SIDE))
+    views = [view.reduced(factor * view.downscale) for view in views]
+    longest = max(sides) / factor
     samples = max(1.0, window / longest)
     scale = min(int(samples), CROP // LEAST_CROP)
     config = _config(run.config, scale)

@@ -57,7 +57,7 @@ def write_glb(
     ]
     primitive: dict[str, Any] = {"mode": POINTS, "attributes": names}
     if faces is not None:
-        primitive |= {"mode": TRIANGLES, "indices": len(names)}
+        primitive |= {"mode": TRIANGLES, "indices": len(names), "material": 0}
     gltf: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "pp-cl"},
         "scene": 0,
@@ -68,6 +68,8 @@ def write_glb(
         "bufferViews": views,
         "buffers": [{"byteLength": starts[-1]}],
     }
+    if faces is not None:  # without a material it would be metal
+        gltf["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
     if extension:
         primitive["extensions"] = dict([extension])
         gltf["extensionsUsed"] = [extension[0]]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from tqdm import tqdm
@@ -81,7 +82,13 @@ def _colours(vertices, points: ColouredPoints, edge):
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
     """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does."""
     if Path(path).suffix.lower() == ".glb":
-        attributes = {"POSITION": mesh.vertices, "COLOR_0": gltf_colours(mesh.colours)}
+        near = mesh.vertices - mesh.vertices.mean(0)
+        normals = trimesh.Trimesh(near, mesh.faces, process=False).vertex_normals  # else all flat
+        attributes = {
+            "POSITION": mesh.vertices,
+            "NORMAL": normals.astype(np.float32),
+            "COLOR_0": gltf_colours(mesh.colours),
+        }
         write_glb(path, attributes, faces=mesh.faces)
         return
     faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])

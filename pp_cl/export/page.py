@@ -5,14 +5,13 @@ from __future__ import annotations
 import base64
 import html
 import json
-import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, name_of
 from pp_cl.export.harmonics import COUNT, fit_harmonics
 from pp_cl.files.atomic import atomic_folder, write_text
 from pp_cl.files.image import to_8bit, write_png
@@ -91,20 +90,15 @@ def filled(template: str, parts: dict[str, str]) -> str:
     return page
 
 
-def name_of(folder: Path) -> str:
-    """The name of a folder, which may be no UTF-8."""
-    return os.fsencode(folder.resolve().name).decode(errors="replace")
-
-
 def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
     """Write a page and a still of each run into a folder, with an index of them; returns their
     number. Raises UserError as check_drawable and atomic_folder do.
     """
-    cards = {}
+    cards: dict[str, str] = {}
     with atomic_folder(folder) as unfinished:
         for run in runs:
             stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name_of(run.folder.path)).strip("-") or "run"
-            while stem in cards or stem == "index":
+            while stem.lower() in {"index", *map(str.lower, cards)}:  # as some disks take names
                 stem += "-2"
             write_text(unfinished / f"{stem}.html", page_text(run, f"{stem}.png"))
             write_png(unfinished / f"{stem}.png", still(run))

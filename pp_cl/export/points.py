@@ -15,16 +15,18 @@ from pp_cl.files.atomic import atomic_file
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture
 from pp_cl.raster.points import PointCloud
+from pp_cl.render import point_radius
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 
 COMMENTS = (
-    "pp-cl: points of a run, world axes and units of its scene",
     "red, green, blue: sRGB, as the run shows the point in the training view where it weighs most",
     "weight: blend weights of the point in that view, summed over its pixels",
     "point_opacity: of its centre, 0 to 1",
+    "radius: where its opacity has fallen to 0",
     "feature_C_D_K: coefficient K of degree D of the spherical harmonics of feature C, C from 0 to",
-    "15; basis and signs of PlenOctrees; features are the input of the run's network, no colours",
+    "15; basis and signs of PlenOctrees, in the axes of the scene whatever those of x, y, z are;",
+    "features are the input of the run's network, no colours",
 )
 COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
 FINEST = 1e-3  # of the grid's edge: how far rounding to float32 may move a point in a file
@@ -36,7 +38,7 @@ class ColouredPoints:
 
     rows: (M,) int64, their rows in the run's point cloud. positions: (M, 3) as in_world() gives
     them. colours: (M, 3) uint8 sRGB. weight: (M,) float32, the blend weights in the view that gave
-    the colour, summed over its pixels. opacity: (M,) float32.
+    the colour, summed over its pixels. opacity: (M,) float32. radius: (M,) float32, world units.
     """
 
     rows: np.ndarray
@@ -44,6 +46,7 @@ class ColouredPoints:
     colours: np.ndarray
     weight: np.ndarray
     opacity: np.ndarray
+    radius: np.ndarray
 
 
 def coloured_points(
@@ -55,7 +58,7 @@ def coloured_points(
     No colour is invented for points that no training view shows: they are left out. box: (2, 3)
     that holds the points, or None. Raises UserError where no point is left.
     """
-    cloud = run.model.cloud
+    cloud, edge = run.model.cloud, run.model.grid.edge
     positions = run.model.positions()
     colours, best = np.zeros((cloud.count, 3), np.uint8), np.zeros(cloud.count, np.float32)
     for seen in observe(run, run.cameras("train"), "colours"):
@@ -72,10 +75,12 @@ def coloured_points(
     rows = rows[inside(positions[rows], box)]
     return ColouredPoints(
         rows,
-        in_world(positions[rows], run.model.grid.edge),
+        in_world(positions[rows], edge),
         colours[rows],
         best[rows],
         cloud.opacity.get()[rows],
+        point_radius(run.config.raster, edge, run.model.depth_range)
+        * np.exp(cloud.offset.get()[rows, 3]),
     )
 
 
@@ -109,17 +114,22 @@ def _colours(picture: Picture, camera: Camera, positions):
     return to_8bit(picture.rgba()[row, column, :3])
 
 
-def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> None:
-    """Write points and what `cloud` learned of them, as write_elements() does."""
+def write_ply(
+    path: Path | str, points: ColouredPoints, cloud: PointCloud, frame: str = "its scene's"
+) -> None:
+    """Write points and what `cloud` learned of them, as write_elements() does. frame: whose axes
+    and units the positions have, in words.
+    """
     columns = place_and_colour(points.positions, points.colours)
-    columns |= {"point_opacity": points.opacity, "weight": points.weight}
+    columns |= {"point_opacity": points.opacity, "weight": points.weight, "radius": points.radius}
     for block, array in zip(cloud.blocks, cloud.sh, strict=True):
         values = array.get()[points.rows].astype(np.float32)
         for k in range(block.count):
             order = block.first + k - block.degree**2  # within its degree
             named = {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
             columns |= named
-    write_elements(path, {"vertex": table_of(columns)}, COMMENTS)
+    about = (f"pp-cl: points of a run; axes and units: {frame}", *COMMENTS)
+    write_elements(path, {"vertex": table_of(columns)}, about)
 
 
 def write_elements(

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pp_cl.errors import UserError
-from pp_cl.export.page import card, filled, name_of, page_text, still
+from pp_cl.errors import UserError, name_of
+from pp_cl.export.page import card, filled, page_text, still
 from pp_cl.files.atomic import atomic_file, write_text
 from pp_cl.files.image import write_png
 from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest

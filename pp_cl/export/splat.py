@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl.errors import UserError
 from pp_cl.export.gaussians import (
     CONSTANT,
     FACTORS,
@@ -113,17 +111,8 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
 
 
-def check_spz() -> None:
-    """Raise UserError where the package that writes .spz is missing."""
-    if find_spec("gsply") is None:
-        raise UserError("splat-spz needs gsply; install it with `pip install gsply`")
-
-
 def write_splat_spz(path: Path, table: np.ndarray) -> None:
-    """Write splats() with y up as Niantic's .spz. Raises UserError as check_spz() and atomic_path
-    do.
-    """
-    check_spz()
+    """Write splats() with y up as Niantic's .spz. Raises UserError as atomic_path does."""
     from gsply import GSData, write_spz
 
     place = table["position"]

@@ -4,7 +4,6 @@ renderings of its training views.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from pp_cl.errors import UserError
+from pp_cl.errors import require
 from pp_cl.export.fusion import COVERED
 from pp_cl.export.mesh import surface
 from pp_cl.export.observe import progress
@@ -32,20 +31,11 @@ LEAST_COSINE = 0.2  # between a texel's normal and the direction to an eye that 
 SHARPNESS = 6  # power of that cosine in a view's weight: the best views make up most of a colour
 
 
-def check_texture() -> None:
-    """Raise UserError where a package is missing."""
-    if find_spec("xatlas") is None or find_spec("fast_simplification") is None:
-        raise UserError(
-            "textured needs xatlas and fast-simplification; install them with"
-            " `pip install xatlas fast-simplification`"
-        )
-
-
 def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> trimesh.Trimesh:
     """The surface of the training views' depths, of which a box (2, 3) may hold a part, turned by
-    (3, 3); in scene units. Raises UserError as surface() and check_texture().
+    (3, 3); in scene units. Raises UserError as surface() and require() do.
     """
-    check_texture()
+    require("textured", "xatlas", "fast-simplification")
     import fast_simplification
     import xatlas
 
@@ -77,6 +67,7 @@ def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> 
     return trimesh.Trimesh(
         (vertices + middle) @ turn.T,
         faces,
+        vertex_normals=normals @ turn.T,
         visual=TextureVisuals(uv, material=material),
         process=False,
     )
@@ -151,7 +142,13 @@ def _looked_up(picture: Picture, camera: Camera, positions, normals, behind):
 
 
 def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:
-    """Write a GLB. Raises UserError as atomic_file does."""
-    data: Any = mesh.export(file_type="glb")
+    """Write a GLB, whose positions are float32: relative to the middle, to which its node moves
+    them. Raises UserError as atomic_file does.
+    """
+    middle = np.rint(mesh.vertices.mean(0))
+    near, scene = mesh.copy(), trimesh.Scene()
+    near.apply_translation(-middle)
+    scene.add_geometry(near, transform=trimesh.transformations.translation_matrix(middle))
+    data: Any = scene.export(file_type="glb", include_normals=True)
     with atomic_file(path) as file:
         file.write(data)

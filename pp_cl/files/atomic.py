@@ -172,18 +172,6 @@ def check_target(path: Path) -> None:
         _remove(_temporary(tried))
 
 
-def check_writable(folder: Path | str) -> None:
-    """Raise UserError where a folder, or the one in which it would be made, may not be written."""
-    there = Path(folder).absolute()
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise UserError(
-            f"{folder}: may not be written (check the permissions of {there}, and that its file"
-            " system is not read-only); choose another --out"
-        )
-
-
 def _sync_folder(folder):
     """Make a rename in the folder survive a power cut, where system and file system know how."""
     if not hasattr(os, "O_DIRECTORY"):

@@ -85,24 +85,18 @@ class Surface:
         return (words >> (i % 32).astype(np.uint32) & 1).astype(bool)
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """points: how many. iou: of them and the surface's vertices, intersection over union. recall:
+def overlap(surface: Surface, grid: Grid, ids: np.ndarray) -> dict[str, float]:
+    """Of the points with these ids (N,), N > 0, on the grid that the surface was sampled for:
+    points: how many; iou: of them and the surface's vertices, intersection over union; recall:
     share of the surface's that are among the points; precision: share of the points that are on it.
     """
-
-    points: int
-    iou: float
-    recall: float
-    precision: float
-
-
-def overlap(surface: Surface, grid: Grid, ids: np.ndarray) -> Overlap:
-    """Of the points with these ids (N,), N > 0, on the grid that the surface was sampled for."""
     shared, points = int(surface.holds(grid, ids).sum()), len(ids)
-    return Overlap(
-        points, shared / (surface.count + points - shared), shared / surface.count, shared / points
-    )
+    return {
+        "points": points,
+        "iou": shared / (surface.count + points - shared),
+        "recall": shared / surface.count,
+        "precision": shared / points,
+    }
 
 
 def sample_surface(

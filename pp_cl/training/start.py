@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.config import RANDOM, Config, load_config, text_of
+from pp_cl.config import OPEN, RANDOM, Config, load_config, text_of
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError, listing
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
@@ -22,7 +22,7 @@ from pp_cl.training.checkpoint import opened_run
 from pp_cl.training.memory import Room
 from pp_cl.training.schedule import refine_steps
 
-OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
+UNDECIDED, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 # train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
@@ -75,7 +75,7 @@ def first_hull(
     points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
     hull = build_grid(dev, views, points, box, forgiven)
-    if shares != OPEN:
+    if shares != UNDECIDED:
         return hull, shares
     cameras = [view.camera for view in views]
     spacing = spacing_pixels(hull.grid, cameras)
@@ -96,8 +96,9 @@ def fitting_hull(
     apart in the end, they are as close as it allows. Raises UserError as Room.check_points() does,
     and for an open radius of footprints that are not soft.
     """
-    is_open, train, coarsest = config.train.refine_at == OPEN, config.train, COARSEST
+    is_open, train, coarsest = config.train.refine_at == UNDECIDED, config.train, COARSEST
     raster, is_radius_open = config.raster, config.raster.radius == 0
+    config.decided = [key for key, one in zip(OPEN, (is_open, is_radius_open), strict=True) if one]
     if is_radius_open and raster.footprint != "soft":
         raise UserError(
             f"raster.radius: is open, which raster.footprint={raster.footprint} cannot be; give it"
@@ -117,7 +118,7 @@ def fitting_hull(
         except UserError:
             if not is_open or train.refine_at == NEVER:
                 raise
-        train.refine_at, coarsest = OPEN, COARSER * coarsest
+        train.refine_at, coarsest = UNDECIDED, COARSER * coarsest
 
 
 def picture_of_masks(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, name_of
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import through, up_of
@@ -261,7 +261,7 @@ class ModelPage:
         if found := self._image(self._camera(tab)):
             file = io.BytesIO()
             Image.fromarray(found[0]).save(file, "PNG")
-            run = self.run.folder.path.resolve().name
+            run = name_of(self.run.folder.path)
             name = f"{run}_step_{self.run.header['step']}_{self._show.value}.png"
             tab.client.send_file_download(name, file.getvalue(), save_immediately=True)
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pp_cl.device.device import Device
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, name_of
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import Run, load_run
 from pp_cl.session import OnStep, Training
@@ -102,7 +102,7 @@ def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
     run.renderer = trainer.renderer  # not one of its own, which would freeze the network
     cameras = [view.camera for view in trainer.views]
     most = max(camera.width * camera.height for camera in cameras)  # what memory is planned for
-    with started(training.folder.path.resolve().name) as (server, address):
+    with started(name_of(training.folder.path)) as (server, address):
         page = ModelPage(server, run, trainer.views, most_pixels=most, is_training=True)
         page.tell("the first step builds kernels")
         rows, free, renewed = logged(training.folder), 0.0, 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import logging
 import socket
@@ -15,12 +14,6 @@ from pp_cl.errors import UserError
 
 LOOPBACK, PORT = "127.0.0.1", 8733
 ANY = ("0.0.0.0", "::")  # noqa: S104 compared with, not bound to
-
-
-def check_installed() -> None:
-    """Raise UserError where viser is missing."""
-    if importlib.util.find_spec("viser") is None:
-        raise UserError("the viewer needs viser; install it with `pip install viser`")
 
 
 @contextmanager

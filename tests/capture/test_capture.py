@@ -217,6 +217,20 @@ def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys)
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == box
 
 
+def test_photographs_that_have_moved_are_the_same(captured, shot, tmp_path):
+    """Where they have the same names, and are not where they were."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    moved, options = shutil.copytree(shot[0], tmp_path / "moved"), scene / "capture/options.json"
+    refused(moved, scene, named="was made from")
+    options.write_text(options.read_text().replace(str(shot[0]), str(tmp_path / "gone")))
+    before = changed(scene)
+    assert capture(moved, scene) == (0, [])
+    assert {path for path, time in changed(scene).items() if before[path] != time} == {options}
+    options.write_text(options.read_text().replace(str(moved), str(tmp_path / "gone")))
+    next(moved.iterdir()).unlink()
+    refused(moved, scene, named="was made from")
+
+
 @pytest.mark.parametrize(
     "source, words, named",
     [
@@ -444,7 +458,11 @@ def test_an_object_that_turns(dev, tmp_path, wall):
     scene = tmp_path / "scene"
     photographs, masks = turned(dev, tmp_path, range(14), wall)
     told = ["--turntable"] if wall else []
+    if wall:  # it is only told when it goes on
+        capture(photographs, scene, "--masks", masks)
+        assert not any((scene / "capture/inside").iterdir())
     assert capture(photographs, scene, "--masks", masks, *told) == (0, [])
+    assert any((scene / "capture/inside").iterdir()) == bool(wall)
     assert found(scene, "matches")["turns"] and found(scene, "poses")["placed"] == 14
     assert off(scene, cameras(SIZE, "turntable")).position < 0.01
 

@@ -2,6 +2,7 @@
 out with a reason.
 """
 
+import os
 import subprocess
 
 import numpy as np
@@ -35,6 +36,17 @@ def folder(tmp_path):
     """An empty folder of photographs."""
     (tmp_path / "photographs").mkdir()
     return tmp_path / "photographs"
+
+
+@pytest.mark.unix
+def test_names_that_are_no_utf_8(shots, folder, tmp_path):
+    """COLMAP takes none; two of them may become one."""
+    for i, image in enumerate(shots):
+        name = b"foto_%c%d.png" % (0xE9 + i % 2, i // 2)
+        Image.fromarray(image).save(folder / os.fsdecode(name))
+    found = take_images(folder, tmp_path / "images")
+    names = [one["name"] for one in found["images"]]
+    assert len({*names}) == len(shots) and all(name.isascii() for name in names)
 
 
 def test_photographs_of_other_programs(shots, folder, tmp_path):

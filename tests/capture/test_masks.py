@@ -303,6 +303,20 @@ def test_what_is_there_is_kept_and_helps(capture):
     assert capture.agreement()[5] > first[5] - 0.05
 
 
+def test_a_mask_that_the_user_has_written_has_the_shape_of_its_image(capture):
+    """Of another size it is resized, of another shape it is named."""
+    capture.write()
+    with Image.open(capture.file(3)) as mask:
+        mask.resize((SIZE // 2, SIZE // 2)).save(capture.file(3))
+    with pytest.warns(UserWarning, match="masks are resized"):
+        assert "kept" in capture.write()
+    with pytest.warns(UserWarning, match="masks are resized"):
+        picture(capture.folder, capture.photographs)
+    Image.fromarray(np.zeros((SIZE, SIZE // 2), np.uint8)).save(capture.file(3))
+    with pytest.raises(UserError, match="make it the image's size"):
+        capture.write()
+
+
 def test_given_masks_come_first(capture, tmp_path):
     """They are those of the photographs before their distortion was removed, and named like them or
     like their sources, as spaces are none of COLMAP's.

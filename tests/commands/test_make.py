@@ -1,5 +1,6 @@
 """`pp-cl make`: what is left is done, and a folder tells of it."""
 
+import json
 import re
 import shutil
 
@@ -42,12 +43,26 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
     scene, folder = made
     checkpoint = (folder / "run/checkpoint.npz").read_bytes()
     (folder / "index.html").unlink()
+    made = [(folder / name).stat().st_mtime_ns for name in ("film.mp4", "splat.ply")]
     assert main(["make", scene, "--out", str(folder)]) == 0
     assert "is finished" in capsys.readouterr().out
+    assert made == [(folder / name).stat().st_mtime_ns for name in ("film.mp4", "splat.ply")]
     assert (folder / "index.html").exists()
     assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
     status, lines = spoken(["make", scene, "--out", folder, "--minutes", "7"])
     assert status == 2 and "train.minutes is 0.1 there, 7.0 asked for" in lines[-1]
+
+
+def test_a_folder_that_has_moved_goes_on(made, tmp_path):
+    """With its scene."""
+    scene, folder = made
+    shutil.copytree(scene, tmp_path / "scene")
+    shutil.copytree(folder, tmp_path / "out")
+    (tmp_path / "out/index.html").unlink()
+    status, lines = spoken(["make", tmp_path / "scene", "--out", tmp_path / "out"])
+    assert status == 0, lines
+    stored = json.loads((tmp_path / "out/run/config.json").read_text())
+    assert stored["scene"]["path"] == str(tmp_path / "scene")
 
 
 def test_what_is_not_its_own_stays(made, tmp_path):

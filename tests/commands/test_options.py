@@ -14,7 +14,7 @@ from pp_cl.files.image import write_png
 
 REFUSED = [
     (options.integer(1, 16), ("16.5", "0", "17", "x", "nan", "1,2", "9" * 5000)),
-    (options.side, ("30", "-4", "0", "inf")),
+    (options.integer(4, 4096, 4), ("30", "-4", "0", "inf")),
     (options.number(0.5, 2), ("0.4", "3", "nan", "1,2", "")),
     (options.several(options.integer(1, 10)), ("1,,2", "1,11")),
     (options.words(options.METRICS), ("beauty", "psnr,beauty", ",")),
@@ -36,7 +36,7 @@ def test_texts_become_what_is_meant(tmp_path):
     assert options.integer(1, 10**6)("1e3") == 1000
     assert options.several(options.integer(1, 10**6))("1e3,10,10") == [10, 1000]
     assert options.words(options.METRICS)("psnr, lpips") == ("psnr", "lpips")
-    assert options.side("64") == 64 and options.widths("16,32,48") == (16, 32, 48)
+    assert options.widths("16,32,48") == (16, 32, 48)
     for text in (str(tmp_path / "new.PNG"), "new.png"):
         assert options.output_file(".png")(text) == text
 

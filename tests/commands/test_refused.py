@@ -95,6 +95,10 @@ REFUSED = [
     ("bench raster --widths 16,16,16", "--widths"),
     ("bench train --plot b.png", "--plot"),
     ("export run other --format html", "other"),
+    ("export run other --format gallery", "other"),
+    # an option that is wrong, behind a word that may stand alone
+    ("eval --metrics run --splt test", "--splt"),
+    ("info --json run --pictur a.png", "--pictur"),
     ("export run --format html --min-weight 1", "--min-weight"),
     ("export run --format html --box 0,0,0,1,1,1", "--box"),
     ("export run --format scene --axes viewer", "--axes"),
@@ -110,6 +114,9 @@ REFUSED = [
     ("render run --fps 60 --out a.gif", "--fps"),
     ("render run --path test --seconds 1", "--seconds"),
     # values that make no sense
+    (f"{TRAIN} --set train.offset_rate=0.01,0", "train.offset_rate"),
+    (f"{TRAIN} --iterations 9 --set train.iterations=12", "--set: train.iterations"),
+    ("make BALL --out new --minutes 2000", "--minutes"),
     (f"{TRAIN} --iterations 0", "--iterations: train.iterations"),
     (f"{TRAIN} --iterations x", "--iterations"),
     (f"{TRAIN} --downscale 20", "--downscale"),

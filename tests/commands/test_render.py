@@ -106,7 +106,7 @@ def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys)
     assert "rendered 1 of 4 frames" in capsys.readouterr().out
     assert {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()} == whole
     told = failure(*words, "--background", "black")
-    assert "holds frames of another model or path" in told
+    assert "holds frames of another model, path or style" in told
     assert {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()} == whole
 
 

@@ -5,14 +5,15 @@ import json
 import numpy as np
 import pytest
 from support.refused import failure
-from support.runs import arguments
+from support.runs import SETTINGS, arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.config import begin_with, load_config
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session import run_config
+from pp_cl.session import run_config, train_scene
 
 
 def trained_lines(capsys, *words):
@@ -91,6 +92,47 @@ def test_a_start_without_a_checkpoint_keeps_what_is_not_said_anew(tmp_path, monk
     config = run_config(folder, scene, None, [("network.rate", "1e-3,1e-4", "--set")])
     assert config.network.rate == (1e-3, 1e-4)
     assert (config.scene.downscale, config.points.count, config.train.crop) == (2, 1500, 24)
+
+
+def test_iterations_take_the_place_of_minutes_that_came_to_nothing(tmp_path, monkeypatch):
+    scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
+    words = ["train", scene, "--out", str(folder.path), "--minutes", "0.1", "--points", "300"]
+    with monkeypatch.context() as patch:
+        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        assert main(words) == 2
+    config = run_config(folder, scene, None, [("train.iterations", "40", "--iterations")])
+    assert (config.train.iterations, config.train.minutes) == (40, 0)
+
+
+def test_what_a_training_has_decided_is_decided_anew(tmp_path, monkeypatch):
+    """Of images of another size: by a start without a checkpoint, and with --config."""
+    scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
+    words = arguments(scene, folder.path, train__refine_at="0,0", raster__radius=0)
+    with monkeypatch.context() as patch:
+        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        assert main(words) == 2
+    stored = load_config(folder.config)
+    assert stored.decided == ["train.refine_at", "raster.radius"] and stored.raster.radius > 0
+    config = run_config(folder, scene)
+    assert (config.train.refine_at, config.raster.radius) == ((0, 0), 0)
+    _, given = begin_with(folder.config, [])
+    assert not {"train.refine_at", "raster.radius"} & {key for key, _, _ in given}
+    own = [("raster.radius", "0.9", "--set")]
+    assert run_config(folder, scene, None, own).raster.radius == 0.9
+
+
+def test_a_setting_has_one_origin(tmp_path):
+    given = [("train.seed", "3", "--set"), ("train.seed", "4", "--seed")]
+    with pytest.raises(UserError, match="--seed: train.seed is set by --set, too"):
+        run_config(RunFolder(tmp_path / "run"), "demo", None, given)
+
+
+def test_a_checkpoint_goes_on_with_what_the_model_does_not_depend_on(tmp_path):
+    scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
+    train_scene(scene, folder.path, settings=SETTINGS, is_stopped=lambda: True)
+    other = ("--memory", "7", "--set", "train.checkpoint_every=50", "--set", "train.log_every=20")
+    assert main(["train", "--out", str(folder.path), *other]) == 0
+    assert load_config(folder.config).train.memory_gib == 7
 
 
 def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from pp_cl.errors import UserError
 from pp_cl.export import AXES, FORMATS
 from pp_cl.export.formats import check_target, export, renderings
 from pp_cl.export.splat import Y_DOWN, Y_UP, upright
@@ -27,6 +28,13 @@ def test_it_is_written_where_it_belongs_and_twice_alike(name, run, tmp_path):
         shutil.rmtree(tmp_path / "export")
     assert said[0] == said[1] and contents[0] == contents[1] and contents[0]
     assert any(character.isdigit() for character in said[0])
+
+
+def test_a_path_may_be_a_text_and_a_format_that_there_is_not_is_one_line(run, tmp_path):
+    export(run, "glb", str(tmp_path / "a.glb"))
+    assert (tmp_path / "a.glb").stat().st_size
+    with pytest.raises(UserError, match="no format obj; choose from splat, "):
+        export(run, "obj", tmp_path / "a.obj")
 
 
 def test_a_scene_can_be_given_its_folder(run, tmp_path):

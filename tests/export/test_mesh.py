@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from support.gltf import glb
 
 from pp_cl.errors import UserError
 from pp_cl.export import mesh as module
@@ -38,7 +39,12 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
     read = trimesh.load(path, process=False)
     if suffix == "glb":
         (read,) = read.geometry.values()
-        assert np.array_equal(read.visual.vertex_colors, gltf_colours(mesh.colours))
+        colours = read.visual.vertex_attributes["color"]
+        assert np.array_equal(colours, gltf_colours(mesh.colours))
+        header, stored = glb(path)
+        outwards = read.vertices / np.linalg.norm(read.vertices, axis=1)[:, None]
+        assert np.median((stored["NORMAL"] * outwards).sum(1)) > 0.9
+        assert header["materials"] == [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
     else:
         assert np.array_equal(read.visual.vertex_colors[:, :3], mesh.colours)
     assert np.array_equal(np.float32(read.vertices), mesh.vertices)

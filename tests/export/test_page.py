@@ -16,6 +16,7 @@ from pp_cl.export.harmonics import basis
 from pp_cl.export.observe import directions, observe
 from pp_cl.export.page import POINT, check_drawable, pack, page_text, write_gallery
 from pp_cl.files.image import read_rgba, to_8bit
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import load_run
 from pp_cl.scene.camera import Camera
@@ -268,6 +269,13 @@ def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):
         still = read_rgba(tmp_path / "all" / f"{stem}.png")
         assert still.shape[:2] == (315, 600) and still[..., :3].min() < 200
         assert still[:, [0, -1], :3].min() > 200
+
+
+def test_names_in_a_gallery_differ_whatever_their_case(run, tmp_path):
+    others = [replace(run, folder=RunFolder(tmp_path / name)) for name in ("RUN", "Index")]
+    assert write_gallery(tmp_path / "all", [run, *others]) == 3
+    names = [path.name.lower() for path in (tmp_path / "all").iterdir()]
+    assert len({*names}) == len(names) == 2 * 3 + 1
 
 
 def test_the_runs_name_is_text(run_folder, session_device, tmp_path):

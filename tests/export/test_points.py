@@ -64,15 +64,18 @@ def test_the_ply_reads_back_by_plyfile(run, written):
         assert vertex[name].dtype == "u1" and (vertex[name] == points.colours[:, channel]).all()
     assert (vertex["point_opacity"] == points.opacity).all()
     assert (vertex["weight"] == points.weight).all()
+    offset = run.model.cloud.offset.get()[points.rows, 3]
+    spacings = vertex["radius"] / run.model.grid.edge / run.config.raster.radius
+    assert np.log(spacings) == pytest.approx(offset, abs=1e-5)
     stored = run.model.cloud.arrays(run.dev)
     by_degree = [stored[f"points.sh{degree}"].get()[points.rows] for degree in range(3)]
     for c in range(16):
         for degree in (0, 1, 2):
             for k in range(2 * degree + 1):
                 assert (vertex[f"feature_{c}_{degree}_{k}"] == by_degree[degree][:, k, c]).all()
-    assert len(vertex.properties) == 8 + 9 * 16
+    assert len(vertex.properties) == 9 + 9 * 16
     comments = " ".join(data.comments)
-    for name in ("red, green, blue:", "weight:", "point_opacity:", "feature_C_D_K:"):
+    for name in ("red, green, blue:", "weight:", "point_opacity:", "radius:", "feature_C_D_K:"):
         assert name in comments
 
 

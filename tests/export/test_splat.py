@@ -1,7 +1,5 @@
 """Splat files: the layout that others read, and what they show when drawn as others draw them."""
 
-import json
-import struct
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -12,15 +10,14 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from support.gltf import glb
 from support.splats import colours, draw_splats, read_splats
 
-from pp_cl.errors import UserError
-from pp_cl.export import gaussians, splat
+from pp_cl.export import gaussians
 from pp_cl.export.gaussians import DEVIATION, fit_gaussians
 from pp_cl.export.splat import (
     Y_DOWN,
     Y_UP,
-    check_spz,
     splats,
     upright,
     write_splat_glb,
@@ -118,13 +115,17 @@ def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monke
     """
     monkeypatch.setattr(gaussians, "Trainer", fitted := Mock(side_effect=InterruptedError))
 
-    def views():
+    def views(window=30):
         with pytest.raises(InterruptedError):
-            fit_gaussians(run, 30)
+            fit_gaussians(run, window)
         return fitted.call_args[0][3]
 
     photographs, found = run.scene("train").splits["train"], views()
     assert len(found) == 2 * len(photographs)
+    with monkeypatch.context() as patch:  # for a window that is smaller than the images
+        for module in ("scene.views", "export.gaussians"):
+            patch.setattr(f"pp_cl.{module}.MIN_SIDE", 8)
+        assert {view.camera.width for view in views(15)} == {15}
     for one, other in zip(photographs, found, strict=False):
         assert one.name == other.name and (one.image == other.image).all()
     rendered = [view.image.shape for view in run.rendered(run.photographs("train"), opaque=True)]
@@ -159,36 +160,6 @@ def test_the_spz_says_the_same_with_y_up(y_up, ply, tmp_path):
     rest = table["harmonics"][:, 1:].clip(-127 / 128, 127 / 128)  # what 8 bits hold
     assert np.abs(found.shN - rest).max() < 0.0392
     assert (tmp_path / "a.spz").stat().st_size < ply.stat().st_size / 9
-
-
-def test_where_nothing_writes_spz_it_is_one_line(monkeypatch):
-    monkeypatch.setattr(splat, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match="pip install gsply"):
-        check_spz()
-
-
-def glb(path):
-    """(JSON, {attribute: array}) of a file."""
-    data = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON" and size % 4 == 0
-    gltf, body = json.loads(data[20 : 20 + size]), data[28 + size :]
-    assert struct.unpack_from("<I4s", data, 20 + size) == (len(body), b"BIN\0")
-    arrays = {}
-    for name, i in gltf["meshes"][0]["primitives"][0]["attributes"].items():
-        accessor = gltf["accessors"][i]
-        view = gltf["bufferViews"][accessor["bufferView"]]
-        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        assert view["byteOffset"] % 4 == 0
-        assert accessor["normalized"] == (dtype == "u1")
-        found = np.frombuffer(
-            body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], dtype
-        )
-        arrays[name] = found.reshape(accessor["count"], width)
-    return gltf, arrays
 
 
 def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from support.refused import refusing
+from support.gltf import glb
 
 from pp_cl.export import texture
 from pp_cl.export.formats import export
-from pp_cl.export.texture import check_texture, texels
+from pp_cl.export.texture import texels, write_textured
 from pp_cl.scene.camera_path import up_of
 
 
@@ -28,12 +28,26 @@ def test_texels_are_each_in_one_face(rng):
     assert (1 - at[:, 1]) * 40 - 0.5 == pytest.approx(row)
 
 
+def test_far_from_the_origin_the_file_has_the_same_shape(tmp_path):
+    solid = trimesh.creation.box((0.01, 0.02, 0.03))
+    visual = trimesh.visual.TextureVisuals(np.zeros((len(solid.vertices), 2)))
+    places = solid.vertices + (1e6, -1e6, 1e6 + 0.25)
+    far = trimesh.Trimesh(places, solid.faces, visual=visual)
+    write_textured(tmp_path / "a.glb", far)
+    read = trimesh.load(tmp_path / "a.glb", force="mesh")
+    assert np.ptp(read.vertices, axis=0) == pytest.approx((0.01, 0.02, 0.03), abs=1e-6)
+    assert read.vertices.mean(0) == pytest.approx(far.vertices.mean(0), abs=1e-6)
+
+
 def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
     said = export(run, "textured", tmp_path / "a.glb")
     solid = trimesh.load(tmp_path / "a.glb", force="mesh")
     assert said == f"{len(solid.vertices)} vertices, {len(solid.faces)} faces"
     assert 300 < len(solid.faces) <= 600 and solid.visual.uv.shape == (len(solid.vertices), 2)
+    _, stored = glb(tmp_path / "a.glb")
+    outwards = stored["POSITION"] - stored["POSITION"].mean(0)
+    assert np.mean((stored["NORMAL"] * outwards).sum(1) > 0) > 0.9
     image = np.asarray(solid.visual.material.baseColorTexture.convert("RGB")) / 255
     up = up_of(run.cameras("train"))
     turn = Rotation.align_vectors([(0, 1, 0)], [up])[0].as_matrix()
@@ -49,9 +63,3 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
         shown = picture.rgba().reshape(-1, 4)[ray]
         sure = shown[:, 3] > 0.95
         assert sure.sum() > 150 and np.abs(found - shown[:, :3])[sure].mean() < 0.06
-
-
-def test_a_missing_package_is_one_line(monkeypatch):
-    monkeypatch.setattr(texture, "find_spec", lambda name: None)
-    with refusing("pip install xatlas fast-simplification"):
-        check_texture()

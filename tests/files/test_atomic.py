@@ -11,7 +11,6 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import (
     atomic_file,
     atomic_folder,
-    check_writable,
     remove_leftovers,
     write_text,
 )
@@ -90,18 +89,6 @@ def test_a_link_named_like_a_leftover_loses_nothing_behind_it(tmp_path):
     (tmp_path / "run" / f".a.{DEAD}.pp-cl.tmp").symlink_to(tmp_path / "far")
     remove_leftovers(tmp_path / "run")
     assert (tmp_path / "far" / "photo.png").exists() and not list((tmp_path / "run").iterdir())
-
-
-def test_a_place_that_may_not_be_written_is_named(tmp_path, monkeypatch):
-    check_writable(tmp_path / "a" / "b")
-    assert not list(tmp_path.iterdir())
-    monkeypatch.setattr(os, "access", lambda path, _mode: Path(path) != tmp_path)
-    with pytest.raises(UserError) as caught:
-        check_writable(tmp_path / "a" / "b")
-    message = str(caught.value)
-    assert message.startswith(f"{tmp_path}/a/b: ") and f"permissions of {tmp_path}," in message
-    (tmp_path / "a").mkdir()
-    check_writable(tmp_path / "a" / "b")
 
 
 def test_windows_waits_for_a_reader_and_replaces_no_folder(tmp_path, monkeypatch):

@@ -84,11 +84,11 @@ def test_overlap_by_hand():
     ids = grid.ids(np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (2, 1, 0)]))
     surface = Surface(grid, np.array([[0b010], [0b011]], np.uint32), 3)
     found = overlap(surface, grid, ids)
-    assert (found.points, found.iou, found.recall, found.precision) == (4, 2 / 5, 2 / 3, 2 / 4)
+    assert found == {"points": 4, "iou": 2 / 5, "recall": 2 / 3, "precision": 2 / 4}
     larger = Surface(
         Grid((-1.0, -1, 0), 1.0, (4, 3, 1)), np.array([[0], [0b100], [0b110]], np.uint32), 3
     )
-    assert overlap(larger, grid, ids).recall == 2 / 3
+    assert overlap(larger, grid, ids)["recall"] == 2 / 3
 
 
 # --------------------------------------------------------------------------------------------------

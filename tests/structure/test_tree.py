@@ -62,13 +62,16 @@ def test_commands_that_install_work_in_a_checkout_and_with_the_wheel(monkeypatch
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(UserError) as caught:
         needed("pycolmap")
-    named = [set(re.search("`pip install (.+)`", str(caught.value))[1].split(" "))]
+    named = {frozenset(re.search("`pip install (.+)`", str(caught.value))[1].split(" "))}
     for path in (ROOT / "pp_cl").rglob("*.py"):
-        found = re.findall("pip install ([^`{]+)`", path.read_text("utf-8"))
-        named += [set(packages.split(" ")) for packages in found]
+        text = path.read_text("utf-8")
+        named |= {
+            frozenset(found.split(" ")) for found in re.findall("pip install ([^`{]+)`", text)
+        }
+        required = re.findall(r'    require\("[^"]+", ([^)]+)\)', text)
+        named |= {frozenset(re.findall('"([^"]+)"', packages)) for packages in required}
     for_users = set(extras) - {"cpu", "test", "lint", "torch"}
-    wanted = [extras[name] for name in for_users]
-    assert sorted(map(sorted, named)) == sorted(map(sorted, wanted))
+    assert named == {frozenset(extras[name]) for name in for_users}
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*.ipynb")]
     assert not [page.name for page in pages if "pp-cl[" in page.read_text("utf-8")]
 
