@@ -29,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--config",
         metavar="FILE",
-        help="begin with the settings of a config.json, all but those of its scene; options come"
-        " on top",
+        help="begin with the settings of a config.json, all but those of its scene and what its"
+        " images decided; options come on top",
     )
     shared.add_short(parser, SHORT)
     add(
