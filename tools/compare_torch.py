@@ -13,7 +13,7 @@ import numpy as np
 
 from pp_cl.bench import unet as bench
 from pp_cl.bench.timing import errors, interleave
-from pp_cl.commands.options import integer, side, widths
+from pp_cl.commands.options import integer, widths
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -134,7 +134,13 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     add, count = parser.add_argument, integer(1, 10_000)
     add("--widths", default="128,256,512", type=widths, metavar="A,B,C", help="of the levels")
-    add("--size", default="256", type=side, metavar="S", help="of the image, a multiple of 4 (256)")
+    add(
+        "--size",
+        default="256",
+        type=integer(4, 4096, 4),
+        metavar="S",
+        help="of the image, a multiple of 4 (256)",
+    )
     add("--variant", choices=(AUTO, *VARIANTS), default="auto", help="of our convolutions (auto)")
     add("--threads", type=count, default=2, metavar="N", help="PyTorch's (2)")
     add("--runs", type=count, default=15, metavar="N", help="timed runs of each (15)")

@@ -29,7 +29,7 @@ FLIPS = [
     ("raster/weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
     ("raster/softmax", "(floats)(-M)), 0.0f", "(floats)(M)), 0.0f", "softmax: forward, disc"),
     ("raster/softmax", "1.0f + o_z *", "1.0f - o_z *", "softmax: backward, soft"),
-    ("raster/alpha", "fmax(1.0f - alpha", "fmax(1.0f + alpha", "alpha: forward, soft"),
+    ("raster/alpha", "through = 1.0f - alpha", "through = 1.0f + alpha", "alpha: forward, soft"),
     ("raster/blend", "b / T * gain", "T / b * gain", "alpha: backward, soft"),
     ("raster/blend", "+ g - B;", "- g - B;", "alpha: gradient of alpha"),
     ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
