@@ -50,7 +50,7 @@ def test_the_same_scene_elsewhere_and_in_other_files(folder):
 
 @pytest.mark.parametrize("far, said", [(1e-9, False), (1e-4, True)])
 def test_cameras_that_another_processor_rounds_otherwise_are_the_same(folder, far, said):
-    """Also where that changes the last digit, or the sign of a zero."""
+    """Whatever the digest of the rounded numbers is."""
     views, listed = views_of(folder), scene_frames(str(folder))
     header = identity(views, listed)
     listed = [replace(o, camera=replace(o.camera, pose=o.camera.pose - far)) for o in listed]

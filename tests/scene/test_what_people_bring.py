@@ -17,6 +17,7 @@ from support.scenes import ball_image, ring_cameras
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import ORIENTATION
 from pp_cl.scene.convention import GL_FROM_CV
+from pp_cl.scene.load import list_split
 from pp_cl.scene.views import View
 from tools.convert_scene import convert
 
@@ -292,11 +293,6 @@ TRAINS = {
         ],
         "masks are taken from",
     ),
-    "masks of training images alone": (
-        "colmap",
-        gone("masks/000000.png.png", "masks/000008.png.png"),
-        "",
-    ),
     "paths of another machine": (
         "nerfstudio",
         frame_by_frame("file_path", lambda _, name: WINDOWS + name.replace("/", "\\")),
@@ -400,6 +396,12 @@ def test_it_is_refused_with_the_reason(tmp_path, report):
     change(a_ball(tmp_path / "scene", form))
     status, lines = train(tmp_path / "scene", tmp_path / "run")
     assert status == 2 and told in lines[-1] and not (tmp_path / "run").exists()
+
+
+def test_a_test_split_of_which_no_image_has_a_mask_is_listed(tmp_path):
+    folder = a_ball(tmp_path / "scene", "colmap")
+    gone("masks/000000.png.png", "masks/000008.png.png")(folder)
+    assert [one.mask for one in list_split(folder, "test").photographs] == [None, None]
 
 
 def test_axes_that_the_user_has_stated(tmp_path):
