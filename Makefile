@@ -14,7 +14,7 @@ SEED ?= 0
 ON_ALL_CORES := --numprocesses auto --dist worksteal
 
 # The tests that are named like a kernel file, and those with the marker `kernels`.
-OCLGRIND = $(wildcard $(shell find cl -name "*.cl" | sed "s|^cl/\(.*\)/\(.*\).cl|tests/\1/test_\2.py|")) \
+OCLGRIND = $(wildcard $(shell find cl -name "*.cl" | sed "s|^cl/\(.*\)/\(.*\).cl|tests/\1/test_\2.py tests/engine/\1/test_\2.py|")) \
 	$(shell grep -rl "pytest.mark.kernels" --include="test_*.py" tests)
 # Its check for uninitialised reads knows no optimised code and no forced inlining; it takes its options from here, where
 # pyopencl's cache does not see them.
@@ -54,12 +54,12 @@ test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if
 # With it PoCL divides with errors up to 2.5 ulp, as GPUs may; more than they do, it takes no number for NaN or infinite.
 test-coarse: $(READY) ## run the tests of all kernels on PoCL with the coarse division that GPUs may have
 	@PYOPENCL_BUILD_OPTIONS=-cl-fast-relaxed-math PP_DEVICE="Portable Computing Language" \
-		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/device/test_rounding.py tests/raster/test_pulsar.py)
+		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/engine/device/test_rounding.py tests/engine/raster/test_pulsar.py)
 
 test-no-unix: $(READY) ## run the tests without fcntl, resource, os.fork and the signals that Windows lacks
 	@PYTHONPATH=$(CURDIR)/tests/support/hidden $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
-# Drivers and kernels work in one way on CPUs and in another on GPUs (pp_cl/device/launch.py).
+# Drivers and kernels work in one way on CPUs and in another on GPUs (pp_cl/engine/device/launch.py).
 test-gpu-form: $(READY) ## run the tests on PoCL with all drivers and kernels working as on GPUs
 	@PP_FORM=gpu PP_DEVICE="Portable Computing Language" $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 

@@ -2,4 +2,4 @@
 
 from setuptools import find_packages, setup
 
-setup(packages=[*find_packages(include=["pp_cl*"]), "pp_cl.cl"])
+setup(packages=[*find_packages(include=["pp_cl*", "pp_studio*"]), "pp_cl.cl"])

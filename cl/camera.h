@@ -1,4 +1,4 @@
-// A pinhole camera read from one buffer of 21 floats (docs/conventions.md); pp_cl/scene/camera.py
+// A pinhole camera read from one buffer of 21 floats (docs/conventions.md); pp_cl/engine/camera.py
 // writes it. World coordinates count from a centre near the points, as in grid.h.
 #ifndef PP_CAMERA_H
 #define PP_CAMERA_H

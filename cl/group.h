@@ -1,5 +1,5 @@
 // Sums and scans by work-items that share local memory: GROUP neighbours, a power of two on GPUs; 1
-// on CPUs, where nothing is shared (pp_cl/device/launch.py). A work-group holds one or more of them
+// on CPUs, where nothing is shared (pp_cl/engine/device/launch.py). A work-group holds one or more of them
 // as a whole, and all its work-items call these functions together.
 #ifndef PP_GROUP_H
 #define PP_GROUP_H

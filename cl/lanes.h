@@ -1,5 +1,5 @@
 // Vectors of LANES neighbouring values, which one work-item handles: 16 on CPUs, 4 or 1 on GPUs
-// (pp_cl/device/launch.py). The formulas are the same for all.
+// (pp_cl/engine/device/launch.py). The formulas are the same for all.
 #ifndef PP_LANES_H
 #define PP_LANES_H
 

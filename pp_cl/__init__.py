@@ -4,14 +4,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pp_cl.device.discover import open_device
+    from pp_cl.drivers.discover import open_device
+    from pp_cl.engine.camera import Camera
     from pp_cl.errors import UserError
-    from pp_cl.export.formats import export as export_run
+    from pp_cl.evaluate import evaluate_run
     from pp_cl.files.picture import Picture
-    from pp_cl.run import Run, evaluate_run, load
-    from pp_cl.scene.camera import Camera
+    from pp_cl.run import Run, load
     from pp_cl.scene.load import Scene, load_scene
-    from pp_cl.session import train_scene
+    from pp_cl.session.training import train_scene
 
 __version__ = "0.2.0"
 
@@ -23,7 +23,6 @@ __all__ = [
     "UserError",
     "__version__",
     "evaluate_run",
-    "export_run",
     "load",
     "load_scene",
     "open_device",
@@ -32,25 +31,23 @@ __all__ = [
 
 # where each of them is, which is imported when it is asked for
 _MODULES = {
-    "Camera": "scene.camera",
+    "Camera": "engine.camera",
     "Picture": "files.picture",
     "Run": "run",
     "Scene": "scene.load",
     "UserError": "errors",
-    "evaluate_run": "run",
-    "export_run": "export.formats",
+    "evaluate_run": "evaluate",
     "load": "run",
     "load_scene": "scene.load",
-    "open_device": "device.discover",
-    "train_scene": "session",
+    "open_device": "drivers.discover",
+    "train_scene": "session.training",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
-    return getattr(module, "export" if name == "export_run" else name)
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -15,27 +15,10 @@ from contextlib import nullcontext, redirect_stdout, suppress
 from itertools import pairwise
 
 from pp_cl import __version__
+from pp_cl.commands import COMMANDS
 from pp_cl.commands.options import METRICS
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
 from pp_cl.files.atomic import mend
-
-COMMANDS = (
-    "devices",
-    "make",
-    "capture",
-    "train",
-    "eval",
-    "sweep",
-    "info",
-    "render",
-    "view",
-    "export",
-    "compare",
-    "compress",
-    "bench",
-    "selftest",
-)  # modules of pp_cl.commands
-
 
 # options whose value may be left out, and what it is then
 ALONE = {"--json": "-", "--metrics": ",".join(METRICS)}
@@ -184,8 +167,8 @@ def _parser():
     )
     parser.add_argument("--version", action="version", version=f"pp-cl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
-    for name in COMMANDS:
-        module = importlib.import_module(f"pp_cl.commands.{name}")
+    for name, path in COMMANDS.items():
+        module = importlib.import_module(path)
         command = commands.add_parser(
             name,
             help=module.HELP,

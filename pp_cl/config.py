@@ -6,17 +6,19 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+from pp_cl.checkpoint import opened_run
+from pp_cl.engine.views import MIN_SIDE, fitting_downscale
 from pp_cl.errors import UserError, quoted, shown, suggestion
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.files.untrusted import read_regular
-from pp_cl.presets import PRESETS
-from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
+from pp_cl.presets import IMAGE_SIZES, PRESETS
+from pp_cl.scene.load import scene_frames
+from pp_cl.settings import FORMAT, Config, sections
 
-FORMAT = 1  # of config.json: raised when keys are added, change meaning or are removed
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder
@@ -24,25 +26,6 @@ OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolera
 LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
 OPEN = ("train.refine_at", "raster.radius")  # that a training decides where they are 0
 MEND_SETTINGS = "restore it or start a new run"
-
-
-@dataclass
-class Config:
-    """All settings of a run. decided: those of OPEN that nobody has set."""
-
-    preset: str = "tiny"
-    decided: list[str] = field(default_factory=list)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    points: PointsConfig = field(default_factory=PointsConfig)
-    raster: RasterConfig = field(default_factory=RasterConfig)
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    train: TrainConfig = field(default_factory=TrainConfig)
-
-    def to_json(self) -> str:
-        """The settings as JSON text: {"format": FORMAT, "preset": name, "decided": keys,
-        section: {name: value}}.
-        """
-        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)
 
 
 def preset(name: str) -> Config:
@@ -53,13 +36,6 @@ def preset(name: str) -> Config:
     for key, value in PRESETS[name].items():
         assign(config, key, value, "preset")
     return config
-
-
-def sections(config: Config) -> Iterator[tuple[str, Any]]:
-    """(name, dataclass) of each section, in their order."""
-    for name, value in vars(config).items():
-        if dataclasses.is_dataclass(value):
-            yield name, value
 
 
 def assign(config: Config, key: str, value: Any, origin: str) -> None:
@@ -310,3 +286,103 @@ def help_lines() -> list[str]:
         for section, values in sections(Config())
         for item in dataclasses.fields(values)
     ]
+
+
+# ---- the settings of a training in a folder: of a new one, or of one that goes on
+
+# settings that a checkpoint may go on with others of: places, which it knows by more than that, and
+# what the model does not depend on
+FREE = (
+    *("scene.path", "scene.masks", "scene.ignore", "train.memory_gib", "train.eval_every"),
+    *("train.log_every", "train.checkpoint_every", "train.checkpoint_minutes"),
+)
+
+
+def run_config(
+    folder: RunFolder,
+    scene: str,
+    preset_name: str | None = None,
+    given: Iterable[tuple[str, Any, str]] = (),
+    *,
+    extends: bool = False,
+) -> Config:
+    """Config of a training in `folder`: that of the run which has a checkpoint there, else the
+    preset's, with the given settings.
+
+    scene: a folder, or the word demo. given: (key, value or its text, origin); a run that has a
+    checkpoint must have the same values. extends: whether train.iterations of a finished run may
+    change: with more of them it goes on, with fewer it stays finished. Raises UserError naming the
+    first setting that differs or makes no sense, or what is wrong with the scene's files.
+    """
+    given = list(given)
+    if folder.config.exists() and folder.checkpoint.exists():
+        return _config_to_resume(folder, scene, preset_name, given, extends)
+    return _config_to_begin(folder, scene, preset_name, given)
+
+
+def _config_to_begin(folder, scene, preset_name, given):
+    """That of a run that was stopped before its first checkpoint, if it is of this preset; else the
+    preset's, which reduces the images to about its size unless scene.downscale is given.
+    """
+    if folder.config.exists():
+        stored = load_config(folder.config)
+        if preset_name in (None, stored.preset):
+            for key in stored.decided:  # of other images, maybe
+                assign(stored, key, field_of(key).default, "preset")
+            if "train.iterations" in [key for key, _, _ in given]:
+                stored.train.minutes = 0
+            return configure(stored, scene, given)
+    config = configure(preset(preset_name or "tiny"), scene, given)
+    if "scene.downscale" not in [key for key, _, _ in given]:
+        downscale = preset_downscale(config.scene.path, config.preset)
+        assign(config, "scene.downscale", downscale, "preset")
+    return config
+
+
+def _config_to_resume(folder, scene, preset_name, given, extends):
+    """That of the run, which may change in nothing but the iterations of a finished one."""
+    stored, config = load_config(folder.config), load_config(folder.config)
+    if preset_name not in (None, stored.preset):
+        raise UserError(
+            f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
+            " another --out"
+        )
+    configure(config, scene, given)
+    if stored.train.minutes:  # planned meanwhile, as train.iterations are
+        config.train.refine_at = stored.train.refine_at
+    if extends and config.train.iterations != stored.train.iterations:
+        with opened_run(folder, stored) as run:
+            if run.header["step"] == stored.train.iterations:
+                most = max(config.train.iterations, stored.train.iterations)
+                for one in (config, stored):
+                    assign(one, "train.iterations", most, "settings")
+                    assign(one, "train.minutes", 0, "settings")
+    _check_same(config, stored, folder)
+    return config
+
+
+def _check_same(asked, stored, folder):
+    """Raise UserError naming the first setting that differs, but for those of FREE."""
+    for (section, ours), (_, theirs) in zip(sections(asked), sections(stored), strict=True):
+        for name, value in vars(ours).items():
+            there = getattr(theirs, name)
+            if value != there and f"{section}.{name}" not in FREE:
+                refuse_setting(folder, f"{section}.{name}", there, value)
+
+
+def refuse_setting(folder: RunFolder, key: str, there: Any, asked: Any) -> NoReturn:
+    """Raise UserError: a training in the folder has another value of a setting."""
+    raise UserError(
+        f"{folder.config}: {key} is {there} there, {asked} asked for; use another --out, or the"
+        " settings of the run"
+    )
+
+
+def preset_downscale(path: str, preset: str) -> int:
+    """How many times a preset reduces the images of a scene, by the size of the largest training
+    image that leaves the smallest enough pixels. Raises UserError as scene_frames does.
+    """
+    cameras = [one.camera for one in scene_frames(path)]
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    fitting = fitting_downscale(max(sizes, key=max), IMAGE_SIZES[preset])
+    return max(1, min(fitting, min(map(min, sizes)) // MIN_SIDE))

@@ -1,8 +1,12 @@
 """Every setting with its default, help text and limits: one dataclass for each section."""
 
+import dataclasses
+import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+FORMAT = 1  # of config.json: raised when keys are added, change meaning or are removed
 BLOCKS = ("double", "single", "gated")  # what a level of the network computes
 
 
@@ -247,3 +251,29 @@ class TrainConfig:
         0,
         10**8,
     )
+
+
+@dataclass
+class Config:
+    """All settings of a run. decided: those of OPEN that nobody has set."""
+
+    preset: str = "tiny"
+    decided: list[str] = field(default_factory=list)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    points: PointsConfig = field(default_factory=PointsConfig)
+    raster: RasterConfig = field(default_factory=RasterConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def to_json(self) -> str:
+        """The settings as JSON text: {"format": FORMAT, "preset": name, "decided": keys,
+        section: {name: value}}.
+        """
+        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)
+
+
+def sections(config: Config) -> Iterator[tuple[str, Any]]:
+    """(name, dataclass) of each section, in their order."""
+    for name, value in vars(config).items():
+        if dataclasses.is_dataclass(value):
+            yield name, value

@@ -10,12 +10,12 @@ from hypothesis import HealthCheck, settings
 from support.guarded import DATA, GuardedDevice, TracedDevice
 from support.runs import Runs
 
-from pp_cl.device import discover
-from pp_cl.device.device import Device
-from pp_cl.device.discover import open_device
-from pp_cl.export import gaussians, texture
+from pp_cl.drivers import discover
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.device.device import Device
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
+from pp_studio.export import gaussians, texture
 
 # of Hypothesis: the same few examples each time, or as many as `make fuzz` is told
 settings.register_profile(

@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from support.runs import arguments, spoken
+from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
@@ -24,7 +24,7 @@ def alone(tmp_path_factory):
 
 
 def test_a_run_alone_is_exported(alone, tmp_path):
-    """The other formats: tests/commands/test_export.py."""
+    """The other formats: tests/studio/commands/test_export.py."""
     mesh, scene = tmp_path / "mesh.ply", tmp_path / "scene"
     for kind, out in {"mesh": mesh, "scene": scene}.items():
         assert main(["export", str(alone), "--format", kind, "--out", str(out)]) == 0
@@ -48,16 +48,3 @@ def test_a_run_alone_says_what_is_in_it(alone, tmp_path, capsys):
     assert main(["info", str(alone)]) == 0
     text = capsys.readouterr().out
     assert "8 of 48x48" in text and "not there" in text
-
-
-def test_a_run_alone_is_compressed_by_what_it_rendered(alone, tmp_path):
-    out = tmp_path / "small"
-    assert main(["compress", str(alone), "--max-loss", "1", "--out", str(out)]) == 0
-    report = json.loads((out / "compress.json").read_text())
-    assert report["bytes"][1] < 0.8 * report["bytes"][0]
-    rows = [json.loads(line) for line in (alone / "log.jsonl").read_text().splitlines()]
-    logged = [row["psnr"] for row in rows if "psnr" in row][-1]
-    assert report["psnr"] == pytest.approx(logged, abs=0.05)
-    losses = [trial["loss"] for trial in report["trials"] if trial["taken"]]
-    assert losses[-1] == report["loss"] <= 1 and max(losses) > 0.05
-    assert spoken(["info", out])[0] == 0

@@ -21,7 +21,7 @@ READ = """
 import sys
 from pathlib import Path
 import pp_cl.metrics.compare  # its memory is to be there before a bomb
-from pp_cl.device.host import at_most_more
+from pp_cl.engine.device.host import at_most_more
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.shape import read_mesh

@@ -7,8 +7,8 @@ import pytest
 from support.runs import arguments
 
 from pp_cl.cli import main
+from pp_cl.engine.step import Trainer
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.train import Trainer
 
 RARELY = {"train__checkpoint_every": 1000}
 
@@ -35,7 +35,7 @@ def saved(monkeypatch):
         return train_step(self)
 
     clock = SimpleNamespace(monotonic=lambda: now[0], perf_counter=time.perf_counter)
-    monkeypatch.setattr("pp_cl.session.time", clock)
+    monkeypatch.setattr("pp_cl.session.training.time", clock)
     monkeypatch.setattr(RunFolder, "save", saving)
     monkeypatch.setattr(Trainer, "train_step", stepping)
     return steps

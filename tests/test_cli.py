@@ -24,7 +24,7 @@ def test_devices_are_listed_and_without_one_it_is_said_what_to_install(
     assert "works" in capsys.readouterr().out
     assert main(["devices", "--json"]) == 0
     assert any(d["problem"] is None and d["name"] for d in json.loads(capsys.readouterr().out))
-    monkeypatch.setattr("pp_cl.device.discover.list_devices", lambda **_: [])
+    monkeypatch.setattr("pp_cl.drivers.discover.list_devices", lambda **_: [])
     for words in (["train", scene, "--out", tmp_path / "run"], ["devices"]):
         assert "install" in failure(*words)
 
@@ -34,7 +34,7 @@ def test_a_run_that_lies_in_runs_is_named(tmp_path, monkeypatch):
     run = tmp_path / "runs" / "mine"
     run.mkdir(parents=True)
     (run / "config.json").write_text("{}")
-    for command in ("eval", "info", "compare", "compress"):
+    for command in ("eval", "info", "compare"):
         assert "runs/mine?" in failure(command, "mine")
 
 
@@ -54,7 +54,7 @@ def test_a_kernel_that_does_not_build_is_one_line_below_the_log(scene, tmp_path,
             "cl/a.cl does not build on a device with -DA=1", "<kernel>:3:\nno such type\n"
         )
 
-    monkeypatch.setattr("pp_cl.session.open_training", broken)
+    monkeypatch.setattr("pp_cl.session.training.open_training", broken)
     line = failure("train", scene, "--out", tmp_path / "run", "--downscale", "1")
     assert line.startswith(
         "pp-cl: cl/a.cl does not build on a device with -DA=1; update the driver"

@@ -4,10 +4,11 @@ import json
 
 import pytest
 
-from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
+from pp_cl.config import assign, configure, help_lines, load_config, preset, validate
+from pp_cl.engine.training import schedule
 from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS
-from pp_cl.training import schedule
+from pp_cl.settings import Config
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -10,7 +10,7 @@ from support.checkpoints import load_checkpoint
 from support.refused import failure
 from support.runs import arguments, rows
 
-from pp_cl.training.optim import Optimiser
+from pp_cl.engine.training.optim import Optimiser
 
 KEPT = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"
 # {what happens: (the step after which, to what, other settings, what is said)}
@@ -30,7 +30,7 @@ def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
 ):
     after, what, settings, words = DIVERGENCES[case]
     _poison(monkeypatch, after, what)
-    monkeypatch.setattr("pp_cl.session.PREVIEWS", 3 if case == "preview" else 1)
+    monkeypatch.setattr("pp_cl.session.training.PREVIEWS", 3 if case == "preview" else 1)
     line = failure(*arguments(scene, tmp_path / "run", **settings))
     assert words in line and KEPT in line and str(tmp_path / "run") in line
     header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")

@@ -13,9 +13,9 @@ from support.scenes import write_ball_scene
 
 from pp_cl import load
 from pp_cl.cli import main
+from pp_cl.evaluate import image_files, render_views
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.metrics.psnr_ssim import psnr
-from pp_cl.run import image_files, render_views
 
 
 @pytest.fixture(scope="module")

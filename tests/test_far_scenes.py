@@ -12,13 +12,13 @@ from support.runs import arguments
 from support.scenes import move_scene, write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.export.gltf import write_glb
-from pp_cl.export.mesh import Mesh, write_mesh
-from pp_cl.export.points import coloured_points, in_world, write_ply
-from pp_cl.export.splat import splats, write_splat_glb
+from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
 from pp_cl.metrics.shape import read_mesh
-from pp_cl.raster.points import MOST_OF_GAUSSIANS
 from pp_cl.run import load_run
+from pp_studio.export.gltf import write_glb
+from pp_studio.export.mesh import Mesh, write_mesh
+from pp_studio.export.points import coloured_points, in_world, write_ply
+from pp_studio.export.splat import splats, write_splat_glb
 
 FAR = np.array([1e6, -1e6, 1e6])
 UNIT = 2.0**-24  # of the eyes: float64 holds them exactly 1e6 away, and the grid too

@@ -38,25 +38,25 @@ from support.fuzz_world import (
 )
 from support.sparse import write_model, write_ply, write_some_edits
 
-from pp_cl.cli import COMMANDS
-from pp_cl.config import Config, load_config, sections
+from pp_cl.checkpoint import load_run_state
+from pp_cl.commands import COMMANDS
+from pp_cl.config import load_config, run_config
+from pp_cl.engine.grid import Grid
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_mask, read_rgba
 from pp_cl.files.run_folder import Log, RunFolder
 from pp_cl.metrics.compare import compare
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
 from pp_cl.scene.edits import read_edits
-from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import find_reader, load_scene
 from pp_cl.scene.masks import MaskRule, cut_out
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
-from pp_cl.session import run_config
-from pp_cl.sweep.plan import Job, plan, read_varied
-from pp_cl.sweep.result import finished_row
-from pp_cl.training.checkpoint import load_run_state
+from pp_cl.settings import Config, sections
+from pp_studio.sweep.plan import Job, plan, read_varied
+from pp_studio.sweep.result import finished_row
 
 MOST_MEMORY = 2**26  # bytes of pixels that a small file may unfold to without a word
 KEYS = [f"{section}.{name}" for section, values in sections(Config()) for name in vars(values)]
@@ -67,7 +67,7 @@ ENDING = {
     "train": set_words(train__iterations=1),
     "sweep": ["--dry-run"],
     "bench": ["--points", "100", "--size", "16"],
-    **{name: ["--no-such"] for name in ("view", "selftest", "compress")},
+    **{name: ["--no-such"] for name in ("view", "selftest")},
 }
 
 
@@ -447,7 +447,7 @@ def test_settings(world, pairs, what):
 def test_a_command_line(world, data):
     draw, name = data.draw, one(data.draw, *COMMANDS)
     parser = argparse.ArgumentParser()
-    importlib.import_module(f"pp_cl.commands.{name}").add_arguments(parser)
+    importlib.import_module(COMMANDS[name]).add_arguments(parser)
     options = st.sampled_from(re.findall(r"--[\w-]+", parser.format_help())) | damage.words
     with world.watched() as folder:
         words = [world.run(folder)]

@@ -40,8 +40,8 @@ def measure(folder):
     scene = write_ball_scene(folder / "ball", views=12, size=96)
     out = folder / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pp_cl.train.SMOOTHING_EVERY", 1)
-        patch.setattr("pp_cl.training.schedule.PRUNE_LOOKS", 5)
+        patch.setattr("pp_cl.engine.step.SMOOTHING_EVERY", 1)
+        patch.setattr("pp_cl.engine.training.schedule.PRUNE_LOOKS", 5)
         assert main(["train", scene, "--out", str(out), *set_words(SETTINGS)]) == 0
     assert main(["eval", str(out)]) == 0
     rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]

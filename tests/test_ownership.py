@@ -12,7 +12,7 @@ from support.runs import arguments, spoken
 from support.sweeps import jobs_of, pretend, words_of
 
 from pp_cl.cli import main
-from pp_cl.export import FORMATS
+from pp_studio.export import FORMATS
 
 FILM = ["render", "run", "--seconds", "0.2", "--fps", "10"]
 OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
@@ -41,8 +41,6 @@ COMMANDS = {
         for end in (ends or ("",))[:1]
         for named in ((f"a{end}",) if end else (),)
     },
-    "compress": (["compress", "run", "--max-loss", "0.01"], ()),
-    "compress elsewhere": (["compress", "run", "--max-loss", "0.01", "--out", "there"], ()),
     "info": (["info", "run", "--picture", "a.png", "--json", "a.json"], ("a.png", "a.json")),
     "compare": ([*OF_BALL, "a.json"], ("a.json",)),
     "bench": ([*RASTER, "--json", "a.json"], ("a.json",)),

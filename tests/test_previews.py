@@ -47,8 +47,8 @@ def test_previews_leave_the_run_as_it_is(tmp_path, monkeypatch, changes):
     scene = write_ball_scene(tmp_path / "ball")
     none, many = tmp_path / "none", tmp_path / "many"
     for out, previews, first in ((none, 1, 1e9), (many, 7, 0)):
-        monkeypatch.setattr("pp_cl.session.PREVIEWS", previews)
-        monkeypatch.setattr("pp_cl.session.FIRST_PREVIEW", first)
+        monkeypatch.setattr("pp_cl.session.training.PREVIEWS", previews)
+        monkeypatch.setattr("pp_cl.session.training.FIRST_PREVIEW", first)
         assert main(arguments(scene, out, **changes)) == 0
     names = [[p.name for p in sorted((run / "previews").iterdir())] for run in (none, many)]
     assert names[0] == ["step_000060.png"]
@@ -59,7 +59,7 @@ def test_previews_leave_the_run_as_it_is(tmp_path, monkeypatch, changes):
 def test_a_run_that_has_a_preview_needs_no_early_one(tmp_path, monkeypatch):
     scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
     train_and_interrupt(scene, out, 35, monkeypatch)
-    monkeypatch.setattr("pp_cl.session.FIRST_PREVIEW", 0)
+    monkeypatch.setattr("pp_cl.session.training.FIRST_PREVIEW", 0)
     before = {p.name for p in (out / "previews").iterdir()}
     assert main(arguments(scene, out)) == 0
     after = {p.name for p in (out / "previews").iterdir()}

@@ -15,13 +15,13 @@ from support.runs import SETTINGS, arguments
 
 import pp_cl
 from pp_cl.cli import main
-from pp_cl.config import assign
-from pp_cl.device.discover import open_device
+from pp_cl.config import assign, run_config
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.training.schedule import GAMMA
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session import open_training, run_config
-from pp_cl.training.schedule import GAMMA
+from pp_cl.session.training import open_training
 
 
 @pytest.fixture(scope="module")

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from pp_cl.device.device import Device
-from pp_cl.device.discover import open_device
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
 from pp_cl.files.image import to_8bit, write_png
-from pp_cl.files.video import write_video
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import ANGLE, DISTANCE, demo_frames, render
 from pp_cl.scene.load import scene_frames
+from pp_studio.video import write_video
 
 WIDER = 1.6  # angle of view, so that the room is seen around the object
 ROOM = 6.0  # radius of the room, world units; the cameras are 3.4 from its middle

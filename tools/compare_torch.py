@@ -14,10 +14,10 @@ import numpy as np
 from pp_cl.bench import unet as bench
 from pp_cl.bench.timing import errors, interleave
 from pp_cl.commands.options import integer, widths
-from pp_cl.device.discover import open_device
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.layers.choice import AUTO, VARIANTS
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
-from pp_cl.layers.choice import AUTO, VARIANTS
 
 # Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after
 # PyTorch is done, on cores that our device's threads need.

@@ -14,12 +14,12 @@ from importlib import import_module
 from pathlib import Path
 
 from pp_cl.config import configure, preset
-from pp_cl.device.discover import open_device
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
 from pp_cl.scene.load import open_scene, scene_splits
 from pp_cl.scene.readers.common import SPLITS, hold_out
-from pp_cl.scene.views import View
 
 FOLDER = Path(__file__).with_name("scene_formats")
 FORMATS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "common")

@@ -14,13 +14,13 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from pp_cl import load
-from pp_cl.device.device import Device
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid, smallest_edge
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.run import Run
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import OBJECT_BOX, distances
-from pp_cl.scene.grid import Grid, smallest_edge
 
 CELLS = 2**24  # of the distance field
 STEPS = 200  # along a ray

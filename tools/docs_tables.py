@@ -26,11 +26,14 @@ import string
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 import pp_cl
-from pp_cl.cli import COMMANDS
-from pp_cl.config import Config, sections, text_of
+import pp_studio
+from pp_cl.commands import COMMANDS
+from pp_cl.config import text_of
 from pp_cl.presets import PRESETS
+from pp_cl.settings import Config, sections
 from tools.provenance import ROOT, digest, sentence
 
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
@@ -120,7 +123,7 @@ def commands() -> str:
 
 def _command(name: str) -> tuple[str, list[tuple[str, str]]]:
     """(its help, [(an argument as it is written, what it means)]) of a command."""
-    module = importlib.import_module(f"pp_cl.commands.{name}")
+    module = importlib.import_module(COMMANDS[name])
     parser = argparse.ArgumentParser(add_help=False)
     module.add_arguments(parser)
     return module.HELP, [(_written(a), a.help.replace("%%", "%")) for a in parser._actions]
@@ -138,15 +141,16 @@ def api() -> str:
         "Picture.over",
         "Picture.rgba",
         "evaluate_run",
-        "export_run",
+        "Camera",
+        "Camera.look_at",
     ]
-    names += ["Camera", "Camera.look_at"]
-    return "\n".join(line for name in names for line in _entry(name)).rstrip()
+    lines = [line for name in names for line in _entry(pp_cl, name)]
+    return "\n".join([*lines, *_entry(pp_studio, "export_run")]).rstrip()
 
 
-def _entry(name: str) -> list[str]:
+def _entry(package: ModuleType, name: str) -> list[str]:
     """The call or the class, and the docstring."""
-    thing = operator.attrgetter(name)(pp_cl)
+    thing = operator.attrgetter(name)(package)
     written = name
     if inspect.isroutine(thing):
         signature = inspect.signature(thing)

@@ -10,16 +10,16 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.training.target import Target
 from pp_cl.errors import UserError
-from pp_cl.export.fusion import HIDDEN, box_around, fuse
-from pp_cl.export.harmonics import STEPS, basis, fit_harmonics
-from pp_cl.export.observe import directions, observe
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import Run, load
 from pp_cl.scene.demo import demo_mesh, distances
-from pp_cl.scene.grid import Grid
-from pp_cl.scene.target import Target
+from pp_studio.export.fusion import HIDDEN, box_around, fuse
+from pp_studio.export.harmonics import STEPS, basis, fit_harmonics
+from pp_studio.export.observe import directions, observe
 
 SAMPLES = 60_000  # of a surface
 EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances are asked for

@@ -30,7 +30,8 @@ from typing import NamedTuple
 from unittest.mock import patch
 
 from pp_cl.cli import main as pp_cl
-from pp_cl.device.device import (
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.device.device import (
     INTEL_PLATFORM,
     STANDARD,
     Device,
@@ -38,7 +39,6 @@ from pp_cl.device.device import (
     kernel_folder,
     vendor_options,
 )
-from pp_cl.device.discover import open_device
 from pp_cl.scene.demo import demo_views
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.selftest.run import CASES, run_cases

@@ -9,10 +9,10 @@ import sys
 
 import numpy as np
 
+from pp_cl.checkpoint import opened_run
 from pp_cl.config import load_config
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.training.checkpoint import opened_run
-from pp_cl.training.start import DEMO_NETWORK
+from pp_cl.session.start import DEMO_NETWORK
 
 
 def main() -> None:

@@ -19,12 +19,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pp_cl.device.discover import open_device
+from pp_cl.config import run_config
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.camera import Camera
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.frame import frame_keys
-from pp_cl.session import open_training, run_config
+from pp_cl.session.training import open_training
 
 MIB = 2**20
 PHONE, PHONES, SHRUNK = (4000, 3000), 300, 4  # pixels, photographs, times the drawing is enlarged

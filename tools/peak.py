@@ -5,9 +5,9 @@ than any cache.
 import time
 from pathlib import Path
 
-from pp_cl.device.device import Device, Program
-from pp_cl.layers.choice import device_class
-from pp_cl.layers.tiles import VECTOR
+from pp_cl.engine.device.device import Device, Program
+from pp_cl.engine.layers.choice import device_class
+from pp_cl.engine.layers.tiles import VECTOR
 
 # Of one run of PeakFlops: long against the 30 us of a launch, short enough to run between any two
 # others.

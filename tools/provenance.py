@@ -19,10 +19,9 @@ ROOT = Path(__file__).parents[1]
 # what decides the numbers of a training, its evaluation and a capture
 DECIDES = (
     "cl",
-    *(f"pp_cl/{name}.py" for name in ("config", "model", "presets", "render", "run")),
-    *(f"pp_cl/{name}.py" for name in ("session", "settings", "train")),
-    *(f"pp_cl/{name}" for name in ("capture", "device", "layers", "metrics", "network")),
-    *(f"pp_cl/{name}" for name in ("raster", "scene", "training")),
+    *(f"pp_cl/{name}.py" for name in ("config", "evaluate", "presets", "run", "settings")),
+    *(f"pp_cl/{name}" for name in ("engine", "metrics", "scene", "session")),
+    "pp_studio/capture",
 )
 KINDS = (".py", ".cl", ".h", ".npz", ".json")
 

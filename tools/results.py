@@ -25,7 +25,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from pp_cl.device.discover import open_device
+from pp_cl.drivers.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.metrics.published import tables as published
@@ -279,7 +279,7 @@ def memory(kept: Path) -> list[dict]:
 
 
 def demo(kept: Path) -> list[dict]:
-    """Rows of DEMO: depth, mesh, page and compression of the demo's runs."""
+    """Rows of DEMO: depth, mesh and page of the demo's runs."""
     rows = []
     short, long = (kept / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
@@ -293,10 +293,6 @@ def demo(kept: Path) -> list[dict]:
     near = f"{mesh['mean']} on average, median {mesh['median']}"
     rows.append({"what": "exported mesh, spacings from the surface", "result": near})
     rows.append({"what": "exported page against the run's images", "result": f"{page['run']} dB"})
-    run_program(*PP_CL, "compress", short, "--max-loss", "0.1dB", "--out", kept / "smaller")
-    before, after = (read_found(kept, *PP_CL, "info", r) for r in (short, kept / "smaller"))
-    mib = [about["files"]["checkpoint.npz"] / 2**20 for about in (before, after)]
-    rows.append({"what": "compressed by 0.1 dB", "result": f"{mib[0]:.1f} to {mib[1]:.1f} MiB"})
     return rows
 
 

@@ -15,14 +15,15 @@ import sys
 from pathlib import Path
 
 from pp_cl.bench.timing import interleave
-from pp_cl.device.discover import open_device
+from pp_cl.config import run_config
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.network.layers import multiplications
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.weights import listed_hits
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.network.layers import multiplications
-from pp_cl.network.unet import UNet
-from pp_cl.raster.weights import listed_hits
-from pp_cl.session import open_training, run_config, stored_state
+from pp_cl.session.training import open_training, stored_state
 from tools.peak import CopyBandwidth, PeakFlops
 
 UNTIMED, TIMED = 4, 15  # steps; the first ones build kernels and grow buffers

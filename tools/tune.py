@@ -1,4 +1,4 @@
-"""Times what a row of the table in pp_cl/layers/choice.py can hold, on the device at hand, and
+"""Times what a row of the table in pp_cl/engine/layers/choice.py can hold, on this device, and
 prints the best of it as such a row.
 
     python -m tools.tune [--device D]
@@ -18,11 +18,11 @@ import numpy as np
 from pp_cl.bench.conv import Layer, UploadedLayer
 from pp_cl.bench.timing import interleave
 from pp_cl.config import preset
-from pp_cl.device.device import Device
-from pp_cl.device.discover import open_device
-from pp_cl.layers.choice import blocking_of, device_class
-from pp_cl.layers.conv_direct import Blocking, Direction
-from pp_cl.network.layers import convolutions, unet_layers
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.choice import blocking_of, device_class
+from pp_cl.engine.layers.conv_direct import Blocking, Direction
+from pp_cl.engine.network.layers import convolutions, unet_layers
 
 SIDE = 96
 IMAGES = Direction.FORWARD, Direction.BACKWARD_INPUT

@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 
 from pp_cl.bench.timing import errors, variant_rows
-from pp_cl.device.device import Device
-from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_class
-from pp_cl.layers.conv_direct import (
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_class
+from pp_cl.engine.layers.conv_direct import (
     Blocking,
     ConvShape,
     DirectConv,
@@ -23,8 +23,8 @@ from pp_cl.layers.conv_direct import (
     sum_parts,
     table_of_sums,
 )
-from pp_cl.layers.tiles import Tiles, all_tiles
-from pp_cl.network.layers import convolutions, unet_layers
+from pp_cl.engine.layers.tiles import Tiles, all_tiles
+from pp_cl.engine.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
 
 CHECK_SIDE = 33  # several tiles of any variant, and parts of some; float64 takes a second

@@ -11,7 +11,7 @@ import numpy as np
 
 from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.bench.timing import interleave
-from pp_cl.device.device import Device
+from pp_cl.engine.device.device import Device
 
 BLENDS = ("alpha", "softmax")
 

@@ -11,17 +11,17 @@ from functools import cached_property
 import numpy as np
 
 from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
-from pp_cl.device.buffers import Buffers, gather_rows
-from pp_cl.device.device import Device
-from pp_cl.model import Model
-from pp_cl.network.unet import UNet
-from pp_cl.raster.blend import blend_backward, blend_forward
-from pp_cl.raster.points import PointCloud
-from pp_cl.raster.weights import BLENDS, blend_weights
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.buffers import Buffers, gather_rows
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.model import Model
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.blend import blend_backward, blend_forward
+from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.raster.weights import BLENDS, blend_weights
+from pp_cl.engine.render import Renderer, RenderResult
 from pp_cl.reference import dense
-from pp_cl.render import Renderer, RenderResult
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import Grid
 from pp_cl.settings import RasterConfig
 
 SAMPLES = 64  # pixels compared with float64

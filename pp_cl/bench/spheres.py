@@ -6,12 +6,12 @@ import math
 
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers
-from pp_cl.device.device import Device
-from pp_cl.device.launch import lanes
-from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
-from pp_cl.raster.project import ProjectedPoints, projection_program, projection_table
-from pp_cl.raster.weights import BlendWeights
+from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes
+from pp_cl.engine.raster.pairs import Pairs, find_pairs, room_needed
+from pp_cl.engine.raster.project import ProjectedPoints, projection_program, projection_table
+from pp_cl.engine.raster.weights import BlendWeights
 
 
 def project_spheres(

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.config import Config
-from pp_cl.device.device import Device
-from pp_cl.model import Model
-from pp_cl.network.unet import UNet
-from pp_cl.raster.points import PointCloud
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.model import Model
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.step import Trainer
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import open_scene, scene_box
-from pp_cl.train import Trainer
+from pp_cl.settings import Config
 
 STEPS = 5  # that are timed, after one that builds the kernels
 

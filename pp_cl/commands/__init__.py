@@ -1,5 +1,20 @@
-"""The commands of pp-cl, one module each: HELP, add_arguments(parser), run(options).
-
-Here text becomes numbers, and here alone is printed. A module imports what needs OpenCL only when
-its command runs, so that --help is quick.
+"""The commands: a module each, with HELP, add_arguments(parser) and run(options). Only here is
+printed.
 """
+
+# the module of each command, imported when it is given; in the order of the help
+COMMANDS = {
+    "devices": "pp_cl.commands.devices",
+    "make": "pp_studio.commands.make",
+    "capture": "pp_studio.commands.capture",
+    "train": "pp_cl.commands.train",
+    "eval": "pp_cl.commands.eval",
+    "sweep": "pp_studio.commands.sweep",
+    "info": "pp_cl.commands.info",
+    "render": "pp_studio.commands.render",
+    "view": "pp_studio.commands.view",
+    "export": "pp_studio.commands.export",
+    "compare": "pp_cl.commands.compare",
+    "bench": "pp_cl.commands.bench",
+    "selftest": "pp_cl.commands.selftest",
+}

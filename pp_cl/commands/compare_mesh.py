@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.config import Config
-from pp_cl.device.device import Device
+from pp_cl.checkpoint import opened_run
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid, smallest_edge
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
 from pp_cl.run import check_scene, stored_config
 from pp_cl.scene.demo import demo_mesh
-from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.hull import CELL_CAP, agreeing, hull_on
 from pp_cl.scene.load import DEMO, open_scene, scene_box
-from pp_cl.training.checkpoint import opened_run
+from pp_cl.settings import Config
 
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 

@@ -25,8 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.device.discover import open_device
-    from pp_cl.run import evaluate, load_run
+    from pp_cl.drivers.discover import open_device
+    from pp_cl.evaluate import evaluate
+    from pp_cl.run import load_run
 
     metrics = options.metrics
     dev = open_device(options.device)

@@ -9,32 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.config import assign, configure, preset
-from pp_cl.device.device import Device
+from pp_cl.checkpoint import opened_run
+from pp_cl.config import assign, configure, preset, preset_downscale
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.edits import read_edits
-from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
 from pp_cl.scene.identity import kept_views
-from pp_cl.scene.load import (
-    DEMO,
-    open_scene,
-    preset_downscale,
-    scene_box,
-    scene_format,
-    scene_frames,
-    scene_splits,
-)
+from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
 from pp_cl.scene.overview import overview
 from pp_cl.scene.sparse import sparse_points
-from pp_cl.scene.views import MASK_THRESHOLD, View, evenly
-from pp_cl.training.checkpoint import opened_run
-from pp_cl.training.start import first_hull
+from pp_cl.session.start import first_hull
 
 SHOWN_POINTS = 20_000  # of a hull
 HULL_COLOUR = (230, 140, 200)

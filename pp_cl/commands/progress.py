@@ -13,7 +13,7 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 from pp_cl.config import preset
-from pp_cl.session import Training
+from pp_cl.session.training import Training
 
 BUILDING = 2  # steps in which nearly all kernels are built, if the driver has not kept them
 REDRAWN = 1  # seconds, at least, between two states of the bar

@@ -1,12 +1,13 @@
 """`pp-cl train`: trains a scene into the folder of a run, or resumes the training there."""
 
 import argparse
+import importlib
 import math
 import signal
 from contextlib import ExitStack
 
+from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
-from pp_cl.commands.view import open_browser
 from pp_cl.config import begin_with, help_lines, load_config
 from pp_cl.errors import UserError, require
 from pp_cl.presets import PRESETS, SHORT
@@ -45,11 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
-    from pp_cl.device.discover import open_device
+    from pp_cl.config import run_config
+    from pp_cl.drivers.discover import open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.files.scalars import writer_class
-    from pp_cl.session import is_finished, open_training, run_config, stored_state
-    from pp_cl.training.memory import memory_line
+    from pp_cl.session.memory import memory_line
+    from pp_cl.session.training import is_finished, open_training, stored_state
 
     if options.view:
         require("the viewer", "viser")
@@ -130,7 +132,7 @@ def _extended_line(training):
 
 def _left_out_line(train):
     """A line of text if some refinements of train.refine_at are left out, else an empty one."""
-    from pp_cl.training.schedule import refine_steps
+    from pp_cl.engine.training.schedule import refine_steps
 
     wanted, made = sum(0 < share < 1 for share in train.refine_at), len(refine_steps(train))
     if made < wanted:
@@ -179,12 +181,8 @@ def _run(training, options):
             drawn = curves(folder.path / "tensorboard", trainer.step)
             followers.append(stack.enter_context(drawn))
         if options.view:
-            from pp_cl.view.run_view import shown_training
-
-            address, show = stack.enter_context(shown_training(training))
-            print(f"watch at {address}", flush=True)
-            open_browser(address)
-            followers.append(show)
+            viewer = importlib.import_module(COMMANDS["view"])
+            followers.append(stack.enter_context(viewer.following(training)))
         caught = stack.enter_context(first_signal())
 
         def on_step(step, row):

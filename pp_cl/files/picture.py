@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pp_cl.files.exr import srgb_to_linear
 from pp_cl.files.image import to_8bit, write_png
+from pp_cl.files.srgb import srgb_to_linear
 
 WHITE = (1.0, 1.0, 1.0)
 

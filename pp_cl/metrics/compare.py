@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.device.device import Device
+from pp_cl.engine.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import ENDINGS, read_rgba
 from pp_cl.metrics.psnr_ssim import Metrics, mean

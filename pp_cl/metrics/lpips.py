@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.device import Device, Program
-from pp_cl.device.launch import group_ranges, lanes, row_parts
+from pp_cl.engine.device.device import Device, Program
+from pp_cl.engine.device.launch import group_ranges, lanes, row_parts
+from pp_cl.engine.layers.choice import blocking_of, choose
+from pp_cl.engine.layers.conv_direct import ConvShape, Direction, pack_weights
+from pp_cl.engine.layers.simple import maxpool2_forward
+from pp_cl.engine.layers.tiles import all_tiles
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import blocking_of, choose
-from pp_cl.layers.conv_direct import ConvShape, Direction, pack_weights
-from pp_cl.layers.simple import maxpool2_forward
-from pp_cl.layers.tiles import all_tiles
 from pp_cl.metrics.lpips_weights import load_weights
 
 # convolutions between the poolings of VGG16; the last one of each block is compared

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pp_cl.scene.camera import Camera
+from pp_cl.engine.camera import Camera
 
 FILE = Path(__file__).with_name("published.json")
 SYNTHETIC_SIZE, SYNTHETIC_FOCAL = 800, 1111.11  # pixels, of all eight scenes' stored images

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from pp_cl.device.device import Device
-from pp_cl.device.host import at_most_more
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.host import at_most_more
+from pp_cl.engine.grid import Grid
 from pp_cl.errors import UserError
 from pp_cl.files.untrusted import refusal
-from pp_cl.scene.grid import Grid
 
 SAMPLES = 1024**3  # of the supplemental
 RUN = 256  # samples of a work-item

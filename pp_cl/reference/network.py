@@ -84,7 +84,7 @@ def upsample_backward(grad_out: np.ndarray) -> np.ndarray:
 def network(layers: list, parameters: dict, x: np.ndarray) -> dict[str, np.ndarray]:
     """{layer: its float64 output} of a network; "image" is the image, "x" the input (H, W, C).
 
-    layers: pp_cl.network.layers.Layer in the order of the forward pass. parameters:
+    layers: pp_cl.engine.network.layers.Layer in the order of the forward pass. parameters:
     {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
     """
     outputs = {"x": np.asarray(x, np.float64)}

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pp_cl.engine.grid import Grid, smallest_edge
+from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.errors import listing
-from pp_cl.scene.grid import Grid, smallest_edge
-from pp_cl.scene.views import MASK_THRESHOLD, View
 
 # pp-cl warns about a view that alone rejects more than this share of the object, and several times
 # the usual share: each view carves a little that no other does, more so where there are few. Lego's

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import explain_empty_hull
-from pp_cl.scene.views import MASK_THRESHOLD, View
 
 # how far, in image sizes, an object that the image border cuts off may reach beyond the border
 CROPPED_MARGIN = 0.5

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from pp_cl.scene.camera import Camera, look_at
+from pp_cl.engine.camera import Camera, look_at
 
 MARGIN = 0.95  # of the image that the object may fill
 HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles a picture would spin

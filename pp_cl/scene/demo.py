@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
-from pp_cl.device.device import Device
-from pp_cl.device.launch import lanes
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.views import View, evenly
 from pp_cl.errors import UserError
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import Grid
-from pp_cl.scene.views import Photograph, View, evenly
+from pp_cl.scene.image_file import Photograph
 
 SPLITS = ("train", "test")
 SIZE = 400  # pixels

@@ -4,8 +4,8 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from pp_cl.device.device import Device
-from pp_cl.scene.camera import Camera
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
 
 PROBED = 65  # places along each axis
 BAND_BYTES = 2**23  # of the spline's coefficients that are on the device at a time

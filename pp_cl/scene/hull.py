@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from skimage.morphology import closing, dilation, disk
 
-from pp_cl.device.device import Device
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid, smallest_edge
+from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, reach_of
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import Grid, smallest_edge
-from pp_cl.scene.views import MASK_THRESHOLD, View, border
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
 CELL_CAP = 2**27

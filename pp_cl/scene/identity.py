@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.views import View
 from pp_cl.errors import listing
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import MOST, numbers
-from pp_cl.scene.views import Photograph, View
 
 STRAIGHT = Distortion()  # of a lens without distortion
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged

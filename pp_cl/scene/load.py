@@ -19,18 +19,24 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.config import Config
-from pp_cl.device.device import Device
-from pp_cl.device.discover import open_device
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.views import (
+    MASK_THRESHOLD,
+    View,
+    border,
+    check_downscale,
+    evenly,
+)
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, listing, quoted
 from pp_cl.files.image import is_transparent, read_mask, read_rgba
-from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.distortion import BAND_BYTES, undistort
 from pp_cl.scene.edits import FILE as EDITS
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.identity import pixel_digest
+from pp_cl.scene.image_file import Photograph, shrink, shrink_factor
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
@@ -43,18 +49,7 @@ from pp_cl.scene.readers.found import (
     folder_named,
 )
 from pp_cl.scene.silhouette import within_silhouettes
-from pp_cl.scene.views import (
-    MASK_THRESHOLD,
-    MIN_SIDE,
-    Photograph,
-    View,
-    border,
-    check_downscale,
-    evenly,
-    fitting_downscale,
-    shrink,
-    shrink_factor,
-)
+from pp_cl.settings import Config
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
@@ -322,15 +317,6 @@ def _checked(folder, photograph):
             "distortion that folds",
         )
     return photograph
-
-
-def preset_downscale(path: str, preset: str) -> int:
-    """How many times a preset reduces the images of a scene, by the size of the largest training
-    image that leaves the smallest enough pixels. Raises UserError as scene_frames does.
-    """
-    sizes = _sizes(scene_frames(path))
-    fitting = fitting_downscale(max(sizes, key=max), IMAGE_SIZES[preset])
-    return max(1, min(fitting, min(map(min, sizes)) // MIN_SIDE))
 
 
 def measured_split(path: str) -> str:

@@ -10,10 +10,10 @@ from scipy.ndimage import distance_transform_edt
 from skimage.color import rgb2lab
 from skimage.measure import label
 
+from pp_cl.engine.views import border
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_mask, same_shape
 from pp_cl.scene.readers.found import mask_names
-from pp_cl.scene.views import border
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = 255

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 from skimage.segmentation import find_boundaries
 
-from pp_cl.device.device import Device
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.training.target import Target
+from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
 from pp_cl.scene.agreement import Disagreement
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, silhouette
-from pp_cl.scene.target import Target
-from pp_cl.scene.views import MASK_THRESHOLD, View, evenly, shrink
+from pp_cl.scene.image_file import shrink
 
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from pp_cl.device.device import Device
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.scene.hull import agreeing, build_grid, silhouette
-from pp_cl.scene.views import View
 
 POINTS, SIDE = 250_000, 400  # of the hull, and pixels of the images in which it is looked at
 # The rim of a silhouette that is ignored: the hull is larger than the object, by 1 to 4 % of its

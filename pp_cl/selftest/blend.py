@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.device.device import Device
-from pp_cl.raster.project import FOOTPRINTS
-from pp_cl.raster.weights import BLENDS
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.raster.project import FOOTPRINTS
+from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.reference import dense
 from pp_cl.reference.differences import numeric_gradient
-from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import (
     SIZES,
     Case,

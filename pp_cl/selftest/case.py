@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pp_cl.device.device import Device
+from pp_cl.engine.device.device import Device
 
 EPS = 2.0**-23  # float32's distance from 1 to the next number; a rounding is half of it at most
 SIZES = (1, 31, 33, 257)  # below, at and beside every vector width and work-group size

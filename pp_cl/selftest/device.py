@@ -5,10 +5,10 @@ from itertools import product
 
 import numpy as np
 
-from pp_cl.device.buffers import compact_rows, gather_rows
-from pp_cl.device.device import Device
-from pp_cl.device.launch import LARGEST_GROUP
-from pp_cl.device.scan import BLOCK, exclusive_scan, nonzero
+from pp_cl.engine.device.buffers import compact_rows, gather_rows
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import LARGEST_GROUP
+from pp_cl.engine.device.scan import BLOCK, exclusive_scan, nonzero
 from pp_cl.selftest.case import SIZES, Case, Check, exact
 
 

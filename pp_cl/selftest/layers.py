@@ -6,9 +6,9 @@ from functools import cache, partial
 import numpy as np
 
 from pp_cl.bench.conv import Layer
-from pp_cl.device.device import Device
-from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run
-from pp_cl.layers.simple import (
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.choice import OFFERED, VARIANTS, blocking_of, can_run
+from pp_cl.engine.layers.simple import (
     SHARE,
     avgpool2_backward,
     avgpool2_forward,
@@ -23,7 +23,7 @@ from pp_cl.layers.simple import (
     upsample2_backward,
     upsample2_forward,
 )
-from pp_cl.layers.tiles import (
+from pp_cl.engine.layers.tiles import (
     SIDE,
     copy_list,
     grid_shape,
@@ -31,7 +31,7 @@ from pp_cl.layers.tiles import (
     tiles_find,
     tiles_hit,
 )
-from pp_cl.network.tile_plan import halve
+from pp_cl.engine.network.tile_plan import halve
 from pp_cl.reference import lpips, network
 from pp_cl.selftest.case import EPS, Case, Check, allowed, each, exact, relative
 

@@ -4,11 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pp_cl.device.device import Device
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.training.exposure import KEPT, PRIOR, Exposure
+from pp_cl.engine.training.loss import FURTHER, Loss, MaskLoss, ignore_gradient, ignore_target
 from pp_cl.reference import loss as reference_loss
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
-from pp_cl.training.exposure import KEPT, PRIOR, Exposure
-from pp_cl.training.loss import FURTHER, Loss, MaskLoss, ignore_gradient, ignore_target
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
 ONE = np.uint8(1)

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.device.device import Device
-from pp_cl.device.launch import group_ranges, row_parts
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import group_ranges, row_parts
+from pp_cl.engine.grid import Grid
 from pp_cl.metrics.lpips import Lpips, lpips_program
 from pp_cl.metrics.shape import Mesh, sample_surface
 from pp_cl.reference import lpips
-from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import SIZES, Case, Check, each, exact, relative
 
 BOX = np.array([(x, y, z) for x in (-0.39, 0.39) for y in (-0.29, 0.29) for z in (-0.19, 0.19)])

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.device import Device
-from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, PointCloud, offset_width
-from pp_cl.raster.project import ProjectedPoints
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.raster.points import MOST_OFFSET, SH_DEGREES, PointCloud, offset_width
+from pp_cl.engine.raster.project import ProjectedPoints
+from pp_cl.engine.training.optim import POINT_EPS, adam_update, ema_update, rmsprop_update
+from pp_cl.engine.training.schedule import Rates
+from pp_cl.engine.training.smooth import Smoother
+from pp_cl.engine.training.state import PointState, split_opacity
 from pp_cl.reference import optim
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import some_ids
-from pp_cl.training.optim import POINT_EPS, adam_update, ema_update, rmsprop_update
-from pp_cl.training.schedule import Rates
-from pp_cl.training.smooth import Smoother
-from pp_cl.training.state import PointState, split_opacity
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
 EPSILONS = {"sh": 4e-7, "offset": POINT_EPS, "opacity": POINT_EPS}  # of the tiny preset

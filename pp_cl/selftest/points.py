@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
-from pp_cl.device.buffers import Buffers
-from pp_cl.device.device import Device
-from pp_cl.raster.blend import BlendGradients, blend_backward, blend_forward
-from pp_cl.raster.project import project_grid
-from pp_cl.raster.weights import blend_weights, listed_hits
+from pp_cl.engine.camera import Camera, look_at
+from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.raster.blend import BlendGradients, blend_backward, blend_forward
+from pp_cl.engine.raster.project import project_grid
+from pp_cl.engine.raster.weights import blend_weights, listed_hits
 from pp_cl.reference import dense
-from pp_cl.scene.camera import Camera, look_at
-from pp_cl.scene.grid import Grid
 
 Gradients = dict[str, np.ndarray]
 

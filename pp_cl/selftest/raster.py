@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.device.buffers import Buffers
-from pp_cl.device.device import Device
-from pp_cl.raster.blend import shade_forward
-from pp_cl.raster.depth import depth_forward
-from pp_cl.raster.points import SH_DEGREES, sh_blocks
-from pp_cl.raster.project import FOOTPRINTS, project_grid
-from pp_cl.raster.weights import BLENDS, list_weights, record_weights
+from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.raster.blend import shade_forward
+from pp_cl.engine.raster.depth import depth_forward
+from pp_cl.engine.raster.points import SH_DEGREES, sh_blocks
+from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
+from pp_cl.engine.raster.weights import BLENDS, list_weights, record_weights
 from pp_cl.reference import dense
-from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import (
     AXIS,
@@ -120,7 +120,7 @@ def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _check_pairs(scene, expected):
-    """tests/raster/test_pairs.py says more of each."""
+    """tests/engine/raster/test_pairs.py says more of each."""
     pairs, total, hits = scene.pairs, scene.pairs.total, scene.hits()
     clear = expected["margin"] > BAND
     yield exact(hits[clear], expected["hit"][clear])

@@ -13,8 +13,8 @@ import numpy as np
 import pyopencl
 
 from pp_cl import __version__
-from pp_cl.device.device import Device
-from pp_cl.layers.choice import OFFERED, device_class
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.choice import OFFERED, device_class
 from pp_cl.selftest import blend, device, layers, loss, metrics, optim, raster, scene
 from pp_cl.selftest.case import Case
 

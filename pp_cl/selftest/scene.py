@@ -6,7 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pp_cl.device.device import Device
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.training.target import Target
+from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.reference.scene import (
     dilated_mask,
     distance,
@@ -15,13 +19,9 @@ from pp_cl.reference.scene import (
     target_forward,
     undistorted,
 )
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import distances
 from pp_cl.scene.distortion import Distortion, undistort
-from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Carver
-from pp_cl.scene.target import Target
-from pp_cl.scene.views import MASK_THRESHOLD, View
 from pp_cl.selftest.case import SIZES, Case, Check, absolute, exact
 
 BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel

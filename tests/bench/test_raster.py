@@ -7,7 +7,7 @@ import pytest
 
 from pp_cl.bench.raster import bench_raster
 from pp_cl.bench.raster_scenes import SCENES
-from pp_cl.raster.weights import BLENDS
+from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.reference import dense
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -3,8 +3,8 @@
 import pytest
 
 from pp_cl.bench import unet
-from pp_cl.layers.choice import OFFERED, device_class
-from pp_cl.network.layers import multiplications, unet_layers
+from pp_cl.engine.layers.choice import OFFERED, device_class
+from pp_cl.engine.network.layers import multiplications, unet_layers
 
 pytestmark = pytest.mark.usefixtures("quick")
 

@@ -13,7 +13,7 @@ from pp_cl.cli import main
 from pp_cl.run import Run
 
 TRAIN = "train BALL --out new"
-OF_RUNS = ("eval", "render", "view", "export --format ply", "compress", "info --picture a.png")
+OF_RUNS = ("eval", "render", "view", "export --format ply", "info --picture a.png")
 SHAPE = "compare --mesh ball.ply"
 REFUSED = [
     ("", "command"),
@@ -55,8 +55,6 @@ REFUSED = [
     ("sweep demo --out run", "run"),
     ("eval run --save-images --out full", "full"),
     ("eval run --out file", "file"),
-    ("compress run --out full", "full"),
-    ("compress run --out " + 300 * "x", "name"),
     ("render run --out full", "full"),
     ("render run --out /", "/"),
     ("render run --out folder.mp4", "folder.mp4"),
@@ -73,7 +71,7 @@ REFUSED = [
         for name, suffix in {"ply": ".ply", "glb": ".glb", "html": ".html", "scene": ""}.items()
     ),
     # devices
-    *((f"{command} run --device abacus", "abacus") for command in ("eval", "render", "compress")),
+    *((f"{command} run --device abacus", "abacus") for command in ("eval", "render")),
     *((f"{command} --device abacus", "abacus") for command in (TRAIN, "bench unet", "selftest")),
     # options that are unknown, of other commands or subjects, or do not fit each other
     (f"{TRAIN} --speed 9", "--speed"),
@@ -149,7 +147,6 @@ REFUSED = [
     ("bench train --points 10,20", "--points"),
     ("compare run --samples 0", "--samples"),
     ("compare ball.ply --edge nan", "--edge"),
-    ("compress run --max-loss much", "--max-loss"),
     ("export run", "--format"),
     ("export run --format obj", "obj"),
     ("export run --format ply --min-weight x", "--min-weight"),
@@ -185,7 +182,7 @@ def folder(scene, finished, tmp_path, monkeypatch):
 @pytest.mark.parametrize("line, named", REFUSED, ids=[line[:60] for line, _ in REFUSED])
 def test_bad_input_is_one_line_and_nothing_is_done(folder, scene, capsys, monkeypatch, line, named):
     monkeypatch.setattr(Run, "render", None)  # that nothing is computed
-    monkeypatch.setitem(sys.modules, "pp_cl.sweep.cluster", None)
+    monkeypatch.setitem(sys.modules, "pp_studio.sweep.cluster", None)
     before = sorted(folder.rglob("*"))
     assert main([scene if word == "BALL" else word for word in line.split()]) == 2
     said = capsys.readouterr().err.splitlines()

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from pp_cl.cli import main
-from pp_cl.device import device as device_module
+from pp_cl.engine.device import device as device_module
 from pp_cl.selftest import run
 
 NAMES = ("device: scan", "training: split opacities", "training: moving average")

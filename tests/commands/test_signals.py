@@ -9,7 +9,7 @@ from support.runs import arguments
 
 from pp_cl.cli import main
 from pp_cl.commands.progress import first_signal
-from pp_cl.train import Trainer
+from pp_cl.engine.step import Trainer
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,11 +9,11 @@ from support.runs import SETTINGS, arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import begin_with, load_config
+from pp_cl.config import begin_with, load_config, run_config
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session import run_config, train_scene
+from pp_cl.session.training import train_scene
 
 
 def trained_lines(capsys, *words):
@@ -39,7 +39,7 @@ def test_a_run_keeps_the_size_of_its_images(tmp_path, capsys, monkeypatch):
     scene, out = write_ball_scene(tmp_path / "ball", size=300), tmp_path / "run"
     words = arguments(scene, out, downscale=1, train__iterations=6)
     with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.session.Training._after_step", _interrupting)
+        patch.setattr("pp_cl.session.training.Training._after_step", _interrupting)
         assert main(words) == 130
     capsys.readouterr()
     assert main(["train", scene, "--out", str(out)]) == 0
@@ -71,7 +71,7 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
     """As a training advises that fails in its first steps; nothing of it shows in the next."""
     scene, out, plain = write_ball_scene(tmp_path / "ball"), tmp_path / "run", tmp_path / "plain"
     with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
         assert main(arguments(scene, out, network__rate="100,100")) == 2
     write_png(out / "previews" / "step_000001.png", np.zeros((8, 8, 3)))  # of other settings
     words = {"network__rate": "0.002,0.001", "train__iterations": 12, "train__refine_at": "1,1"}
@@ -87,7 +87,7 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
 def test_a_start_without_a_checkpoint_keeps_what_is_not_said_anew(tmp_path, monkeypatch):
     scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
     with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
         main(arguments(scene, folder.path, network__rate="100,100"))
     config = run_config(folder, scene, None, [("network.rate", "1e-3,1e-4", "--set")])
     assert config.network.rate == (1e-3, 1e-4)
@@ -98,7 +98,7 @@ def test_iterations_take_the_place_of_minutes_that_came_to_nothing(tmp_path, mon
     scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
     words = ["train", scene, "--out", str(folder.path), "--minutes", "0.1", "--points", "300"]
     with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
         assert main(words) == 2
     config = run_config(folder, scene, None, [("train.iterations", "40", "--iterations")])
     assert (config.train.iterations, config.train.minutes) == (40, 0)
@@ -109,7 +109,7 @@ def test_what_a_training_has_decided_is_decided_anew(tmp_path, monkeypatch):
     scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
     words = arguments(scene, folder.path, train__refine_at="0,0", raster__radius=0)
     with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
         assert main(words) == 2
     stored = load_config(folder.config)
     assert stored.decided == ["train.refine_at", "raster.radius"] and stored.raster.radius > 0
@@ -149,7 +149,7 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
 
     save.append(RunFolder.save)
     monkeypatch.setattr(RunFolder, "save", saving)
-    monkeypatch.setattr("pp_cl.session.PREVIEWS", 3)
+    monkeypatch.setattr("pp_cl.session.training.PREVIEWS", 3)
     assert main(arguments(scene, out, train__checkpoint_every=20)) == 0
     assert found == {20: (20, None, [20]), 40: (40, None, [40]), 60: (60, True, [60])}
 

@@ -6,7 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from pp_cl.device.buffers import DeviceRows
+from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files import atomic
 from pp_cl.files.atomic import write_json

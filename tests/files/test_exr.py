@@ -9,9 +9,10 @@ from support.refused import refusing
 from support.scenes import write_ball_scene
 
 from pp_cl.errors import UserError
-from pp_cl.files.exr import srgb_to_linear, write_exr
+from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_rgba
 from pp_cl.files.picture import Picture
+from pp_cl.files.srgb import srgb_to_linear
 from pp_cl.scene.load import load_scene
 
 

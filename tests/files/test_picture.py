@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pp_cl.files.exr import linear_to_srgb, srgb_to_linear
 from pp_cl.files.image import read_rgba
 from pp_cl.files.picture import Picture, mean_picture
+from pp_cl.files.srgb import linear_to_srgb, srgb_to_linear
 
 
 def picture(rng, height=7, width=5):

@@ -5,8 +5,8 @@ no other.
 import numpy as np
 import pytest
 
+from pp_cl.engine.camera import Camera
 from pp_cl.metrics.published import CO3D_SEQUENCES, METRICS, differences, published_rows, tables
-from pp_cl.scene.camera import Camera
 
 OURS = {"psnr": 33.00, "ssim": 0.975, "lpips": 0.026}
 PRINTED = {"psnr": 0.0051, "ssim": 0.00051, "lpips": 0.00051}  # half a unit of the last digit

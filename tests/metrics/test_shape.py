@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from support.refused import refusing
 
+from pp_cl.engine.grid import Grid
 from pp_cl.errors import UserError
 from pp_cl.metrics.shape import (
     RUN,
@@ -16,7 +17,6 @@ from pp_cl.metrics.shape import (
     read_mesh,
     sample_surface,
 )
-from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import SIZES
 
 SQUARE = Mesh(

@@ -8,7 +8,7 @@ from scipy.ndimage import correlate, zoom
 from scipy.special import expit
 from support.comparisons import relative_error
 
-from pp_cl.network.layers import convolutions, unet_layers
+from pp_cl.engine.network.layers import convolutions, unet_layers
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.reference.network import (
     convolution,

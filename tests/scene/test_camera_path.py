@@ -7,7 +7,7 @@ import pytest
 from support.ball_views import CENTRE, ball_camera
 from support.scenes import ring_cameras
 
-from pp_cl.scene.camera import Camera
+from pp_cl.engine.camera import Camera
 from pp_cl.scene.camera_path import MARGIN, Surroundings, between, looked_at, through, up_of
 
 

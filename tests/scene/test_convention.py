@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pp_cl.scene.camera import Camera
+from pp_cl.engine.camera import Camera
 from pp_cl.scene.convention import other_axes
 
 COUNT = 24

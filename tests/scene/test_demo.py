@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.grid import Grid
 from pp_cl.reference.scene import CENTRE, distance
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import OBJECT_BOX, SPLITS, demo_mesh, demo_views, distances, render
-from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid
 
 KEY = np.array([0.40, -0.52, 0.7547])  # direction of the key light

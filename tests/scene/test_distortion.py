@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from support.transforms_scenes import refused, write_scene
 
+from pp_cl.engine.camera import Camera
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion, undistort
+from pp_cl.scene.image_file import shrink
 from pp_cl.scene.load import load_scene
-from pp_cl.scene.views import shrink
 
 CAMERA = Camera(np.eye(3, 4), 150.0, 140.0, 84.0, 57.5, 161, 120)
 LENSES = {

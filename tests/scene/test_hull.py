@@ -9,14 +9,14 @@ import pytest
 from support.ball_views import CENTRE, RADIUS, ball_camera, ball_views
 from support.launches import check_parts
 
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.errors import UserError
 from pp_cl.scene import hull
 from pp_cl.scene.bounds import bounding_box
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Carver, build_grid, depth_range
 from pp_cl.scene.load import load_scene
-from pp_cl.scene.views import MASK_THRESHOLD, View
 
 
 def positions_of(found):

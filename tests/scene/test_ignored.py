@@ -10,13 +10,13 @@ from support.runs import SETTINGS, set_words, spoken
 from support.scenes import ball_image, ring_cameras, write_ball_scene
 
 from pp_cl.config import preset
-from pp_cl.model import Model
-from pp_cl.network.unet import UNet
-from pp_cl.raster.points import PointCloud
+from pp_cl.engine.model import Model
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.step import Trainer
+from pp_cl.engine.views import View
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import load_scene
-from pp_cl.scene.views import View
-from pp_cl.train import Trainer
 
 HAND = np.s_[14:31, 20:29]  # rows, columns that cut the ball's outline
 SPLITS = ("train", "test")
@@ -113,7 +113,7 @@ def test_the_network_learns_the_same_where_tiles_are_left_out(dev, monkeypatch, 
     config.train.crop, config.train.refine_at, config.train.pixel_jitter = 0, (1.0, 1.0), False
 
     def gradient(least):
-        monkeypatch.setattr("pp_cl.network.unet.LEAST_PIXELS", least)
+        monkeypatch.setattr("pp_cl.engine.network.unet.LEAST_PIXELS", least)
         net = UNet.of_settings(dev, config.network, seed=0)
         cloud = PointCloud.create(dev, hull.ids)
         model = Model(dev, hull.grid, depth_range(views, hull), cloud, net=net)

@@ -5,13 +5,13 @@ import pytest
 from support.same_scene import views
 from support.transforms_scenes import refused, write_scene
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import BAND_BYTES, Distortion
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.load import BAND_COPIES, load_scene, reading, scene_frames, scene_splits
 from pp_cl.scene.masks import MaskRule
-from pp_cl.scene.views import Photograph
 from tools.scene_formats import nerfstudio
 
 

@@ -14,7 +14,8 @@ from support.transforms_scenes import SIZE, write_scene
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
-from pp_cl.device.discover import open_device
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.views import MASK_THRESHOLD
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.run import load_run
@@ -23,7 +24,6 @@ from pp_cl.scene.hull import agreeing, build_grid
 from pp_cl.scene.load import load_scene, open_scene, scene_box
 from pp_cl.scene.masks import MaskRule, cut_out
 from pp_cl.scene.readers.frame import frame_keys
-from pp_cl.scene.views import MASK_THRESHOLD
 
 TOLERANCE = 10.0
 

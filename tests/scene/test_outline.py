@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from support.ball_views import CENTRE, RADIUS, ball_camera, ball_view
 
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.grid import Grid
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.grid import Grid
 from pp_cl.scene.hull import silhouette
 from pp_cl.scene.outline import outline
 

@@ -10,8 +10,8 @@ from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.identity import difference, identity
+from pp_cl.scene.image_file import KEPT_BYTES, kept_bytes, shrink, shrink_factor
 from pp_cl.scene.load import load_scene, open_scene, scene_frames
-from pp_cl.scene.views import KEPT_BYTES, kept_bytes, shrink, shrink_factor
 
 PHONE = (4000, 3000)
 
@@ -61,7 +61,7 @@ def scene(tmp_path):
 
 def large(monkeypatch, most=8 * 4 * 50 * 50):
     """Scenes are large from `most` bytes on: eight images of 98 pixels are halved."""
-    monkeypatch.setattr("pp_cl.scene.views.KEPT_BYTES", most)
+    monkeypatch.setattr("pp_cl.engine.views.KEPT_BYTES", most)
 
 
 def opened(dev, scene, downscale):

@@ -5,9 +5,9 @@ import pytest
 from support.same_scene import held_out
 from support.scenes import ball_image, ring_cameras
 
+from pp_cl.engine.views import View
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.silhouette import within_silhouettes
-from pp_cl.scene.views import View
 from tools.convert_scene import convert
 
 SIDE = 300

@@ -14,11 +14,11 @@ from support.runs import SETTINGS, set_words, spoken
 from support.same_scene import held_out
 from support.scenes import ball_image, ring_cameras
 
+from pp_cl.engine.views import View
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import ORIENTATION
 from pp_cl.scene.convention import GL_FROM_CV
 from pp_cl.scene.load import list_split
-from pp_cl.scene.views import View
 from tools.convert_scene import convert
 
 VIEWS = 14  # of which 12 are for training

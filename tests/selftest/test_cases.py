@@ -4,7 +4,7 @@ what nobody wrote.
 
 import pytest
 
-from pp_cl.device.kernel import Kernel
+from pp_cl.engine.device.kernel import Kernel
 from pp_cl.selftest.run import CASES, run_case
 
 pytestmark = pytest.mark.kernels

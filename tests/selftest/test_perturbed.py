@@ -4,8 +4,8 @@ named.
 
 import pytest
 
-from pp_cl.device import device as device_module
-from pp_cl.device.device import Program
+from pp_cl.engine.device import device as device_module
+from pp_cl.engine.device.device import Program
 from pp_cl.selftest.run import CASES, run_cases
 
 KERNELS = device_module.kernel_folder()
@@ -18,7 +18,7 @@ FLIPS = [
     ("scene/distortion", "c - *at", "c + *at", "scene: distortion"),
     ("scene/distortion", "2.0f * p2 * xy", "-2.0f * p2 * xy", "scene: distortion"),
     ("scene/hull", "counts & ~(in", "counts & (in", "scene: hull"),
-    ("scene/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
+    ("training/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
     ("raster/project", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
     ("raster/project", "(wide + least", "(wide - least", "alpha: shapes of Gaussians"),
     ("raster/pairs", "keys[a] < keys[b]", "keys[a] > keys[b]", "raster: thousands of equal depths"),

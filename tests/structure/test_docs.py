@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from pp_cl.config import Config, sections
+from pp_cl.settings import Config, sections
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
-PATH = re.compile(r"`((?:pp_cl|cl|tests|tools|docs)/[\w./]+)`")
+PATH = re.compile(r"`((?:pp_cl|pp_studio|cl|tests|tools|docs)/[\w./]+)`")
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
 
 
@@ -37,11 +37,15 @@ def test_files_in_the_architecture_exist():
     text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
     names = {n for n in re.findall(r"`((?:\w+/)*\w+\.py)`", text) if not PLACEHOLDER.search(n)}
     assert names
-    assert not [n for n in names if not ((ROOT / n).exists() or (ROOT / "pp_cl" / n).exists())]
+    assert not [
+        n
+        for n in names
+        if not any((ROOT / top / n).exists() for top in ("", "pp_cl", "pp_cl/engine", "pp_studio"))
+    ]
 
 
 def test_documents_named_in_the_code_exist():
-    folders = [ROOT / name for name in ("pp_cl", "cl", "tools", "tests")]
+    folders = [ROOT / name for name in ("pp_cl", "pp_studio", "cl", "tools", "tests")]
     kinds = ("*.py", "*.cl", "*.h")
     sources = [p for folder in folders for kind in kinds for p in folder.rglob(kind)]
     named = {w for p in sources for w in re.findall(r"\bdocs/\w+\.md", p.read_text("utf-8"))}

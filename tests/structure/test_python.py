@@ -28,9 +28,7 @@ def test_public_functions_have_types():
     assert untyped_functions("class A:\n    def f(self, a, *, b: int): pass") == [
         "f: a has no type"
     ]
-    found = {
-        path: untyped_functions(path.read_text("utf-8")) for path in ROOT.glob("pp_cl/**/*.py")
-    }
+    found = {path: untyped_functions(path.read_text("utf-8")) for path in ROOT.glob("pp_*/**/*.py")}
     assert not {str(path): lines for path, lines in found.items() if lines} and found
 
 

@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from pp_cl import __version__
-from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
+from pp_studio.capture.packages import needed
 
 ROOT = Path(__file__).parents[2]
+OURS = ("pp_cl", "pp_studio")
 KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
 
 
@@ -24,7 +25,8 @@ def test_every_kernel_file_is_launched_by_its_own_wing():
     orphans = []
     for path in KERNEL_FILES:
         name = path.relative_to(ROOT / "cl").with_suffix("").as_posix()
-        modules = (ROOT / "pp_cl" / name).parent.glob("*.py")
+        folders = [(ROOT / top / name).parent for top in ("pp_cl/engine", "pp_cl")]
+        modules = [module for folder in folders for module in folder.glob("*.py")]
         if not any(f'"{name}"' in module.read_text("utf-8") for module in modules):
             orphans.append(name)
     assert KERNEL_FILES
@@ -37,13 +39,13 @@ def test_setup_cfg_declares_every_package_that_is_imported():
     lists = setup["options"]["install_requires"], *setup["options.extras_require"].values()
     declared = {re.split("[<>=;]", line)[0] for text in lists for line in text.split("\n")}
     found, names = packages_distributions(), set()
-    for path in (p for top in ("pp_cl", "tests", "tools") for p in (ROOT / top).rglob("*.py")):
+    for path in (p for top in (*OURS, "tests", "tools") for p in (ROOT / top).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Import):
                 names |= {alias.name.partition(".")[0] for alias in node.names}
             if isinstance(node, ast.ImportFrom) and not node.level:
                 names.add(node.module.partition(".")[0])
-    names -= sys.stdlib_module_names | {"pp_cl", "tests", "tools", "support"}
+    names -= sys.stdlib_module_names | {*OURS, "tests", "tools", "support"}
     packages = {name: found.get(name, [name])[0].lower().replace("_", "-") for name in names}
     assert "numpy" in names
     assert set(packages.values()) <= {name.lower() for name in declared}
@@ -63,7 +65,7 @@ def test_commands_that_install_work_in_a_checkout_and_with_the_wheel(monkeypatch
     with pytest.raises(UserError) as caught:
         needed("pycolmap")
     named = {frozenset(re.search("`pip install (.+)`", str(caught.value))[1].split(" "))}
-    for path in (ROOT / "pp_cl").rglob("*.py"):
+    for path in (path for top in OURS for path in (ROOT / top).rglob("*.py")):
         text = path.read_text("utf-8")
         named |= {
             frozenset(found.split(" ")) for found in re.findall("pip install ([^`{]+)`", text)
@@ -107,7 +109,7 @@ def packed(folder, tmp_path):
 def test_the_source_archive_lacks_what_is_not_free(tmp_path):
     """Pictures of photographs under CC BY-NC-SA; their pages say so."""
     found = packed(ROOT, tmp_path)
-    assert {"docs/demo.png", "cl/common.h", "pp_cl/train.py"} <= found
+    assert {"docs/demo.png", "cl/common.h", "pp_cl/engine/step.py"} <= found
     assert not {"docs/film.webp", "docs/orbits.png"} & found
 
 
@@ -118,7 +120,9 @@ def test_docker_gets_all_that_is_installed(tmp_path):
     for path in (ROOT / name.removeprefix("!") for name in names):
         copy = shutil.copytree if path.is_dir() else shutil.copy
         copy(path, tmp_path / path.name)
-    expected = {name for name in packed(ROOT, tmp_path) if name.startswith(("cl/", "pp_cl/"))}
+    expected = {
+        name for name in packed(ROOT, tmp_path) if name.startswith(("cl/", "pp_cl/", "pp_studio/"))
+    }
     expected |= {"LICENSE", "README.md", "pyproject.toml", "setup.cfg", "setup.py"}
     shutil.rmtree(tmp_path / "pp_cl.egg-info")
     assert expected <= packed(tmp_path, tmp_path)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.views import View
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.views import View
 
 CENTRE, RADIUS = np.array([-0.5, 1.3, 1.7]), 0.8
 UP = (0.3, 0.2, 1)  # of all cameras: none is parallel to an axis

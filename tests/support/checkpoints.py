@@ -7,15 +7,15 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from pp_cl.checkpoint import load_run_state, stored_forms
 from pp_cl.config import preset
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.training.exposure import decided_at
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import opened_checkpoint, save_checkpoint
 from pp_cl.scene.demo import demo_frames
-from pp_cl.scene.grid import Grid
 from pp_cl.scene.identity import kept_camera
 from pp_cl.selftest.points import some_ids
-from pp_cl.training.checkpoint import load_run_state, stored_forms
-from pp_cl.training.exposure import decided_at
 
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {

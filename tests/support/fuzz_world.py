@@ -21,10 +21,10 @@ from support import runs
 from support.checkpoints import load_checkpoint
 from support.scenes import ball_image, ring_cameras
 
+from pp_cl.engine.step import Trainer
+from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.scene.views import View
-from pp_cl.train import Trainer
 from tools.convert_scene import dealt
 
 LONGEST = 60  # seconds for an input

@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from pp_cl.device.device import Device, Memory
+from pp_cl.engine.device.device import Device, Memory
 
 DATA = Path(
     os.environ.get("PP_DATA") or Path(__file__).parents[2] / ".." / "shared" / "data"

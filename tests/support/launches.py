@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pp_cl.device import device
+from pp_cl.engine.device import device
 
 
 def check_parts(dev, monkeypatch, kernel, run):

@@ -5,11 +5,11 @@ import weakref
 import numpy as np
 from scipy.sparse import csr_array
 
-from pp_cl.model import Model
-from pp_cl.network.unet import UNet
-from pp_cl.raster.points import PointCloud
-from pp_cl.raster.weights import listed_hits
-from pp_cl.scene.grid import Grid
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.model import Model
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.raster.weights import listed_hits
 from pp_cl.selftest.points import some_ids
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))

@@ -12,7 +12,7 @@ from filelock import FileLock
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.train import Trainer
+from pp_cl.engine.step import Trainer
 
 # Every mechanism of the loop is due several times within 60 steps.
 SETTINGS = {

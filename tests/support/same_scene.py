@@ -3,10 +3,10 @@
 import numpy as np
 from support.scenes import ring_cameras
 
-from pp_cl.scene.camera import Camera
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.views import View
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.common import SPLITS, hold_out
-from pp_cl.scene.views import View
 
 
 def views(count=11, size=(30, 22), *, centred=False, alike=False):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from PIL import Image
 
-from pp_cl.scene.camera import Camera
+from pp_cl.engine.camera import Camera
 
 
 def ring_cameras(n, size, distance=4.0, field_of_view=0.7):

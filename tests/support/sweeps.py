@@ -5,9 +5,9 @@ import json
 from support.checkpoints import contents
 from support.runs import SETTINGS, set_words
 
+from pp_cl.config import run_config
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session import run_config
-from pp_cl.sweep.plan import plan
+from pp_studio.sweep.plan import plan
 
 ITERATIONS = 16
 SETS = SETTINGS | {

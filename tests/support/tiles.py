@@ -1,6 +1,6 @@
 """Tiles of feature maps that a kernel computes."""
 
-from pp_cl.layers.tiles import SIDE, grid_shape
+from pp_cl.engine.layers.tiles import SIDE, grid_shape
 
 
 def pixels_of(tiles, height, width):

@@ -6,8 +6,8 @@ import os
 import numpy as np
 from support.refused import refusing
 
+from pp_cl.engine.camera import look_at
 from pp_cl.files.image import write_png
-from pp_cl.scene.camera import look_at
 from pp_cl.scene.load import find_reader, load_scene
 from pp_cl.scene.readers.found import Notes
 

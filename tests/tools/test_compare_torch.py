@@ -10,7 +10,7 @@ import pytest
 from support.comparisons import relative_error
 
 from pp_cl.bench.unet import make_network, plain_parameters
-from pp_cl.layers.choice import AUTO, VARIANTS
+from pp_cl.engine.layers.choice import AUTO, VARIANTS
 from tools.compare_torch import TorchNetwork, main
 
 

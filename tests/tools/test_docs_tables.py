@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pp_cl.cli import COMMANDS
-from pp_cl.config import Config, sections
+from pp_cl.commands import COMMANDS
+from pp_cl.settings import Config, sections
 from tools import docs_tables as TOOL
 from tools import provenance
 
@@ -43,14 +43,19 @@ def test_a_table():
 def test_a_page_says_so_where_the_code_has_changed_since(tmp_path, monkeypatch):
     """A digest is of all that decides a training, and of nothing else; a commit has one, too."""
     assert TOOL.table(RESULTS, "4567").endswith(f"a machine. {LATER}*")
-    for name in ("cl/a.cl", "pp_cl/train.py", "pp_cl/raster/b.py", "pp_cl/view/c.py"):
+    for name in (
+        "cl/a.cl",
+        "pp_cl/engine/step.py",
+        "pp_cl/engine/raster/b.py",
+        "pp_studio/view/c.py",
+    ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("one")
     before = provenance.digest(tmp_path)
-    (tmp_path / "pp_cl/view/c.py").write_text("two")
-    (tmp_path / "pp_cl/raster/b.pyc").write_text("two")
+    (tmp_path / "pp_studio/view/c.py").write_text("two")
+    (tmp_path / "pp_cl/engine/raster/b.pyc").write_text("two")
     assert provenance.digest(tmp_path) == before
-    for name in ("cl/a.cl", "pp_cl/train.py", "pp_cl/raster/b.py"):
+    for name in ("cl/a.cl", "pp_cl/engine/step.py", "pp_cl/engine/raster/b.py"):
         (tmp_path / name).write_text("two")
         assert provenance.digest(tmp_path) != before
         (tmp_path / name).write_text("one")

@@ -2,10 +2,10 @@
 
 import pytest
 
-from pp_cl.device.buffers import gather_rows
-from pp_cl.device.device import Device, kernel_folder
-from pp_cl.device.discover import open_device
-from pp_cl.device.kernel import parse_signatures
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.device.buffers import gather_rows
+from pp_cl.engine.device.device import Device, kernel_folder
+from pp_cl.engine.device.kernel import parse_signatures
 from tools import gpu_check
 from tools.gpu_check import TARGETS, Build, check, complaints, main, missing
 

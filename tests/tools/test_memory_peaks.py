@@ -6,7 +6,7 @@ import pytest
 from support.scenes import write_ball_scene
 
 from pp_cl.config import assign, preset, validate
-from pp_cl.device.device import Device
+from pp_cl.engine.device.device import Device
 from pp_cl.scene.load import load_scene
 from tools import memory_peaks as TOOL
 from tools.results import MEMORY

@@ -2,7 +2,7 @@
 
 from support.scenes import write_ball_scene
 
-from pp_cl.session import train_scene
+from pp_cl.session.training import train_scene
 from tools import stages as TOOL
 
 SETTINGS = {"points.count": 400, "network.widths": (16, 16, 16), "train.iterations": 4}

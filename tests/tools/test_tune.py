@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from pp_cl.bench.conv import Layer, UploadedLayer, layer_errors
-from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, device_class
+from pp_cl.engine.layers.choice import OFFERED, VARIANTS, blocking_of, device_class
 from tools import tune as TOOL
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.scene.readers.co3d import ANNOTATIONS, CV_FROM_P3D, ISOTROPIC, NORMALISED
-from pp_cl.scene.views import View
 from tools.scene_formats.common import number, write_mask, write_rgb
 
 CATEGORY, SEQUENCE = "object", "sequence"

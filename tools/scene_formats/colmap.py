@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl.scene.views import View
+from pp_cl.engine.views import View
 from tools.scene_formats.common import number, ordered, write_mask, write_rgb
 
 PINHOLE = 1  # COLMAP's number of the model

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import HELD_OUT, hold_out
-from pp_cl.scene.views import View
 
 
 def ordered(splits: dict[str, list[View]]) -> list[View]:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.scene.readers.llff import LLFF_FROM_CV
-from pp_cl.scene.views import View
 from tools.scene_formats.common import number, one_lens, ordered, write_mask, write_rgb
 
 BOUNDS = (0.01, 100.0)  # of depths, in distances of the nearest camera from the origin

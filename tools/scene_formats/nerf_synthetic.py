@@ -4,8 +4,8 @@ for the intrinsics.
 
 from pathlib import Path
 
+from pp_cl.engine.views import View
 from pp_cl.scene.readers.transforms import write_scene
-from pp_cl.scene.views import View
 
 
 def write(folder: Path, splits: dict[str, list[View]]) -> None:

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from pp_cl.engine.views import View
 from pp_cl.files.atomic import write_json
 from pp_cl.scene.readers.frame import frame_keys
-from pp_cl.scene.views import View
 from tools.scene_formats.common import number, write_mask, write_rgb
 
 

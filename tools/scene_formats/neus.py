@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.scene.views import View
+from pp_cl.engine.views import View
 from tools.scene_formats.common import number, ordered, write_mask, write_rgb
 
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.readers.nsvf import PREFIXES
-from pp_cl.scene.views import View
 from tools.scene_formats.common import number, one_lens
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import read_json
 from pp_cl.scene.readers.frame import GL_FROM_CV, LEAST_ANGLE, Frame, distortion, pinhole, rigid
 

@@ -13,10 +13,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError, quoted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
-from pp_cl.scene.camera import Camera
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     MOST,
     SPLITS,
@@ -26,7 +27,6 @@ from pp_cl.scene.readers.common import (
 )
 from pp_cl.scene.readers.found import Notes, find_image
 from pp_cl.scene.readers.frame import Frame, rigid
-from pp_cl.scene.views import Photograph
 
 FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
 ANNOTATIONS = "frame_annotations.jgz"

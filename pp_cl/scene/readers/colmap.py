@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     MOST,
     fail_at,
@@ -30,7 +31,6 @@ from pp_cl.scene.readers.common import (
     two_splits,
 )
 from pp_cl.scene.readers.found import Notes, find_image, folder_named, holds_images
-from pp_cl.scene.views import Photograph
 
 FILES = "a sparse model of COLMAP beside images"
 # and in numbered folders in them; the folder itself has the model of RealityScan

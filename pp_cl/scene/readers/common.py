@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from tqdm import tqdm
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError, quoted, shown
 from pp_cl.files.image import ENDINGS, same_shape
 from pp_cl.files.untrusted import (
@@ -21,9 +22,8 @@ from pp_cl.files.untrusted import (
     read_regular,
     refusal,
 )
-from pp_cl.scene.camera import Camera
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.found import Fail, Notes, numbered
-from pp_cl.scene.views import Photograph
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
 SPLITS = ["test", "train"]  # of a format that knows none

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.readers.common import MOST, numbers
 from pp_cl.scene.readers.found import Fail, find_image

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
-from pp_cl.scene.camera import Camera
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     fail_at,
     fitted,
@@ -17,7 +18,6 @@ from pp_cl.scene.readers.common import (
 )
 from pp_cl.scene.readers.found import Notes, image_folder
 from pp_cl.scene.readers.frame import rigid
-from pp_cl.scene.views import Photograph
 
 FILES = "poses_bounds.npy (LLFF)"
 POSES = "poses_bounds.npy"

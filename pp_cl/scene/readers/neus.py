@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
+from pp_cl.engine.camera import Camera
 from pp_cl.files.image import image_size
-from pp_cl.scene.camera import Camera
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz, two_splits
 from pp_cl.scene.readers.found import Notes, image_folder
-from pp_cl.scene.views import Photograph
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")

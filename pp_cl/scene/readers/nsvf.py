@@ -5,13 +5,13 @@ read.
 
 from pathlib import Path
 
+from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
-from pp_cl.scene.camera import Camera
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import fail_at, fitted, folder_images, read_numbers
 from pp_cl.scene.readers.found import Notes
 from pp_cl.scene.readers.frame import rigid
-from pp_cl.scene.views import Photograph
 
 FILES = "rgb, pose and intrinsics.txt (NSVF)"
 PREFIXES = {"0_": "train", "1_": "val", "2_": "test"}

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl.engine.views import View
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
+from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     SPLITS,
     checked_box,
@@ -24,7 +26,6 @@ from pp_cl.scene.readers.common import (
 )
 from pp_cl.scene.readers.found import CASED_ENDINGS, Notes
 from pp_cl.scene.readers.frame import Frame, distortion, frame_keys, pinhole
-from pp_cl.scene.views import Photograph, View
 
 FILES = "transforms_train.json or transforms.json"
 SINGLE = "transforms.json"

@@ -1,1 +1,0 @@
-"""Makes trained models smaller within a stated loss of quality."""

@@ -1,0 +1,1 @@
+"""OpenCL drivers of this machine: which work, and which device is taken."""

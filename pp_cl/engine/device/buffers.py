@@ -1,0 +1,252 @@
+"""Device arrays by many: declared as a table, {name: (shape, dtype)}; packed into one buffer; read
+without waiting; and their rows gathered, kept or read piecewise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import pyopencl as cl
+from pyopencl.array import Array
+
+from pp_cl.engine.device.device import FINISH, Device, QueuedArray
+from pp_cl.engine.device.launch import row_parts
+
+# bytes of the scratch that rows are moved through: 1.4 % of a training with 4 million points
+SCRATCH_BYTES = 2**27
+PIECE_BYTES = 2**26  # that the host reads at a time
+CHANNELS = 16  # words of a row of features
+
+T = TypeVar("T")
+Row = tuple[tuple[int, ...], Any]  # (shape, dtype)
+Table = dict[str, Row]
+
+
+def table_bytes(table: Table) -> int:
+    """Bytes of all arrays of a table."""
+    return sum(_row_bytes(*row) for row in table.values())
+
+
+def _row_bytes(shape, dtype):
+    return math.prod(shape) * np.dtype(dtype).itemsize
+
+
+def grown(capacity: int, needed: int) -> int:
+    """The capacity if it holds `needed`, else a quarter more than `needed`."""
+    return capacity if needed <= capacity else needed + needed // 4
+
+
+class Buffers:
+    """The device arrays of one stage, as attributes named like the rows of its table.
+
+    An array whose shape and dtype stay the same keeps its memory and its content.
+    """
+
+    def __init__(self, dev: Device):
+        self._dev = dev
+        self._arrays: dict[str, Array] = {}
+
+    def require(self, table: Table) -> None:
+        """Allocate the arrays of the table that are missing or have another shape or dtype,
+        uninitialised.
+
+        Old arrays are released before new ones are allocated. Raises UserError where memory does
+        not suffice.
+        """
+        changed = [name for name, row in table.items() if not self._fits(name, *row)]
+        for name in changed:
+            self._arrays.pop(name, None)
+        for name in changed:
+            self._arrays[name] = self._dev.empty(*table[name])
+
+    def _fits(self, name, shape, dtype):
+        array = self._arrays.get(name)
+        return array is not None and array.shape == tuple(shape) and array.dtype == dtype
+
+    def __getattr__(self, name: str) -> Array:
+        try:
+            return self._arrays[name]
+        except KeyError:
+            raise AttributeError(f"no buffer {name!r} was required yet") from None
+
+
+def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]:
+    """(octets, arrays of these shapes and dtypes that lie in them), all zeros: one launch or
+    transfer handles them all. The arrays are valid as long as the octets are held.
+    """
+    starts = _packed_starts(dev, rows)
+    whole = dev.zeros((starts.pop(),), np.uint8)
+    data: Any = whole.base_data
+    arrays: list[Array] = []
+    for start, (shape, dtype) in zip(starts, rows, strict=True):
+        region = data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
+        arrays.append(QueuedArray(dev.queue, shape, dtype, data=region))
+    return whole, arrays
+
+
+def _packed_starts(dev, rows):
+    """Where each of the rows begins, aligned as the device needs, and the end."""
+    align = dev.device.mem_base_addr_align // 8
+    sizes = [-(-max(1, _row_bytes(*row)) // align) * align for row in rows]
+    return [0, *map(int, np.cumsum(sizes))]
+
+
+class PackedArrays:
+    """Device arrays in one buffer, which one transfer overwrites."""
+
+    def __init__(self, dev: Device):
+        self._dev = dev
+        self._rows: list[Row] = []
+        self._arrays: list[Array] = []
+        self._whole: Any = None
+
+    def send(self, rows: list[Row], values: Sequence[np.ndarray]) -> list[Array]:
+        """Arrays of these shapes and dtypes, in the same memory as those before if these were the
+        same, overwritten after what is enqueued. values: of these dtypes; what is behind shorter
+        ones is undefined.
+        """
+        if rows != self._rows:
+            self._rows, self._whole, self._arrays = [], None, []  # frees the old ones first
+            self._whole, self._arrays = packed_arrays(self._dev, rows)
+            self._rows = rows
+        packed = np.empty(self._whole.shape, np.uint8)
+        for array, value in zip(self._arrays, values, strict=True):
+            octets = np.ascontiguousarray(value).reshape(-1).view(np.uint8)
+            data: Any = array.base_data
+            packed[data.offset : data.offset + value.nbytes] = octets
+        self._dev.send(self._whole, packed)
+        return self._arrays
+
+
+class Reading(Generic[T]):
+    """A value that the host gets from a download under way.
+
+    values: the target of the download, filled at the event. convert: makes the value of them.
+    """
+
+    def __init__(
+        self,
+        dev: Device,
+        event: cl.Event,
+        values: np.ndarray,
+        convert: Callable[[np.ndarray], T],
+    ):
+        self._dev = dev
+        self._event: cl.Event | None = event
+        self._values: Any = values
+        self._convert = convert
+
+    def get(self) -> T:
+        """The value; waits for the download. Raises UserError as Device.attempt() does."""
+        if self._event is not None:
+            self._dev.attempt(FINISH, self._event.wait)
+            self._values = self._convert(self._values)
+            self._event = None
+        return self._values
+
+
+def read_later(
+    dev: Device,
+    array: Array,
+    start: int = 0,
+    convert: Callable[[np.ndarray], Any] = lambda values: values,
+) -> Reading:
+    """array[start:], (N,), as the kernels enqueued so far will leave it. convert: applied once to
+    the numpy array, when it is asked for; what it raises, get() raises.
+    """
+    values = np.empty(len(array) - start, array.dtype)
+    event = dev.attempt(
+        "download a buffer",
+        cl.enqueue_copy,
+        dev.queue,
+        values,
+        array.base_data,
+        src_offset=array.offset + start * array.dtype.itemsize,
+        is_blocking=False,
+    )
+    return Reading(dev, event, values, convert)
+
+
+# ---- rows; none of it takes a second array of a model's size, which may not fit into memory
+
+
+def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
+    """The rows `keep` of `array`; the content of `array` is lost.
+
+    Rows that fit SCRATCH_BYTES become an array of their own. Others move to the front of the same
+    buffer, piece by piece: ascending indices never lie before their new place, so a piece
+    overwrites nothing that a later one reads. array: (N, ...), rows of whole 4-byte words. keep:
+    (M,) uint32, ascending.
+    """
+    m, row_bytes = len(keep), array.nbytes // len(array)
+    piece = min(m, max(1, SCRATCH_BYTES // row_bytes))
+    scratch = dev.empty((piece, *array.shape[1:]), array.dtype)
+    for start in range(0, m, piece):
+        count = min(piece, m - start)
+        _gather(dev, array, keep, scratch, first=start, count=count)
+        if piece < m:
+            dev.copy_rows(array, start, scratch, count)
+    return scratch if piece == m else array[:m]
+
+
+def gather_rows(dev: Device, array: Array, rows: Array) -> Array:
+    """A new array of the rows `rows` of `array`, (N, ...) of whole 4-byte words. rows: (M,) uint32,
+    in any order, with repetitions.
+    """
+    gathered = dev.empty((len(rows), *array.shape[1:]), array.dtype)
+    _gather(dev, array, rows, gathered, first=0, count=len(rows))
+    return gathered
+
+
+def _gather(dev, array, rows, target, *, first, count):
+    """Copy the rows rows[first] to rows[first + count] of `array` to the front of `target`."""
+    words = array.nbytes // len(array) // 4
+    items = row_parts(dev) if words >= CHANNELS else 1
+    dev.program("device/rows", GROUP=items).launch(
+        "gather_rows",
+        count * items,
+        first=first,
+        m=count,
+        r=words,
+        indices=rows,
+        source=_words(array),
+        target=_words(target),
+    )
+
+
+def _words(array):
+    """The same memory as (rows, words) uint32."""
+    return array.reshape(len(array), -1).view(np.uint32)
+
+
+class DeviceRows:
+    """Arrays (N, ...) of a device side by side, joined along their second axis. Fetched when asked
+    for: they must not change before. shape, dtype: of the joined array.
+    """
+
+    def __init__(self, dev: Device, *parts: Array) -> None:
+        self._dev, self._parts = dev, parts
+        first = parts[0]
+        joined = (sum(part.shape[1] for part in parts),) if len(parts) > 1 else first.shape[1:2]
+        self.shape = (*first.shape[:1], *joined, *first.shape[2:])
+        self.dtype = first.dtype
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the joined array."""
+        return sum(part.nbytes for part in self._parts)
+
+    def pieces(self) -> Iterator[np.ndarray]:
+        """The rows in numpy arrays of at most PIECE_BYTES, or of one row."""
+        count = self.shape[0]
+        rows = max(1, PIECE_BYTES * count // max(1, self.nbytes))
+        for start in range(0, count, rows):
+            columns = [self._dev.download(part[start : start + rows]) for part in self._parts]
+            yield np.concatenate(columns, 1) if len(columns) > 1 else columns[0]
+
+    def get(self) -> np.ndarray:
+        """The joined array."""
+        return np.concatenate([*self.pieces()] or [np.empty(self.shape, self.dtype)])

@@ -1,0 +1,521 @@
+"""An OpenCL device: builds programs, allocates and copies buffers, times stages and kernels, and
+works around the faults of drivers.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+import os
+import sys
+import time
+import weakref
+from collections import defaultdict, deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import ArrayLike, DTypeLike
+from pyopencl.array import Array
+
+from pp_cl.engine.device.host import ask_for_huge_pages
+from pp_cl.engine.device.kernel import Kernel, cut, parse_signatures, quiet_compiler
+from pp_cl.errors import BuildError, UserError
+
+SMALLER = "lower --points or raise --downscale"
+FINISH = "finish its work"  # what drivers of GPUs often fail at, for lack of memory
+HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
+# Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
+# multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
+MOST_MULTIPLY_ADDS = 25e9
+STANDARD = ("-cl-std=CL1.2",)  # options of every build
+# Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
+INTEL_PLATFORM = "Intel(R) OpenCL"
+# Files with a kernel that spills, or becomes narrow, with the 128 registers that a thread has there
+# by default, and not with 256, of which half as many threads run (docs/devices.md).
+SPILLING_ON_INTEL = frozenset(
+    (
+        "layers/conv_backward_weights",
+        "layers/conv_local",
+        "layers/conv_local_backward_weights",
+    )
+)
+
+
+def vendor_options(info: dict[str, Any], name: str) -> tuple[str, ...]:
+    """Options of cl/<name>.cl on devices of one vendor. info: of describe()."""
+    intel_gpu = info["type"] == "GPU" and info["platform"].startswith(INTEL_PLATFORM)
+    large = intel_gpu and name in SPILLING_ON_INTEL
+    return ("-cl-intel-256-GRF-per-thread",) if large else ()
+
+
+def has_watchdog(device: cl.Device) -> bool:
+    """Whether the system may stop a kernel that takes long: only NVIDIA's driver says so."""
+    try:
+        return bool(device.kernel_exec_timeout_nv)
+    except (cl.Error, AttributeError):
+        return True
+
+
+def acts_as_cpu(device: cl.Device) -> bool:
+    """Whether drivers and kernels work as they do on CPUs: on CPUs, unless PP_FORM=gpu.
+
+    Raises UserError for another PP_FORM.
+    """
+    asked = os.environ.get("PP_FORM")
+    if asked not in (None, "", "gpu"):
+        raise UserError(f"PP_FORM={asked}: must be gpu, or unset")
+    return not asked and bool(device.type & cl.device_type.CPU)
+
+
+def kernel_folder() -> Path:
+    """The folder of the .cl files: inside the installed package, or beside it in a checkout."""
+    inside = Path(__file__).parents[2] / "cl"
+    return inside if inside.is_dir() else Path(__file__).parents[3] / "cl"
+
+
+def describe(device: cl.Device) -> dict[str, Any]:
+    """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units",
+    "memory_bytes", "max_allocation_bytes" in a dictionary.
+    """
+    return {
+        "name": device.name.strip(),
+        "platform": device.platform.name.strip(),
+        "version": device.version.strip(),
+        "driver": device.driver_version.strip(),
+        "type": _type_name(device),
+        "compute_units": device.max_compute_units,
+        "memory_bytes": _memory_bytes(device),
+        "max_allocation_bytes": _max_allocation_bytes(device),
+    }
+
+
+def _type_name(device):
+    return next(
+        (t for t in ("GPU", "CPU", "ACCELERATOR") if device.type & getattr(cl.device_type, t)),
+        "OTHER",
+    )
+
+
+def _memory_bytes(device):
+    """A GPU's memory; for a CPU the machine's or its container's, as PoCL reports a fraction that
+    it does not keep to.
+    """
+    if not (device.type & cl.device_type.CPU and hasattr(os, "sysconf")):
+        return device.global_mem_size
+    sizes = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        if os.path.exists(limit):
+            text = Path(limit).read_text().strip()
+            sizes += [int(text)] if text.isdigit() else []  # "max": no limit
+    return min(sizes)
+
+
+def _max_allocation_bytes(device):
+    """What the device allocates at once, or PP_MAX_ALLOCATION (MiB) if that is less."""
+    text = os.environ.get("PP_MAX_ALLOCATION") or "inf"
+    try:
+        mebibytes = float(text)
+    except ValueError:
+        mebibytes = 0.0
+    if not mebibytes > 0:
+        raise UserError(f"PP_MAX_ALLOCATION={text}: must be a number of MiB above 0")
+    return int(min(device.max_mem_alloc_size, mebibytes * 2**20))
+
+
+def _debug_level():
+    text = os.environ.get("PP_DEBUG") or "0"
+    if text not in ("0", "1", "2", "3"):
+        raise UserError(f"PP_DEBUG={text}: must be 0, 1, 2 or 3")
+    return int(text)
+
+
+def _released(device, nbytes):
+    """Count freed memory off the device's total. device: a weak reference."""
+    alive = device()
+    if alive is not None:
+        alive.bytes -= nbytes
+
+
+class Memory(cl.Buffer):
+    """A cl.Buffer that takes weak references, so that its release can be counted."""
+
+
+class QueuedArray(Array):
+    """An Array whose queue works in order, so that it keeps no events: with those of its transfers
+    it would keep the last dozen numpy arrays that it was copied to.
+    """
+
+    def add_event(self, evt: cl.Event) -> None:
+        """Nothing."""
+
+
+class Device:
+    """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
+    (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
+    kernels are launched in parts.
+    """
+
+    def __init__(self, device: cl.Device):
+        self.device = device
+        self.name = device.name.strip()
+        self.info = describe(device)
+        self.is_cpu = acts_as_cpu(device)
+        self.has_watchdog = not self.is_cpu and has_watchdog(device)
+        self.debug = _debug_level()
+        self.context = cl.Context([device])
+        profiling: Any = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
+        self.queue = cl.CommandQueue(self.context, properties=profiling)
+        self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
+        self.bytes = self.peak_bytes = 0
+        self._sent: deque[Any] = deque()  # events of send()
+        self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
+        self._programs: dict[Any, Program] = {}
+        self._constants: dict[Any, Any] = {}
+        self._seconds: dict[str, list[float]] = defaultdict(list)
+        self._stage_seconds: dict[str, list[float]] | None = None
+        if self.debug:
+            self._stage_seconds = defaultdict(list)
+            atexit.register(self.print_profile)
+
+    @property
+    def build_options(self) -> list[str]:
+        """Options of every build; each program adds its folder and macros."""
+        # PoCL writes the number of clang's warnings to the terminal: dozens without AVX-512, all
+        # about how a float16 is passed
+        return [*STANDARD, *([] if self.debug else ["-w"])]
+
+    def program(self, name: str, **defines: int | float | str) -> Program:
+        """The Program of cl/<name>.cl built with -D for each define; built once.
+
+        Raises BuildError with the file, the options and the compiler's words when it does not
+        build.
+        """
+        key = name, frozenset(defines.items())
+        if key not in self._programs:
+            folder = kernel_folder()
+            if " " in str(folder):  # PoCL 3.1 splits its options at spaces, quoted or not
+                raise UserError(
+                    f"{folder}: OpenCL compilers cannot include from a folder with a space in its"
+                    " path; move it"
+                )
+            macros = [f"-D{k}={v}" for k, v in sorted(defines.items())]
+            start = time.perf_counter()
+            self._programs[key] = Program(
+                self,
+                name,
+                (folder / f"{name}.cl").read_text("utf-8"),
+                options=[
+                    *self.build_options,
+                    *vendor_options(self.info, name),
+                    "-I",
+                    folder.as_posix(),
+                    *macros,
+                ],
+                defines=defines,
+            )
+            if self.debug:
+                seconds = time.perf_counter() - start
+                print(
+                    f"cl/{name}.cl {' '.join(macros)} built in {seconds:.2f} s",
+                    file=sys.stderr,
+                )
+        return self._programs[key]
+
+    def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
+        """Uninitialised array on the device; zeros under PP_DEBUG=3, so that its scan sees only
+        what kernels wrote.
+        """
+        array = self._allocate(shape, dtype)
+        if self.debug >= 3 and array.nbytes:
+            self.fill(array, 0)
+        return array
+
+    def scratch(self, name: Hashable, n: int, dtype: type = np.float32, *, zeros: int = 0) -> Array:
+        """(n,) or longer, uninitialised, in memory that all calls with this name share: only for
+        what kernels enqueued before the next such call read. zeros: values at its front that are
+        0 when it is allocated, for kernels that leave zeros there.
+        """
+        held = self._scratch.get(name)
+        if held is None or len(held) < n or held.dtype != dtype:
+            held = self._scratch[name] = None  # frees the old one first
+            held = self._scratch[name] = self.empty((n,), dtype)
+            if zeros:
+                self.fill(held[:zeros], 0)
+        return held
+
+    def constant(self, rows: Sequence[tuple[int, ...]]) -> Array:
+        """The rows as an int32 array on the device, which is made once."""
+        key = tuple(rows)
+        if key not in self._constants:
+            self._constants[key] = self.upload(key, np.int32)
+        return self._constants[key]
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
+        """Array of zeros on the device."""
+        array = self._allocate(shape, dtype)
+        self.fill(array, 0)
+        return array
+
+    def upload(self, values: ArrayLike, dtype: type | None = None) -> Array:
+        """Copy of a numpy array on the device."""
+        values = np.ascontiguousarray(values, dtype)
+        array = self._allocate(values.shape, values.dtype)
+        self.write(array, values)
+        return array
+
+    def write(self, array: Array, values: np.ndarray) -> None:
+        """Overwrite an array of this device by a numpy array of its shape and dtype."""
+        if array.size:
+            self._upload(array, values, is_blocking=True)
+
+    def send(self, array: Array, values: np.ndarray) -> None:
+        """Overwrite an array once what is enqueued is done, without waiting for it: `values` must
+        not change any more.
+        """
+        self._sent.append(self._upload(array, values, is_blocking=False))
+        # an event that is dropped waits for the end of its transfer
+        complete = cl.command_execution_status.COMPLETE
+        while len(self._sent) > 1 and self._sent[0].command_execution_status == complete:
+            self._sent.popleft()
+
+    def _upload(self, array, values, *, is_blocking):
+        if values.shape != array.shape or values.dtype != array.dtype:
+            raise ValueError(f"write: {values.shape} {values.dtype} to {array.shape} {array.dtype}")
+        values = np.ascontiguousarray(values)
+        place = {"dst_offset": array.offset, "is_blocking": is_blocking}
+        return self._copy("upload a buffer", array.base_data, values, **place)
+
+    def download(self, array: Array) -> np.ndarray:
+        """Copy of an array of this device."""
+        values = np.empty(array.shape, array.dtype)
+        if array.size:
+            self._copy("download a buffer", values, array.base_data, src_offset=array.offset)
+        return values
+
+    def fill(self, array: Array, value: float) -> None:
+        """Set all elements of an array of this device to one value."""
+        if array.size:
+            self.attempt(
+                "fill a buffer",
+                cl.enqueue_fill_buffer,
+                self.queue,
+                array.data,
+                array.dtype.type(value),
+                0,
+                array.nbytes,
+            )
+
+    def copy(self, target: Array, source: Array) -> None:
+        """Copy one array of this device into another of the same size."""
+        if target.nbytes != source.nbytes:
+            raise ValueError(
+                f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}"
+            )
+        self.copy_rows(target, 0, source, len(source))
+
+    def copy_rows(self, target: Array, start: int, source: Array, count: int) -> None:
+        """Copy the first `count` rows of one array of this device over those of another from row
+        `start` on.
+        """
+        row_bytes = source[:1].nbytes
+        if target[:1].nbytes != row_bytes or target.dtype != source.dtype:
+            raise ValueError(
+                f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}"
+            )
+        if count:
+            size = {"byte_count": count * row_bytes, "dst_offset": start * row_bytes}
+            self._copy("copy a buffer", target.data, source.data, **size)
+
+    def _copy(self, what, target, source, **place):
+        return self.attempt(what, cl.enqueue_copy, self.queue, target, source, **place)
+
+    def finish(self) -> None:
+        """Wait until everything enqueued is done."""
+        self.attempt(FINISH, self.queue.finish)
+
+    def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
+        """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
+        many allocate only at a buffer's first use, or with OUT_OF_RESOURCES, which NVIDIA's says of
+        kernels that fault or run too long as well.
+        """
+        try:
+            return function(*args, **kwargs)
+        except (cl.MemoryError, cl.RuntimeError) as error:
+            unsaid = "OUT_OF_RESOURCES" in str(error)
+            why = " for want of memory, or since the driver ended a kernel" if unsaid else ""
+            raise UserError(
+                f"{self.name} cannot {what}{why} ({error}; {self.bytes / 2**20:.0f} MiB in use):"
+                f" {SMALLER}, or choose another device (`pp-cl devices`)"
+                f"{'; the log of the system may say more' if unsaid else ''}"
+            ) from error
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Times the part of a pass called `name` under PP_DEBUG >= 1 and timed_stages().
+
+        When timed, the queue is drained before and after, so that stages do not overlap.
+        """
+        if self._stage_seconds is None:
+            yield
+            return
+        self.finish()
+        start = time.perf_counter()
+        yield
+        self.finish()
+        self._stage_seconds[name].append(time.perf_counter() - start)
+
+    @contextmanager
+    def timed_stages(self) -> Iterator[dict[str, list[float]]]:
+        """Yields {stage name: [seconds of each pass]}, filled by the stages inside the block."""
+        before, self._stage_seconds = self._stage_seconds, defaultdict(list)
+        try:
+            yield self._stage_seconds
+        finally:
+            self._stage_seconds = before
+
+    def reset_peak(self) -> int:
+        """Measure peak_bytes anew from here on. Returns the bytes in use."""
+        self.peak_bytes = self.bytes
+        return self.bytes
+
+    def _allocate(self, shape, dtype):
+        dtype = np.dtype(dtype)
+        nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+        largest, total = self.info["max_allocation_bytes"], self.info["memory_bytes"]
+        if nbytes > largest or self.bytes + nbytes > total:
+            raise UserError(
+                f"a buffer of shape {tuple(np.atleast_1d(shape).tolist())} needs"
+                f" {nbytes / 2**30:.2f} GiB; {self.name} allocates at most {largest / 2**30:.2f}"
+                f" GiB at once and {total / 2**30:.2f} GiB in all, {self.bytes / 2**30:.2f} GiB are"
+                f" in use: {SMALLER}"
+            )
+        what = f"allocate {nbytes / 2**20:.0f} MiB"
+        return self.attempt(what, QueuedArray, self.queue, shape, dtype, allocator=self._counted)
+
+    def _counted(self, nbytes):
+        """Memory that is counted until the last array on it is gone, be it a slice or a view."""
+        memory = self._memory(nbytes)
+        self.bytes += nbytes
+        self.peak_bytes = max(self.peak_bytes, self.bytes)
+        # weakly: scratch memory that kept its device alive would never end, nor would the device
+        weakref.finalize(memory, _released, weakref.ref(self), nbytes)
+        return memory
+
+    def _memory(self, nbytes):
+        memory = Memory(self.context, cl.mem_flags.READ_WRITE, nbytes)
+        if self.is_cpu and nbytes >= HUGE:  # the host's memory: a map shows where it lies
+            flags = cl.map_flags.WRITE_INVALIDATE_REGION
+            place = 0, (nbytes,), np.uint8
+            mapped, _ = cl.enqueue_map_buffer(self._maps, memory, flags, *place)
+            ask_for_huge_pages(mapped.ctypes.data, nbytes)
+            mapped.base.release(self._maps)
+            self._maps.finish()  # other queues use the memory next
+        return memory
+
+    def observe(self, kernel: Kernel, event: cl.Event, arguments: dict[str, Any]) -> None:
+        """PP_DEBUG 1, 2: wait, note the kernel's time. PP_DEBUG 3: stop at the first NaN or Inf in
+        an output as well.
+        """
+        event.wait()
+        self._seconds[kernel.label].append((event.profile.end - event.profile.start) * 1e-9)
+        if self.debug < 3:
+            return
+        for p in kernel.parameters:
+            if p.is_buffer and not p.const and p.dtype is np.float32:
+                values = arguments[p.name].get()
+                bad = np.flatnonzero(
+                    np.isnan(values) if p.may_be_infinite else ~np.isfinite(values)
+                )
+                if bad.size:
+                    raise FloatingPointError(
+                        f"{kernel.label}: {p.name} has {bad.size} NaN or Inf, first at {bad[0]}"
+                    )
+
+    def print_profile(self) -> None:
+        """A table on stderr, longest first: passes, median and total time of stages and, at
+        PP_DEBUG 1, of kernel files, else of kernels.
+        """
+        rows: dict[str, list[float]] = defaultdict(list)
+        rows |= {f"stage {name}": seconds for name, seconds in (self._stage_seconds or {}).items()}
+        for label, seconds in self._seconds.items():
+            rows[label if self.debug >= 2 else label.partition(":")[0]] += seconds
+        for label, seconds in sorted(rows.items(), key=lambda r: -sum(r[1])):
+            median, total = np.median(seconds) * 1e3, sum(seconds)
+            print(
+                f"{label:40s} {len(seconds):7d} x {median:9.3f} ms, {total:9.3f} s in all",
+                file=sys.stderr,
+            )
+
+
+class Program:
+    """One built cl/*.cl file."""
+
+    def __init__(
+        self,
+        device: Device,
+        name: str,
+        source: str,
+        *,
+        options: list[str],
+        defines: dict[str, Any],
+    ):
+        self.device = device
+        signatures = parse_signatures(source, f"cl/{name}.cl")
+        try:
+            with quiet_compiler():
+                built = cl.Program(device.context, source).build(options=options)
+        except cl.RuntimeError as error:
+            raise BuildError(
+                f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}", str(error)
+            ) from error
+        self.kernels = {
+            k: Kernel(getattr(built, k), device.device, p, defines=defines, label=f"{name}.cl:{k}")
+            for k, p in signatures.items()
+        }
+
+    def launch(
+        self,
+        kernel_name: str,
+        size: int | tuple[int, ...],
+        local: int | tuple[int, ...] | None = None,
+        *,
+        multiply_adds: float = 0,
+        along: int = 0,
+        **arguments,
+    ) -> None:
+        """Enqueue one kernel.
+
+        size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
+        tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
+        multiply_adds: at most so many in all; where they may take too long for a watchdog, several
+        launches share the work-items, cut along the dimension `along`, in which the kernel must use
+        global ids alone. arguments: by parameter name. Raises TypeError (names, dtypes) and
+        ValueError (shapes) before anything is enqueued, UserError when the work-group is too large
+        for the device or the driver gives up.
+        """
+        kernel = self.kernels[kernel_name]
+        values = kernel.arguments(arguments)
+        ranges = kernel.ranges(size, local)
+        if ranges is None:
+            return
+        size, local = ranges
+        watched = multiply_adds > 0 and self.device.has_watchdog
+        parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if watched else 1
+        for offset, part in cut(size, local, parts, along) if parts > 1 else [(None, size)]:
+            event = self.device.attempt(
+                f"run {kernel.label}",
+                kernel.kernel,
+                self.device.queue,
+                part,
+                local,
+                *values,
+                global_offset=offset,
+            )
+            if watched:  # what drivers hand to the system together is timed together
+                self.device.queue.flush()
+            if self.device.debug:
+                self.device.observe(kernel, event, arguments)

@@ -1,0 +1,70 @@
+"""How many values a work-item takes and how many work together, on CPUs and on GPUs."""
+
+from pp_cl.engine.device.device import Device
+
+SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
+LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
+
+
+def lanes(dev: Device, on_gpu: int = 1) -> int:
+    """LANES of kernels (cl/lanes.h): neighbouring values that one work-item takes. on_gpu: how many
+    on GPUs, 1 or 4.
+
+    A CPU's core has vectors of 16 floats and works on one item at a time. A GPU runs 32 or 64 items
+    in step, which reach memory together, and keeps the values of each in registers: 16 of
+    everything do not fit.
+    """
+    return 16 if dev.is_cpu else on_gpu
+
+
+def row_parts(dev: Device, on_gpu: int = 1) -> int:
+    """Work-items for the 16 channels of a row, LANES each. on_gpu: as for lanes()."""
+    return 16 // lanes(dev, on_gpu)
+
+
+def channel_ranges(
+    dev: Device, height: int, width: int, channels: int
+) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
+    """(work-items, work-group) of a kernel with an item per (LANES channels, x, y) of a feature map
+    (height, width, channels). On GPUs those in step are neighbours in memory.
+    """
+    size = (-(-channels // lanes(dev)), width, height)
+    return size, (1, 16, 4) if dev.is_cpu else (16, 4, 1)
+
+
+def group_ranges(dev: Device, groups: int, members: int) -> tuple[int, int | None]:
+    """(work-items, work-group) of a kernel in which groups of `members` work-items cooperate; on
+    CPUs a group is one work-item. A work-group holds one or more groups as a whole.
+    """
+    return (groups, None) if dev.is_cpu else (groups * members, max(members, SMALL_GROUP))
+
+
+def group_items(dev: Device) -> int:
+    """GROUP of kernels (cl/group.h): work-items that sum or scan together; a power of two on GPUs,
+    1 on CPUs. Of kernels that the device runs in fewer, launch_groups() takes less.
+    """
+    if dev.is_cpu:
+        return 1
+    return 1 << min(LARGEST_GROUP, dev.device.max_work_group_size).bit_length() - 1
+
+
+def launch_groups(
+    dev: Device,
+    name: str,
+    kernel: str,
+    groups: int,
+    *,
+    defines: dict[str, int] | None = None,
+    **arguments,
+) -> None:
+    """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times. A
+    GPU's compiler may allow fewer of one kernel than the device runs of others.
+
+    defines: of the program, beside GROUP. arguments: by parameter name.
+    """
+    items, defines = group_items(dev), defines or {}
+    program = dev.program(name, GROUP=items, **defines)
+    while items > 1 and items > program.kernels[kernel].largest_group:
+        items //= 2
+        program = dev.program(name, GROUP=items, **defines)
+    program.launch(kernel, groups * items, None if dev.is_cpu else items, **arguments)

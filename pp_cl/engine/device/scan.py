@@ -1,0 +1,66 @@
+"""Exclusive prefix sums on the device, and stream compaction (the indices of non-zero flags)."""
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.buffers import Reading, read_later
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import launch_groups
+
+BLOCK = 2048  # values that a work-item of a CPU, or a work-group of a GPU, scans
+
+
+def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
+    """Write offsets[i] = sum of values[:i], so that offsets[N] is the total; at most 2^32 - 1,
+    where sums stay.
+
+    values: (N) uint32, N >= 1. offsets: (N+1) uint32.
+    """
+    n = values.size
+    block_sum = _block_sums(dev, "scan_sums", n, values=values)
+    _launch(dev, "scan_offsets", n, values=values, block_sum=block_sum, offsets=offsets)
+
+
+def _block_sums(dev, kernel, n, **entries):
+    """(blocks,) what the kernel finds in each block of n entries."""
+    # of a power of two: numbers of pairs differ from step to step
+    held = dev.scratch("scan", 1 << (_blocks(n) - 1).bit_length(), np.uint32)
+    _launch(dev, kernel, n, block_sum=held[: _blocks(n)], **entries)
+    return held[: _blocks(n)]
+
+
+def _blocks(n):
+    return -(-n // BLOCK)
+
+
+def _launch(dev, kernel, n, **arguments):
+    blocks = _blocks(n)
+    launch_groups(
+        dev, "device/scan", kernel, blocks, defines={"BLOCK": BLOCK}, n=n, b=blocks, **arguments
+    )
+
+
+def read_total(dev: Device, offsets: Array) -> Reading[int]:
+    """The last entry of `offsets`."""
+    return read_later(dev, offsets, len(offsets) - 1, lambda last: int(last[0]))
+
+
+def nonzero(dev: Device, flags: Array, indices: Array, places: Array) -> Reading[Array]:
+    """(S,) uint32 on the device, the front of `indices`: where flags are not zero, ascending.
+
+    flags: (N) uint8, N >= 1. indices: (N) uint32. places: (N) uint32, where each of them stands in
+    `indices`; others are left alone.
+    """
+    n, found = flags.size, dev.scratch("found", 1, np.uint32)
+    block_sum = _block_sums(dev, "count_nonzero", n, flags=flags)
+    _launch(
+        dev,
+        "scan_nonzero",
+        n,
+        flags=flags,
+        block_sum=block_sum,
+        indices=indices,
+        places=places,
+        found=found,
+    )
+    return read_later(dev, found, convert=lambda total: indices[: int(total[0])])

@@ -1,0 +1,194 @@
+"""The regular grid on whose vertices the points lie, and its refinement to half the spacing."""
+
+import math
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pp_cl.engine.camera import Camera
+
+FLOAT32_BITS = 24
+MOST_IDS = 2**32  # an id has 32 bits
+BRICK = 8  # vertices along each side of a brick, a power of two as cl/grid.h has it
+# steps (x, y, z) to 13 of a vertex's 26 neighbours; the others are their opposites
+HALF_OF_NEIGHBOURS = [step for step in product((0, 1, -1), repeat=3) if step[::-1] > (0, 0, 0)]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid.
+
+    origin: world position of vertex (0, 0, 0). edge: spacing, world units. dims: number of vertices
+    along x, y and z.
+
+    Ids number the vertices brick by brick of 8x8x8, bricks and the vertices in each x first, so
+    that points in the order of their ids lie near one another in all directions: 16 of them meet
+    few pixels, and what they read is still in a cache. Ids of whole bricks are more than vertices.
+    """
+
+    origin: tuple[float, ...]
+    edge: float
+    dims: tuple[int, ...]
+
+    @classmethod
+    def centred_in(cls, box: np.ndarray, edge: float) -> "Grid":
+        """The largest grid of this edge that fits into a (2, 3) box, centred in it."""
+        steps = np.maximum(box[1] - box[0], 0) // edge
+        origin = box.mean(0) - edge * steps / 2
+        return cls(tuple(float(x) for x in origin), edge, tuple(int(n) + 1 for n in steps))
+
+    @classmethod
+    def of_header(cls, stored: dict[str, Any]) -> "Grid":
+        """The grid of what header() gave."""
+        origin = tuple(map(float, stored["origin"]))  # JSON may hold integers beyond 64 bits
+        return cls(origin, float(stored["edge"]), tuple(stored["dims"]))
+
+    def header(self) -> dict[str, Any]:
+        """JSON-able: {"origin", "edge", "dims"}."""
+        return {
+            "origin": [float(x) for x in self.origin],
+            "edge": float(self.edge),
+            "dims": [int(n) for n in self.dims],
+        }
+
+    def refined(self) -> "Grid":
+        """The grid of half the spacing that has eight vertices around each of this one's: vertex
+        (i, j, k) is in the middle of (2 i, 2 j, 2 k) to (2 i + 1, 2 j + 1, 2 k + 1).
+        """
+        origin = tuple(x - self.edge / 4 for x in self.origin)
+        return Grid(origin, self.edge / 2, tuple(2 * n for n in self.dims))
+
+    def coarsened(self) -> "Grid":
+        """The grid whose refined() this is."""
+        origin = tuple(x + self.edge / 2 for x in self.origin)
+        return Grid(origin, 2 * self.edge, tuple(n // 2 for n in self.dims))
+
+    def children(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(ids of refined(), ascending, the place in `ids` of each one's parent), (8 N) uint32
+        both. Raises ValueError where refined() has more vertices than 32 bits can number.
+        """
+        refined, first = self.refined(), 2 * self.coordinates(ids)
+        if refined.id_count > MOST_IDS:
+            raise ValueError(f"a grid of {self.dims} vertices cannot be refined")
+        corners = product((0, 1), repeat=3)
+        found = np.concatenate([refined.ids(first + corner) for corner in corners])
+        order = np.argsort(found)
+        return found[order].astype(np.uint32), (order % len(ids)).astype(np.uint32)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) float64 world position of the middle of the vertices."""
+        return np.asarray(self.origin) + self.edge * (np.asarray(self.dims) - 1) / 2
+
+    @property
+    def box(self) -> np.ndarray:
+        """(2, 3) float64: the first and the last vertex."""
+        low = np.asarray(self.origin)
+        return np.stack([low, low + self.edge * (np.asarray(self.dims) - 1)])
+
+    @property
+    def diagonal(self) -> float:
+        """From the first to the last vertex, world units; an edge where there is one vertex."""
+        return float(np.linalg.norm(np.ptp(self.box, axis=0))) or self.edge
+
+    def moved(self, by: ArrayLike) -> "Grid":
+        """The grid moved by (3,) world units."""
+        return replace(self, origin=tuple(float(x) for x in np.add(self.origin, by)))
+
+    def rounded(self) -> "Grid":
+        """The grid with an edge that float32 holds, and an origin of whole units of its last bit.
+        So float64 holds each vertex and the centre exactly, up to 2^28 edges from the world's
+        origin, and moves by whole units change nothing else.
+        """
+        unit = 2.0 ** (math.frexp(self.edge)[1] - FLOAT32_BITS)
+        origin = tuple(float(x) for x in unit * np.rint(np.divide(self.origin, unit)))
+        return replace(self, origin=origin, edge=float(unit * np.rint(self.edge / unit)))
+
+    def packed(self, centre: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
+        """(8,) float32, the layout of cl/grid.h. centre: as Camera.packed has it."""
+        origin = np.subtract(self.origin, centre)
+        return np.array([*origin, self.edge, *self.dims, 0], np.float32)
+
+    def positions(self, ids: ArrayLike) -> np.ndarray:
+        """(N, 3) float64 world positions of the vertices with ids (N,)."""
+        return np.asarray(self.origin) + self.edge * self.coordinates(ids)
+
+    def lattice(self) -> np.ndarray:
+        """(nz ny nx, 3) float64: the world positions of all vertices, x first."""
+        places = np.moveaxis(np.indices(self.dims[::-1]), 0, -1)[..., ::-1].reshape(-1, 3)
+        return np.asarray(self.origin) + self.edge * places
+
+    @property
+    def id_count(self) -> int:
+        """The ids of whole bricks; all are below it."""
+        return BRICK**3 * math.prod(self._bricks())
+
+    def coordinates(self, ids: ArrayLike) -> np.ndarray:
+        """(N, 3) int64 (i, j, k) of the vertices with ids (N,)."""
+        nx, ny, _ = self._bricks()
+        brick, vertex = np.divmod(np.asarray(ids, np.int64), BRICK**3)
+        bricks = np.stack([brick % nx, brick // nx % ny, brick // (nx * ny)], -1)
+        inside = np.stack([vertex % BRICK, vertex // BRICK % BRICK, vertex // BRICK**2], -1)
+        return BRICK * bricks + inside
+
+    def ids(self, coordinates: np.ndarray) -> np.ndarray:
+        """(N,) int64 ids of the vertices (i, j, k), (N, 3) int64: the inverse of coordinates()."""
+        nx, ny, _ = self._bricks()
+        brick, vertex = np.divmod(coordinates, BRICK)
+        return np.dot(brick, (1, nx, nx * ny)) * BRICK**3 + np.dot(vertex, (1, BRICK, BRICK**2))
+
+    def ids_of(self, is_chosen: np.ndarray) -> np.ndarray:
+        """(N,) uint32, the ascending ids of the vertices that are True in (nz, ny, nx) bool."""
+        coordinates = np.stack(np.nonzero(is_chosen)[::-1], -1)
+        return np.sort(self.ids(coordinates).astype(np.uint32))
+
+    def _bricks(self):
+        """Bricks along x, y and z."""
+        return [-(-n // BRICK) for n in self.dims]
+
+    def in_large_parts(self, ids: np.ndarray, least: int) -> np.ndarray:
+        """(N,) bool: which of the vertices with ids (N,), ascending, are in a connected part
+        (edges, diagonals) of at least `least`; where there is none, those in the largest. It takes
+        the memory of the vertices, not of the box around them.
+        """
+        ids, place, edges = np.asarray(ids, np.int64), self.coordinates(ids), []
+        for step in HALF_OF_NEIGHBOURS:
+            there = place + step
+            inside = np.flatnonzero(((there >= 0) & (there < self.dims)).all(1))
+            wanted = self.ids(there[inside])
+            found = np.searchsorted(ids, wanted)
+            found[found == len(ids)] = 0
+            known = ids[found] == wanted
+            edges.append(np.stack([inside[known], found[known]]).astype(np.int32))
+        one, other = np.concatenate(edges, 1)
+        graph = coo_array((np.ones(len(one), bool), (one, other)), (len(ids), len(ids)))
+        part = connected_components(graph, directed=False)[1]
+        size = np.bincount(part)
+        return size[part] >= min(least, size.max())
+
+    def projection(self, camera: Camera) -> np.ndarray:
+        """(3, 4) float64: vertex (i, j, k, 1) -> (u w, v w, w), with pixel (u, v) of the camera and
+        depth w along its optical axis.
+        """
+        intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        offset = np.asarray(self.origin) - camera.eye
+        return intrinsics @ camera.pose[:, :3].T @ np.column_stack([self.edge * np.eye(3), offset])
+
+
+def smallest_edge(box: np.ndarray, cells: int) -> float:
+    """Edge, within 0.1 %, of the finest grid over a (2, 3) box with at most `cells` vertices; 1
+    where the box is one place.
+    """
+    size = box[1] - box[0]
+    if not size.any():
+        return 1.0
+    size = np.maximum(size, 1e-6 * size.max())  # a box may be flat
+    edge = (size.prod() / cells) ** (1 / 3)
+    while (excess := np.prod(size // edge + 1) / cells) > 1:
+        edge *= max(excess ** (1 / 3), 1.001)
+    return float(edge)

@@ -1,0 +1,101 @@
+"""How a device computes convolutions: which variant (direct, Winograd or local) runs for a shape,
+and the sizes that the kernels are built with. Both are shipped, by the kind of device and, for
+CPUs, by the width of their vectors; `python -m tools.tune` measures a row of that table.
+"""
+
+import math
+
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.conv_direct import Blocking, ConvShape, DirectConv, Direction
+from pp_cl.engine.layers.conv_local import LocalConv
+from pp_cl.engine.layers.conv_winograd import WinogradConv, fits
+
+AUTO = "auto"
+VARIANTS: dict[str, type[DirectConv]] = {
+    "local": LocalConv,
+    "direct": DirectConv,
+    "winograd": WinogradConv,
+}
+# {class of device: the variants that it is offered}. On GPUs "local" is 3 times as fast as "direct"
+# (an NVIDIA H100); Winograd's groups would be one lane, and spill 15 KB of registers.
+OFFERED = {"CPU": ("direct", "winograd"), "GPU": ("local", "direct")}
+# {direction: pixels}: on CPUs Winograd runs in images of at least so many. It is 2.7 times as fast
+# as direct in the paper's network at 256x256, on 2 cores with AVX-512. In smaller images too few
+# tiles share the cost of transforming the weights; channels matter less, from 16 on all gain.
+WINOGRAD_FROM = {
+    Direction.FORWARD: 900,
+    Direction.BACKWARD_INPUT: 900,
+    Direction.BACKWARD_WEIGHTS: 64,
+}
+
+# AVX2 has 16 registers of 8 floats, which hold 8 vectors of 16: 4 sums, the weights of a row, and
+# what they are multiplied with. Measured on Zen 3: 1.6 times (forward) and 1.75 times (training)
+# the speed of the numbers for AVX-512.
+_EIGHT_VECTORS = Blocking(
+    direct=(4, 1, (1, 1, 1)),
+    direct_odd=(4, 1, (1, 1, 1)),
+    accumulators=4,
+    work_group=(1, 1, 1),
+    winograd_groups=1,
+    winograd=(64, 4),
+    winograd_narrow=(24, 4),
+)
+# {floats of a CPU's vectors: Blocking}
+CPUS = {
+    # AVX-512 has 32 registers of 16 floats. Where groups of 16 channels pair up, two share each
+    # input value and take 8 pixels: 16 accumulators and 6 weights; else one takes 12.
+    16: Blocking(
+        direct=(8, 2, (1, 1, 1)),
+        direct_odd=(12, 1, (1, 1, 1)),
+        accumulators=24,
+        work_group=(1, 1, 1),
+        winograd_groups=2,
+        winograd=(64, 8),
+        winograd_narrow=(12, 12),
+    ),
+    8: _EIGHT_VECTORS,
+    # Not measured: Arm's and Apple's 32 registers of 4 floats hold 8 vectors of 16, as AVX2's do.
+    4: _EIGHT_VECTORS,
+}
+# A work-item has about 255 scalar registers, and a vector of 16 takes 16 of them: 4 pixels.
+GPU = Blocking(
+    direct=(4, 1, (16, 4, 1)),
+    direct_odd=(4, 1, (16, 4, 1)),
+    accumulators=6,
+    work_group=None,
+)
+
+
+def device_class(dev: Device) -> str:
+    """The key of a device in OFFERED: "CPU", or "GPU" for every other device."""
+    return "CPU" if dev.is_cpu else "GPU"
+
+
+def blocking_of(dev: Device) -> Blocking:
+    """The shipped sizes of a device's kernels."""
+    if not dev.is_cpu:
+        return GPU
+    width = dev.device.native_vector_width_float
+    return CPUS[max((floats for floats in CPUS if floats <= width), default=min(CPUS))]
+
+
+def can_run(variant: str, k: int, *channels: int) -> bool:
+    """Whether a variant takes a K x K kernel and these numbers of channels, of each source and of
+    the output.
+    """
+    return variant != "winograd" or (k == 3 and fits(*channels))
+
+
+def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> type[DirectConv]:
+    """What computes a convolution, of VARIANTS. variant: a name there is taken wherever it can run,
+    "direct" elsewhere; AUTO takes the shipped choice. Raises ValueError for another variant.
+    """
+    if variant not in (AUTO, *VARIANTS):
+        raise ValueError(f"variant {variant!r}: must be one of {', '.join((AUTO, *VARIANTS))}")
+    channels = *shape.sources, shape.co
+    if variant == AUTO and not dev.is_cpu:
+        variant = "local"
+    elif variant == AUTO:
+        gains = math.prod(shape.size) >= WINOGRAD_FROM[shape.direction]
+        variant = "winograd" if gains else "direct"
+    return VARIANTS[variant if can_run(variant, shape.k, *channels) else "direct"]

@@ -1,0 +1,143 @@
+"""Tiles of 4 x 4 pixels of a feature map: lists of those that a kernel computes, tests for tiles
+that are not background, and copies from tile to tile.
+
+A feature map of (height, width) pixels has ceil(height / 4) x ceil(width / 4) tiles, numbered row
+by row; the last ones may be cut off by the border.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.buffers import Reading, Table, read_later
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import channel_ranges, lanes
+
+VECTOR = 16  # channels in one float16
+# pixels: the outputs of F(4x4, 3x3), and one pixel after the network has halved its input twice
+SIDE = 4
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """The tiles of a feature map that a kernel computes.
+
+    size: (height, width) of the feature map. number: how many tiles are computed. list: (?,)
+    int32: height, width, number, the computed tiles ascending. count: (rows, columns)
+    float32: in sums over the whole feature map a computed tile counts that often, for itself and
+    its copies; 0 for tiles that are not computed.
+    """
+
+    size: tuple[int, int]
+    number: int
+    list: Array
+    count: Array
+
+
+def grid_shape(height: int, width: int) -> tuple[int, int]:
+    """(rows, columns) of the tiles of a feature map."""
+    return -(-height // SIDE), -(-width // SIDE)
+
+
+def some_tiles(dev: Device, size: tuple[int, int], count: np.ndarray) -> Tiles:
+    """Tiles of a feature map of `size` = (height, width) from their count (rows, columns).
+
+    Raises ValueError when no count is above 0.
+    """
+    return Tiles(size, int(np.count_nonzero(count)), *map(dev.upload, tile_arrays(size, count)))
+
+
+def tile_arrays(size: tuple[int, int], count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tiles.list and Tiles.count as numpy arrays. Raises ValueError as some_tiles()."""
+    chosen = np.flatnonzero(count)
+    if not len(chosen):
+        raise ValueError(f"no tile of {size} chosen")
+    return np.array([*size, len(chosen), *chosen], np.int32), count.astype(np.float32)
+
+
+def all_tiles(dev: Device, height: int, width: int) -> Tiles:
+    """Every tile of a feature map."""
+    return some_tiles(dev, (height, width), np.ones(grid_shape(height, width)))
+
+
+def all_tiles_buffers(height: int, width: int) -> Table:
+    """{name: (shape, dtype)} of the device buffers of all_tiles()."""
+    rows, columns = grid_shape(height, width)
+    return {"list": ((3 + rows * columns,), np.int32), "count": ((rows, columns), np.float32)}
+
+
+def checked_tiles(dev: Device, tiles: Tiles | None, height: int, width: int) -> Tiles:
+    """`tiles`, or all tiles of the feature map if None. Raises ValueError for tiles of a feature
+    map of another size.
+    """
+    if tiles is None:
+        return all_tiles(dev, height, width)
+    if tiles.size != (height, width):
+        raise ValueError(f"tiles of {tiles.size} for a feature map of {(height, width)}")
+    return tiles
+
+
+def tiles_find(dev: Device, x: Array, background: float) -> Reading[np.ndarray]:
+    """(rows, columns) bool: the tiles of x (H, W, C) float32 in which some value is not
+    `background`.
+    """
+    h, w, c = x.shape
+    return _flags(dev, "tiles_find", (h, w), c=c, background=background, x=x)
+
+
+def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Reading[np.ndarray]:
+    """(rows, columns) bool: the tiles of an image of size (height, width) in which some pixel has
+    hits, by its Pairs.pixel_offset (HW+1,) uint32.
+    """
+    return _flags(dev, "tiles_hit", size, pixel_offset=pixel_offset)
+
+
+def tiles_with(pixels: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the tiles in which any of the pixels (H, W) bool is set."""
+    (height, width), (rows, columns) = pixels.shape, grid_shape(*pixels.shape)
+    whole = np.pad(pixels, ((0, rows * SIDE - height), (0, columns * SIDE - width)))
+    return np.logical_or.reduce(whole.reshape(rows, SIDE, columns, SIDE), (1, 3))
+
+
+def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """(n, 2) int32: for tiles_copy(), the tiles whose numbers `source` gives for the n chosen ones,
+    and these.
+
+    source: (rows, columns) integers; chosen: (rows, columns) bool.
+    """
+    to = np.flatnonzero(chosen)
+    return np.stack([source.ravel()[to], to], axis=1).astype(np.int32)
+
+
+def tiles_copy(dev: Device, x: Array, from_to: Array, n: int) -> None:
+    """Copy tiles of x (H, W, C) float32 to others: the first n of from_to, (?, 2) int32 as
+    copy_list() has them; none is both. A tile and its source have the same shape.
+    """
+    h, w, c = x.shape
+    size, local = channel_ranges(dev, n, SIDE * SIDE, c)
+    _program(dev).launch(
+        "tiles_copy",
+        size,
+        local,
+        h=h,
+        w=w,
+        c=c,
+        n=n,
+        from_to=from_to,
+        x=x,
+    )
+
+
+def _program(dev):
+    return dev.program("layers/tiles", LANES=lanes(dev))
+
+
+def _flags(dev, kernel, size, **arguments):
+    shape = grid_shape(*size)
+    tiles = shape[0] * shape[1]
+    flags = dev.scratch("tile flags", tiles, np.int32)[:tiles]
+    _program(dev).launch(
+        kernel, tiles, h=size[0], w=size[1], flags=flags.reshape(shape), **arguments
+    )
+    return read_later(dev, flags, convert=lambda values: values.reshape(shape) != 0)

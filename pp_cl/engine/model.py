@@ -1,0 +1,97 @@
+"""The model: points in the cells of a grid with radii, opacities and SH coefficients, and the U-Net
+that turns blended features into colours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.buffers import DeviceRows
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.points import PointCloud
+
+
+class Model:
+    """Points and network on a device.
+
+    grid: the vertices in whose cells points lie; grid_buffer: the same, packed, (8) float32 on the
+    device. depth_range: (near, far), distances from the eye in world units, of all cameras. What
+    the device gets is relative to the grid's centre, which refinement keeps.
+    """
+
+    def __init__(
+        self,
+        dev: Device,
+        grid: Grid,
+        depth_range: tuple[float, float],
+        cloud: PointCloud,
+        *,
+        net: UNet,
+    ):
+        self.dev = dev
+        self.grid = grid
+        self.grid_buffer = dev.upload(grid.packed(grid.centre))
+        self.depth_range = depth_range
+        self.cloud = cloud
+        self.net = net
+
+    def positions(self) -> np.ndarray:
+        """(N, 3) float64 world positions of the points."""
+        vertices = self.grid.positions(self.dev.download(self.cloud.ids))
+        return vertices + self.grid.edge * self.dev.download(self.cloud.offset)[:, :3]
+
+    def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
+        """(21,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the
+        model's.
+        """
+        return camera.packed(depth_range or self.depth_range, self.grid.centre)
+
+    def refine(self) -> Array:
+        """Densify: replace every point by the eight around it on the grid of half the spacing,
+        which take over its offset, opacity and SH coefficients. Returns the point that each one
+        comes from, (8 N,) uint32.
+
+        Raises ValueError as Grid.children does.
+        """
+        ids, parents = self.grid.children(self.dev.download(self.cloud.ids))
+        rows = self.dev.upload(parents)
+        self.cloud.replace_by(self.dev, ids, rows)
+        self.grid = self.grid.refined()
+        self.grid_buffer = self.dev.upload(self.grid.packed(self.grid.centre))
+        return rows
+
+    def header(self) -> dict:
+        """JSON-able description that load() needs beside the arrays."""
+        return {
+            "grid": self.grid.header(),
+            "depth_range": [float(x) for x in self.depth_range],
+        }
+
+    def arrays(self) -> dict[str, DeviceRows]:
+        """{name: array} of everything learned, as a checkpoint stores it."""
+        parameters = self.net.parameters.items()
+        network = {f"net.{name}": DeviceRows(self.dev, array) for name, array in parameters}
+        return self.cloud.arrays(self.dev) | network
+
+    @classmethod
+    def load(
+        cls,
+        dev: Device,
+        header: dict,
+        arrays: dict[str, np.ndarray],
+        net: UNet,
+        *,
+        degree: int,
+    ) -> Model:
+        """Model of a checkpoint's header and arrays, as training/checkpoint.py has checked them;
+        the arrays are taken out of `arrays`, net takes the parameters stored there.
+        """
+        grid = Grid.of_header(header["grid"])
+        cloud = PointCloud.load(dev, arrays, degree)
+        for name, parameter in net.parameters.items():
+            dev.write(parameter, arrays.pop(f"net.{name}"))
+        return cls(dev, grid, tuple(header["depth_range"]), cloud, net=net)

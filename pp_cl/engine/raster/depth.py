@@ -1,0 +1,41 @@
+"""Alpha, mean depth and median depth of each pixel, from its blend weights; no network."""
+
+from __future__ import annotations
+
+from pyopencl.array import Array
+
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.raster.pairs import Pairs
+from pp_cl.engine.raster.project import FOOTPRINTS, ProjectedPoints
+from pp_cl.engine.raster.weights import BlendWeights
+
+
+def depth_forward(
+    dev: Device,
+    points: ProjectedPoints,
+    pairs: Pairs,
+    weights: BlendWeights,
+    size: tuple[int, int],
+) -> tuple[Array, Array, Array]:
+    """(alpha, depth, median) of the view that points, pairs and weights belong to, float32 (H, W).
+
+    alpha: share of the pixel that is not background, in [0, 1]; 1 after an early stop. depth: of
+    the surface, along the camera's axis, world units, mean by blend weight; median: where half of
+    the weight is reached, interpolated between hits; both infinite where alpha is 0. size: (H, W).
+    """
+    alpha, depth, median = (dev.empty(size) for _ in range(3))
+    dev.program("raster/depth", FOOTPRINT=FOOTPRINTS.index(points.footprint)).launch(
+        "depth_forward",
+        pairs.pixels,
+        hw=pairs.pixels,
+        camera=points.camera_buffer,
+        point_radius=points.point_radius,
+        pixel_offset=pairs.pixel_offset,
+        pair_key=pairs.pair_key,
+        pair_point_closeness=pairs.pair_point_closeness,
+        pixel_entry=weights.pixel_entry,
+        pixel_alpha=alpha,
+        pixel_depth=depth,
+        pixel_median=median,
+    )
+    return alpha, depth, median

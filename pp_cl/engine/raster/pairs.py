@@ -1,0 +1,193 @@
+"""Pairs (hits) of a point and a pixel that it covers in a view: listed by point for the backward
+pass, and by pixel sorted by depth for blending.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.buffers import Buffers, Reading, Table, grown
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes
+from pp_cl.engine.device.scan import exclusive_scan, read_total
+from pp_cl.engine.raster.project import FOOTPRINTS, ProjectedPoints
+from pp_cl.errors import UserError
+
+MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
+# keys ranked at once by comparing all with all, on CPUs 16 a step; longer lists are merged
+RUN, CPU_RUN = 64, 128
+BUCKETS = 256  # of pairs, at most, which CPUs sort side by side
+MOST_CHUNKS = 64  # of pairs, which CPUs put into buckets side by side
+LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The hits of a view of N points and HW pixels, valid until the next ones are found.
+
+    The arrays have room for P pairs. If the view has more, pixel_offset is all zeros and the other
+    arrays must not be read: find the pairs again with more room (room_needed()).
+
+    footprint: of the points, one of FOOTPRINTS. count: how many pairs there are.
+    point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
+    pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
+    pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
+    of the closeness d of Eq. (1). pair_key: (P,) uint64, depth bits << 32 | pair, sorted within
+    each pixel by depth, then by point.
+    """
+
+    footprint: str
+    count: Reading[int]
+    point_offset: Array
+    pixel_offset: Array
+    pair_pixel: Array
+    pair_point_closeness: Array
+    pair_key: Array
+
+    @property
+    def total(self) -> int:
+        """The number of pairs; waits until it is known."""
+        return self.count.get()
+
+    @property
+    def capacity(self) -> int:
+        """P."""
+        return len(self.pair_pixel)
+
+    @property
+    def points(self) -> int:
+        """N."""
+        return self.point_offset.size - 1
+
+    @property
+    def pixels(self) -> int:
+        """HW."""
+        return self.pixel_offset.size - 1
+
+
+def pairs_table(n: int, pixels: int, pairs: int) -> Table:
+    """The buffers for n points, a number of pixels and room for a number of pairs."""
+    return {
+        "point_offset": ((n + 1,), np.uint32),
+        "pixel_count": ((pixels,), np.uint32),
+        "pixel_offset": ((pixels + 1,), np.uint32),
+        "pair_pixel": ((pairs,), np.uint32),
+        "pair_point_closeness": ((pairs, 2), np.uint32),
+        "pair_key": ((pairs,), np.uint64),
+        # on GPUs the depth and place of each pair, on CPUs its key by bucket; then for sorting
+        # keys, at last the entries of weights.py
+        "pair_scratch": ((pairs,), np.uint64),
+    }
+
+
+def find_pairs(
+    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], room: int = 1
+) -> Pairs:
+    """The hits in an image of size (height, width), if there are no more than `room`; does not wait
+    for the device.
+    """
+    n, pixels = len(points.point_box), size[0] * size[1]
+    b.require(pairs_table(n, pixels, room))
+    pair_place = b.pair_key if dev.is_cpu else b.pair_scratch  # until the keys are written
+    program = dev.program(
+        "raster/pairs",
+        LANES=lanes(dev),
+        RUN=CPU_RUN if dev.is_cpu else RUN,
+        BUCKETS=BUCKETS,
+        FOOTPRINT=FOOTPRINTS.index(points.footprint),
+    )
+    exclusive_scan(dev, points.point_count, b.point_offset)
+    count = read_total(dev, b.point_offset)
+    if not dev.is_cpu:
+        dev.fill(b.pixel_count, 0)
+    program.launch(
+        "pairs_fill",
+        -(-n // lanes(dev)),
+        n=n,
+        p=room,
+        camera=points.camera_buffer,
+        point_radius=points.point_radius,
+        point_camera=points.point_camera,
+        point_box=points.point_box,
+        point_white=points.point_white,
+        point_offset=b.point_offset,
+        pair_pixel=b.pair_pixel,
+        pair_point_closeness=b.pair_point_closeness,
+        pair_place=pair_place,
+        pixel_count=b.pixel_count,
+    )
+    pairs = Pairs(
+        points.footprint,
+        count,
+        b.point_offset,
+        b.pixel_offset,
+        b.pair_pixel,
+        b.pair_point_closeness,
+        b.pair_key,
+    )
+    make_lists = _list_by_bucket if dev.is_cpu else _list_in_parallel
+    make_lists(dev, program, b, n, pixels, room)
+    return pairs
+
+
+def _list_by_bucket(dev, program, b, n, pixels, room):
+    """Write the keys, sorted, and pixel_offset."""
+    chunks = min(MOST_CHUNKS, dev.info["compute_units"])
+    stretch = (-(-pixels // BUCKETS) - 1).bit_length()  # 2^stretch pixels each
+    bucket_size = dev.scratch("buckets", BUCKETS * chunks, np.uint32)
+    shared = {
+        "chunks": chunks,
+        "stretch": stretch,
+        "pair_pixel": b.pair_pixel,
+        "bucket_size": bucket_size,
+    }
+    filled = {"n": n, "p": room, "point_offset": b.point_offset, **shared}
+    program.launch("pairs_bucket_sizes", chunks, local=1, **filled)
+    bucket_key = b.pair_scratch
+    program.launch(
+        "pairs_bucket", chunks, local=1, pair_place=b.pair_key, bucket_key=bucket_key, **filled
+    )
+    program.launch(
+        "pairs_list",
+        ((pixels - 1) >> stretch) + 1,
+        local=1,
+        hw=pixels,
+        bucket_key=bucket_key,
+        pixel_offset=b.pixel_offset,
+        pair_key=b.pair_key,
+        **shared,
+    )
+
+
+def _list_in_parallel(dev, program, b, _, pixels, room):
+    """Write the keys, sorted, and pixel_offset: one work-item per key."""
+    exclusive_scan(dev, b.pixel_count, b.pixel_offset)
+    shared = {"p": room, "hw": pixels, "pair_pixel": b.pair_pixel, "pixel_offset": b.pixel_offset}
+    keys, other = b.pair_key, b.pair_scratch
+    program.launch("pairs_scatter", room, pair_place=other, pair_key=keys, **shared)
+    program.launch("pairs_sort_runs", room, pair_key=keys, sorted=other, **shared)
+
+    def merge(source, target, width, group, least):
+        sizes = {"width": width, "group": group, "least": least}
+        program.launch("pairs_merge_runs", room, sorted=source, pair_key=target, **sizes, **shared)
+
+    merge(other, keys, RUN, LONG_LIST, 0)
+    if room > LONG_LIST:  # there and back, for the lists that are longer
+        merge(keys, other, LONG_LIST, LONG_LIST * RUN, LONG_LIST)
+        merge(other, keys, LONG_LIST * RUN, MOST_PAIRS, LONG_LIST)
+
+
+def room_needed(pairs: Pairs) -> int:
+    """The capacity of these pairs if all fitted, else a larger one with which they fit. Waits until
+    their number is known. Raises UserError for more pairs than uint32 can number.
+    """
+    total = pairs.total
+    if total >= MOST_PAIRS:
+        raise UserError(
+            f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
+            "lower --points, raise --downscale, or lower raster.radius"
+        )
+    return min(grown(pairs.capacity, total), MOST_PAIRS)

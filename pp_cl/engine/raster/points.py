@@ -1,0 +1,181 @@
+"""The point cloud on the device: vertices of a grid, offsets from them, radii, opacities, and SH
+coefficients in arrays by degree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.buffers import DeviceRows, Table, compact_rows, gather_rows
+from pp_cl.engine.device.device import Device
+
+
+@dataclass(frozen=True)
+class ShBlock:
+    """The SH coefficients of one array (N, count, 16): `count` of one degree, those of the basis
+    functions `first`, `first` + 1, ...
+
+    name: sh_ and the degree, then a or b where a degree fills two arrays.
+    """
+
+    name: str
+    first: int
+    count: int
+
+    @property
+    def degree(self) -> int:
+        """0, 1 or 2."""
+        return math.isqrt(self.first)
+
+
+# Degree 2 fills two arrays: no array takes more than 192 bytes a point, so that 4.04 million
+# points fit devices that allocate at most 1 GiB at once. The layout is the same everywhere, and so
+# are the bits.
+SH_BLOCKS = (
+    ShBlock("sh_0", 0, 1),
+    ShBlock("sh_1", 1, 3),
+    ShBlock("sh_2a", 4, 3),
+    ShBlock("sh_2b", 7, 2),
+)
+SH_DEGREES = (0, 1, 2)
+MOST_OFFSET = 0.5  # edges along each axis: a point stays in its cell; radii times 0.61 to 1.65
+MOST_OF_GAUSSIANS = 2.0  # edges, logarithms and deviations
+MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: what a .spz can hold
+
+
+def offset_width(footprint: str) -> int:
+    """Numbers in a row of PointCloud.offset: of Gaussians those of cl/cloud.h."""
+    return 16 if footprint == "gaussian" else 4
+
+
+def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
+    """Those of SH_BLOCKS up to a degree."""
+    return tuple(block for block in SH_BLOCKS if block.degree <= degree)
+
+
+def stored_degree(sh: Sequence[Array]) -> int:
+    """The highest degree of coefficients in arrays of the first SH_BLOCKS."""
+    return SH_BLOCKS[len(sh) - 1].degree
+
+
+def four_blocks(sh: Sequence[Array]) -> list[Array]:
+    """Four arrays for a kernel's arguments. Where the degree is lower, the first one takes the
+    place of the missing ones, which a kernel built for that degree does not read.
+    """
+    return [*sh, *[sh[0]] * (len(SH_BLOCKS) - len(sh))]
+
+
+@dataclass
+class PointCloud:
+    """The points, one row each; device arrays.
+
+    ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
+    point in its cell, in edges of the grid, and the logarithm of its radius over
+    point_radius() of the settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up
+    to MOST_OF_GAUSSIANS: see cl/cloud.h. opacity: (N) float32 in [0, 1]. sh: the
+    SH coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained
+    any more.
+    """
+
+    ids: Array
+    offset: Array
+    opacity: Array
+    sh: list[Array]
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return len(self.ids)
+
+    @property
+    def most_offset(self) -> float:
+        """The bound of `offset`."""
+        return MOST_OFFSET if self.offset.shape[1] == 4 else MOST_OF_GAUSSIANS
+
+    @property
+    def most_sh(self) -> float:
+        """The bound of SH coefficients above degree 0, infinity if they have none."""
+        return math.inf if self.offset.shape[1] == 4 else MOST_SH_OF_GAUSSIANS
+
+    @property
+    def blocks(self) -> tuple[ShBlock, ...]:
+        """The block that each array of `sh` holds."""
+        return SH_BLOCKS[: len(self.sh)]
+
+    @staticmethod
+    def table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
+        """The arrays of n points."""
+        table: Table = {"ids": ((n,), np.uint32), "offset": ((n, 4), np.float32)}
+        table["opacity"] = (n,), np.float32
+        return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
+
+    @classmethod
+    def create(
+        cls, dev: Device, ids: np.ndarray, degree: int = SH_DEGREES[-1], opacity: float = 1.0
+    ) -> PointCloud:
+        """Points of one opacity on their vertices, SH coefficients of 0 of a degree, 0 to 2. ids:
+        (N), ascending.
+        """
+        n = len(ids)
+        opacities = dev.upload(np.full(n, opacity, np.float32))
+        sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]
+        return cls(dev.upload(ids, np.uint32), dev.zeros((n, 4)), opacities, sh)
+
+    def learned(self) -> dict[str, Array]:
+        """{name: array} of all that training changes: "offset", "opacity", and the SH by block."""
+        names = (block.name for block in self.blocks)
+        places = {"offset": self.offset, "opacity": self.opacity}
+        return places | dict(zip(names, self.sh, strict=True))
+
+    def compact(self, dev: Device, keep: Array) -> None:
+        """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
+        self.ids = compact_rows(dev, self.ids, keep)
+        self.offset = compact_rows(dev, self.offset, keep)
+        self.opacity = compact_rows(dev, self.opacity, keep)
+        for i in range(len(self.sh)):
+            self.sh[i] = compact_rows(dev, self.sh[i], keep)
+
+    def rows(self, dev: Device, keep: Array) -> PointCloud:
+        """A copy of the rows `keep`, (M) uint32, ascending."""
+        arrays = self.ids, self.offset, self.opacity, *self.sh
+        ids, offset, opacity, *sh = (gather_rows(dev, array, keep) for array in arrays)
+        return PointCloud(ids, offset, opacity, sh)
+
+    def replace_by(self, dev: Device, ids: np.ndarray, rows: Array) -> None:
+        """Become the points `ids`, (M) ascending, each with what point rows[i] of the present ones
+        has learned; one array after the other. rows: (M,) uint32.
+        """
+        self.ids = dev.upload(ids, np.uint32)
+        self.offset = gather_rows(dev, self.offset, rows)
+        self.opacity = gather_rows(dev, self.opacity, rows)
+        for i in range(len(self.sh)):
+            self.sh[i] = gather_rows(dev, self.sh[i], rows)
+
+    def arrays(self, dev: Device) -> dict[str, DeviceRows]:
+        """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16),
+        (N, 5, 16).
+        """
+        learned = {"ids": self.ids, "offset": self.offset, "opacity": self.opacity}
+        stored = {name: DeviceRows(dev, array) for name, array in learned.items()}
+        blocks = list(zip(self.blocks, self.sh, strict=True))
+        for degree in range(stored_degree(self.sh) + 1):
+            parts = [array for block, array in blocks if block.degree == degree]
+            stored[f"sh{degree}"] = DeviceRows(dev, *parts)
+        return {f"points.{name}": rows for name, rows in stored.items()}
+
+    @classmethod
+    def load(cls, dev: Device, arrays: dict[str, np.ndarray], degree: int) -> PointCloud:
+        """The points of a checkpoint's arrays, which are taken out of `arrays`."""
+        names = "ids", "offset", "opacity"
+        ids, offset, opacity = (dev.upload(arrays.pop(f"points.{name}")) for name in names)
+        by_degree = [arrays.pop(f"points.sh{d}") for d in SH_DEGREES[: degree + 1]]
+        sh = []
+        for block in sh_blocks(degree):
+            start = block.first - block.degree**2  # within its degree
+            sh.append(dev.upload(by_degree[block.degree][:, start : start + block.count]))
+        return cls(ids, offset, opacity, sh)

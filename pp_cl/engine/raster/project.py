@@ -1,0 +1,112 @@
+"""Projection and culling: points to camera axes, the box of pixels that each may cover, and how
+many pixels it hits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.buffers import Buffers, Table
+from pp_cl.engine.device.device import Device, Program
+from pp_cl.engine.device.launch import lanes
+from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
+
+# numbered as in cl/raster/footprint.h, which explains them
+FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
+MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in edges of the grid
+
+
+@dataclass(frozen=True)
+class ProjectedPoints:
+    """N points in one view, valid until the next projection.
+
+    footprint: one of FOOTPRINTS. camera_buffer: (21,) float32, cl/camera.h. point_count: (N,)
+    uint32, pixels that are hit. The others are undefined in a run of LANES points without hits.
+    point_camera: (N, 4) float32, x, y, z in camera axes and the distance from the eye; (0, 0, 0,
+    -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels
+    that may be hit; last < first means none. point_radius: (N,) float32, world units. Of Gaussians
+    alone: point_white, (N, 4) float32, from pixels to deviations (cl/raster/footprint.h); and the
+    cloud_offset and radius of project_grid().
+    """
+
+    footprint: str
+    camera_buffer: Array
+    point_camera: Array
+    point_box: Array
+    point_count: Array
+    point_radius: Array
+    point_white: Array
+    cloud_offset: Array | None = None
+    radius: float = 0.0
+
+
+def projection_table(n: int, footprint: str = "soft") -> Table:
+    """The buffers for n points."""
+    return {
+        "point_camera": ((n, 4), np.float32),
+        "point_box": ((n, 4), np.uint16),
+        "point_count": ((n,), np.uint32),
+        "point_radius": ((n,), np.float32),
+        "point_white": ((n if footprint == "gaussian" else 1, 4), np.float32),
+    }
+
+
+def projection_program(dev: Device, footprint: str) -> Program:
+    """The kernels that project points of one of FOOTPRINTS."""
+    return dev.program(
+        "raster/project",
+        LANES=lanes(dev),
+        FOOTPRINT=FOOTPRINTS.index(footprint),
+        OFFSETS=offset_width(footprint),
+        MOST_OFFSET=f"{MOST_OFFSET}f",
+    )
+
+
+def project_grid(
+    dev: Device,
+    b: Buffers,
+    footprint: str,
+    camera_buffer: Array,
+    grid_buffer: Array,
+    *,
+    point_id: Array,
+    cloud_offset: Array,
+    radius: float,
+) -> ProjectedPoints:
+    """Project the points, each in the cell of a grid's vertex, into a camera.
+
+    grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
+    PointCloud.offset; of Gaussians (N, 16). radius: of points without offsets, world units.
+    """
+    n = point_id.size
+    b.require(projection_table(n, footprint))
+    program = projection_program(dev, footprint)
+    program.launch(
+        "project_grid",
+        -(-n // lanes(dev)),
+        n=n,
+        camera=camera_buffer,
+        grid=grid_buffer,
+        point_id=point_id,
+        radius=radius,
+        cloud_offset=cloud_offset,
+        point_radius=b.point_radius,
+        point_camera=b.point_camera,
+        point_box=b.point_box,
+        point_count=b.point_count,
+        point_white=b.point_white,
+    )
+    return ProjectedPoints(
+        footprint,
+        camera_buffer,
+        b.point_camera,
+        b.point_box,
+        b.point_count,
+        b.point_radius,
+        b.point_white,
+        cloud_offset,
+        radius,
+    )

@@ -1,0 +1,264 @@
+"""The renderer: from a model and a camera to an image, and back to gradients. This is the
+one place that writes the order of the stages.
+
+project -> pairs -> blend weights -> shade the visible points -> blend their features -> U-Net
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.buffers import Buffers, Reading, grown
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.tiles import tiles_hit
+from pp_cl.engine.model import Model
+from pp_cl.engine.raster.blend import BlendGradients, blend_backward, blend_forward, shade_forward
+from pp_cl.engine.raster.pairs import Pairs, find_pairs, room_needed
+from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid
+from pp_cl.engine.raster.weights import (
+    BlendWeights,
+    blend_weights,
+    list_weights,
+    record_weights,
+)
+from pp_cl.errors import UserError
+from pp_cl.settings import RasterConfig
+
+MOST_SIDE = 2**16 - 1  # pixels of an image: the boxes of points have 16 bits
+# far - near of the scenes for which the paper's radius of 0.0015 was chosen
+PAPER_DEPTH_RANGE = 4.0
+
+
+def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, float]) -> float:
+    """The radius in world units of points whose offset is 0. edge: of the grid, world units."""
+    if settings.footprint in MOVED:
+        return settings.radius * edge
+    near, far = depth_range
+    return settings.radius * (far - near) / PAPER_DEPTH_RANGE
+
+
+@dataclass
+class RenderResult:
+    """What the stages of a view have made, up to the one that was asked for; arrays are valid until
+    the next view.
+
+    camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
+    offset: (left, top) of the view in it. points: the N points as the padded camera sees them.
+    tiles: (rows, columns) bool, the 4x4 tiles of the padded image that have hits; None where the
+    network computes all. shaded_features: float32, one row of 16 for each point of weights.shaded,
+    then room for more. features: (H, W, 16) float32, blended from them. image: (H, W, 3) float32,
+    unclamped. computed_fraction: share of the network's multiplications that was done; the others
+    would have seen only background.
+    """
+
+    dev: Device
+    camera: Camera
+    offset: tuple[int, int]
+    size: tuple[int, int]
+    points: ProjectedPoints
+    pairs: Pairs
+    weights: BlendWeights
+    tiles: Reading[np.ndarray] | None
+    shaded_features: Array = field(init=False)
+    features: Array = field(init=False)
+    image: Array = field(init=False)
+    computed_fraction: float = 1.0
+
+    def clamped(self) -> np.ndarray:
+        """(height, width, 3) float32 image without the padding, clamped to [0, 1]."""
+        return np.clip(self.cropped(self.dev.download(self.image)), 0, 1)
+
+    def cropped(self, array: np.ndarray) -> np.ndarray:
+        """(height, width, ...): an array of the padded pixels without the padding."""
+        left, top = self.offset
+        return array[top : top + self.camera.height, left : left + self.camera.width]
+
+
+class Renderer:
+    """Renders a model. Its buffers are reused from view to view."""
+
+    def __init__(self, dev: Device, model: Model, settings: RasterConfig):
+        self.dev = dev
+        self.model = model
+        self.settings = settings
+        # Images and a training's steps take turns in memory, as its previews are larger than its
+        # crops. Of each: capacities of the arrays of pairs and of visible points, which grow with
+        # the views.
+        self._by_pair = False
+        self._room, self._shaded_room = [1, 1], [1, 1]
+        self.release()
+
+    def release(self) -> None:
+        """Free the buffers; the next view makes them anew."""
+        self._buffers = Buffers(self.dev)
+
+    def forward(
+        self,
+        camera: Camera,
+        gamma: float,
+        *,
+        until: Literal["weights", "features", "image"] = "image",
+        early_stop: float | None = None,
+        depth_range: tuple[float, float] | None = None,
+        training: bool = False,
+        gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
+    ) -> RenderResult:
+        """Render a camera, which is padded to multiples of net.multiple pixels.
+
+        until: the last stage wanted: blend weights, blended features or the network's image.
+        gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
+        the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
+        softmax needs the model's.
+        training: keep what backward() needs. gradient_tiles: returns that argument of
+        UNet.plan_tiles(); called after the wait for the device.
+        """
+        dev, cloud, net = self.dev, self.model.cloud, self.model.net
+        padded, left, top = camera.padded(net.multiple)
+        size = (padded.height, padded.width)
+        if max(size) > MOST_SIDE:
+            raise UserError(
+                f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
+                " are rendered; render parts of it"
+            )
+        by_pair = training or until == "weights"
+        if by_pair != self._by_pair:
+            self._by_pair = by_pair
+            self.release()
+        b = self._buffers
+        b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
+        dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
+        with dev.stage("project"):
+            points = project_grid(
+                dev,
+                b,
+                self.settings.footprint,
+                b.camera_buffer,
+                self.model.grid_buffer,
+                point_id=cloud.ids,
+                cloud_offset=cloud.offset,
+                radius=point_radius(self.settings, self.model.grid.edge, self.model.depth_range),
+            )
+        pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop, training)
+        result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)
+        if until == "weights":
+            return result
+        with dev.stage("shade"):
+            shaded = weights.shaded
+            room = self._shaded_room[by_pair] = grown(self._shaded_room[by_pair], shaded.size)
+            b.require({"shaded_features": ((min(room, cloud.count), 16), np.float32)})
+            shade_forward(dev, points, shaded, cloud.sh, shaded_features=b.shaded_features)
+        with dev.stage("blend"):
+            blend_forward(dev, pairs, weights, b.shaded_features, b.features)
+        result.shaded_features, result.features = b.shaded_features, b.features
+        if until == "features":
+            return result
+        with dev.stage("network"):
+            plan: Any = None
+            if net.is_planned(size):
+                plan = net.plan_tiles(size, tiles.get(), gradient_tiles())
+                result.computed_fraction = plan.computed_fraction if plan else 1.0
+            result.image = net.forward(b.features, training, plan)
+        return result
+
+    def _pairs_and_weights(self, points, size, gamma, early_stop, training):
+        """(Pairs, BlendWeights, RenderResult.tiles). Both stages are enqueued before the number
+        of pairs is known, and run again with more room if it was too small.
+        """
+        settings, by_pair = self.settings, self._by_pair
+        while True:
+            with self.dev.stage("pairs"):
+                pairs = find_pairs(self.dev, self._buffers, points, size, self._room[by_pair])
+            with self.dev.stage("weights"):
+                weights = blend_weights(
+                    self.dev,
+                    self._buffers,
+                    pairs,
+                    points.camera_buffer,
+                    self.model.cloud.opacity,
+                    blend=settings.blend,
+                    gamma=gamma,
+                    max_tracked=settings.max_tracked,
+                    early_stop=settings.early_stop if early_stop is None else early_stop,
+                    slopes=training,
+                )
+            tiles = None
+            if self.model.net.is_planned(size):
+                tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
+            (tiles or weights.shaded_list).get()  # the host's one wait for the device
+            self._room[by_pair] = room_needed(pairs)
+            if self._room[by_pair] == pairs.capacity:
+                return pairs, weights, tiles
+            del pairs, weights  # else their arrays would stay beside the larger ones
+
+    def backward(self, result: RenderResult, grad_image: Array, **options: Any) -> BlendGradients:
+        """What backward_features() returns, from dL/dimage of result.image. The gradients of the
+        network's parameters are left in model.net.gradients. options: of backward_features().
+        """
+        with self.dev.stage("network backward"):
+            grad_features = self.model.net.backward(grad_image)
+        return self.backward_features(result, grad_features, **options)
+
+    def backward_features(
+        self,
+        result: RenderResult,
+        grad_features: Array,
+        *,
+        grad_alpha: Array | None = None,
+        spread_weight: float = 0.0,
+        with_offsets: bool = False,
+    ) -> BlendGradients:
+        """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
+        alpha compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with
+        this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
+        points are composited by alpha, there are none of offsets.
+
+        result: of the last forward(training=True). The gradients of the SH coefficients are those
+        of the shaded features times the basis functions in the view's direction; the optimiser
+        multiplies them as it moves each coefficient, and never stores them.
+        """
+        settings = self.settings
+        moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
+        with self.dev.stage("backward"):
+            return blend_backward(
+                self.dev,
+                self._buffers,
+                result.points,
+                result.pairs,
+                result.weights,
+                opacity=self.model.cloud.opacity,
+                shaded_features=result.shaded_features,
+                features=result.features,
+                grad_features=grad_features,
+                grad_alpha=grad_alpha,
+                spread_weight=spread_weight,
+                edge=self.model.grid.edge if moves else 0.0,
+            )
+
+    def record_weights(
+        self,
+        result: RenderResult,
+        max_weight: Array,
+        times_seen: Array,
+        *,
+        least: float = 0.0,
+        gradients: BlendGradients | None = None,
+    ) -> None:
+        """Update what pruning looks at by the last forward(), see raster/weights.py. gradients: of
+        its backward pass, if there was one.
+        """
+        dev, pairs, weights = self.dev, result.pairs, result.weights
+        if gradients:
+            listed = gradients.pair_gradient
+        else:
+            listed = list_weights(dev, self._buffers, pairs, weights)
+        record_weights(dev, pairs, weights, listed, max_weight, times_seen, least)
+
+    def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
+        """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of forward()."""
+        return self.forward(camera, gamma, **options).clamped()

@@ -1,0 +1,304 @@
+"""One step of training: draw a crop of a view, render it, loss, backward, optimiser; then
+smoothing, EMA, pruning and refining where they are due. session.py has the loop around it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.buffers import Buffers, DeviceRows, Reading
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.model import Model
+from pp_cl.engine.render import Renderer, RenderResult
+from pp_cl.engine.training.crops import Crop, Crops
+from pp_cl.engine.training.exposure import Exposure, decided_at
+from pp_cl.engine.training.loss import Loss, MaskLoss, ignore_gradient, ignore_target
+from pp_cl.engine.training.optim import Optimiser
+from pp_cl.engine.training.prune import (
+    points_of_large_parts,
+    points_that_views_show,
+    points_to_keep,
+)
+from pp_cl.engine.training.schedule import (
+    SMOOTHING_EVERY,
+    Rates,
+    ema_start,
+    ema_weight,
+    gamma_at,
+    refine_steps,
+    rising_weight,
+)
+from pp_cl.engine.training.smooth import Smoother
+from pp_cl.engine.training.state import PointState, split_opacity
+from pp_cl.engine.training.target import Target
+from pp_cl.engine.views import View
+from pp_cl.settings import Config
+
+
+class Trainer:
+    """Optimises a model on views; every random choice is a function of (seed, step), so a run can
+    start at any step.
+
+    step: number of steps done. begun: the step at which the optimiser's moments started; above 0
+    if a finished training is extended. state: what training keeps for each point.
+    """
+
+    def __init__(self, dev: Device, config: Config, model: Model, views: list[View]):
+        train = config.train
+        self.dev = dev
+        self.config = config
+        self.model = model
+        self.views = views
+        self.step = self.begun = 0
+        self.renderer = Renderer(dev, model, config.raster)
+        self.loss = Loss(dev, train.ssim_weight, train.smooth_l1)
+        self.mask_loss = MaskLoss(dev, train.mask_weight)
+        self.exposure: Exposure | None = None
+        if train.exposure != "off":
+            self.exposure = Exposure(dev, len(views), train.exposure == "on")
+        self.state = PointState(dev, model.cloud)
+        self.optimiser = Optimiser(dev, model, self.state)
+        self._composited = config.raster.blend == "alpha"
+        self._target = Target(dev)
+        self._buffers = Buffers(dev)
+        self._terms: Reading[dict[str, float]] | None = None  # of the loss of the last step
+        self._smoother: Smoother | None = None  # made when it is due, anew when the points change
+        self._refine_steps = refine_steps(train)
+        self.crops = Crops(views, train, self.refinements_to_come)
+
+    def take_plan(self) -> None:
+        """Follow config.train.iterations and refine_at, which a plan for some minutes changes."""
+        self._refine_steps = refine_steps(self.config.train)
+        if self.refinements_to_come != self.crops.halvings:
+            self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
+
+    @property
+    def refinements_to_come(self) -> int:
+        """How often the grid will still be refined; the images are halved as often."""
+        return sum(self.step < step for step in self._refine_steps)
+
+    @property
+    def is_exposed(self) -> bool:
+        """Whether photographs are divided by gains."""
+        return self.exposure is not None and self.exposure.is_applied
+
+    @property
+    def gamma(self) -> float:
+        """Depth sharpness of the softmax after the steps done."""
+        return gamma_at(self.step, self.config.train.iterations)
+
+    # ---- a step ----------------------------------------------------------------------------------
+
+    def train_step(self) -> Reading[dict[str, float]]:
+        """Enqueue one step, which the device may not have finished on return; returns the terms of
+        its loss. Raises Diverged if a term of the previous step is not finite.
+        """
+        config, train = self.config, self.config.train
+        rates = Rates.at(self.step, config.network, train)
+        crop = self.crops.draw(self.step)
+        with self.dev.stage("target"):
+            photograph, alpha = self._target.crop(crop.view, crop.box, crop.jitter)
+            target = photograph
+            if self.exposure and self.exposure.is_applied:
+                target = self.exposure.target(crop.view_index, photograph, alpha)
+            says_nothing = crop.view.ignored_crop(crop.box, crop.jitter)
+            padded, *corner = crop.camera.padded(self.model.net.multiple)
+            size = padded.height, padded.width
+            tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
+            ignored = None if says_nothing is None else self._sent(says_nothing)
+
+        rendered = self.renderer.forward(
+            crop.camera, self.gamma, training=True, gradient_tiles=tiles
+        )
+        with self.dev.stage("loss"):
+            if self.exposure:
+                offset = rendered.offset
+                self.exposure.fit(crop.view_index, rendered.image, photograph, alpha, offset)
+            grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
+        # the spread is a mean over the pixels, as a share of the grid's diagonal
+        all_depths = alpha.size * self.model.grid.diagonal
+        spread_weight = self._rising(train.spread_weight if self._composited else 0.0)
+        gradients = self.renderer.backward(
+            rendered,
+            grad_image,
+            grad_alpha=grad_alpha,
+            spread_weight=spread_weight / all_depths,
+            with_offsets=rates.offset > 0,
+        )
+        if spread_weight > 0:
+            self.loss.add("spread", gradients.pixel_spread, spread_weight, 1 / all_depths)
+
+        with self.dev.stage("update"):
+            self.optimiser.update(
+                self.step + 1 - self.begun,
+                rates,
+                gradients,
+                points=rendered.points,
+                shaded=rendered.weights.shaded,
+                sh_eps=train.sh_eps / target.size,
+            )
+        with self.dev.stage("max weights"):
+            state = self.state
+            self.renderer.record_weights(
+                rendered, state.max_weight, state.times_seen, gradients=gradients
+            )
+        self.step += 1
+        self.check()
+        self._terms = self.loss.read(self.step)
+        # the renderer may release them now
+        del rendered, gradients
+        self._after_update(rates)
+        return self._terms
+
+    def _losses(
+        self,
+        crop: Crop,
+        rendered: RenderResult,
+        target: Array,
+        alpha: Array,
+        ignored: Array | None,
+    ) -> tuple[Array, Array | None]:
+        """(dL/dimage, dL/dalpha or None) of all terms but the spread; their values go to self.loss,
+        which stays on the device. ignored: (H, W) uint8, 1 where a pixel of the crop is.
+        """
+        train, image, offset, grad_alpha = self.config.train, rendered.image, rendered.offset, None
+        if ignored is not None:
+            ignore_target(self.dev, ignored, image, target, alpha, offset)
+        grad_image = self.loss.forward_backward(image, target, *offset)
+        transmittance = rendered.weights.transmittance  # None of a softmax
+        if transmittance is not None and train.mask_weight > 0 and crop.view.has_mask:
+            squares, grad_alpha = self.mask_loss.forward_backward(
+                transmittance,
+                alpha,
+                size=rendered.size,
+                offset=offset,
+                shortfall=self._rising(1.0),
+            )
+            self.loss.add("mask", squares, train.mask_weight, 1 / alpha.size)
+        if ignored is not None:
+            ignore_gradient(self.dev, ignored, grad_image, offset)
+        return grad_image, grad_alpha
+
+    def _sent(self, says_nothing):
+        """The crop's ignored pixels on the device."""
+        self._buffers.require({"ignored": (says_nothing.shape, np.uint8)})
+        self.dev.send(self._buffers.ignored, says_nothing.astype(np.uint8))
+        return self._buffers.ignored
+
+    def _rising(self, weight):
+        """A weight of the loss that rises from 0 during the training."""
+        return rising_weight(self.step, self.config.train.iterations, weight)
+
+    def check(self) -> None:
+        """Raise Diverged if a term of the loss of the last step is not finite."""
+        if self._terms:
+            self._terms.get()
+
+    # ---- between steps ---------------------------------------------------------------------------
+
+    def _after_update(self, rates):
+        """Smooth the SH coefficients, update the EMA, prune and refine, each if due after this
+        step.
+        """
+        train, step = self.config.train, self.step
+        is_open = self.exposure is not None and not self.exposure.is_applied
+        if is_open and step == decided_at(self.begun, len(self.views)):
+            self.exposure = self.exposure.decided()
+        if train.sh_smoothing > 0 and step % SMOOTHING_EVERY == 0:
+            with self.dev.stage("smoothing"):
+                self._smooth(rates)
+        weight = ema_weight(step, train.iterations) if train.ema else 0
+        if weight > 0:
+            with self.dev.stage("averages"):
+                self.optimiser.update_ema(weight)
+        is_judged = train.prune_weight > 0 and step % train.prune_every == 0
+        if is_judged and step < train.iterations:
+            with self.dev.stage("pruning"):
+                self.prune()
+        if step in self._refine_steps:
+            with self.dev.stage("refining"):
+                self._refine()
+
+    def _smooth(self, rates):
+        """Pull every SH coefficient towards the mean of its grid neighbours."""
+        train, cloud = self.config.train, self.model.cloud
+        if self._smoother is None:
+            self._smoother = Smoother(self.dev, self.model.grid_buffer, cloud.ids)
+        pull = train.sh_smoothing * SMOOTHING_EVERY
+        for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
+            if rates.sh[block.degree] > 0:
+                self._smoother.smooth(sh, min(1.0, pull * rates.sh[block.degree]))
+
+    def prune(self) -> None:
+        """Drop the points that were in enough images and had too low a blend weight or opacity."""
+        opacity, train = self.model.cloud.opacity, self.config.train
+        self._keep(points_to_keep(self.dev, self.state, opacity, train))
+
+    def _keep(self, rows):
+        """Drop all points but `rows`, with their training state."""
+        if len(rows) < self.model.cloud.count:
+            self._smoother = None
+            self.renderer.release()  # rows are moved through scratch memory
+            self.model.cloud.compact(self.dev, rows)
+            self.state.compact(self.dev, rows)
+
+    def _refine(self):
+        """Densify: replace each point by eight at half the spacing, and double the images."""
+        self._smoother = None
+        self.renderer.release()
+        self.state.refine(self.dev, self.model.refine())
+        if self._composited:
+            split_opacity(self.dev, self.model.cloud.opacity)
+            if "opacity" in self.state.averages:
+                split_opacity(self.dev, self.state.averages["opacity"])
+        self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
+
+    def finish(self) -> None:
+        """End the training: take the EMA as parameters, and drop the points whose opacity is too
+        low or that too few training views show, and those that then hang in the air by few.
+        """
+        self.optimiser.apply_ema()
+        if self.config.train.prune_weight > 0:
+            self.renderer.release()  # for whole views with weights by pair
+            self._keep(points_that_views_show(self.renderer, self.views, self.config))
+            self._keep(points_of_large_parts(self.model))
+
+    # ---- what the session shows and stores -------------------------------------------------------
+
+    def rates(self) -> dict:
+        """The learning rates of the last step, for the log."""
+        return vars(Rates.at(max(self.step - 1, 0), self.config.network, self.config.train))
+
+    def render(self, view: View) -> np.ndarray:
+        """(H, W, 3) float32 in [0, 1]: the present model's image of a view."""
+        return self.renderer.render(view.camera, self.gamma)
+
+    def target(self, view: View) -> np.ndarray:
+        """(H, W, 3) float32 in [0, 1]: what render(view) should be."""
+        return self._target.whole(view)
+
+    def arrays(self) -> dict[str, DeviceRows]:
+        """{name in a checkpoint: array} of the model and of the training's state. Raises UserError
+        as check().
+        """
+        self.check()
+        exposure = {"exposure": DeviceRows(self.dev, self.exposure.state)} if self.exposure else {}
+        return self.model.arrays() | self.optimiser.arrays() | exposure
+
+    def restore(self, step: int, arrays: dict[str, np.ndarray], begun: int) -> None:
+        """Resume after `step` steps with the training state of a checkpoint, which is taken out of
+        `arrays`; the model has been loaded already. A finished training stores no such state: its
+        moments start anew, and its EMA if that is due.
+        """
+        self.step, self.begun = step, begun
+        self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
+        if arrays:
+            self.optimiser.restore(arrays)
+            if "exposure" not in arrays:
+                self.exposure = None
+            elif self.exposure:
+                self.dev.write(self.exposure.state, arrays.pop("exposure"))
+                self.exposure.is_applied |= step >= decided_at(begun, len(self.views))
+        elif self.config.train.ema and step >= ema_start(self.config.train.iterations):
+            self.optimiser.update_ema(1.0)

@@ -1,0 +1,88 @@
+"""Which points are kept: during a training by the weights of its steps, at its end by its views."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.model import Model
+from pp_cl.engine.render import Renderer
+from pp_cl.engine.training import schedule
+from pp_cl.engine.training.state import PointState
+from pp_cl.engine.views import View
+from pp_cl.errors import Diverged
+from pp_cl.settings import Config, TrainConfig
+
+LEAST_OPACITY = 0.01
+MANY_VIEWS = 24  # so many show every place several times
+SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
+
+
+def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainConfig) -> Array:
+    """(M,) uint32, ascending: the points that are kept during training. A point is judged once
+    PRUNE_LOOKS steps had it in their image: it is kept if its blend weight reached
+    train.prune_weight in one of them and its opacity is at least LEAST_OPACITY, and its
+    counts start anew. Points seen less often are kept.
+
+    The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
+    Raises Diverged for weights and opacities that are not finite, which nothing later would find.
+    """
+    weight, seen = dev.download(state.max_weight), dev.download(state.times_seen)
+    opacities = dev.download(opacity)
+    broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
+    if broken:
+        raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
+    judged = seen >= schedule.PRUNE_LOOKS
+    passes = (weight >= train.prune_weight) & (opacities >= LEAST_OPACITY)
+    dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
+    dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
+    return _listed(dev, ~judged | passes, weight)
+
+
+def final_points_to_keep(
+    dev: Device,
+    max_weight: Array,
+    times_seen: Array,
+    opacity: Array,
+    train: TrainConfig,
+    least: int,
+) -> Array:
+    """(M,) uint32, ascending: the points of a finished training that weigh at least
+    train.prune_weight in `least` training views and have LEAST_OPACITY. NaN counts as
+    too little.
+
+    max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
+    many it is train.prune_weight.
+    """
+    weight, seen = dev.download(max_weight), dev.download(times_seen)
+    keep = (weight >= train.prune_weight) & (seen >= least)
+    return _listed(dev, keep & (dev.download(opacity) >= LEAST_OPACITY), weight)
+
+
+def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Config) -> Array:
+    """final_points_to_keep() of training views: in one of them, where there are many in two, as
+    what a single photograph shows is mostly a speck in others.
+    """
+    dev, cloud, train = renderer.dev, renderer.model.cloud, config.train
+    max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
+    for view in views:
+        drawn = renderer.forward(view.camera, schedule.GAMMA[1], until="weights")
+        renderer.record_weights(drawn, max_weight, seen, least=train.prune_weight)
+        del drawn  # else its arrays would stay beside the larger ones of the next view
+    least = 2 if len(views) >= MANY_VIEWS else 1
+    return final_points_to_keep(dev, max_weight, seen, cloud.opacity, train, least)
+
+
+def points_of_large_parts(model: Model) -> Array:
+    """(M,) uint32, ascending: the points of parts that are large enough to be of the object."""
+    is_kept = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
+    return model.dev.upload(np.flatnonzero(is_kept), np.uint32)
+
+
+def _listed(dev, keep, weight):
+    """Indices of the points to keep; if there are none, that of the highest weight."""
+    indices = np.flatnonzero(keep)
+    if indices.size == 0:
+        indices = [np.argmax(np.nan_to_num(weight, nan=-np.inf))]
+    return dev.upload(indices, np.uint32)

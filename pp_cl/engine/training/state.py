@@ -1,0 +1,96 @@
+"""The training state of each point: optimiser moments, EMA, highest blend weight and view count."""
+
+from __future__ import annotations
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.buffers import Table, compact_rows, gather_rows
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.raster.points import PointCloud, sh_blocks
+
+
+class PointState:
+    """Arrays with one row per point of the cloud, in its order; they start as zeros.
+
+    averages: {name as in PointCloud.learned(): EMA}, empty until Optimiser.update_ema().
+    """
+
+    def __init__(self, dev: Device, cloud: PointCloud):
+        table = self.table(cloud.count, cloud.offset.shape[1])
+        self._arrays = {name: dev.zeros(*row) for name, row in table.items()}
+        self.averages: dict[str, Array] = {}
+
+    @staticmethod
+    def table(n: int, width: int = 4) -> Table:
+        """The arrays of n points without the averages. width: of PointCloud.offset."""
+        return {
+            "max_weight": ((n,), np.float32),
+            "times_seen": ((n,), np.float32),
+            "v.offset": ((n, width), np.float32),
+            "v.opacity": ((n,), np.float32),
+            "v.sh": ((n, 16), np.float32),
+            "last_step": ((n,), np.uint32),
+        }
+
+    @staticmethod
+    def ema_table(n: int) -> Table:
+        """The averages of n points: of all but their harmonics above degree 0, whose averages would
+        take most of the memory and gain 0.02 dB (docs/recipe.md).
+        """
+        table = PointCloud.table(n, sh_blocks(0))
+        del table["ids"]
+        return table
+
+    @property
+    def max_weight(self) -> Array:
+        """(N) float32: the sum over an image's pixels of the point's blend weights, the highest of
+        all images since pruning last judged the point.
+        """
+        return self._arrays["max_weight"]
+
+    @property
+    def times_seen(self) -> Array:
+        """(N) float32: number of those images that had a hit of the point, occluded or not."""
+        return self._arrays["times_seen"]
+
+    @property
+    def second_moments(self) -> dict[str, Array]:
+        """RMSprop's: of "offset", (N, 4), "opacity", (N,), and "sh", (N, 16), of each feature; all
+        float32.
+        """
+        return {name: self._arrays[f"v.{name}"] for name in ("offset", "opacity", "sh")}
+
+    @property
+    def last_step(self) -> Array:
+        """(N,) uint32: the last step in which the point had a gradient; 0: none yet."""
+        return self._arrays["last_step"]
+
+    def compact(self, dev: Device, keep: Array) -> None:
+        """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
+        for arrays in (self._arrays, self.averages):
+            for name in arrays:
+                arrays[name] = compact_rows(dev, arrays[name], keep)
+
+    def refine(self, dev: Device, parents: Array) -> None:
+        """Become the state of a refined cloud: point i takes over the state of parents[i], (M,)
+        uint32, but max_weight and times_seen start anew.
+        """
+        for arrays in (self._arrays, self.averages):
+            for name in arrays:
+                arrays[name] = gather_rows(dev, arrays[name], parents)
+        for array in (self.max_weight, self.times_seen):
+            dev.fill(array, 0)
+
+    def arrays(self) -> dict[str, Array]:
+        """{name in a checkpoint: array}."""
+        averages = {f"a.{name}": array for name, array in self.averages.items()}
+        return {f"state.{name}": array for name, array in (self._arrays | averages).items()}
+
+
+def split_opacity(dev: Device, opacity: Array) -> None:
+    """Replace every opacity o in [0, 1], (N,) float32, by 1 - sqrt(1 - o), in place. On a refined
+    grid a ray crosses two points where it crossed one, and their transmittances multiply to 1 - o.
+    """
+    n = len(opacity)
+    dev.program("training/refine").launch("split_opacity", n, n=n, opacity=opacity)

@@ -1,0 +1,194 @@
+"""Views: photographs with their cameras, listed by a scene, loaded, and reduced."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pp_cl.engine.camera import Camera
+from pp_cl.errors import UserError
+
+# Alpha (0 to 255) above which a pixel belongs to the object. Low, since a mask that is too large
+# costs points but one that is too small carves the object away, translucent parts first; not 0,
+# because the reconstruction filter of NeRF-synthetic leaves alphas of 1 and 2 as far as 3 pixels
+# from the object, and masks that once were JPEG carry noise of that size around their edge (NeRD's
+# captures). Above 8 both end within 1.5 pixels of alpha 0.5.
+MASK_THRESHOLD = 8
+# pixels of a reduced image, each way: SSIM's window of 11 and the U-Net's two poolings need room
+MIN_SIDE = 16
+LEAST_SHARE = 0.75  # of the size that a preset is made for: further down, details would be lost
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A photograph, which is used reduced: its pixels are the means of blocks of
+    downscale x downscale stored pixels.
+
+    name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
+    image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
+    file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
+    in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
+    None for one that the program makes itself. shrunk: how many times the stored image was reduced
+    while it was read from its file (shrink()). unshrunk_camera: of the file's image, where
+    that is another one. is_masked: a mask of its own says so where the object fills the image.
+    ignored: (H, W) bool, the pixels that say nothing, neither for the hull nor for the loss; the
+    image is 0 there. None: there are none.
+    """
+
+    name: str
+    stored_camera: Camera
+    image: np.ndarray
+    depth_range: tuple[float, float] | None = None
+    downscale: int = 1
+    digest: str | None = None
+    shrunk: int = 1
+    unshrunk_camera: Camera | None = None
+    is_masked: bool = False
+    ignored: np.ndarray | None = None
+
+    @property
+    def file_camera(self) -> Camera:
+        """The camera of the image in its file."""
+        return self.unshrunk_camera or self.stored_camera
+
+    @property
+    def file_downscale(self) -> int:
+        """How many times the image in its file is reduced in all."""
+        return self.shrunk * self.downscale
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera of the reduced image."""
+        return self.stored_camera.downscaled(self.downscale)
+
+    @cached_property
+    def has_mask(self) -> bool:
+        """Whether some pixel that says something is not wholly opaque."""
+        return bool((self.hull_alpha < 255).any())
+
+    @property
+    def hull_alpha(self) -> np.ndarray:
+        """(H, W) uint8: the alpha of the stored image, 255 where it says nothing."""
+        alpha = self.image[..., 3]
+        return alpha if self.ignored is None else np.where(self.ignored, np.uint8(255), alpha)
+
+    def ignored_crop(
+        self, box: tuple[int, int, int, int], jitter: tuple[float, float] = (0, 0)
+    ) -> np.ndarray | None:
+        """(height, width) bool: the pixels of Target.crop(box, jitter) whose blocks have one that
+        is ignored; None where there are none.
+        """
+        if self.ignored is None:
+            return None
+        (x0, y0, width, height), k = box, self.downscale
+        left, top = (k * c + round(d) for c, d in zip((x0, y0), jitter, strict=True))
+        there = self.ignored[max(top, 0) : top + height * k, max(left, 0) : left + width * k]
+        before = max(-top, 0), max(-left, 0)
+        after = np.subtract((height * k, width * k), np.add(before, there.shape))
+        blocks = np.pad(there, list(zip(before, after, strict=True)))
+        found = np.logical_or.reduce(blocks.reshape(height, k, width, k), (1, 3))
+        return found if found.any() else None
+
+    def ignoring(self, truth: np.ndarray, image: np.ndarray) -> np.ndarray:
+        """(height, width, 3): what an image of this view should be, which is what it is where
+        pixels are ignored.
+        """
+        ignored = self.ignored_crop((0, 0, *truth.shape[1::-1]))
+        return truth if ignored is None else np.where(ignored[..., None], image, truth)
+
+    def moved(self, by: ArrayLike) -> "View":
+        """The same photograph, its camera moved by (3,) world units."""
+        unshrunk = self.unshrunk_camera and self.unshrunk_camera.moved(by)
+        return replace(self, stored_camera=self.stored_camera.moved(by), unshrunk_camera=unshrunk)
+
+    def reduced(self, downscale: int) -> "View":
+        """The same photograph reduced `downscale` times from its stored resolution.
+
+        Raises UserError unless that is a whole number that leaves at least MIN_SIDE pixels each
+        way.
+        """
+        asked = downscale * self.shrunk if isinstance(downscale, int) else downscale
+        check_downscale(self.name, self.file_camera, asked)
+        return replace(self, downscale=downscale)
+
+    def near_size(self, side: int) -> "View":
+        """The same photograph reduced to about `side` pixels, as fitting_downscale() has it."""
+        size = self.stored_camera.width, self.stored_camera.height
+        return replace(self, downscale=fitting_downscale(size, side))
+
+    def crop_camera(
+        self, box: tuple[int, int, int, int], jitter: tuple[float, float] = (0, 0)
+    ) -> Camera:
+        """The camera of Target.crop(box, jitter) of this view."""
+        dx, dy = (stored / self.downscale for stored in jitter)
+        return self.camera.shifted(dx, dy).crop(*box)
+
+    def crop_size(self, side: int) -> tuple[int, int]:
+        """(width, height) of a crop of at most `side` x `side` pixels; 0: the whole image."""
+        size = self.camera.width, self.camera.height
+        return (min(side, size[0]), min(side, size[1])) if side else size
+
+    def object_bounds(self, margin: int) -> tuple[int, int, int, int]:
+        """(x0, y0, x1, y1): the pixels of the reduced image, half-open, that show the object, and
+        `margin` more on every side, cut off at the image's border.
+
+        The whole image if its mask is empty.
+        """
+        camera, k = self.camera, self.downscale
+        mask = self.image[: camera.height * k, : camera.width * k, 3] > MASK_THRESHOLD
+        x0, x1 = _extent(mask.any(axis=0), k, margin)
+        y0, y1 = _extent(mask.any(axis=1), k, margin)
+        return x0, y0, x1, y1
+
+
+def check_downscale(name: str, camera: Camera, downscale: int) -> None:
+    """Raise UserError unless the photograph `name` of a camera can be reduced `downscale` times: a
+    whole number that leaves at least MIN_SIDE pixels each way.
+    """
+    width, height = camera.width, camera.height
+    most = min(width, height) // MIN_SIDE
+    if most == 0:
+        raise UserError(
+            f"{name}: {width}x{height} pixels; at least {MIN_SIDE}x{MIN_SIDE} are needed"
+        )
+    if not isinstance(downscale, int) or not 1 <= downscale <= most:
+        raise UserError(
+            f"--downscale {downscale}: not a whole number from 1 to {most}, the range for the "
+            f"{width}x{height} pixels of {name}"
+        )
+
+
+def fitting_downscale(size: tuple[int, int], side: int | None) -> int:
+    """The whole number that reduces images of `size`, (width, height) pixels, so that their longer
+    side comes nearest to `side`, not below three quarters of it; 1 where side is None.
+    """
+    if side is None:
+        return 1
+    longer, most = max(size), min(size) // MIN_SIDE
+    fitting = [k for k in range(1, most + 1) if longer / k >= LEAST_SHARE * side]
+    return min(fitting, key=lambda k: abs(longer / k - side), default=1)
+
+
+def _extent(occupied, downscale, margin):
+    """(first, last + 1) reduced pixel of the occupied stored columns or rows (N,) bool, grown by
+    the margin; the whole length if none is occupied.
+    """
+    size, found = len(occupied) // downscale, np.flatnonzero(occupied) // downscale
+    if found.size == 0:
+        return 0, size
+    return max(int(found[0]) - margin, 0), min(int(found[-1]) + 1 + margin, size)
+
+
+def border(image: np.ndarray) -> np.ndarray:
+    """(N, ...) the pixels of the outermost rows and columns of an image (H, W, ...)."""
+    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
+
+
+def evenly(items: Sequence[Item], most: int | None) -> list[Item]:
+    """At most `most` of the items, spread evenly, the first among them; None: all."""
+    n = len(items)
+    return list(items) if most is None or n <= most else [items[n * i // most] for i in range(most)]

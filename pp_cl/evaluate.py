@@ -1,0 +1,180 @@
+"""Measures a run on the views of a split."""
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from pp_cl.engine.training.target import Target
+from pp_cl.engine.views import View
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import check_target, remove_leftovers, write_json
+from pp_cl.files.contact_sheet import write_comparison
+from pp_cl.files.image import write_png
+from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest, remove_ours
+from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
+from pp_cl.metrics.published import differences, published_rows
+from pp_cl.run import Run, load
+
+SHOWN_VIEWS = 4  # rows of the comparison image
+MOVE = "move it away, or choose another --out"
+
+
+class Rendered(NamedTuple):
+    """A view as the run renders it.
+
+    image, truth: (H, W, 3) float32 in [0, 1]. alpha: (H, W) of the truth. computed: fraction of the
+    network's multiplications that were computed; the others would have seen background alone.
+    """
+
+    name: str
+    image: np.ndarray
+    truth: np.ndarray
+    alpha: np.ndarray
+    seconds: float
+    computed: float
+
+
+def evaluate_run(
+    folder: Path | str,
+    split: str = "test",
+    metrics: tuple[str, ...] = ("psnr", "ssim"),
+    *,
+    save_images: bool = False,
+    device: str | None = None,
+    scene: str | None = None,
+    out: Path | str | None = None,
+) -> dict[str, Any]:
+    """Measure the run in a folder as `pp-cl eval` does, into `out`, else into its own folder;
+    returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write every
+    view, too. device, scene: as load() takes them.
+    """
+    run = load(folder, device, scene=scene)
+    return evaluate(run, split, metrics, save_images=save_images, out=out)
+
+
+def evaluate(
+    run: Run,
+    split: str,
+    metrics: tuple[str, ...],
+    *,
+    save_images: bool = False,
+    out: Path | str | None = None,
+) -> dict[str, Any]:
+    """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
+    RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former. Where the
+    run's photographs had gains, views are also measured after the best ones, exposed_alike().
+
+    metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
+    place of what an earlier evaluation left. A progress bar shows on a terminal. Raises UserError
+    for a missing or broken split, a folder that may not be written, an `out` that holds something
+    else than an evaluation, and a file in the place of one that it writes which no evaluation has
+    written as it is now.
+    """
+    target = run.folder.evaluation(split) if out is None else Path(out)
+    _check_target(target, is_new=out is not None)
+    scene = run.scene(split)
+    views = scene.splits[split]
+    images = [target / "images" / file for file in image_files([view.name for view in views])]
+    if save_images:
+        check_ours(images, MOVE)
+    measure = Metrics(run.dev, metrics)
+    begin_manifest(target)
+    remove_leftovers(target)
+    if save_images:
+        remove_ours((target / "images").rglob("*"))
+    rows: list[dict[str, Any]] = []
+    costs, shown = [], []
+    every = render_views(run, views)
+    bar = tqdm(every, "measuring", len(views), unit="view", leave=False, disable=None)
+    for i, rendered in enumerate(bar):
+        image, truth = rendered.image, rendered.truth
+        rows.append({"name": rendered.name} | measure(image, truth))
+        if "exposed" in run.header:
+            matched = exposed_alike(truth, image, rendered.alpha)
+            rows[-1]["after_gains"] = measure(image, matched)
+        costs.append((rendered.seconds, rendered.computed))
+        if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
+            shown.append((image, truth))
+        if save_images:
+            images[i].parent.mkdir(parents=True, exist_ok=True)
+            write_png(images[i], image)
+    means = mean([{name: row[name] for name in metrics} for row in rows])
+    result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
+    if "exposed" in run.header:
+        result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
+    result |= _about(run, costs) | _published(scene, split, views)
+    write_json(target / "metrics.json", result)
+    write_comparison(target / "comparison.png", *zip(*shown, strict=True))
+    return result
+
+
+def _check_target(target, *, is_new):
+    """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
+    files and no evaluation.
+    """
+    if target.exists() and not target.is_dir():
+        raise UserError(f"{target}: is not a folder; choose another --out")
+    check_target(target / "metrics.json")
+    if is_new and target.exists() and not has_manifest(target) and any(target.iterdir()):
+        raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
+    check_ours([target / "metrics.json", target / "comparison.png"], MOVE)
+
+
+def _published(scene, split, views):
+    """{"published": rows of the scene, "published_differs": how this measurement differs from
+    them}.
+    """
+    cameras = [view.file_camera for view in views]
+    rows = published_rows(scene.name, cameras)
+    differs = differences(scene.name, cameras, views[0].file_downscale, split) if rows else ""
+    return {"published": rows, "published_differs": differs}
+
+
+def _about(run, costs):
+    """What metrics.json says of the run. costs: [(seconds, fraction computed)] of each view."""
+    seconds, computed = zip(*costs, strict=True)
+    return {
+        "step": run.header["step"],
+        "finished": run.header["finished"],
+        "points": {
+            "initial": run.header["initial_points"],
+            "final": run.model.cloud.count,
+            "grid": run.header["grid"]["dims"],
+        },
+        "seconds_per_frame": float(np.median(seconds)),
+        "computed_fraction": float(np.mean(computed)),
+    }
+
+
+def image_files(names: list[str]) -> list[PurePosixPath]:
+    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
+    those that all of them share go.
+    """
+    paths = [PurePosixPath(name) for name in names]
+    shared = os.path.commonpath([path.parent for path in paths])
+    paths = [path.relative_to(shared) for path in paths]
+    files = [path.with_suffix(".png") for path in paths]
+    if len(set(files)) < len(files):  # a.jpg beside a.png
+        files = [path.with_name(f"{path.name}.png") for path in paths]
+    return files
+
+
+def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
+    """Each view as the run renders it, in turn."""
+    target = Target(run.dev)
+    run.render(views[0].camera)  # builds the programs
+    for view in views:
+        start = time.perf_counter()
+        result = run.renderer.forward(view.camera, run.gamma)
+        image, computed = run.checked(result.clamped()), result.computed_fraction
+        seconds = time.perf_counter() - start
+        del result  # else its arrays would stay beside the larger ones of the next view
+        whole = target.crop(view, (0, 0, view.camera.width, view.camera.height))
+        truth, alpha = (array.get() for array in whole)
+        truth = view.ignoring(truth, image)
+        yield Rendered(view.name, image, truth, alpha, seconds, computed)

@@ -1,0 +1,61 @@
+"""The number of steps of a training that is given minutes: planned again and again from the time
+that its steps take.
+"""
+
+import math
+import statistics
+from collections import deque
+
+from pp_cl.engine.training.schedule import refine_steps
+from pp_cl.settings import TrainConfig
+
+PLANS = 50  # in the minutes given
+KEPT = 0.8  # share of the steps after which their number stays: soon the averages begin
+FOG = 0.35  # of the first step's time, which later ones save: a third of the steps clears it
+DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
+ENDING = 0.15  # of a step's time, for as many pixels of a training view, which the end looks at
+FEWEST, MOST = 10, 100  # last steps whose median time counts: first ones may build kernels
+
+
+class Budget:
+    """Sets train.iterations, so that the training takes train.minutes. pixels: of all its views."""
+
+    def __init__(self, train: TrainConfig, pixels: int):
+        self._train = train
+        self._ending = ENDING * pixels / train.crop**2 if train.crop else 0.0  # steps
+        self._times: deque[float] = deque(maxlen=MOST)
+        self._next = 0.0  # seconds of training at which to plan
+
+    def plan(self, step: int, seconds: float, took: float) -> bool:
+        """Plan if that is due after a step, which took seconds, as all up to it; whether it was."""
+        train = self._train
+        self._times.append(took)
+        if step in refine_steps(train):
+            self._times.clear()
+        enough = len(self._times) >= FEWEST and seconds >= self._next
+        if not enough or step >= KEPT * train.iterations:
+            return False
+        self._next = seconds + 60 * train.minutes / PLANS
+        left = 60 * train.minutes - seconds
+        clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
+        replan(train, step, left / (clearing * statistics.median(self._times)), self._ending)
+        return True
+
+
+def replan(train: TrainConfig, step: int, left: float, ending: float = 0.0) -> None:
+    """Set train.iterations of a training that has time for `left` more steps if it is not refined
+    further; and shares of train.refine_at, so that past refinements stay where they were. ending:
+    steps at last that its end takes as long as.
+    """
+    steps, shares = train.iterations, [share for share in train.refine_at if 0 < share < 1]
+    past = {share: at for share in shares if (at := max(1, round(share * steps))) <= step}
+    to_come = [at / steps for at in refine_steps(train) if at > step]
+    all_as_one, start = 0.0, 0.0
+    for level, end in enumerate([*to_come, 1.0]):
+        all_as_one += (end - start) * DEARER**level
+        start = end
+    soonest = min([KEPT, *(share for share in shares if share not in past)])  # is not jumped over
+    left -= ending * DEARER ** len(to_come)
+    planned = max(round((step + left) / all_as_one), math.ceil((step + 1) / soonest))
+    train.iterations = planned
+    train.refine_at = tuple(past[s] / planned if s in past else s for s in train.refine_at)

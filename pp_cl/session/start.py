@@ -1,0 +1,139 @@
+"""What a new training starts from: its network, its visual hull, and the size that its points are
+to be refined to.
+"""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.checkpoint import opened_run
+from pp_cl.config import OPEN, RANDOM, load_config, text_of
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.training.schedule import refine_steps
+from pp_cl.engine.views import View
+from pp_cl.errors import UserError, listing
+from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.scene.agreement import disagreements
+from pp_cl.scene.hull import Agreement, Hull, build_grid, depth_range, spacing_pixels
+from pp_cl.scene.load import DEMO, scene_box
+from pp_cl.scene.outline import picture
+from pp_cl.session.memory import Room
+from pp_cl.settings import Config, NetworkConfig
+
+UNDECIDED, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
+# train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
+REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
+FINEST, COARSEST = 1.25, 1.5
+# raster.radius where it is open, in point spacings: one pixel within these bounds; less is no
+# better where points lie farther apart
+LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
+COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1.7 times less points
+LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
+# what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
+DEMO_NETWORK = Path(__file__).with_name("demo.npz")
+
+
+def begin_network(net: UNet, config: Config) -> None:
+    """Give net the parameters that network.start names; those of the demo only where the scene is
+    another and they fit. Raises UserError for a run whose network has another shape.
+    """
+    settings, folder = config.network, RunFolder(config.network.start)
+    if settings.start == DEMO:
+        if config.scene.path != DEMO and not _unlike(settings, NetworkConfig()):
+            with np.load(DEMO_NETWORK) as stored:
+                for name, parameter in net.parameters.items():
+                    net.dev.write(parameter, stored[f"net.{name}"].astype(np.float32))
+    elif settings.start != RANDOM:
+        other = load_config(folder.config)
+        for key, ours, theirs in _unlike(settings, other.network):
+            raise UserError(
+                f"network.start: {folder} has {key}={theirs}, this training {ours}; set {key}"
+                " alike, or begin with another network"
+            )
+        with opened_run(folder, other) as run:
+            for name, parameter in net.parameters.items():
+                net.dev.write(parameter, run.array(f"net.{name}"))
+
+
+def _unlike(ours, theirs):
+    """[(key, our value, their value)] of the settings by which two networks differ in shape."""
+    pairs = [(n, getattr(ours, n), getattr(theirs, n)) for n in ("widths", "blocks")]
+    return [(f"network.{n}", text_of(a), text_of(b)) for n, a, b in pairs if a != b]
+
+
+def first_hull(
+    dev: Device, config: Config, agreement: Agreement, coarsest: float = COARSEST
+) -> tuple[Hull, tuple[float, float]]:
+    """(the hull that a training starts from, its train.refine_at).
+
+    Where the settings leave train.refine_at open, there are as many refinements as bring points
+    `coarsest` pixels of the images close, and the hull has the spacing from which these lead to
+    FINEST to `coarsest`.
+    """
+    points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
+    views, _, forgiven = agreement
+    hull = build_grid(dev, views, points, box, forgiven)
+    if shares != UNDECIDED:
+        return hull, shares
+    cameras = [view.camera for view in views]
+    spacing = spacing_pixels(hull.grid, cameras)
+    smallest = min(min(camera.width, camera.height) for camera in cameras)
+    possible = [n for n in range(1, len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
+    times = sum(spacing > coarsest * 2 ** (n - 1) for n in possible)
+    first = min(max(spacing, 2**times * FINEST), 2**times * coarsest)
+    if times and first != spacing:
+        hull = build_grid(dev, views, round(points * (spacing / first) ** 3), box, forgiven)
+    return hull, REFINE_AT[times]
+
+
+def fitting_hull(
+    dev: Device, config: Config, agreement: Agreement, room: Room
+) -> tuple[Hull, tuple[float, float]]:
+    """first_hull() and its (near, far); config.train.refine_at becomes what it says, and an open
+    raster.radius one pixel of the images. Where memory is too small for points COARSEST pixels
+    apart in the end, they are as close as it allows. Raises UserError as Room.check_points() does,
+    and for an open radius of footprints that are not soft.
+    """
+    is_open, train, coarsest = config.train.refine_at == UNDECIDED, config.train, COARSEST
+    raster, is_radius_open = config.raster, config.raster.radius == 0
+    config.decided = [key for key, one in zip(OPEN, (is_open, is_radius_open), strict=True) if one]
+    if is_radius_open and raster.footprint != "soft":
+        raise UserError(
+            f"raster.radius: is open, which raster.footprint={raster.footprint} cannot be; give it"
+            " in world units at a depth range of 4 (0.0015 in the paper)"
+        )
+    while True:
+        hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
+        if is_radius_open:
+            # refining halves the spacing, and doubles the images
+            pixels = spacing_pixels(hull.grid, [view.camera for view in agreement.views])
+            spacing = pixels / 2 ** len(refine_steps(train))
+            raster.radius = round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
+        near_far = depth_range(agreement.views, hull)
+        try:
+            room.check_points(hull.grid, len(hull.ids), near_far)
+            return hull, near_far
+        except UserError:
+            if not is_open or train.refine_at == NEVER:
+                raise
+        train.refine_at, coarsest = UNDECIDED, COARSER * coarsest
+
+
+def picture_of_masks(
+    dev: Device, views: list[View], hull: Hull, left_out: dict[str, float]
+) -> np.ndarray | None:
+    """Warn of masks that disagree with the others; return their picture, None if all agree."""
+    found = disagreements(views, hull.grid.box)
+    rejecting = {one.view.name: one.share for one in found if one.view.name not in left_out}
+    for what, shares in (
+        ("lie beside what the other views agree on, and are left out of the training", left_out),
+        ("reject what the other views agree on", rejecting),
+    ):
+        if shares:
+            worst = listing([f"{name} ({share:.0%} of it)" for name, share in shares.items()])
+            warnings.warn(
+                f"masks {what}: {worst}; see {MASKS_PICTURE} in the run's folder", stacklevel=2
+            )
+    return picture(dev, views, hull, found) if found or left_out else None

@@ -1,0 +1,393 @@
+"""Runs a training in the folder of a run: begun with a visual hull or resumed from a checkpoint,
+then Trainer's steps with log, previews and checkpoints.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pp_cl.checkpoint import load_run_state, opened_run
+from pp_cl.config import load_config, refuse_setting, run_config
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.model import Model
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.step import Trainer
+from pp_cl.engine.views import View
+from pp_cl.errors import Diverged, UserError
+from pp_cl.files.atomic import check_target
+from pp_cl.files.checkpoint import check_finite
+from pp_cl.files.contact_sheet import write_comparison
+from pp_cl.files.image import to_8bit, write_png
+from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.presets import SHORT
+from pp_cl.run import Run, load_run
+from pp_cl.scene.hull import agreeing
+from pp_cl.scene.identity import difference, identity, learned
+from pp_cl.scene.kept import KeptViews
+from pp_cl.scene.load import (
+    Listing,
+    list_split,
+    measured_split,
+    open_scene,
+    scene_box,
+    scene_frames,
+)
+from pp_cl.session.budget import Budget
+from pp_cl.session.memory import Room
+from pp_cl.session.start import NEVER, begin_network, fitting_hull, picture_of_masks
+from pp_cl.settings import Config
+
+PREVIEWS = 4  # of a training, besides an early one
+FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
+MEASURED_VIEWS = 4
+Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
+OnStep = Callable[[int, dict[str, Any] | None], None]
+
+
+class HullFacts(NamedTuple):
+    """What a new training says of its visual hull.
+
+    capped: it has fewer points than asked for, as the grid may not be finer. seconds: time that
+    carving took. picture: of the masks that disagree with the others, None if all agree.
+    """
+
+    capped: bool
+    seconds: float
+    picture: np.ndarray | None
+
+
+@dataclass
+class Training:
+    """A training that is ready to begin or to go on.
+
+    info: what a checkpoint's header holds beside the model's. room: the available memory and the
+    plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
+    views on which train.eval_every measures PSNR. kept: images that a resume need not read again.
+    """
+
+    folder: RunFolder
+    config: Config
+    trainer: Trainer
+    info: dict[str, Any]
+    room: Room
+    hull: HullFacts | None
+    measured: list[View]
+    kept: KeptViews
+    _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
+    _save_by: float = field(default=math.inf, init=False)
+    _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
+
+    def run(
+        self,
+        on_step: OnStep | None = None,
+        is_stopped: Callable[[], bool] = lambda: False,
+    ) -> float:
+        """Train to the end with log, previews and checkpoints; returns the seconds of training,
+        those before an interruption included.
+
+        on_step(step, row) is called after each step, with its row of the log where it has one.
+        is_stopped() is asked after each step: if it is true, a checkpoint is written and the
+        training ends, to be resumed later. Raises UserError before anything is written if another
+        process trains into the folder; later, after writing a checkpoint, if a refinement or the
+        EMA needs more memory than there is; and if numbers are no longer finite, keeping the last
+        checkpoint.
+        """
+        with self.folder.owned():
+            self._check_unchanged()
+            self.folder.create(self.config.to_json())
+            self.kept.write()
+            if self.hull and self.hull.picture is not None:
+                write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
+            self._saved = self.trainer.step
+            try:
+                return self._run(on_step, is_stopped)
+            except Diverged as error:
+                kept = f"{self.folder.checkpoint} of step {self._saved} is kept"
+                raise UserError(
+                    f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
+                    " --out with a lower network.rate or train.sh_rate"
+                ) from None
+
+    def _check_unchanged(self):
+        """Raise UserError where another process trained into the folder since it was looked at."""
+        step = 0
+        if self.folder.checkpoint.exists():
+            with opened_run(self.folder, self.config) as stored:
+                step = stored.header["step"]
+        if step != self.trainer.step:
+            raise UserError(
+                f"{self.folder}: another training has gone on to step {step} meanwhile;"
+                " give the command again"
+            )
+
+    def _run(self, on_step, is_stopped):
+        trainer, train = self.trainer, self.config.train
+        with self.folder.open_log(trainer.step) as log:
+            pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
+            seconds, budget = log.seconds, Budget(train, pixels)
+            first = trainer.step + 1
+            self._expect_save()
+            while trainer.step < train.iterations:
+                try:
+                    self.room.check_growth(trainer.model, trainer.step)
+                except UserError:  # the next step would not fit the memory
+                    self._save(finished=False)
+                    raise
+                start = time.perf_counter()
+                terms = trainer.train_step()
+                took = time.perf_counter() - start
+                seconds += took
+                is_planned = train.minutes and not trainer.begun
+                if is_planned and budget.plan(trainer.step, seconds, took):
+                    trainer.take_plan()
+                    self.folder.configure(self.config.to_json())
+                if trainer.step == first and not any(self.folder.previews.glob("*.png")):
+                    self._preview_by = time.monotonic() + FIRST_PREVIEW  # the kernels are built
+                row = self._after_step(log, terms, seconds)
+                if on_step:
+                    on_step(trainer.step, row)
+                if is_stopped() and trainer.step < train.iterations:
+                    self._save(finished=False)
+                    return seconds
+            check_finite(trainer.arrays())  # before the EMA replaces the parameters
+            start = time.perf_counter()
+            trainer.finish()
+            seconds += time.perf_counter() - start
+            # Before the checkpoint: a log row without its checkpoint is made again by resuming,
+            # but a finished run is not resumed.
+            log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
+            self._save(finished=True)
+            self.kept.remove()
+        return seconds
+
+    def _after_step(self, log, terms, seconds):
+        """Write the log's row, the preview and the checkpoint that are due; return the row or None.
+        The checkpoint comes last: resuming from it does not make the others again.
+        """
+        trainer, train = self.trainer, self.config.train
+        step, last, row = trainer.step, trainer.step == train.iterations, None
+        is_measured = train.eval_every and step % train.eval_every == 0
+        measured = self._measure() if is_measured else {}
+        if step % train.log_every == 0 or last or is_measured:
+            state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
+            row = self._row(seconds) | terms.get() | state | measured
+            log.write(row)
+        due = step % -(-train.iterations // PREVIEWS) == 0
+        if last or due or time.monotonic() >= self._preview_by:
+            self._preview()
+        due = step % train.checkpoint_every == 0 or time.monotonic() >= self._save_by
+        if due and not last:
+            self._save(finished=False)
+        return row
+
+    def _row(self, seconds):
+        device = self.trainer.dev.name
+        return {"step": self.trainer.step, "seconds": round(seconds, 3), "device": device}
+
+    def _measure(self):
+        """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
+        found = [
+            psnr(to_8bit(image), to_8bit(view.ignoring(self.trainer.target(view), image)))
+            for view in self.measured
+            for image in [self._rendered(view)]
+        ]
+        return {"test_psnr": float(np.mean(found))}
+
+    def _expect_save(self):
+        """Set the time of the next checkpoint; the clock influences nothing else."""
+        minutes = self.config.train.checkpoint_minutes
+        self._save_by = time.monotonic() + 60 * minutes if minutes else math.inf
+
+    def _save(self, finished):
+        trainer = self.trainer
+        header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
+        header |= {"exposed": True} if trainer.is_exposed else {}
+        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        self._expect_save()
+        self._saved = trainer.step
+
+    def _preview(self):
+        """Prediction, truth and error of the first training view."""
+        trainer, view = self.trainer, self.trainer.views[0]
+        self._preview_by = math.inf
+        path = self.folder.previews / f"step_{trainer.step:06d}.png"
+        write_comparison(path, [self._rendered(view)], [trainer.target(view)])
+
+    def _rendered(self, view):
+        """The present model's image of a view. Raises Diverged where there is none."""
+        image = self.trainer.render(view)
+        if not np.isfinite(image).all():
+            raise Diverged(f"the image of {view.name} holds NaN after step {self.trainer.step}")
+        return image
+
+
+# ---- to begin and to resume: nothing is written
+
+
+def open_training(
+    dev: Device, folder: RunFolder, config: Config, stored: Stored | None
+) -> Training:
+    """resume_training() from the folder's checkpoint `stored` where it has one, else
+    begin_training().
+    """
+    if stored is None:
+        return begin_training(dev, folder, config)
+    return resume_training(dev, folder, config, stored)
+
+
+def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
+    """A training in `folder` from its beginning; what is open in config (train.refine_at,
+    raster.radius) is decided.
+
+    Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
+    written, and for pictures in it that would be lost.
+    """
+    check_target(folder.config)
+    folder.check_pictures(0)
+    net = UNet.of_settings(dev, config.network, seed=config.train.seed)
+    begin_network(net, config)
+    listing = list_split(config.scene.path)
+    room = Room(config, net, listing.photographs)
+    room.check_unseen()
+    views, info, kept = _read_views(dev, folder, config, listing)
+
+    start = time.perf_counter()
+    agreement = agreeing(dev, views, scene_box(config))
+    hull, depth_range = fitting_hull(dev, config, agreement, room)
+    seconds = time.perf_counter() - start
+    picture = picture_of_masks(dev, views, hull, agreement.left_out)
+
+    cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
+    model = Model(dev, hull.grid, depth_range, cloud, net=net)
+    trainer = Trainer(dev, config, model, agreement.views)
+    info["initial_points"] = model.cloud.count
+    if agreement.left_out:
+        info["left_out"] = list(agreement.left_out)
+    facts, measured = HullFacts(hull.capped, seconds, picture), _measured_views(dev, config)
+    return Training(folder, config, trainer, info, room, facts, measured, kept)
+
+
+def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
+    """The training in `folder` from its checkpoint on.
+
+    A finished one is extended to config.train.iterations, with new moments and without refinements:
+    every schedule ends at the last step, so it is not what it would have been from its beginning.
+    Raises UserError as begin_training() does, and for a checkpoint of another scene.
+    """
+    header, arrays = stored
+    check_target(folder.config)
+    folder.check_pictures(header["step"])
+    begun = header["step"] if header["finished"] else header.get("extended_from", 0)
+    extended = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
+
+    net = UNet.of_settings(dev, config.network)
+    listing = list_split(config.scene.path)
+    room = Room(extended, net, listing.photographs)
+    grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
+    room.check_points(grid, points, header["depth_range"], header["step"])
+    views, info, kept = _read_views(dev, folder, config, listing)
+    if mismatch := difference(header, listing.photographs, views):
+        unedited = scene_frames(config.scene.path, edited=False)
+        if not difference(header, learned(header, unedited), views):
+            mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
+        raise UserError(
+            f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
+            " use another --out"
+        )
+
+    for name, array in arrays.items():
+        if name.startswith("points.") and array.dtype == np.float16:  # of a compressed run
+            arrays[name] = array.astype(np.float32)
+    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+    left_out = header.get("left_out", [])
+    trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])
+    trainer.restore(header["step"], arrays, begun)
+    info["initial_points"] = header["initial_points"]
+    info |= {"extended_from": begun} if begun else {}
+    info |= {"left_out": left_out} if left_out else {}
+    measured = _measured_views(dev, config)
+    return Training(folder, config, trainer, info, room, None, measured, kept)
+
+
+def _read_views(dev: Device, folder: RunFolder, config: Config, listing: Listing):
+    """(the training views, what a checkpoint's header holds of them, their images that a resume
+    need not read again).
+    """
+    kept = KeptViews(folder.views)
+    scene = open_scene(dev, config, ("train",), listed={"train": listing}, kept=kept)
+    views = scene.splits["train"]
+    info = identity(views, listing.photographs)
+    return views, info | ({"notes": scene.notes} if scene.notes else {}), kept
+
+
+def _measured_views(dev, config):
+    """The views on which train.eval_every measures PSNR: of the split val, else test."""
+    if not config.train.eval_every:
+        return []
+    split = measured_split(config.scene.path)
+    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
+
+
+def train_scene(
+    scene: str,
+    out: Path | str,
+    preset: str | None = None,
+    device: str | None = None,
+    *,
+    settings: dict[str, Any] | None = None,
+    on_step: OnStep | None = None,
+    is_stopped: Callable[[], bool] | None = None,
+    **options: Any,
+) -> Run:
+    """Train a scene into the folder `out`, or go on with the run there; a finished one is left
+    alone, unless more iterations are asked for than it has.
+
+    scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
+    value}; options: the same by the names of the command's options, such as iterations.
+    on_step(step, row): called after each step, with its row of the log or None. is_stopped: asked
+    after each step; where it is true, training ends with a checkpoint. Raises UserError.
+    """
+    unknown = set(options) - set(SHORT)
+    if unknown:
+        raise TypeError(f"train_scene() has no {min(unknown)}; it has {', '.join(SHORT)}, settings")
+    settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
+    folder = RunFolder(out)
+    given = [(*s, "settings") for s in settings.items()]
+    config = run_config(folder, str(scene), preset, given, extends=True)
+    stored, dev = stored_state(folder, config), open_device(device)
+    if not is_finished(stored, config):
+        open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
+    return load_run(dev, out)
+
+
+# ---- what is asked for, and what there is
+
+
+def stored_state(folder: RunFolder, config: Config) -> Stored | None:
+    """(header, arrays) of the folder's checkpoint, None where there is none. A finished run takes
+    note of where its scene is now. Raises UserError for a folder or checkpoint that does not fit.
+    """
+    folder.check_usable()
+    stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
+    if folder.config.exists() and (stored is None or is_finished(stored, config)):
+        path, now = load_config(folder.config).scene.path, config.scene.path
+        if path != now:
+            listed = [] if stored is None else scene_frames(now, edited=False)
+            if stored is None or difference(stored[0], learned(stored[0], listed), []):
+                refuse_setting(folder, "scene.path", path, now)
+            folder.configure(config.to_json())
+    return stored
+
+
+def is_finished(stored: Stored | None, config: Config) -> bool:
+    """Whether there is a checkpoint and it is of the last step."""
+    return stored is not None and stored[0]["step"] == config.train.iterations

@@ -1,0 +1,113 @@
+"""The box of the object that all cameras look at, from sparse points, and the world in which it is
+upright, centred and of unit size.
+"""
+
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pp_cl.engine.camera import Camera
+from pp_cl.scene.camera_path import level, looked_at, up_of
+
+SEEN = 0.75  # of the cameras that see what most of them see: what the object's points have
+NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from which on it is alone
+CUT = 0.005  # of the points at each end of an axis: what may be wrong
+MARGIN = 0.06  # of the box's diagonal, added on every side: smooth parts have no points
+LEAST_POINTS = 100
+FILLED = 0.55  # of the images, by an object whose sides may have no points
+SLOPES = np.tan(np.radians(np.arange(-10, 11, 2)))  # of the plane that carries the object
+THICK = 0.01  # of the cameras' distance: points of a plane are no further from it
+TABLE, BELOW = 0.08, 0.03  # of the points: on a table at least, and below it at most
+LEAST_SPREAD = 0.9  # of the width of what stands on it
+
+
+class World(NamedTuple):
+    """A similarity to the scene's world, x -> scale * rotation @ x + shift, and there the (2, 3)
+    lower and upper corner of the object.
+    """
+
+    scale: float
+    rotation: np.ndarray
+    shift: np.ndarray
+    box: np.ndarray
+
+
+def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
+    """The world whose z axis is up, whose origin is the middle of the object, and where its box
+    fits into [-1, 1]. points: (N, 3).
+    """
+    up = up_of(cameras)
+    centre = looked_at(cameras)
+    eyes = np.stack([camera.eye for camera in cameras])
+    reach = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
+    ahead = level(eyes[0] - centre, up)
+    rotation = np.stack([ahead, np.cross(up, ahead), up])  # the first camera to the side of x
+    upright = (points - centre) @ rotation.T / reach
+    kept = _on_object(upright, _seen_share(cameras, points))
+    ball = min(_seen_radius(camera, centre) for camera in cameras) / reach
+    low, high = np.outer([-ball, ball], np.ones(3))
+    if len(kept) >= LEAST_POINTS:
+        ends = np.quantile(kept, [CUT, 1 - CUT], axis=0)
+        margin = MARGIN * np.linalg.norm(ends[1] - ends[0])
+        low, high = (
+            np.minimum(ends[0] - margin, FILLED * low),
+            np.maximum(ends[1] + margin, FILLED * high),
+        )
+        low[2] = ends[0, 2] - margin  # what it stands on
+    middle, size = (low + high) / 2, (high - low).max() / 2
+    scale = 1 / (reach * size)
+    shift = -scale * rotation @ centre - middle / size
+    return World(scale, rotation, shift, np.stack([low - middle, high - middle]) / size)
+
+
+def _seen_radius(camera, centre):
+    """Radius of the ball around the centre that the camera sees as a whole."""
+    angle = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
+    return np.linalg.norm(camera.eye - centre) * np.sin(angle)
+
+
+def _seen_share(cameras, points):
+    """(N,) share of the cameras whose image has room for each point."""
+    return np.mean([camera.pixels(points)[2] for camera in cameras], axis=0)
+
+
+def _on_object(points, seen):
+    """(M, 3) of the points: those that nearly all cameras see and that are not alone, without the
+    table that they stand on. points: (N, 3), z up, the cameras at a distance of 1 from the origin.
+    """
+    near = np.linalg.norm(points, axis=1) < 1
+    if not near.any():
+        return points[near]
+    kept = points[near & (seen >= SEEN * np.quantile(seen[near], 0.95))]
+    if len(kept) <= NEIGHBOURS:
+        return kept
+    away = cKDTree(kept).query(kept, NEIGHBOURS + 1)[0][:, -1]
+    kept = kept[away < LONELY * np.median(away)]
+    table = _table(kept)
+    return kept if table is None else kept[kept @ table[:3] > table[3] + THICK]
+
+
+def _table(points):
+    """(4,) normal and height of the level plane that the points stand on, None without one."""
+    best, found = TABLE * len(points), None
+    for x, y in product(SLOPES, SLOPES):
+        normal = np.array([x, y, 1]) / np.sqrt(x * x + y * y + 1)
+        height = points @ normal
+        order = np.sort(height)
+        first = order[: int(BELOW * len(points)) + 1]  # as the lowest point of the layer
+        inside = np.searchsorted(order, first + 2 * THICK) - np.arange(len(first))
+        if inside.max() <= best:
+            continue
+        middle = first[inside.argmax()] + THICK
+        on, above = np.abs(height - middle) <= THICK, height > middle + THICK
+        if above.any() and (_spread(points[on]) > LEAST_SPREAD * _spread(points[above])).all():
+            best, found = inside.max(), np.append(normal, middle)
+    return found
+
+
+def _spread(points):
+    """(2,) width of points in x and y, but for some at the ends."""
+    return np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0)

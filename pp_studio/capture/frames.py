@@ -1,0 +1,315 @@
+"""The images of a scene from what a camera gives: upright copies of photographs, or the sharpest
+frames of a film; what is blurred, broken or there twice is left out.
+"""
+
+import logging
+import os
+import re
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageOps
+from tqdm import tqdm
+
+from pp_cl.errors import UserError, shown
+from pp_cl.files.atomic import atomic_file, atomic_folder
+from pp_cl.files.image import ORIENTATION, in_srgb, is_deep_png
+from pp_cl.files.manifest import has_manifest
+from pp_cl.files.untrusted import opened_regular
+from pp_cl.scene.readers.found import MASK_FOLDERS
+from pp_studio.capture.packages import needed
+
+ENDINGS = (
+    *(".jpg", ".jpeg", ".jfif", ".png", ".webp", ".tif", ".tiff", ".bmp"),
+    *(".avif", ".heic", ".heif"),
+)
+# of Pillow; JPEG opens MPO, which phones write, too
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "HEIF")
+KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
+MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769
+FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
+# there, too: pixels across and down, pixels per unit, the unit
+SENSOR = (0xA002, 0xA003, 0xA20E, 0xA210)
+PER_MM = {2: 25.4, 3: 10.0, 4: 1.0}  # millimetres in a unit
+REDUCED = 0.01  # difference of sizes, of the one in EXIF
+POSSIBLE = 0.2, 20.0  # focal lengths, of the longer side
+QUALITY = {"quality": 95, "subsampling": 0}  # of JPEGs
+LEAST = 8  # photographs
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef")  # of cameras
+DIGITS = 6  # of numbers in names, where 10 is to stand behind 9
+SEEN, SMALL = 640, 64  # pixels, longer side, at which sharpness and likeness are measured
+BLURRED = 0.2  # of the neighbours' median sharpness
+EMPTY = 1.0  # sharpness, levels squared: noise alone has more
+NEIGHBOURS = 10  # on either side
+ALIKE = 0.15  # of the neighbours' usual difference
+SAME = 0.3  # levels of 255 by which small copies of one photograph differ at most
+FRAMES, GROUP = 120, 12  # of a film
+LOCAL = ["-protocol_whitelist", "file,pipe"]  # a film names no other machine
+EACH_ONCE = ["-fps_mode", "passthrough"]
+HDR = ("arib-std-b67", "smpte2084")  # transfers of phones: HLG and PQ
+WHITE = 203  # candela per square metre, of BT.2408's diffuse white
+# to sRGB: brighter than 0.7 of white is compressed; HLG and PQ are of BT.2020, tagged or not
+TONE_MAPPED = (
+    f",setparams=color_primaries=bt2020:colorspace=bt2020nc,zscale=t=linear:npl={WHITE}"
+    ",format=gbrpf32le,zscale=p=bt709,tonemap=mobius:param=0.7:desat=0"
+    ",zscale=t=iec61966-2-1:m=gbr:r=full"
+)
+
+
+def take_images(source: Path, images: Path) -> dict[str, Any]:
+    """Write the photographs of a folder, or the sharpest frame of each of FRAMES intervals of a
+    film, to the new folder `images`, upright, as JPEG or PNG.
+
+    Returns {"images": [{name, source, lens, focal, size, sharpness}], "left_out": [{source,
+    reason}]}; lens is equal for photographs of one camera at one focal length; focal, in pixels, is
+    None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
+    """
+    with atomic_folder(images) as unfinished:
+        is_film = not source.is_dir()
+        taken = _frames(source, unfinished) if is_film else _photographs(source, unfinished)
+        found = list(taken)
+        _leave_out(found)
+        for one in found:
+            if "reason" in one and "name" in one:
+                (unfinished / one["name"]).unlink()
+        kept = [one for one in found if "reason" not in one]
+        left_out = [one for one in found if "reason" in one]
+        if len(kept) < LEAST:
+            why = [f"{one['source']} {one['reason']}" for one in left_out[:3]]
+            raise UserError(
+                f"{source}: {len(kept)} of {len(found)} images can be used, at least {LEAST} are"
+                f" needed ({'; '.join(why) or 'nothing is wrong with them'}); take 30 or more all"
+                " around the object"
+            )
+    for one in kept:
+        del one["small"]
+    reasons = [{"source": one["source"], "reason": one["reason"]} for one in left_out]
+    return {"images": kept, "left_out": reasons}
+
+
+# Photographs --------------------------------------------------------------------------------------
+
+
+def _photographs(folder, images):
+    """The facts of each photograph, written to `images` where it can be read; of raw ones that they
+    are left out.
+    """
+    needed("pillow_heif").register_heif_opener()
+    files = listed(folder)
+    if not files:
+        raise UserError(
+            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
+            " or a video"
+        )
+    stems = [file.relative_to(folder).with_suffix("").as_posix() for file in files]
+    if sorted(stems) != stems:  # 10 after 9: matching takes neighbours by name
+        stems = [re.sub(r"\d+", lambda digits: digits[0].zfill(DIGITS), stem) for stem in stems]
+    targets, taken = [], set()
+    for stem in stems:
+        # COLMAP's lists of pairs know no spaces, and take lines that begin with # for comments; its
+        # names are UTF-8, and Python stands for bytes that are not by these
+        name = re.sub(r"[\s\udc80-\udcff]+|^#|/", "_", stem)
+        while name.lower() in taken:
+            name += "_"
+        taken.add(name.lower())
+        targets.append(images / name)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = pool.map(lambda file, target: _take(folder, file, target), files, targets)
+        yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
+    for file in listed(folder, RAW):
+        source = file.relative_to(folder).as_posix()
+        yield {"source": source, "reason": f"is raw ({file.suffix}): write JPEGs of it"}
+
+
+def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
+    """The photographs of a folder and of those in it, in the order of their names, 10 after 9.
+    Hidden ones are left out, and folders of masks and those that the program fills, as the scene.
+    """
+    found = []
+    for place, folders, files in os.walk(folder):
+        here = Path(place)
+        if here != folder and has_manifest(here):
+            folders.clear()
+            continue
+        folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]
+        found += [here / f for f in files if f.lower().endswith(tuple(endings)) and f[0] != "."]
+    return sorted(found, key=lambda file: _natural(file.relative_to(folder).as_posix()))
+
+
+def _natural(name):
+    """A key by which numbers in names sort as numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
+
+
+def _take(folder, file, target):
+    """A photograph's facts; it is written under target and a suffix."""
+    source = file.relative_to(folder)
+    facts = {"source": source.as_posix()}
+    try:
+        with opened_regular(file) as opened:
+            image = Image.open(opened, formats=FORMATS)
+            image.load()
+            turned = ImageOps.exif_transpose(image)
+            upright = in_srgb(file, turned)
+            is_kept = image.format in KEPT and upright is turned
+            is_kept = is_kept and image.mode in ("RGB", "RGBA", "L")
+            is_kept = is_kept and image.getexif().get(ORIENTATION, 1) == 1 and not is_deep_png(file)
+            content = opened.seek(0) or opened.read() if is_kept else None
+            lens, exif = _lens(image.getexif())
+            # folders are of a round each, or of a camera
+            facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
+            facts["focal"] = _focal_of_larger(image.getexif().get_ifd(EXIF), image.size)
+    except Image.DecompressionBombError:
+        return facts | {"reason": "has more than 178 million pixels"}
+    except Exception as error:  # decoders meet broken bytes with whatever comes up
+        return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
+    facts |= _look(upright)
+    has_alpha = upright.has_transparency_data
+    suffix = KEPT[image.format] if is_kept else ".png" if has_alpha else ".jpg"
+    facts["name"] = target.name + suffix
+    with atomic_file(target.with_name(facts["name"])) as copy:
+        if is_kept:
+            copy.write(content)
+        elif has_alpha:
+            upright.convert("RGBA").save(copy, "PNG")
+        else:
+            upright.convert("RGB").save(copy, "JPEG", exif=exif, **QUALITY)
+    return facts
+
+
+def _lens(exif):
+    """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a focal
+    length): the rest may be broken, or longer than a JPEG has room for.
+    """
+    exposure, kept = exif.get_ifd(EXIF), Image.Exif()
+    kept.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
+    wanted = (FOCAL, FOCAL_35, *SENSOR)
+    kept.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
+    lens = [exif.get(MAKE), exif.get(MODEL), exposure.get(FOCAL), exposure.get(FOCAL_35)]
+    return " ".join(shown(str(part), 40) for part in lens), kept.tobytes()
+
+
+def _focal_of_larger(exposure, size):
+    """The focal length in pixels of a photograph that was reduced, or cropped to another shape and
+    reduced, while its EXIF still tells of the sensor's pixels, which COLMAP takes for the
+    photograph's; None where EXIF says nothing of the kind.
+    """
+    try:
+        across, down, density, unit = (float(exposure[tag]) for tag in SENSOR)
+        reduced = max(size[0] / across, size[1] / down)
+        focal = float(exposure[FOCAL]) * density / PER_MM[unit] * reduced
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None  # not told, or broken
+    is_told = not exposure.get(FOCAL_35) and abs(reduced - 1) > REDUCED
+    return focal if is_told and POSSIBLE[0] < focal / max(size) < POSSIBLE[1] else None
+
+
+# Films --------------------------------------------------------------------------------------------
+
+
+def _frames(film, images):
+    """The facts of the sharpest frame of each interval, written to `images`."""
+    chosen, is_hdr = _sharpest(film)
+    equal = [f"eq(n,{number})" for number in chosen]
+    # in groups, since ffmpeg sums no more than a hundred
+    some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
+    wanted = "+".join(f"({one})" for one in some)
+    frames = _decoded(film, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
+    next(frames)  # what is said of the film
+    bar = tqdm(chosen, "frames", unit="image", leave=False, disable=None)
+    for number, frame in zip(bar, frames, strict=False):
+        image, name = Image.fromarray(frame), f"{number:06d}.jpg"
+        with atomic_file(images / name) as file:
+            image.save(file, "JPEG", **QUALITY)
+        facts = {"name": name, "source": f"frame {number}", "lens": "film", "focal": None}
+        yield _look(image) | facts
+
+
+def _sharpest(film):
+    """(the number of the sharpest frame of each of FRAMES intervals, whether the film is HDR)."""
+    frames = _decoded(film, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
+    meta = next(frames)
+    # an estimate, for the bar alone: what browsers record states no length
+    total = round(meta["duration"] * meta["fps"]) or None
+    bar = tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
+    sharpness = [_look(Image.fromarray(frame[..., 0]))["sharpness"] for frame in bar]
+    if not sharpness:
+        raise UserError(f"{film}: holds no frames; give another video")
+    count = len(sharpness)
+    intervals = groupby(range(count), lambda number: number * FRAMES // max(count, FRAMES))
+    is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)
+    return [max(numbers, key=sharpness.__getitem__) for _, numbers in intervals], is_hdr
+
+
+def _decoded(film: Path, filters: str, pixels: str, channels: int) -> Iterator[Any]:
+    """What ffmpeg says of the film, then its frames after the filters, (H, W, channels) uint8."""
+    # which tells of a film that is shown turned, as phones make them
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
+    reading = needed("imageio_ffmpeg").read_frames(
+        film,
+        pixels,
+        bits_per_pixel=8 * channels,
+        input_params=LOCAL,
+        output_params=["-vf", filters, *EACH_ONCE],
+    )
+    try:
+        yield (meta := next(reading))
+        for content in reading:
+            yield np.frombuffer(content, np.uint8).reshape(*meta["size"][::-1], channels)
+    except (OSError, RuntimeError, ValueError, IndexError, KeyError, StopIteration) as error:
+        # ffmpeg's last line that says what is wrong, without its banner
+        lines = [line for line in str(error).splitlines() if "rror" in line or "nvalid" in line]
+        said = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
+        raise UserError(
+            f"{film}: cannot be read as a video ({shown(said, 100)}); give an MP4, MOV or WebM,"
+            " or a folder of photographs"
+        ) from None
+
+
+# What is left out ---------------------------------------------------------------------------------
+
+
+def _look(image):
+    """What is compared of an image: its sharpness (the variance of its Laplacian), its size and a
+    small copy.
+    """
+    cv2 = needed("cv2")
+    gray = image.convert("L")
+    gray.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
+    sharpness = float(cv2.Laplacian(np.array(gray), cv2.CV_64F).var())
+    small = np.array(gray.resize((SMALL, SMALL), Image.Resampling.BOX), np.float32)
+    return {"sharpness": round(sharpness, 2), "size": image.size, "small": small}
+
+
+def _leave_out(found):
+    """Give a reason to each image that is empty, blurred or there twice."""
+    good = [one for one in found if "reason" not in one]
+    sharpness = np.array([one["sharpness"] for one in good])
+    for i, one in enumerate(good):
+        usual = np.median(sharpness[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+        if one["sharpness"] < EMPTY:
+            one["reason"] = "shows nothing sharp"
+        elif one["sharpness"] < BLURRED * usual:
+            one["reason"] = f"is blurred (sharpness {one['sharpness'] / usual:.0%} of the usual)"
+    good = [one for one in good if "reason" not in one]
+    steps = [_difference(*two) for two in pairwise(good)]
+    last = good[0] if good else None
+    for i, one in enumerate(good[1:]):
+        usual = np.median(steps[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+        if _difference(last, one) < max(SAME, ALIKE * usual):
+            one["reason"] = f"shows the same as {last['source']}"
+        else:
+            last = one
+
+
+def _difference(one, other):
+    """Mean difference of the small copies, in levels, which a change of brightness does not
+    raise.
+    """
+    a, b = (image["small"] - image["small"].mean() for image in (one, other))
+    return float(np.abs(a - b).mean())

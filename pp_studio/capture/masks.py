@@ -1,0 +1,319 @@
+"""Masks of photographs with known cameras: given, of their alpha, of a uniform background, of a
+program of the user's; else cut out by colour around the sparse points and voted on by all views.
+"""
+
+import os
+import shlex
+import subprocess
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import binary_fill_holes
+from skimage.measure import label
+from skimage.segmentation import find_boundaries
+from tqdm import tqdm
+
+from pp_cl.engine.views import View, evenly, fitting_downscale
+from pp_cl.errors import UserError, listing, shown
+from pp_cl.files.contact_sheet import contact_sheet
+from pp_cl.files.image import read_mask, read_rgba, write_png
+from pp_cl.scene.agreement import disagreements
+from pp_cl.scene.image_file import Photograph, shrink
+from pp_cl.scene.masks import MaskRule, cut_out, named_mask, of_size
+from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
+from pp_studio.capture.cut import (
+    FORGIVEN,
+    GROWTHS,
+    cut_out_all,
+    forgiving_hull,
+    gap_of,
+    grown_box,
+    silhouette,
+    whole_mask,
+)
+from pp_studio.capture.packages import needed
+from pp_studio.capture.window import dilated, place_of, window
+
+cv2 = needed("cv2")
+
+OPAQUE = (".jpg", ".jpeg")  # files that have no alpha need not be read for it
+KEYED_SIDE = 1600  # pixels of what a uniform background is told from
+UNIFORM = 0.9  # of a photograph's border, and of the photographs, that show the background alone
+SPOT = 0.5  # of a region that a mask encloses, behind which others see the object
+ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
+CHECKED_SIDE = 200  # pixels of the masks that are compared
+SECONDS = 600  # that a program may take for a mask
+
+
+def mask_file(scene: Path, name: str) -> Path:
+    """Where write_masks() writes the mask of a photograph."""
+    return scene / "masks" / f"{Path(name).stem}.png"
+
+
+def write_masks(
+    scene: Path,
+    photographs: Sequence[Photograph],
+    box: np.ndarray,
+    points: np.ndarray,
+    seen: Sequence[np.ndarray],
+    *,
+    given: Path | None = None,
+    sources: Mapping[str, str] | None = None,
+    fitted: Callable[[str, np.ndarray], np.ndarray] = lambda _, mask: mask,
+    command: str | None = None,
+    turns: bool = False,
+    grows: bool = False,
+) -> tuple[str, list[str], np.ndarray]:
+    """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
+    lies there is kept, and helps to make the others. Returns one line on what was done, the names
+    of photographs whose masks contradict the others, the worst first, and the box.
+
+    scene: the folder that the photographs' names are relative to; their images have no distortion.
+    box: (2, 3) around the object. points: (N, 3) in the scene's world. seen: for each photograph
+    the indices (M,) of the points that it shows. given: a folder of masks of the photographs as
+    they were taken, which may be named like the photographs' sources, as {name: source} has them;
+    fitted(name, mask) is such a mask, (H, W) uint8, for the image. command: of a program that makes
+    masks, which {image} and {mask} stand for. turns: the object turns before a background that
+    stands still. grows: whether the box is enlarged where it cuts off what is cut out. Raises
+    UserError for masks that are given and missing or broken, a program that fails, a box in which
+    nothing is seen.
+    """
+    words = None if command is None else program_words(command)
+    (scene / "masks").mkdir(exist_ok=True)
+    left = _without_mask(scene, photographs)
+    how = {"kept": len(photographs) - len(left)}
+    shown = [i for i, one in enumerate(photographs) if place_of(one, box)]
+    shown = shown or list(range(len(photographs)))  # which window() refuses
+    beside = {one.name for one in photographs} - {photographs[i].name for i in shown}
+    for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
+        source, mask = _found(scene, one, given, sources or {}, fitted, words)
+        if mask is None and one.name in beside:  # as films have, where they begin or end
+            source = "empty, as the object is outside"
+            mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
+        if mask is not None:
+            write_png(mask_file(scene, one.name), mask)
+            how[source] = how.get(source, 0) + 1
+    if _without_mask(scene, photographs):
+        inside = ((points > box[0]) & (points < box[1])).all(1)
+        in_view, seen = [photographs[i] for i in shown], [seen[i] for i in shown]
+        bar = tqdm(in_view, "reading images", unit="image", leave=False, disable=None)
+        windows = [_window(scene, one, box) for one in bar]
+        of_object = [points[some[inside[some]]] for some in seen]
+        how |= _uniform(scene, in_view, windows, box, of_object)
+        if _without_mask(scene, in_view):
+            box, found = _cut(scene, in_view, windows, box, points, inside, seen, turns, grows)
+            how |= found
+    counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
+    wrong = _contradicting(scene, photographs, box)
+    if wrong:
+        shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
+        counts += f"; {len(wrong)} contradict the others: {listing(shares)}"
+    return counts, list(wrong), box
+
+
+def _without_mask(scene, photographs):
+    return [one for one in photographs if not mask_file(scene, one.name).is_file()]
+
+
+def _found(scene, photograph, given, sources, fitted, words):
+    """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
+    if it has not.
+    """
+    file, size = scene / photograph.name, (photograph.camera.width, photograph.camera.height)
+    if given is not None:
+        mask = named_mask(given, sources.get(file.name, file.name), file.name)
+        return "given", fitted(photograph.name, of_size(read_mask(mask), size, mask))
+    if words is not None:
+        return "by the program", _of_program(words, file, size[::-1])
+    if not photograph.name.lower().endswith(OPAQUE):
+        alpha = read_rgba(file)[..., 3]
+        if (alpha < 255).any():
+            return "of their alpha", alpha
+    return "none", None
+
+
+def _of_program(words, image, shape):
+    """The mask that a program makes of a photograph. Raises UserError."""
+    who = f"--mask-command: {shown(words[0])}: {image.name}"
+    with tempfile.TemporaryDirectory(prefix="pp-cl-") as folder:
+        mask = Path(folder) / "mask.png"
+        for key, path in (("{image}", image.resolve()), ("{mask}", mask)):
+            words = [word.replace(key, str(path)) for word in words]
+        try:
+            done = subprocess.run(words, capture_output=True, timeout=SECONDS, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise UserError(f"{who}: {error}; fix the command") from None
+        if done.returncode or not mask.is_file():
+            said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word of it"]
+            what = f"status {done.returncode}" if done.returncode else "no mask written"
+            raise UserError(f"{who}: {what}: {shown(said[-1])}; fix the command")
+        found = read_mask(mask)
+    if found.shape != shape:
+        raise UserError(f"{who}: its mask has another size than the photograph; fix the command")
+    return found
+
+
+def program_words(command: str) -> list[str]:
+    """The words of --mask-command. Raises UserError unless they name a program, {image}, {mask}."""
+    lexer = shlex.shlex(command, posix=True)
+    lexer.whitespace_split, lexer.commenters = True, ""
+    if os.name == "nt":  # where backslashes part folders, and names hold apostrophes
+        lexer.escape, lexer.quotes = "", '"'
+    try:
+        words = list(lexer)
+    except ValueError as error:
+        raise UserError(f"--mask-command {command}: {error}; fix the quotes") from None
+    if not words or "{image}" not in command or "{mask}" not in command:
+        raise UserError(f"--mask-command {command}: write it as 'PROGRAM {{image}} {{mask}}'")
+    return words
+
+
+def _kept(scene, photograph):
+    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written. Raises
+    UserError for one of another shape.
+    """
+    file = mask_file(scene, photograph.name)
+    return of_size(read_mask(file), (photograph.camera.width, photograph.camera.height), file)
+
+
+def _window(scene, photograph, box):
+    """The Window of a photograph, with its mask if that is written."""
+    found = window(read_rgba(scene / photograph.name)[..., :3], photograph, box)
+    if mask_file(scene, photograph.name).is_file():
+        found.mask = found.reduced(_kept(scene, photograph)) > 127
+    return found
+
+
+def _uniform(scene, photographs, windows, box, points):
+    """Write the masks of photographs before a uniform background, where nearly all of those without
+    a mask are. points: (M, 3) of the object that each shows. Returns {what: how many}.
+    """
+    left = [i for i, one in enumerate(windows) if one.mask is None]
+    with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
+    found = {i: _before_uniform(windows[i], points[i], with_holes) for i in left}
+    found = {i: mask for i, mask in found.items() if mask is not None}
+    if len(found) < UNIFORM * len(left):
+        return {}
+    for i, mask in found.items():
+        windows[i].mask = mask
+    spots = _spots(windows, found, box) if with_holes and found else {}
+    for i in tqdm(found, "masks", unit="image", leave=False, disable=None):
+        name, one = photographs[i].name, windows[i]
+        mask, one.mask = uniform_mask(read_rgba(scene / name), name, with_holes), None
+        if mask is None:
+            continue
+        if i in spots:
+            x0, y0, x1, y1 = one.place
+            closed = cv2.resize(spots[i].astype(np.uint8), (x1 - x0, y1 - y0)) > 0
+            mask[y0:y1, x0:x1][closed] = 255
+        write_png(mask_file(scene, name), mask)
+        one.mask = one.reduced(mask) > 127
+    return {"before a uniform background": sum(windows[i].mask is not None for i in found)}
+
+
+def _spots(windows, numbers, box):
+    """{number of a window: (H, W) bool, the regions in the background's colour that its mask
+    encloses, but behind which the other views see the object}.
+    """
+    hull, _, edge = forgiving_hull([one for one in windows if one.mask is not None], box)
+    found = {}
+    for i in numbers:
+        one = windows[i]
+        regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
+        held = silhouette(one, hull, gap_of(one, hull, edge))
+        is_spot = np.bincount(regions.ravel(), held.ravel()) > SPOT * np.bincount(regions.ravel())
+        is_spot[0] = False
+        found[i] = dilated(is_spot[regions], 1)
+    return found
+
+
+def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
+    """(H, W) uint8 mask of a photograph (H, W, 3 or 4), None where its border shows more than one
+    colour. with_holes: as cut_out() takes it.
+    """
+    height, width = image.shape[:2]
+    scale = min(1, KEYED_SIDE / max(height, width))
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    small = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    try:
+        mask = cut_out(small, name, MaskRule.tolerance, with_holes)[..., 3]
+    except UserError:
+        return None
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    return cv2.resize(mask, (width, height)) if (border < 128).mean() >= UNIFORM else None
+
+
+def inside(file: Path, is_turntable: bool) -> np.ndarray | None:
+    """(H, W) uint8: where a photograph shows the object by its alpha, which may hide a wall, or on
+    a turntable by its uniform background; None where neither tells.
+    """
+    if file.name.lower().endswith(OPAQUE) and not is_turntable:
+        return None
+    image = read_rgba(file)
+    if (image[..., 3] < 255).any():
+        return np.where(image[..., 3] > 127, np.uint8(255), np.uint8(0))
+    return uniform_mask(image, file.name) if is_turntable else None
+
+
+def _before_uniform(window, points, with_holes):
+    """(H, W) bool: the mask of a window whose background is uniform, and from which all points
+    (M, 3) of the object stand out; else None.
+    """
+    mask = uniform_mask(window.image, window.name, with_holes)
+    if mask is None:
+        return None
+    mask = mask > 127
+    _, rows, columns = window.inside(points)
+    held = mask[rows, columns].mean() if len(rows) else mask.any()
+    return mask if held >= ON_MASK else None
+
+
+def _cut(scene, photographs, windows, box, points, inside, seen, turns, grows):
+    """Cut out what has no mask, and write it. Returns the box, and {what: how many}."""
+    left = [i for i, one in enumerate(windows) if one.mask is None]
+    for growth in range(1 + GROWTHS):
+        cut_out_all(windows, box, points, inside, seen, turns)
+        larger = grown_box(windows, box) if grows and growth < GROWTHS else None
+        if larger is None:
+            break
+        box = larger
+        windows = [_window(scene, one, box) for one in photographs]
+    for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
+        name = photographs[i].name
+        mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
+        write_png(mask_file(scene, name), mask)
+    return box, {"cut out": len(left)}
+
+
+def picture(
+    scene: Path, photographs: Sequence[Photograph], first: Sequence[str] = ()
+) -> np.ndarray:
+    """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks drawn
+    over them. first: names of those that come first; the others are spread evenly.
+    """
+    wrong = [one for one in photographs if one.name in first][:SHOWN_VIEWS]
+    others = [one for one in photographs if one.name not in first]
+    chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
+    images = []
+    for one in chosen:
+        photograph, mask = read_rgba(scene / one.name), _kept(scene, one)
+        factor = fitting_downscale(mask.shape, SHOWN_SIZE)
+        image = shrink(photograph, factor)[..., :3]
+        held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
+        image[~held] //= 2
+        image[find_boundaries(held, mode="thick")] = OUTLINE
+        images.append(image)
+    return contact_sheet(images, [Path(one.name).name for one in chosen])
+
+
+def _contradicting(scene, photographs, box):
+    """{name: share of the object that its mask alone rejects} of those that contradict others."""
+    views = []
+    for one in photographs:
+        mask = _kept(scene, one)
+        factor = fitting_downscale(mask.shape, CHECKED_SIDE)
+        image = shrink(np.dstack([mask] * 4), factor)
+        views.append(View(one.name, one.camera.downscaled(factor), image))
+    return {one.view.name: one.share for one in disagreements(views, box)}

@@ -1,0 +1,176 @@
+"""Where each image was taken, by pycolmap's incremental mapping, and why some have no place."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from pp_cl.engine.camera import Camera
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_folder
+from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.image_file import Photograph
+from pp_studio.capture.features import cores, forget_focal_lengths, quiet
+from pp_studio.capture.packages import needed
+
+LEAST_SHARE = 0.5  # of the images that have a place
+MANY = 0.75  # of the images of a turned object; with fewer they are placed as others are, too
+FEW_FEATURES, FEW_MATCHES = 200, 30
+GROWTH = 1.4  # COLMAP's 1.1 takes twice the time
+CLOSER = 8.0  # degrees between the two images of a turned object that the mapping begins with
+FEW = 0.15  # of the matches that images have with their best: pairs of a turned object with fewer
+# are far apart, or look alike where a pattern repeats
+BELIEVED = 2.0  # of the points' median error: observations that are further off count less
+CONVERGED = 1e-5  # relative change of the sum of errors
+BLURRED = 0.4  # of the median sharpness
+
+
+def place(
+    database: Path, images: Path, model: Path, taken: Sequence[dict], turns: bool
+) -> dict[str, Any]:
+    """Write the largest model that the matches give to the new folder `model`.
+
+    taken: what take_images() says of the images. turns: the object turns before a camera that
+    stays, and all matches are its own; where few images fit so, they are placed as usual. Returns
+    the numbers of images and points, the reprojection error in pixels, and {image: reason} of those
+    without a place. Raises UserError where more than a half have none.
+    """
+    least = max(3, LEAST_SHARE * len(taken))
+    with atomic_folder(model) as unfinished:
+        found = _mapped(database, images, unfinished, len(taken), turns)
+        if turns and all(one.num_reg_images() < MANY * len(taken) for one in found):
+            (usual := unfinished / "usual").mkdir()
+            found += _mapped(database, images, usual, len(taken), False)
+        if all(one.num_reg_images() < least for one in found):  # EXIF may be of another size
+            (again := unfinished / "again").mkdir()
+            copy = Path(shutil.copy(database, again))  # a stopped run finds its own as it was
+            if forget_focal_lengths(copy):
+                found += _mapped(copy, images, again, len(taken), turns)
+        if found:
+            best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()))
+            for folder in list(unfinished.iterdir()):
+                shutil.rmtree(folder)
+            refine(best)
+            best.write(unfinished)
+        placed = {image.name for image in best.images.values() if image.has_pose} if found else ()
+        reasons = _reasons(database, taken, placed)
+        if len(placed) < least:
+            some = "; ".join(f"{name} {why}" for name, why in list(reasons.items())[:3])
+            raise UserError(
+                f"{images}: only {len(placed)} of {len(taken)} images could be placed ({some});"
+                " take more of them with more overlap (10 degrees apart or less), sharp and of an"
+                " object that has some texture"
+            )
+        return {
+            "placed": len(placed),
+            "points": best.num_points3D(),
+            "error": round(best.compute_mean_reprojection_error(), 3),
+            "unplaced": reasons,
+        }
+
+
+def _mapped(database, images, folder, count, turns):
+    """pycolmap's models of what fits together.
+
+    Without a background, images that are as far apart as those that COLMAP begins with have fewer
+    matches than a pattern has with itself, and closer ones do not tell focal length from lens.
+    """
+    with quiet(database) as colmap:
+        options = colmap.IncrementalPipelineOptions(
+            min_model_size=3, num_threads=cores(), random_seed=0
+        )
+        # all cameras are refined at the end, and before that whenever there are so many more
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH
+        if turns:
+            usual = np.median(list(_most_matches(database).values()))
+            options.min_num_matches = max(options.min_num_matches, int(FEW * usual))
+            options.mapper.init_min_tri_angle = CLOSER
+            options.ba_refine_extra_params = False  # refine() finds them
+        with tqdm(total=count, desc="poses", unit="image", leave=False, disable=None) as bar:
+            models = colmap.incremental_mapping(
+                database, images, folder, options, next_image_callback=lambda: bar.update()
+            )
+            return list(models.values())
+
+
+def refine(model: Any) -> None:
+    """Adjust all cameras and points once more, with a loss by which the few wrong matches, mostly
+    of patterns that repeat, no longer pull at the cameras.
+    """
+    colmap = needed("pycolmap")
+    model.update_point_3d_errors()
+    error = np.median([point.error for point in model.points3D.values()])
+    options = colmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = BELIEVED * error
+    options.ceres.solver_options.function_tolerance = CONVERGED
+    options.ceres.solver_options.num_threads = cores()
+    colmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+
+
+def _reasons(database, taken, placed):
+    """{image: why it has no place}."""
+    best = _most_matches(database)
+    with needed("pycolmap").Database.open(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        features = {name: db.num_keypoints_for_image(i) for name, i in ids.items()}
+    usual = np.median([one["sharpness"] for one in taken])
+    reasons = {}
+    for one in taken:
+        name = one["name"]
+        if name in placed:
+            continue
+        matches = best.get(ids.get(name), 0)
+        if one["sharpness"] < BLURRED * usual:
+            reasons[name] = f"is blurred (sharpness {one['sharpness'] / usual:.0%} of the usual)"
+        elif features.get(name, 0) < FEW_FEATURES:
+            reasons[name] = f"has few features ({features.get(name, 0)}): blurred, dark or plain"
+        elif matches < FEW_MATCHES:
+            reasons[name] = f"has few matches with any other ({matches}): too little overlap"
+        else:
+            reasons[name] = f"fits no others that are placed (at most {matches} matches)"
+    return reasons
+
+
+def _most_matches(database):
+    """{image's id: its matches with the image with which it has most}."""
+    with needed("pycolmap").Database.open(database) as db:
+        best = {image.image_id: 0 for image in db.read_all_images()}
+        for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
+            for one in needed("pycolmap").pair_id_to_image_pair(pair):
+                best[one] = max(best[one], matches)
+    return best
+
+
+def photographs(model: Any) -> list[Photograph]:
+    """The images of pycolmap's model that have a place, in the order of their names, as a scene
+    lists them that has them in its folder `images`.
+    """
+    found = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if not image.has_pose:
+            continue
+        lens = model.cameras[image.camera_id]
+        focal, cx, cy, k1 = lens.params  # of features.LENS
+        world = image.cam_from_world().inverse().matrix()
+        camera = Camera(np.array(world), focal, focal, cx, cy, lens.width, lens.height)
+        found.append(Photograph(f"images/{image.name}", camera, distortion=Distortion(k1)))
+    return found
+
+
+def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
+    """((N, 3) points of pycolmap's model that at least so many images show, for each of
+    photographs() the indices of those in it).
+    """
+    kept = [number for number, one in model.points3D.items() if one.track.length() >= least]
+    index = {number: k for k, number in enumerate(kept)}
+    shown = [
+        np.array([index[p.point3D_id] for p in image.points2D if p.point3D_id in index], int)
+        for image in sorted(model.images.values(), key=lambda image: image.name)
+        if image.has_pose
+    ]
+    return np.array([model.points3D[number].xyz for number in kept]), shown

@@ -1,0 +1,455 @@
+"""The stages from photographs or a film to a scene, each of which is done once: what it found lies
+in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes on after these.
+"""
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.views import evenly, fitting_downscale
+from pp_cl.errors import UserError, listing
+from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
+from pp_cl.files.contact_sheet import contact_sheet
+from pp_cl.files.image import read_rgba, write_png
+from pp_cl.files.manifest import (
+    begin_manifest,
+    check_ours,
+    has_manifest,
+    note_in_place,
+    ours,
+    remove_ours,
+)
+from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.edits import read_edits
+from pp_cl.scene.image_file import shrink
+from pp_cl.scene.masks import named_mask
+from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
+from pp_cl.scene.overview import overview
+from pp_cl.scene.readers.common import read_json
+from pp_cl.scene.readers.frame import frame_keys
+from pp_cl.scene.readers.transforms import SINGLE
+from pp_studio.capture import STAGES, box, features, frames, masks, pinhole, poses, still
+from pp_studio.capture.packages import isolated, needed
+
+FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
+SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
+# decimals of what the scene states: the last digits depend on how COLMAP's threads share a sum
+DECIMALS = 9
+# stages that keep what was done when they are stopped
+RESUMED = ("features", "matches", "images", "masks")
+# what each stage leaves beside its JSON and its picture, in the scene's folder
+LEFT = {
+    "frames": ("capture/frames",),
+    "features": ("capture/inside", *(f"capture/database.db{end}" for end in ("", "-shm", "-wal"))),
+    "matches": ("capture/turns",),
+    "poses": ("capture/model",),
+    "images": ("images",),
+    "box": (),
+    "masks": ("masks",),
+    "scene": (SINGLE, "sparse", "points.ply"),
+}
+CHANGING = (*LEFT["features"][1:], *LEFT["matches"])  # in place
+# {option: (the stage that depends on it, what it is where it is not given)}
+OPTIONS: dict[str, tuple[str, Any]] = {
+    "source": ("frames", None),
+    "turntable": ("features", False),
+    "box": ("box", None),
+    "masks": ("masks", None),
+    "mask_command": ("masks", None),
+}
+
+
+class Capture:
+    """A capture in progress in the folder of a scene.
+
+    given: {name: value} of the OPTIONS that are given; others are as in the captures before. tell:
+    prints a line of a stage.
+    """
+
+    def __init__(self, scene: Path, given: dict[str, Any], tell: Callable[[str], None]) -> None:
+        self.scene, self.given, self.tell = scene, given, tell
+        self.work, self.images = scene / "capture", scene / "images"
+        self.frames = self.work / "frames"
+        self.database, self.model = self.work / "database.db", self.work / "model"
+        self.turns = self.work / "turns"
+        self.kept = self.work / "options.json"
+        self.options: dict[str, Any] = {}
+
+    @property
+    def source(self) -> Path:
+        """The photographs or the film."""
+        return Path(self.options["source"])
+
+    def run(self, begin: str | None = None, *, replace_masks: bool = False) -> None:
+        """Do all stages that are not done, or one of them and all after it, and those that depend
+        on an option that has changed. Masks that the user has changed are kept, or replaced, too.
+        Raises UserError, before anything is removed, where a file of the user's would be lost or
+        what an option names is not there.
+        """
+        with self._locked():
+            changed = self._take_options(begin)
+            anew = {begin, *(OPTIONS[name][0] for name in changed)}
+            anew |= {"masks"} if replace_masks else set()
+            done = list(takewhile(lambda one: one not in anew and self._is_done(one), STAGES))
+            left = list(STAGES)[len(done) :]
+            mended = self._mended() if "masks" in left else []
+            self._check_options(left, [] if replace_masks else mended)
+            if mended and "images" in left and not replace_masks:
+                raise UserError(
+                    f"{mended[0]}: was made or changed by hand, for images that are made again;"
+                    " move it away, or add --replace-masks"
+                )
+            files = {stage: self._files(stage) for stage in left}
+            for stage in left:
+                check_ours(files[stage])
+            note_in_place(self.scene, [self.scene / name for name in CHANGING])
+            remove_leftovers(self.scene)
+            for path in mended if replace_masks else ():
+                path.unlink()
+            for stage in reversed(left):
+                if stage != left[0] or stage in anew or stage not in RESUMED:
+                    if stage == "matches" and self.database.exists():
+                        features.forget_matches(self.database)
+                    remove_ours(files[stage])
+            if changed or not self.kept.exists():
+                write_json(self.kept, self.options)
+            for stage in done:
+                new = self._new() if stage == "frames" else ""
+                self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
+            for name in changed:
+                redone = OPTIONS[name][0]
+                self.tell(f"{_option(name)} has changed: {redone} and all after it are repeated")
+            for stage in left:
+                start = time.monotonic()
+                found = getattr(self, f"_{stage}")()
+                write_json(self._file(stage), found)
+                self.tell(f"{stage}: {found['line']} ({time.monotonic() - start:.0f} s)")
+
+    def _is_done(self, stage):
+        return self._file(stage).is_file()
+
+    def _new(self):
+        """What photographs have come since they were taken, in words."""
+        found = self._found("frames")
+        known = {one["source"] for one in (*found["images"], *found["left_out"])}
+        files = frames.listed(self.source) if self.source.is_dir() else []
+        names = [file.relative_to(self.source).as_posix() for file in files]
+        new = [name for name in names if name not in known]
+        return f"; {listing(new)} came later: --from frames takes all of them again" if new else ""
+
+    @contextmanager
+    def _locked(self):
+        """While it is entered, no other process captures into the folder, which is made."""
+        if self.scene.exists() and not has_manifest(self.scene) and any(self.scene.iterdir()):
+            raise UserError(f"{self.scene}: exists already; choose a new or empty folder")
+        try:
+            begin_manifest(self.scene)
+            self.work.mkdir(exist_ok=True)
+            with FileLock(self.work / ".pp-cl.lock", timeout=0):
+                yield
+        except Timeout:
+            raise UserError(f"{self.scene}: another process captures into it; wait") from None
+
+    def _take_options(self, begin):
+        """Fill in the options of this capture; returns the names of those that have changed."""
+        before = {name: value for name, (_, value) in OPTIONS.items()}
+        self.options = before | self.given
+        if not self.kept.exists():
+            return []
+        before = read_json(self.kept)
+        if not isinstance(before, dict) or before.keys() != OPTIONS.keys():
+            raise UserError(
+                f"{self.kept}: does not have the options {', '.join(OPTIONS)}; delete it, and give"
+                " them again"
+            )
+        self.options = before | self.given
+        changed = [name for name in OPTIONS if self.options[name] != before[name]]
+        if "source" in changed and begin != "frames" and self._is_done("frames"):
+            if not self._has_moved(Path(before["source"])):
+                raise UserError(
+                    f"{self.scene}: was made from {before['source']}; choose another --out, or"
+                    " begin again with --from frames"
+                )
+            write_json(self.kept, before | {"source": self.options["source"]})
+            changed.remove("source")
+        return changed
+
+    def _has_moved(self, before):
+        """Whether the source is what was at another place before, where nothing is now: photographs
+        of the same names, or a video of the same name.
+        """
+        if before.exists():
+            return False
+        if not self.source.is_dir():
+            return self.source.name == before.name
+        taken = {one["source"] for one in self._found("frames")["images"]}
+        names = {file.relative_to(self.source).as_posix() for file in frames.listed(self.source)}
+        return taken <= names
+
+    def _check_options(self, left, mended):
+        """Raise UserError where what the options of the stages that are left name is not there.
+        mended: masks that are kept.
+        """
+        if "frames" in left and self._is_done("frames") and self.source.is_dir():
+            count = len(frames.listed(self.source))
+            if count < frames.LEAST:
+                raise UserError(
+                    f"{self.source}: {count} photographs in it, at least {frames.LEAST} are needed"
+                )
+        command, given = self.options["mask_command"], self.options["masks"]
+        if "masks" not in left:
+            return
+        if command is not None and shutil.which(masks.program_words(command)[0]) is None:
+            raise UserError(f"--mask-command {command}: no such program; install it, or fix it")
+        if given is not None and not Path(given).is_dir():
+            raise UserError(f"--masks {given}: no such folder; auto makes them")
+        if given is not None and self.source.is_dir() and not {"frames", "poses"} & {*left}:
+            unplaced = self._found("poses")["unplaced"]
+            for one in self._found("frames")["images"]:
+                is_kept = masks.mask_file(self.scene, one["name"]) in mended
+                if one["name"] not in unplaced and not is_kept:
+                    named_mask(Path(given), one["source"], one["name"])
+
+    def _files(self, stage):
+        """What a stage has left, and what else lies in its folders, but for masks of others. Its
+        JSON comes first: without it the stage is not done.
+        """
+        found = [self._file(stage), self._file(stage).with_suffix(".png")]
+        for path in (self.scene / name for name in LEFT[stage]):
+            inside = path.rglob("*") if path.is_dir() else [path]
+            inside = [one for one in inside if one.is_symlink() or not one.is_dir()]
+            found += ours(inside) if stage == "masks" else inside
+        return found
+
+    def _mended(self):
+        """The masks of the images that the user has made or changed, which are kept."""
+        taken = self._found("frames")["images"] if self._is_done("frames") else []
+        named = [masks.mask_file(self.scene, one["name"]) for one in taken]
+        there = [path for path in named if path.is_file()]
+        return sorted(set(there) - set(ours(there)))
+
+    def _show(self, stage, picture):
+        write_png(self._file(stage).with_suffix(".png"), picture)
+
+    def _found(self, stage):
+        return read_json(self._file(stage))
+
+    def _file(self, stage):
+        return self.work / f"{stage}.json"
+
+    @cached_property
+    def _dev(self):
+        """Where distortion is removed."""
+        return open_device()
+
+    # ---- the stages
+
+    def _frames(self):
+        found = frames.take_images(self.source, self.frames)
+        names = [one["name"] for one in evenly(found["images"], SHOWN_VIEWS)]
+        shown = [read_rgba(self.frames / name) for name in names]
+        shown = [shrink(one, fitting_downscale(one.shape[:2], SHOWN_SIZE)) for one in shown]
+        self._show("frames", contact_sheet(shown, names))
+        left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
+        line = f"{len(found['images'])} images" + _left_out(left_out, "left out")
+        return {"line": line, **found}
+
+    def _features(self):
+        taken = self._found("frames")["images"]
+        inside = self._inside([one["name"] for one in taken])
+        counts = isolated(
+            self.work, features.find_features, self.database, self.frames, taken, inside
+        )
+        middle = int(np.median(list(counts.values())))
+        return {"line": f"{middle} in an image", "counts": counts}
+
+    def _inside(self, names):
+        """A folder of masks in which features are looked for: the alpha of cut-outs, and on a
+        turntable what stands before a uniform background; None where it is not uniform, but stands
+        still, or where there are none.
+        """
+        folder = self.work / "inside"
+        if folder.is_dir() and any(folder.iterdir()):  # the stage was stopped, and goes on
+            return folder
+        try:
+            with atomic_folder(folder) as unfinished:
+                for name in names:
+                    mask = masks.inside(self.frames / name, self.options["turntable"])
+                    if mask is not None:
+                        write_png(unfinished / f"{name}.png", mask)
+                    elif self.options["turntable"]:
+                        raise UserError(name)
+        except UserError:
+            return None
+        return folder if any(folder.iterdir()) else None
+
+    def _matches(self):
+        is_film = not self.source.is_dir()
+        pairs = isolated(self.work, features.match, self.database, is_film)
+        turntable = self.options["turntable"]
+        turns = isolated(self.work, still.remove_still, self.database, self.turns, turntable)
+        line = f"{pairs} pairs of images"
+        if turns:
+            line += "; the object turns before a background that stands still, which is left out"
+        return {"line": line, "turns": turns}
+
+    def _poses(self):
+        taken = self._found("frames")["images"]
+        turns = self._found("matches")["turns"]
+        found = isolated(
+            self.work, poses.place, self.database, self.frames, self.model, taken, turns
+        )
+        model = needed("pycolmap").Reconstruction(self.model)
+        self._show("poses", _seen_from_outside(model, None))
+        unplaced = [f"{name} {why}" for name, why in found["unplaced"].items()]
+        line = (
+            f"{found['placed']} of {len(taken)} images, {found['points']} points, reprojection"
+            f" error {found['error']:.2f} pixels"
+        )
+        return {"line": line + _left_out(unplaced, "without a place"), **found}
+
+    def _images(self):
+        model = needed("pycolmap").Reconstruction(self.model)
+        taken = poses.photographs(model)
+        made = pinhole.write_images(self._dev, self.frames, self.images, taken)
+        kept = f", {len(taken) - made} of them before" if made < len(taken) else ""
+        return {"line": f"{len(taken)} without distortion{kept}"}
+
+    def _box(self):
+        model = needed("pycolmap").Reconstruction(self.model)
+        cameras = [one.camera for one in poses.photographs(model)]
+        world = box.find_world(cameras, poses.points(model)[0])
+        corners = self.options["box"]
+        chosen = world.box if corners is None else np.sort(np.reshape(corners, (2, 3)), axis=0)
+        size = " x ".join(f"{side:.2f}" for side in np.ptp(chosen, axis=0))
+        _move(model, world.scale, world.rotation, world.shift)
+        eyes = [one.camera.eye for one in poses.photographs(model)]
+        distance = np.median(np.linalg.norm(eyes, axis=1))
+        self._show("box", _seen_from_outside(model, chosen))
+        return {
+            "line": f"{size}, the cameras {distance:.2f} from its middle",
+            "scale": float(world.scale),
+            "rotation": world.rotation.tolist(),
+            "shift": world.shift.tolist(),
+            "box": chosen.tolist(),
+        }
+
+    def _masks(self):
+        model, before = self._world()
+        corners, edits = before, read_edits(self.scene)
+        given, dropped = self.options["masks"], edits.dropped
+        is_given = self.options["box"] is not None or edits.box is not None
+        taken = {one.name: one for one in poses.photographs(model)}
+        photographs = [replace(one, distortion=Distortion()) for one in taken.values()]
+        points, seen = poses.points(model, FOLLOWED)
+        kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
+        files = self._found("frames")["images"] if self.source.is_dir() else []
+        sources = {one["name"]: one["source"] for one in files}
+
+        def fitted(name, mask):
+            return pinhole.undistorted_mask(self._dev, mask, taken[name])
+
+        def write(chosen):
+            return masks.write_masks(
+                self.scene,
+                [photographs[i] for i in chosen],
+                corners,
+                points,
+                [seen[i] for i in chosen],
+                given=given and Path(given),
+                sources=sources,
+                fitted=fitted,
+                command=self.options["mask_command"],
+                turns=self._found("matches")["turns"],
+                grows=not is_given,
+            )
+
+        line, wrong, corners = write(kept)
+        if dropped:  # they have had no say in the others
+            write(range(len(photographs)))
+        self._show("masks", masks.picture(self.scene, photographs, wrong))
+        if (corners == before).all():
+            return {"line": line}
+        size = " x ".join(f"{side:.2f}" for side in np.ptp(corners, axis=0))
+        return {"line": f"{line}; the box cut the object: now {size}", "box": corners.tolist()}
+
+    def _scene(self):
+        model, corners = self._world()
+        found = poses.photographs(model)
+        places = [
+            {
+                "file_path": one.name,
+                "mask_path": masks.mask_file(Path(), one.name).as_posix(),
+                **_rounded(frame_keys(one.camera)),
+            }
+            for one in found
+        ]
+        pinhole.undistort_model(model)
+        with atomic_folder(self.scene / "sparse") as unfinished:
+            (unfinished / "0").mkdir()
+            model.write(unfinished / "0")
+        with atomic_path(self.scene / "points.ply") as unfinished:
+            model.export_PLY(unfinished)
+        write_json(
+            self.scene / SINGLE,
+            {
+                "camera_model": "OPENCV",
+                "ply_file_path": "points.ply",
+                "aabb": _rounded(corners.tolist()),
+                "frames": places,
+            },
+        )
+        return {"line": f"wrote {self.scene / SINGLE} with {len(found)} photographs"}
+
+    def _world(self):
+        """(pycolmap's model in the scene's world, (2, 3) box of the object there: the user's, if
+        one was chosen in the page of `pp-cl view`; once masks are made, the one that they
+        need).
+        """
+        model, found = needed("pycolmap").Reconstruction(self.model), self._found("box")
+        _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
+        edited = read_edits(self.scene).box
+        if edited is not None:
+            return model, edited
+        grown = self._found("masks").get("box") if self._is_done("masks") else None
+        return model, np.array(grown or found["box"])
+
+
+def _option(name):
+    """What an option is called on the command line."""
+    return "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
+
+
+def _rounded(found):
+    """Lists and values of dictionaries with DECIMALS."""
+    if isinstance(found, dict):
+        return {key: _rounded(value) for key, value in found.items()}
+    return np.round(found, DECIMALS).tolist()
+
+
+def _move(model, scale, rotation, shift):
+    """Move pycolmap's model by a similarity."""
+    colmap = needed("pycolmap")
+    model.transform(colmap.Sim3d(scale, colmap.Rotation3d(rotation), shift))
+
+
+def _seen_from_outside(model, box):
+    """The picture of a model's points and cameras, and a box (2, 3), from two sides."""
+    cameras = [one.camera for one in poses.photographs(model)]
+    colours = np.array([point.color for point in model.points3D.values()])
+    return overview(cameras, box, poses.points(model)[0], colours, SHOWN_WIDTH)
+
+
+def _left_out(lines: Sequence[str], what: str) -> str:
+    """`; 3 left out: A, B and 1 more`, empty without lines."""
+    return f"; {len(lines)} {what}: {listing(lines)}" if lines else ""

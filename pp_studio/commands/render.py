@@ -1,0 +1,222 @@
+"""`pp-cl render`: renders a run along a path of cameras, as a film or as frames."""
+
+import argparse
+import math
+import mimetypes
+import statistics
+from pathlib import Path
+
+from pp_cl.commands import options as shared
+from pp_cl.errors import UserError
+
+HELP = "render a run along a path of cameras: a video, or frames with alpha and depth"
+EPILOG = """paths:
+  orbit       a circle around the object, at the height of the photographs
+  spiral      two turns, from the lowest photographs to the highest
+  SPLIT       the cameras of a split of the scene: train, val, test
+  FILE        nerfstudio's camera_path.json, a transforms.json, or cameras.json of 3D Gaussian
+              Splatting and brush, in the world of the scene"""
+FILMS, IMAGES = ("mp4", "webm", "webp", "gif"), ("png", "exr")
+COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "transparent": None}
+MADE = ("orbit", "spiral")  # paths that the program makes
+SECONDS, FPS = 4, 30
+FASTEST_GIF = 50  # frames per second; browsers show faster ones slowly
+MOST_FRAMES = 100_000
+
+
+def _colour(text):
+    """The type of --background: a key of COLOURS, or sRGB in [0, 1]."""
+    if text in COLOURS:
+        return text
+    try:
+        red, green, blue = map(shared.integer(0, 255), text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        raise argparse.ArgumentTypeError(
+            f"{text}: write white, black, transparent or R,G,B from 0 to 255"
+        ) from None
+    return red / 255, green / 255, blue / 255
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add("run_folder", metavar="RUN", help="folder of the run")
+    add("--path", default="orbit", metavar="P", help="orbit (default), spiral, SPLIT or FILE")
+    add(
+        "--out",
+        metavar="NAME",
+        help="a video (.mp4, .webm, .webp, .gif), else a folder for frames (default: in RUN/render,"
+        " named after path and size)",
+    )
+    add(
+        "--format",
+        choices=(*FILMS, *IMAGES),
+        help="a video (mp4, webm, webp, gif) or frames (png, exr); by --out, else mp4",
+    )
+    add("--size", type=shared.size, metavar="WxH", help="pixels (default: those of the training)")
+    add(
+        "--fov",
+        type=shared.number(1, 150),
+        metavar="DEGREES",
+        help="horizontal angle of view (default: the scene's)",
+    )
+    add(
+        "--seconds",
+        type=shared.number(1e-3, 1e5),
+        metavar="S",
+        help=f"length of an orbit or spiral ({SECONDS})",
+    )
+    add(
+        "--fps",
+        type=shared.number(0.1, 240),
+        default=FPS,
+        metavar="F",
+        help=f"frames per second ({FPS})",
+    )
+    add(
+        "--background",
+        type=_colour,
+        metavar="B",
+        help="white (default), black, transparent or R,G,B from 0 to 255",
+    )
+    add(
+        "--samples",
+        type=int,
+        choices=(1, 4, 9, 16),
+        default=1,
+        metavar="N",
+        help="samples per pixel: 1, 4, 9 or 16",
+    )
+    add("--features", action="store_true", help="exr: also the 16 features of each pixel")
+    shared.add_run_scene(parser)
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Render the frames that are missing, and make a film of them where one is asked for."""
+    from tqdm import tqdm
+
+    from pp_cl.drivers.discover import open_device
+    from pp_cl.files.manifest import begin_manifest, check_ours
+    from pp_cl.run import load_run
+    from pp_studio.export.film import render_film, render_frames
+    from pp_studio.video import check_video
+
+    kind = _format(options)
+    style, count = _style(options, kind), _frame_count(options, kind)
+    if kind in FILMS:
+        check_video(kind)
+    run = load_run(open_device(options.device), options.run_folder, scene=options.scene)
+    cameras = _cameras(run, options.path, count, size=options.size, fov=options.fov)
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if kind in FILMS and len(sizes) > 1:
+        raise UserError(
+            f"--path {options.path}: its images differ in size, which no video does; give --size"
+            " WxH, or --format png"
+        )
+    out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
+    if kind in FILMS and not options.out:
+        check_ours([out], "move it away, or choose another --out")
+        begin_manifest(out.parent)
+    seconds = []
+    with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
+
+        def on_frame(took):
+            bar.update()
+            if took is not None:
+                seconds.append(took)
+
+        if kind in FILMS:
+            render_film(run, cameras, out, options.fps, style, on_frame)
+        else:
+            render_frames(run, cameras, out, style, on_frame)
+    made = f"{len(seconds)} of {len(cameras)} frames"
+    if seconds:
+        made += f", {statistics.median(seconds) * 1e3:.0f} ms each on {run.dev.name}"
+    print(f"rendered {made}")
+    print(f"wrote {out}")
+
+
+def _format(options):
+    """Of FILMS or IMAGES, as the name of --out and --format say."""
+    suffix = Path(options.out).suffix[1:].lower() if options.out else ""
+    if suffix in FILMS and options.format not in (None, suffix):
+        raise UserError(
+            f"--out {options.out}: is a video by its name, --format {options.format} is another;"
+            " leave one of them out"
+        )
+    if options.out and suffix not in FILMS and options.format in FILMS:
+        raise UserError(
+            f"--out {options.out}: --format {options.format} is a video; name it"
+            f" {options.out}.{options.format}"
+        )
+    if suffix in FILMS or not options.out:
+        return suffix or options.format or FILMS[0]
+    if (mimetypes.guess_type(options.out)[0] or "").startswith(("video/", "image/")):
+        raise UserError(
+            f"--out {options.out}: videos end in .mp4, .webm, .webp or .gif, frames go into a"
+            " folder; name one of these"
+        )
+    return options.format or IMAGES[0]
+
+
+def _default(run, path, sizes, kind):
+    """Where a path is written that has no --out. sizes: {(width, height)} of its images."""
+    name = Path(path).stem if Path(path).suffix else path
+    name += "_{}x{}".format(*sizes.pop()) if len(sizes) == 1 else ""
+    return run.folder.path / "render" / (f"{name}.{kind}" if kind in FILMS else name)
+
+
+def _style(options, kind):
+    """film.Style of the options."""
+    from pp_studio.export.film import Style
+
+    if options.background and kind == "exr":
+        raise UserError("--background: OpenEXR keeps alpha in its place; leave it out")
+    background = COLOURS.get(options.background or "white", options.background)
+    if background is None and kind == "mp4":
+        raise UserError("--background transparent: mp4 keeps no alpha; write .webm or frames")
+    if options.features and kind != "exr":
+        raise UserError("--features: only OpenEXR has room for them; use --format exr")
+    return Style("exr" if kind == "exr" else "png", background, options.samples, options.features)
+
+
+def _frame_count(options, kind):
+    """Frames of an orbit or spiral, 0 of other paths."""
+    fps, seconds = options.fps, options.seconds
+    if kind == "gif" and fps > FASTEST_GIF:
+        raise UserError(f"--fps {fps:g}: a gif has at most {FASTEST_GIF} frames per second")
+    if options.path not in MADE:
+        if seconds is not None:
+            raise UserError(
+                f"--seconds {seconds:g}: only an orbit or spiral has as many frames as asked for;"
+                " leave it out"
+            )
+        return 0
+    count = round((seconds or SECONDS) * fps)
+    if not 1 <= count <= MOST_FRAMES:
+        seconds = seconds or SECONDS
+        raise UserError(
+            f"--seconds {seconds:g}: {seconds * fps:g} frames at {fps:g} a second; ask for 1 to"
+            f" {MOST_FRAMES}"
+        )
+    return count
+
+
+def _cameras(run, path, count, *, size, fov):
+    """The cameras of a path, `count` of an orbit or spiral, with size and angle of view."""
+    from pp_cl.scene.camera_path import Surroundings
+    from pp_cl.scene.readers.camera_file import read_cameras
+
+    def shaped(camera):
+        camera = camera.resized(*size) if size else camera
+        return camera.with_angle(math.radians(fov)) if fov else camera
+
+    if Path(path).suffix:
+        return [shaped(camera) for camera in read_cameras(Path(path), size)]
+    if path not in MADE:
+        return [shaped(camera) for camera in run.cameras(path)]
+    photographs = run.cameras("train")
+    around, first = Surroundings(photographs, run.model.positions()), shaped(photographs[0])
+    make = around.orbit if path == "orbit" else around.spiral
+    return make(first, count)

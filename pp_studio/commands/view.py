@@ -1,0 +1,111 @@
+"""`pp-cl view`: shows a run or a scene in the browser."""
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pp_cl.commands import options as shared
+from pp_studio.view.server import LOOPBACK, PORT
+
+if TYPE_CHECKING:
+    from pp_cl.session.training import OnStep, Training
+
+HELP = "look at a run, also while it is trained, or at a scene in the browser"
+EPILOG = """A scene: its cameras, and sparse points or visual hull. Its box can be moved and views
+dropped; both are written to pp_cl.json in its folder, which training, info and all other commands
+obey. Whoever reaches the port sees and steers the page."""
+LOOPBACKS = (LOOPBACK, "localhost", "::1")
+BROWSERS = ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")  # without these one for terminals would answer
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add("run_folder", metavar="RUN|SCENE", help="folder of a run, finished or not, or of a scene")
+    add(
+        "--port",
+        type=shared.integer(0, 65535),
+        default=PORT,
+        metavar="P",
+        help=f"port to listen on (default {PORT}; 0: any)",
+    )
+    add(
+        "--host",
+        default=LOOPBACK,
+        metavar="H",
+        help=f"address to listen on (default {LOOPBACK}: this machine only)",
+    )
+    add("--open", action="store_true", help="open the page in the default browser")
+    shared.add_run_scene(parser)
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Serve until Ctrl-C."""
+    from pp_cl.drivers.discover import open_device
+    from pp_cl.errors import UserError, name_of, require
+    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.run import stored_config
+    from pp_cl.scene.load import scene_splits
+    from pp_studio.view.run_view import RunView
+    from pp_studio.view.scene_page import ScenePage
+    from pp_studio.view.server import started
+
+    require("the viewer", "viser")
+    folder, scene = Path(options.run_folder), options.scene
+    is_scene = folder.is_dir() and not RunFolder(folder).config.exists()
+    if is_scene and scene is not None:
+        raise UserError("--scene: only of a run; leave it out")
+    if is_scene:
+        scene_splits(folder)
+    else:
+        stored_config(RunFolder(folder), scene)
+    if options.host not in LOOPBACKS:
+        print(
+            f"pp-cl: --host {options.host}: whoever can reach this address sees the viewer and"
+            " steers it; nothing is encrypted",
+            file=sys.stderr,
+        )
+    # a job in the background ignores Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    with (
+        suppress(KeyboardInterrupt),
+        started(name_of(folder), options.host, options.port) as (server, address),
+    ):
+        view: ScenePage | RunView
+        if is_scene:
+            view = ScenePage(server, folder, options.device)
+        else:
+            view = RunView(server, open_device(options.device), RunFolder(folder), scene)
+        print(f"{options.run_folder}: {address}  (Ctrl-C ends)", flush=True)
+        if options.open:
+            open_browser(address)
+        view.serve()
+
+
+@contextmanager
+def following(training: "Training") -> Iterator["OnStep"]:
+    """Show a training in the browser while the block runs; gives what is to be called after each
+    step.
+    """
+    from pp_studio.view.run_view import shown_training
+
+    with shown_training(training) as (address, show):
+        print(f"watch at {address}", flush=True)
+        open_browser(address)
+        yield show
+
+
+def open_browser(address: str) -> None:
+    """Open an address in the browser, where there is one with windows."""
+    if sys.platform in ("win32", "darwin") or any(name in os.environ for name in BROWSERS):
+        # some browsers answer only when they are closed, and must not keep the server waiting
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()

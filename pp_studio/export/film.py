@@ -1,0 +1,160 @@
+"""Renders a run along a camera path: frames in a folder, resumed by a later call, and films of
+them.
+"""
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from pp_cl.engine.camera import Camera
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import check_file, check_target, remove_leftovers, write_json
+from pp_cl.files.exr import write_exr
+from pp_cl.files.image import read_rgba, write_png
+from pp_cl.files.manifest import NAME, begin_manifest, check_ours, remove_ours
+from pp_cl.files.picture import WHITE
+from pp_cl.files.untrusted import read_regular
+from pp_cl.run import Run
+from pp_studio.video import write_video
+
+MOST_IDENTITY = 1000  # bytes of it
+# bytes of a frame's pixel that Pillow keeps until the film is written, and of all that it may
+KEPT, MOST_KEPT = {".webp": 4, ".gif": 1}, 2**31
+IDENTITY = "frames.json"  # in the folder of the frames: what they show
+LOCK = ".pp-cl.lock"
+OnFrame = Callable[[float | None], None]
+
+
+@dataclass(frozen=True)
+class Style:
+    """How frames are rendered and written.
+
+    suffix: png or exr. background: sRGB in [0, 1], None: transparent; OpenEXR always is. samples:
+    per pixel, a square number. features: in OpenEXR, the network's input too.
+    """
+
+    suffix: str = "png"
+    background: tuple[float, float, float] | None = WHITE
+    samples: int = 1
+    features: bool = False
+
+
+def render_frames(
+    run: Run,
+    cameras: Sequence[Camera],
+    folder: Path,
+    style: Style,
+    on_frame: OnFrame,
+    *,
+    replace: bool = False,
+) -> list[Path]:
+    """Render the frames of the cameras that are not there yet into a folder; returns the files.
+
+    on_frame: called after each one with its seconds, None for one that was there. replace: frames
+    that are there and show something else make room. Raises UserError for a folder that cannot be
+    made, holds other files, or other frames that are not replaced, and where another process
+    renders into it.
+    """
+    # Python stands for bytes that are no UTF-8 by these
+    if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
+        raise UserError(
+            f"{folder}: OpenEXR writes no file whose name is no UTF-8; choose another --out"
+        )
+    identity = {"frames": _digest(run, cameras, style), "count": len(cameras)}
+    paths = [folder / f"{i:05d}.{style.suffix}" for i in range(len(cameras))]
+    with _owned(folder):
+        if _identity_of(folder) not in (None, identity):
+            if not replace:
+                raise UserError(
+                    f"{folder}: holds frames of another model, path or style; choose another --out,"
+                    " or delete it"
+                )
+            check_ours([*paths, folder / IDENTITY])
+            remove_ours(folder.iterdir())
+        begin_manifest(folder)
+        remove_leftovers(folder)
+        write_json(folder / IDENTITY, identity)
+        for camera, path in zip(cameras, paths, strict=True):
+            start, there = time.perf_counter(), path.exists()
+            if not there:
+                picture = run.render(camera, samples=style.samples, features=style.features)
+                if style.suffix == "exr":
+                    write_exr(path, picture.channels())
+                else:
+                    write_png(path, picture.image(style.background))
+            on_frame(None if there else time.perf_counter() - start)
+    return paths
+
+
+def render_film(
+    run: Run, cameras: Sequence[Camera], film: Path, fps: float, style: Style, on_frame: OnFrame
+) -> None:
+    """Render a film, whose frames are in a hidden folder beside it until it is written, for a later
+    call to go on with. Raises UserError as render_frames and write_video do, and for a film whose
+    frames would fill the memory.
+    """
+    check_file(film)
+    kept = KEPT.get(film.suffix.lower(), 0) * sum(c.width * c.height for c in cameras)
+    if kept > MOST_KEPT:
+        raise UserError(
+            f"{film}: in this format all frames are in memory at once, {kept / 2**30:.1f} GiB; make"
+            " it shorter or smaller, or write --format mp4"
+        )
+    folder = film.with_name(f".{film.name}.frames")
+    paths = render_frames(run, cameras, folder, style, on_frame, replace=True)
+    images = (read_rgba(path) for path in paths)
+    if style.background is not None:
+        images = (image[..., :3] for image in images)
+    write_video(film, images, fps)
+    remove_ours(folder.iterdir())
+    if {path.name for path in folder.iterdir()} <= {LOCK, NAME}:
+        shutil.rmtree(folder)
+
+
+def _digest(run, cameras, style):
+    """Of everything that the frames depend on."""
+    checkpoint = run.folder.checkpoint.stat()
+    digest = hashlib.sha256(repr((style, run.header["step"])).encode())
+    digest.update(f"{checkpoint.st_size} {checkpoint.st_mtime_ns}".encode())
+    for camera in cameras:
+        digest.update(run.model.packed(camera).tobytes())
+    return digest.hexdigest()
+
+
+def _identity_of(folder):
+    """What the frames in a folder show, None where there are none. Raises UserError for a folder
+    that holds something else.
+    """
+    if all(path.name.startswith(".") for path in folder.iterdir()):
+        return None
+    try:
+        return json.loads(read_regular(folder / IDENTITY, MOST_IDENTITY))
+    except (OSError, ValueError, RecursionError):
+        raise UserError(f"{folder}: holds files that are no frames; choose another --out") from None
+
+
+@contextmanager
+def _owned(folder) -> Iterator[None]:
+    """While the block runs, no other process renders into the folder, which is made where it is
+    missing.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is not a folder; choose another --out")
+    if folder.exists():
+        _identity_of(folder)  # no lock is made in a folder of others
+    check_target(folder / IDENTITY)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            yield
+    except Timeout:
+        raise UserError(
+            f"{folder}: another process renders there; wait for its end, or choose another --out"
+        ) from None

@@ -1,0 +1,159 @@
+"""The formats of `pp-cl export`: which files each one writes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.engine.views import View
+from pp_cl.errors import UserError, require
+from pp_cl.evaluate import image_files
+from pp_cl.files.atomic import check_file, check_new_folder, write_text
+from pp_cl.files.manifest import begin_manifest, check_ours
+from pp_cl.run import Run
+from pp_cl.scene.readers.transforms import write_scene
+from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
+from pp_studio.export.gltf import gltf_colours, write_glb
+from pp_studio.export.length import metres_per_unit
+from pp_studio.export.mesh import coloured_mesh, write_mesh
+from pp_studio.export.page import page_text, write_gallery
+from pp_studio.export.points import coloured_points, in_world, inside, write_ply
+from pp_studio.export.splat import (
+    Y_DOWN,
+    Y_UP,
+    splats,
+    upright,
+    write_splat_glb,
+    write_splat_ply,
+    write_splat_spz,
+)
+from pp_studio.export.texture import textured_mesh, write_textured
+
+
+def check_target(name: str, folder: Path, out: Path | None) -> Path:
+    """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says.
+
+    Raises UserError unless it can be written there, and no other file is lost that `out` does not
+    name.
+    """
+    default, suffixes, _ = FORMATS[name]
+    path = folder / "export" / default if out is None else out
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise UserError(f"--out {path}: name a file that ends in {' or '.join(suffixes)}")
+    check_file(path) if suffixes else check_new_folder(path)
+    if out is None and suffixes:
+        check_ours([path], "move it away, or choose another --out")
+    if out is not None and not path.parent.is_dir():
+        raise UserError(f"--out {path}: {path.parent} is no folder; make it first")
+    return path
+
+
+def export(
+    run: Run,
+    name: str,
+    path: Path | str,
+    *,
+    min_weight: float = 0.0,
+    window: int = WINDOW,
+    box: Sequence[float] | None = None,
+    axes: str | None = None,
+    others: Iterable[Run] = (),
+) -> str:
+    """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
+    min_weight, window, box, axes: as the options. others: further runs of a gallery. Raises
+    UserError for what cannot be written, before which nothing is.
+    """
+    if name not in FORMATS:
+        raise UserError(f"no format {name}; choose from {', '.join(FORMATS)}")
+    path, count, metres = Path(path), run.model.cloud.count, metres_per_unit(run)
+    unit = "" if metres == 1 else ", in metres"
+    within, turn = None, np.eye(3)
+    if box is not None:
+        within = np.sort(np.reshape(box, (2, 3)), axis=0)
+        inside(run.model.positions(), within)  # an empty one is refused before any work
+    if (axes or AXES_OF.get(name)) == VIEWER:
+        turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
+
+    def placed(positions):
+        return metres * in_world(positions @ turn.T, run.model.grid.edge)
+
+    if name == "mesh":
+        mesh = coloured_mesh(run, within)
+        _begin_default(name, path)
+        write_mesh(path, replace(mesh, vertices=placed(mesh.vertices)))
+        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unit}"
+    if name == "textured":
+        solid = textured_mesh(run, turn, within)
+        solid.apply_scale(metres)
+        _begin_default(name, path)
+        write_textured(path, solid)
+        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces{unit}"
+    if name == "html":
+        text = page_text(run)
+        _begin_default(name, path)
+        write_text(path, text)
+        return f"{count} points, {len(text) / 1e6:.1f} MB"
+    if name == "gallery":
+        return f"{write_gallery(path, chain([run], others))} pages and their index"
+    if name == "scene":
+        splits = renderings(run)
+        write_scene(splits, path)
+        return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
+    if name in ("splat", "splat-spz", "splat-glb"):
+        if name == "splat-spz":
+            require("splat-spz", "gsply")
+        table, origin = splats(run, turn, window, within)
+        table["position"] *= metres
+        table["deviations"] *= metres
+        _begin_default(name, path)
+        if name == "splat":
+            write_splat_ply(path, table)
+        elif name == "splat-spz":
+            write_splat_spz(path, table)
+        else:
+            write_splat_glb(path, table, metres * origin)
+        moved = f", less {', '.join(f'{x:g}' for x in metres * origin)}" if origin.any() else ""
+        return f"{len(table)} Gaussians{unit}{moved if name != 'splat-glb' else ''}"
+    points = coloured_points(run, min_weight, within)
+    points = replace(
+        points, positions=placed(points.positions), radius=np.float32(metres) * points.radius
+    )
+    _begin_default(name, path)
+    if name == "ply":
+        axes = "turned upright, y up" if axes == VIEWER else "its scene's"
+        write_ply(path, points, run.model.cloud, f"{axes}{unit}")
+    else:
+        colours = gltf_colours(points.colours)
+        write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})
+    return f"{len(points.rows)} of {count} points{unit}"
+
+
+def _begin_default(name, path):
+    """Make the folder of a file that has no --out, as its name says."""
+    if path.parts[-2:] == ("export", FORMATS[name][0]):
+        begin_manifest(path.parent)
+
+
+def renderings(run: Run) -> dict[str, list[View]]:
+    """{split: views}: those of train and test at the run's resolution, each image the run's
+    rendering of it as straight RGBA; where the run's scene has no test views, or none that can be
+    read, those are left out with a warning that says why.
+    """
+    splits = {"train": run.photographs("train")}
+    try:
+        splits["test"] = run.photographs("test")
+    except UserError as error:
+        warnings.warn(f"no test views are exported: {error}", stacklevel=2)
+    return {split: _rendered(run, split, listed) for split, listed in splits.items()}
+
+
+def _rendered(run, split, photographs):
+    """The views of a split, named after their files in its folder."""
+    files = image_files([one.name for one in photographs])
+    views = run.rendered(photographs, opaque=False)
+    return [replace(v, name=f"{split}/{file}") for v, file in zip(views, files, strict=True)]

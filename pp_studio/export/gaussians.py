@@ -1,0 +1,209 @@
+"""Gaussians of three axes fitted to a run's photographs, and where these are few to its renderings
+of as many views between them, as viewers of 3D Gaussian splatting draw them: without a network,
+each widened by a third of a pixel^2, and colours below 0 taken for black.
+
+The trainer does it, with the footprint "gaussian" and means of features in place of the network.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pyopencl.array import Array
+from tqdm import tqdm
+
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.simple import mean_backward, mean_forward
+from pp_cl.engine.model import Model
+from pp_cl.engine.raster.points import MOST_SH_OF_GAUSSIANS, PointCloud, offset_width, sh_blocks
+from pp_cl.engine.step import Trainer
+from pp_cl.engine.training.crops import Crop, Crops
+from pp_cl.engine.views import MIN_SIDE, View
+from pp_cl.errors import UserError
+from pp_cl.run import Run
+from pp_cl.scene.camera_path import between
+from pp_cl.settings import Config, TrainConfig
+from pp_studio.export.harmonics import fit_harmonics
+
+STEPS = 7000
+# Of the steps of windows larger than the images, those that draw pictures as large as these, each
+# pixel as if it were the mean of a viewer's: nearly right, and they see as much more of an image.
+COARSE = 0.7
+# Photographs that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
+# to the 57 of ethiopian_head.
+ENOUGH = 200
+CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of what is drawn, of an image
+EARLY_STOP = 1e-4  # of viewers
+# Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
+# rim: the root of its second moment. With the disc's opacity it covers 0.91 of the disc.
+DEVIATION = 0.39
+MOST_OPAQUE = 0.99  # what viewers clamp to
+# 3D Gaussian splatting's functions of degrees 0 to 2 are basis()'s in this order, times these.
+ORDER = [0, 2, 3, 1, 4, 5, 7, 6, 8]
+CONSTANT = 0.28209479177387814
+FACTORS = np.array(
+    [
+        CONSTANT,
+        *(-0.4886025119029199, 0.4886025119029199, -0.4886025119029199),
+        *(1.0925484305920792, -1.0925484305920792, 0.31539156525252005),
+        *(-1.0925484305920792, 0.5462742152960396),
+    ]
+)
+
+
+class Means:
+    """In place of a UNet, without parameters: the image is the first three features, the means of
+    `scale` x `scale` pixels.
+    """
+
+    def __init__(self, dev: Device):
+        self.dev, self.scale = dev, 1
+        self.all_parameters, self.all_gradients = dev.zeros((1,)), dev.zeros((1,))
+        self._features: Any = None  # of the last forward()
+
+    multiple = 1  # of which the sides of images are
+
+    @staticmethod
+    def is_planned(size: tuple[int, int]) -> bool:
+        """See UNet: no tiles are left out."""
+        return False
+
+    def forward(self, x: Array, training: bool = True, plan: None = None) -> Array:
+        """(H, W, 3) image of the features x (scale H, scale W, C)."""
+        height, width, _ = x.shape
+        image = self.dev.empty((height // self.scale, width // self.scale, 3))
+        mean_forward(self.dev, x, image, self.scale)
+        self._features = x
+        return image
+
+    def backward(self, grad_image: Array) -> Array:
+        """(scale H, scale W, C) gradient of the features of the last forward()."""
+        grad_features = self.dev.empty(self._features.shape)
+        mean_backward(self.dev, grad_image, grad_features, self.scale)
+        return grad_features
+
+
+class LargeCrops(Crops):
+    """Crops whose cameras have `scale` times the pixels each way, each the mean of as many of a
+    window's as make `samples` of them a pixel of the image.
+    """
+
+    def __init__(self, views: list[View], train: TrainConfig, scale: int, samples: float):
+        super().__init__(views, replace(train, crop=CROP // scale), 0)
+        self.scale, self.samples = scale, samples / scale
+
+    def draw(self, step: int) -> Crop:
+        """See Crops."""
+        crop = super().draw(step)
+        size = crop.camera.width * self.scale, crop.camera.height * self.scale
+        camera = replace(crop.camera.resized(*size), samples=self.samples)
+        return crop._replace(camera=camera)
+
+
+def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
+    """(the points that training views show, as Gaussians, the deviation of one without offsets):
+    fitted to pictures of about `window` pixels on the longer side. Of the features of their SH,
+    which are 3D Gaussian splatting's, the first three are sRGB colour.
+    """
+    dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
+    cloud, net = _cloud(run, coefficients), Means(dev)
+    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)  # type: ignore[arg-type]
+    views = _photographs(run)
+    if len(views) < ENOUGH:
+        listed = run.photographs("train")
+        cameras = between([one.camera for one in listed])
+        more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
+        views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
+    sides = [side for view in views for side in (view.camera.width, view.camera.height)]
+    factor = max(1, min(round(max(sides) / window), min(sides) // MIN_SIDE))
+    views = [view.reduced(factor * view.downscale) for view in views]
+    longest = max(sides) / factor
+    samples = max(1.0, window / longest)
+    scale = min(int(samples), CROP // LEAST_CROP)
+    config = _config(run.config, scale)
+    trainer = Trainer(dev, config, model, views)
+    steps = tqdm(
+        range(config.train.iterations), "fitting Gaussians", unit="step", leave=False, disable=None
+    )
+    for step in steps:
+        if step in (0, round(COARSE * len(steps))):
+            net.scale = scale if step else 1
+            trainer.crops = LargeCrops(trainer.views, config.train, net.scale, samples)
+        trainer.train_step()
+    trainer.check()
+    trainer.finish()
+    return cloud, config.raster.radius * run.model.grid.edge
+
+
+def triangles(offset: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) L of the covariances L L^T of Gaussians, in deviations of one without offsets.
+    offset: (N, 16), cl/cloud.h.
+    """
+    lower = np.zeros((len(offset), 3, 3))
+    lower[:, range(3), range(3)] = np.exp(offset[:, 3:6])
+    lower[:, [1, 2, 2], [0, 0, 1]] = offset[:, 6:9]
+    return lower
+
+
+def _photographs(run):
+    """The run's training views, none if their exposures differ, or with a warning if they are not
+    there.
+    """
+    if run.header.get("exposed"):
+        return []
+    try:
+        views = run.scene("train").splits["train"]
+    except UserError as error:
+        told = f"the Gaussians are fitted to renderings of the training views alone: {error}"
+        warnings.warn(told, stacklevel=2)
+        return []
+    return [view for view in views if view.name not in run.header.get("left_out", ())]
+
+
+def _cloud(run, coefficients):
+    """A copy of the run's points, those that have no coefficients (N, 9, 3) of basis() left out."""
+    dev, cloud = run.dev, run.model.cloud
+    rows = np.flatnonzero(coefficients.any((1, 2)))
+    if not len(rows):
+        raise UserError(f"{run.folder}: the training views show no points; train it longer")
+    given = cloud.offset.get()[rows]
+    offset = np.zeros((len(rows), offset_width("gaussian")), np.float32)
+    offset[:, :3], offset[:, 3:6] = given[:, :3], given[:, 3:]  # round, as large as the points
+    sh = np.zeros((len(rows), 9, 16), np.float32)
+    sh[..., :3] = coefficients[rows][:, ORDER] / FACTORS[:, None]
+    sh[:, 1:] = sh[:, 1:].clip(-MOST_SH_OF_GAUSSIANS, MOST_SH_OF_GAUSSIANS)
+    begins = np.cumsum([block.count for block in sh_blocks(2)])[:-1]
+    return PointCloud(
+        dev.upload(cloud.ids.get()[rows]),
+        dev.upload(offset),
+        dev.upload(cloud.opacity.get()[rows].clip(0, MOST_OPAQUE)),
+        [dev.upload(part) for part in np.split(sh, begins, axis=1)],
+    )
+
+
+def _config(given: Config, scale: int) -> Config:
+    """What the trainer follows here, for pictures of about `scale` times the images each way."""
+    config = copy.deepcopy(given)
+    raster, train = config.raster, config.train
+    raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
+    raster.radius *= DEVIATION
+    train.iterations = STEPS
+    train.crop, train.refine_at, train.ema = CROP, (), True
+    train.mask_weight = train.spread_weight = train.sh_smoothing = 0.0
+    train.exposure, train.ssim_weight = "off", 0.0
+    # Colours, which begin nearly right, would diverge with their default rates, seventeen times
+    # these and more; shapes have the longest way. In pictures as large as the images colours must
+    # be fast, since they sharpen what viewers widen; in larger ones slower colours and faster
+    # opacities are better (0.4 dB on lego by the colours alone).
+    train.rate_steps = 0
+    if scale == 1:
+        train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (7.6e-3, 2.3e-3)
+    else:
+        train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
+        train.prune_weight = 0.0  # points are judged in images, where larger pictures show more
+    train.offset_rate = (4e-2, 4e-3)
+    return config

@@ -1,0 +1,91 @@
+"""glTF 2.0 in one binary file (GLB): points, Gaussians or triangles with attributes."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pp_cl.files.atomic import atomic_file
+from pp_cl.files.image import to_8bit
+from pp_cl.files.srgb import srgb_to_linear
+
+POINTS, TRIANGLES = 0, 4  # of a primitive
+TYPES = {np.dtype("f4"): 5126, np.dtype("u1"): 5121, np.dtype("u4"): 5125}
+
+
+def write_glb(
+    path: Path | str,
+    attributes: dict[str, np.ndarray],
+    *,
+    faces: np.ndarray | None = None,
+    extension: tuple[str, dict[str, Any]] | None = None,
+) -> None:
+    """Write vertices. attributes: {name: (M,) or (M, K) array of float32, or of uint8 for 0 to 1},
+    POSITION (M, 3) among them, in world coordinates. faces: (F, 3) vertices of triangles; None:
+    points. extension: of the primitive, its name and JSON. Raises UserError as atomic_file does.
+
+    Positions in glTF are float32, so those of float64 are moved to the origin, and the file's node
+    moves them back.
+    """
+    place, arrays = attributes["POSITION"], dict(attributes)
+    origin = np.rint(place.mean(0)) if place.dtype == np.float64 else np.zeros(3)
+    arrays["POSITION"] = place = (place - origin).astype(np.float32)
+    names = {name: i for i, name in enumerate(arrays)}
+    stored = [np.ascontiguousarray(array) for array in arrays.values()]
+    if faces is not None:
+        stored.append(np.ascontiguousarray(faces, np.uint32).ravel())
+    accessors = [
+        {
+            "bufferView": i,
+            "componentType": TYPES[array.dtype],
+            "normalized": array.dtype == np.uint8,
+            "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
+            "count": len(array),
+        }
+        for i, array in enumerate(stored)
+    ]
+    least, most = place.min(0).tolist(), place.max(0).tolist()
+    accessors[names["POSITION"]] |= {"min": least, "max": most}
+    starts = np.cumsum([0, *(array.nbytes for array in stored)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes}
+        for start, array in zip(starts, stored, strict=False)
+    ]
+    primitive: dict[str, Any] = {"mode": POINTS, "attributes": names}
+    if faces is not None:
+        primitive |= {"mode": TRIANGLES, "indices": len(names), "material": 0}
+    gltf: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "pp-cl"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": origin.tolist()}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    if faces is not None:  # without a material it would be metal
+        gltf["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
+    if extension:
+        primitive["extensions"] = dict([extension])
+        gltf["extensionsUsed"] = [extension[0]]
+    text = json.dumps(gltf).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_file(path) as file:
+        length = 12 + 8 + len(text) + 8 + starts[-1]
+        file.write(struct.pack("<4sII", b"glTF", 2, length))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        file.writelines(array.tobytes() for array in stored)
+
+
+def gltf_colours(colours: np.ndarray) -> np.ndarray:
+    """(M, 4) uint8 linear RGBA of (M, 3) uint8 sRGB: glTF 2.0 keeps vertex colours in linear
+    light.
+    """
+    linear = to_8bit(srgb_to_linear(colours / np.float32(255)))
+    return np.column_stack([linear, np.full(len(colours), 255, np.uint8)])

@@ -1,0 +1,156 @@
+"""The points of a run with the colours that its network gives them, as PLY files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import plyfile
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.render import point_radius
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_file
+from pp_cl.files.image import to_8bit
+from pp_cl.files.picture import Picture
+from pp_cl.run import Run
+from pp_studio.export.observe import observe
+
+COMMENTS = (
+    "red, green, blue: sRGB, as the run shows the point in the training view where it weighs most",
+    "weight: blend weights of the point in that view, summed over its pixels",
+    "point_opacity: of its centre, 0 to 1",
+    "radius: where its opacity has fallen to 0",
+    "feature_C_D_K: coefficient K of degree D of the spherical harmonics of feature C, C from 0 to",
+    "15; basis and signs of PlenOctrees, in the axes of the scene whatever those of x, y, z are;",
+    "features are the input of the run's network, no colours",
+)
+COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
+FINEST = 1e-3  # of the grid's edge: how far rounding to float32 may move a point in a file
+
+
+@dataclass(frozen=True)
+class ColouredPoints:
+    """M points in the order of their ids.
+
+    rows: (M,) int64, their rows in the run's point cloud. positions: (M, 3) as in_world() gives
+    them. colours: (M, 3) uint8 sRGB. weight: (M,) float32, the blend weights in the view that gave
+    the colour, summed over its pixels. opacity: (M,) float32. radius: (M,) float32, world units.
+    """
+
+    rows: np.ndarray
+    positions: np.ndarray
+    colours: np.ndarray
+    weight: np.ndarray
+    opacity: np.ndarray
+    radius: np.ndarray
+
+
+def coloured_points(
+    run: Run, min_weight: float = 0.0, box: np.ndarray | None = None
+) -> ColouredPoints:
+    """The points that weigh more than min_weight in some training view, with their colours in the
+    view where they weigh most: that of the pixel which shows their centre, without the background.
+
+    No colour is invented for points that no training view shows: they are left out. box: (2, 3)
+    that holds the points, or None. Raises UserError where no point is left.
+    """
+    cloud, edge = run.model.cloud, run.model.grid.edge
+    positions = run.model.positions()
+    colours, best = np.zeros((cloud.count, 3), np.uint8), np.zeros(cloud.count, np.float32)
+    for seen in observe(run, run.cameras("train"), "colours"):
+        weights = seen.point_weights()
+        higher = np.flatnonzero(weights > best)
+        best[higher] = weights[higher]
+        colours[higher] = _colours(run.render(seen.camera), seen.camera, positions[higher])
+    rows = np.flatnonzero(best > min_weight)
+    if not len(rows):
+        raise UserError(
+            f"--min-weight {min_weight:g}: no point weighs more in any training view (at most "
+            f"{best.max(initial=0):.3g}); lower it"
+        )
+    rows = rows[inside(positions[rows], box)]
+    return ColouredPoints(
+        rows,
+        in_world(positions[rows], edge),
+        colours[rows],
+        best[rows],
+        cloud.opacity.get()[rows],
+        point_radius(run.config.raster, edge, run.model.depth_range)
+        * np.exp(cloud.offset.get()[rows, 3]),
+    )
+
+
+def inside(positions: np.ndarray, box: np.ndarray | None) -> np.ndarray:
+    """(N,) bool: which positions (N, 3) lie in a box (2, 3) of the world, all where there is none.
+    Raises UserError where none does.
+    """
+    if box is None:
+        return np.ones(len(positions), bool)
+    found = ((positions >= box[0]) & (positions <= box[1])).all(1)
+    if not found.any():
+        ends = (positions.min(0), positions.max(0))
+        low, high = (",".join(f"{x:.3g}" for x in corner) for corner in ends)
+        raise UserError(f"--box: nothing lies in it; the run reaches from {low} to {high}")
+    return found
+
+
+def in_world(positions: np.ndarray, edge: float) -> np.ndarray:
+    """(N, 3) float64 world positions as files keep them: float32, which every program reads, or
+    float64 where the world's origin is so far that float32 moves them. edge: of the grid.
+    """
+    resolution = np.spacing(np.float32(np.abs(positions).max(initial=0)))
+    return positions if resolution > FINEST * edge else positions.astype(np.float32)
+
+
+def _colours(picture: Picture, camera: Camera, positions):
+    """(M, 3) uint8: a point whose centre is just outside the image takes the nearest pixel."""
+    column, row, _ = camera.project(positions)  # a seen point has a depth above 0
+    column = column.clip(0, camera.width - 1).astype(np.int64)
+    row = row.clip(0, camera.height - 1).astype(np.int64)
+    return to_8bit(picture.rgba()[row, column, :3])
+
+
+def write_ply(
+    path: Path | str, points: ColouredPoints, cloud: PointCloud, frame: str = "its scene's"
+) -> None:
+    """Write points and what `cloud` learned of them, as write_elements() does. frame: whose axes
+    and units the positions have, in words.
+    """
+    columns = place_and_colour(points.positions, points.colours)
+    columns |= {"point_opacity": points.opacity, "weight": points.weight, "radius": points.radius}
+    for block, array in zip(cloud.blocks, cloud.sh, strict=True):
+        values = array.get()[points.rows].astype(np.float32)
+        for k in range(block.count):
+            order = block.first + k - block.degree**2  # within its degree
+            named = {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
+            columns |= named
+    about = (f"pp-cl: points of a run; axes and units: {frame}", *COMMENTS)
+    write_elements(path, {"vertex": table_of(columns)}, about)
+
+
+def write_elements(
+    path: Path | str, elements: dict[str, np.ndarray], comments: Sequence[str] = ()
+) -> None:
+    """Write a binary little-endian PLY file of {name: records}. Raises UserError as atomic_file
+    does.
+    """
+    described = [plyfile.PlyElement.describe(rows, name) for name, rows in elements.items()]
+    with atomic_file(path) as file:
+        plyfile.PlyData(described, byte_order="<", comments=list(comments)).write(file)
+
+
+def place_and_colour(positions: np.ndarray, colours: np.ndarray) -> dict[str, np.ndarray]:
+    """{property of a PLY vertex: (M,) array} of positions and colours, both (M, 3)."""
+    columns = dict(zip(COORDINATES, positions.T, strict=True))
+    return columns | dict(zip(CHANNELS, colours.T, strict=True))
+
+
+def table_of(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """(M,) records, little-endian, of named columns (M,)."""
+    names = list(columns)
+    formats = [column.dtype.newbyteorder("<") for column in columns.values()]
+    return np.rec.fromarrays(list(columns.values()), dtype=list(zip(names, formats, strict=True)))

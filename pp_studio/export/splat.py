@@ -1,0 +1,158 @@
+"""A run as 3D Gaussians without a network: the .ply of 3D Gaussian splatting, .spz, and glTF."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pp_cl.files.atomic import atomic_path
+from pp_cl.files.image import to_8bit
+from pp_cl.run import Run
+from pp_cl.scene.camera_path import up_of
+from pp_studio.export.gaussians import (
+    CONSTANT,
+    FACTORS,
+    MOST_OPAQUE,
+    ORDER,
+    fit_gaussians,
+    triangles,
+)
+from pp_studio.export.gltf import gltf_colours, write_glb
+from pp_studio.export.harmonics import COUNT, basis
+from pp_studio.export.page import check_drawable
+from pp_studio.export.points import in_world, inside, table_of, write_elements
+
+LEAST_OPAQUE = 1 / 255  # what viewers leave out
+# In a .spz: steps of a place in the widest deviation of the smallest Gaussian, and of harmonics
+# above degree 0, half of all bytes: a multiple of 1/128, of which its bytes are. With 1/16 they are
+# 4 % more, and lego loses 0.05 dB less; two steps, one a degree, take more bytes than their mean.
+STEPS_OF_PLACE = 1
+STEP_OF_HARMONICS = 5 / 64
+STORED = 16  # functions in a .ply: many programs read no file but of degree 3
+Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in glTF
+
+SPLAT = np.dtype(
+    [
+        ("position", "<f4", 3),
+        ("harmonics", "<f4", (COUNT, 3)),
+        ("opacity", "<f4"),
+        ("deviations", "<f4", 3),
+        ("turn", "<f4", 4),
+    ]
+)
+
+
+def splats(
+    run: Run, turn: np.ndarray, window: int, box: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """((M,) records of SPLAT, (3,) origin): the run as Gaussians, fitted to pictures of `window`
+    pixels, in the world of its scene turned by (3, 3), those in a box (2, 3) or all. Positions are
+    relative to the origin, which is 0 unless float32 is too coarse there. harmonics: in the order
+    and with the signs of 3D Gaussian splatting, of colours less 0.5; opacity: after the sigmoid;
+    deviations: along a Gaussian's own axes, which the quaternion turn (w, x, y, z) turns to the
+    world's.
+    Raises UserError as check_drawable and inside() do.
+    """
+    check_drawable(run)
+    cloud, deviation = fit_gaussians(run, window)
+    opacity, offset = cloud.opacity.get().clip(0, MOST_OPAQUE), cloud.offset.get()
+    rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
+    positions = grid.positions(cloud.ids.get()[rows]) + grid.edge * offset[rows, :3]
+    held = inside(positions, box)
+    rows, positions = rows[held], positions[held] @ turn.T
+    coefficients = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
+    near = in_world(positions, grid.edge).dtype == np.float32
+    origin = np.zeros(3) if near else np.rint(positions.mean(0))
+    table = np.zeros(len(rows), SPLAT)
+    table["position"] = positions - origin
+    table["harmonics"] = _turned(coefficients, turn)
+    table["opacity"] = opacity[rows]
+    axes, table["deviations"], _ = np.linalg.svd(deviation * turn @ triangles(offset[rows]))
+    axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
+    table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
+    return table, origin
+
+
+def upright(run: Run, up: tuple[float, float, float]) -> np.ndarray:
+    """(3, 3) rotation that makes what is up in the training views `up`."""
+    return Rotation.align_vectors([up], [up_of(run.cameras("train"))])[0].as_matrix()
+
+
+def _turned(coefficients, turn):
+    """Coefficients (M, 9, 3) of colours, of turned directions and of colours less 0.5."""
+    seen = np.random.default_rng(0).normal(size=(64, 3))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
+    matrix = np.linalg.lstsq(after, before, rcond=None)[0]
+    found = np.einsum("jk,nkc->njc", matrix, coefficients)
+    found[:, 0] -= 0.5 / CONSTANT
+    return found
+
+
+def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
+    """Write splats() as the training code of 3D Gaussian splatting does. Raises UserError as
+    atomic_file does.
+    """
+    nothing = np.zeros(len(table), np.float32)
+    columns = dict(zip(("x", "y", "z"), table["position"].T, strict=True))
+    columns |= dict.fromkeys(("nx", "ny", "nz"), nothing)
+    harmonics = np.zeros((len(table), STORED, 3), np.float32)
+    harmonics[:, :COUNT] = table["harmonics"]
+    columns |= {f"f_dc_{c}": harmonics[:, 0, c] for c in range(3)}
+    rest = harmonics[:, 1:].transpose(2, 1, 0).reshape(-1, len(table))  # all of a channel together
+    columns |= {f"f_rest_{i}": column for i, column in enumerate(rest)}
+    columns["opacity"] = np.log(table["opacity"] / (1 - table["opacity"]))
+    columns |= {f"scale_{i}": np.log(table["deviations"][:, i]) for i in range(3)}
+    columns |= {f"rot_{i}": table["turn"][:, i] for i in range(4)}
+    # brush turns a model by this comment; others take y for the vertical axis anyway
+    write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
+
+
+def write_splat_spz(path: Path, table: np.ndarray) -> None:
+    """Write splats() with y up as Niantic's .spz. Raises UserError as atomic_path does."""
+    from gsply import GSData, write_spz
+
+    place = table["position"]
+    rest = np.rint(table["harmonics"][:, 1:] / STEP_OF_HARMONICS) * STEP_OF_HARMONICS
+    data = GSData.from_arrays(
+        np.ascontiguousarray(place),
+        np.log(table["deviations"]),
+        table["turn"].copy(),
+        np.log(table["opacity"] / (1 - table["opacity"])),
+        np.ascontiguousarray(table["harmonics"][:, 0]),
+        rest,
+        format="ply",
+    )
+    # places are numbers of 24 bits with a sign
+    room = 23 - math.ceil(math.log2(np.abs(place).max(initial=1e-6) * 1.001))
+    widest = table["deviations"].max(axis=1)
+    wanted = math.ceil(math.log2(STEPS_OF_PLACE / widest.min(initial=1)))
+    with atomic_path(path) as temporary:
+        write_spz(temporary, data, fractional_bits=max(0, min(room, wanted)))
+        with temporary.open("r+b") as file:  # gzip's time of writing, the one byte that differs
+            file.seek(4)
+            file.write(bytes(4))
+
+
+def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> None:
+    """Write splats() and their origin as glTF 2.0 with KHR_gaussian_splatting. Raises UserError as
+    atomic_file does.
+    """
+    extension, place = "KHR_gaussian_splatting", table["position"]
+    attributes = {
+        "POSITION": place + origin if origin.any() else place,
+        # of programs that draw points instead
+        "COLOR_0": gltf_colours(to_8bit(0.5 + CONSTANT * table["harmonics"][:, 0])),
+        f"{extension}:ROTATION": np.roll(table["turn"], -1, axis=1),  # x, y, z, w
+        f"{extension}:SCALE": table["deviations"].copy(),
+        f"{extension}:OPACITY": table["opacity"],
+    }
+    for k in range(COUNT):
+        degree = int(k**0.5)
+        name = f"{extension}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
+        attributes[name] = table["harmonics"][:, k]
+    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    write_glb(path, attributes, extension=(extension, kernel))

@@ -1,0 +1,180 @@
+"""Runs the trainings of a sweep with Dask: on workers of this machine, or on a given scheduler."""
+
+import asyncio
+import logging
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from datetime import datetime
+from typing import Any
+
+from tqdm import tqdm
+
+from pp_cl.errors import UserError, one_line
+from pp_cl.evaluate import evaluate
+from pp_cl.scene.load import scene_splits
+from pp_cl.session.training import train_scene
+from pp_studio.sweep.plan import Job
+from pp_studio.sweep.result import failed_row, finished_row
+
+try:
+    import dask
+    from cryptography import x509  # noqa: F401 what Dask makes certificates with
+    from distributed import Client, Event, LocalCluster, WorkerPlugin, get_worker
+except ImportError as error:
+    raise UserError(
+        f"pp-cl sweep needs Dask ({error.name} is missing); install it with"
+        " `pip install dask distributed cryptography`"
+    ) from None
+
+LOOPBACK = "127.0.0.1"
+ANSWER = 20  # seconds that a scheduler, and its first worker, have to answer
+TICK = 0.5  # seconds between two looks at the runs
+SETTINGS = {
+    "distributed.scheduler.worker-saturation": 1.0,  # a worker has its one run, none in line
+    "distributed.nanny.pre-spawn-environ": {},  # Dask's one thread for numpy is too few
+}
+
+# ---- on a worker
+
+
+def run_task(job: Job, devices: Sequence[str], stop: str) -> dict[str, Any]:
+    """The row of a job, by the Dask worker that calls this. devices: indices of `pp-cl devices`
+    that the workers take in turn; empty where each has its own default. stop: name of the Event
+    that ends the sweep.
+    """
+    # tqdm's own is shared by processes, and a worker that is killed would leak it with a warning
+    tqdm.set_lock(threading.RLock())
+    device = devices[get_worker().name % len(devices)] if devices else None
+    return run_job(job, device, Event(stop).is_set)
+
+
+def run_job(job: Job, device: str | None, is_stopped: Callable[[], bool]) -> dict[str, Any]:
+    """The row of a job, trained and evaluated as far as it is not; a failed one says why. What is
+    printed meanwhile is appended to the job's log.
+
+    is_stopped: asked before the first step and after each; where it is true, the training
+    ends with a checkpoint.
+    """
+    try:
+        log = open(job.log, "a", buffering=1, encoding="utf-8")  # noqa: SIM115
+    except OSError as error:
+        why = f"{job.log}: {error.strerror} for process {os.getpid()}"
+        return failed_row(job, f"{why}; all workers must see the same files")
+    with log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} process {os.getpid()}\n")
+            if is_stopped():
+                return failed_row(job, "stopped")
+            return _trained_and_evaluated(job, device, is_stopped)
+        except UserError as error:
+            return failed_row(job, str(error))
+        except Exception as error:
+            traceback.print_exc()
+            what = f"{type(error).__name__}: {one_line(error, 500)}"
+            return failed_row(job, f"{what}; see {job.log}")
+
+
+def _trained_and_evaluated(job, device, is_stopped):
+    """The row of the job. Raises UserError as training and evaluation do."""
+    if row := finished_row(job):
+        return row
+    if "test" not in scene_splits(job.scene):
+        raise UserError(f"{job.scene}: has no split test, which a sweep measures; add one")
+    settings = {key: text for key, text, _ in job.given}
+    run = train_scene(
+        job.scene, job.folder, job.preset, device, settings=settings, is_stopped=is_stopped
+    )
+    if not run.header["finished"]:
+        return failed_row(job, "stopped")
+    evaluate(run, "test", job.metrics)
+    return finished_row(job)
+
+
+# ---- the cluster
+
+
+class Deaf(WorkerPlugin):
+    """Workers that leave Ctrl-C, which reaches all processes of a terminal, to the sweep."""
+
+    def setup(self, worker: object) -> None:
+        """Ignore it."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def local_client(workers: int) -> Iterator[Client]:
+    """Dask with so many worker processes on this machine. They listen on the loopback address alone
+    and answer only who has the certificate of this very cluster. Raises UserError where they do not
+    start.
+    """
+    with dask.config.set(SETTINGS):
+        try:
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                memory_limit=0,
+                host=LOOPBACK,
+                security=True,
+                dashboard_address=f"{LOOPBACK}:0",
+                scheduler_kwargs={"dashboard": False},
+                silence_logs=logging.CRITICAL,
+            )
+        except (OSError, RuntimeError) as error:
+            raise UserError(
+                f"the workers do not start ({error.__cause__ or error}); lower --workers, or raise"
+                " the limits of this shell (ulimit -a)"
+            ) from error
+        with cluster, Client(cluster) as client:
+            client.register_plugin(Deaf())
+            yield client
+
+
+@contextmanager
+def client_of(address: str) -> Iterator[Client]:
+    """Dask whose scheduler is at an address. Raises UserError if none with workers answers there,
+    or if they run several tasks at once.
+    """
+    why = f"--scheduler {address}: "
+    with ExitStack() as stack:
+        try:
+            client = stack.enter_context(Client(address, timeout=ANSWER))
+            client.wait_for_workers(1, timeout=ANSWER)
+        except (OSError, ValueError, asyncio.TimeoutError) as error:
+            reason = one_line(error, 500) or type(error).__name__
+            why += f"no Dask scheduler with workers answers ({reason}); start both"
+            raise UserError(f"{why} as `pp-cl sweep --help` says") from None
+        if max(client.nthreads().values()) > 1:
+            raise UserError(f"{why}a worker would train several runs at once; use --nthreads 1")
+        yield client
+
+
+def run_jobs(
+    client: Client, jobs: Sequence[Job], devices: Sequence[str], is_stopped: Callable[[], bool]
+) -> Iterator[dict[str, Any]]:
+    """The row of each job, as they end. devices: see run_task(). Where is_stopped() is true,
+    trainings write their checkpoints and end, and the rows that are left say so.
+    """
+    for job in jobs:
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+    stop = Event(client=client)
+    pending = {client.submit(run_task, job, devices, stop.name, pure=False): job for job in jobs}
+    while pending:
+        if is_stopped():
+            stop.set()
+        for future in [future for future in pending if future.done()]:
+            yield _row(future, pending.pop(future))
+        time.sleep(TICK)
+
+
+def _row(future, job):
+    """The row of a task that has ended."""
+    if future.status == "finished":
+        return future.result()
+    if future.status == "error":  # its workers have ended
+        return failed_row(job, f"{one_line(future.exception(), 500)}; see {job.log}")
+    return failed_row(job, "the scheduler is gone; the same command goes on")

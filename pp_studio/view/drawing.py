@@ -1,0 +1,138 @@
+"""What a run shows to a camera, as 8-bit images: colours, depth, normals, ..., or a photograph
+beside them.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.model import Model
+from pp_cl.engine.render import Renderer
+from pp_cl.engine.training.target import Target
+from pp_cl.engine.views import View
+from pp_cl.errors import UserError
+from pp_cl.files.contact_sheet import ERROR_GAIN
+from pp_cl.files.image import to_8bit
+from pp_cl.files.srgb import linear_to_srgb, srgb_to_linear
+from pp_cl.run import Run
+
+SHOWN = ("colour", "alpha", "depth", "normals", "fragments", "error", "photograph")
+OWN_CAMERA = SHOWN[5:]  # are shown from the nearest training view's own camera
+DARK = np.array([23, 24, 27]) / 255  # sRGB, where nothing is
+LEAST_ALPHA = 0.5  # of a pixel that has a depth to look at: those below mix edge and background
+# eleven colours of viridis, from low to high (matplotlib, CC0)
+VIRIDIS = (
+    "440154 482475 414487 355f8d 2a788e 21918c 22a884 44bf70 7ad151 bddf26 fde725"  # each RRGGBB
+)
+COLOURS = np.array([list(bytes.fromhex(word)) for word in VIRIDIS.split()]) / 255
+
+
+def draw(
+    run: Run,
+    views: list[View],
+    camera: Camera,
+    show: str = "colour",
+    *,
+    early_stop: float | None = None,
+    kept: float = 1.0,
+    exposure: float = 0.0,
+) -> tuple[np.ndarray, str]:
+    """((H, W, 3) uint8, a line on what it shows). views: the run's training views, none where its
+    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. kept: share of
+    the points, the most opaque ones, in (0, 1]. exposure: in stops. Raises UserError where there is
+    no photograph to show, and where the model computes NaN.
+    """
+    truth, line = np.empty(0), ""
+    if show in OWN_CAMERA:
+        if not views:
+            raise UserError("the photographs are not there")
+        view = views[nearest_view([one.camera for one in views], camera, run.ball[0])]
+        camera, line, truth = view.camera, view.name, Target(run.dev).whole(view)
+    if show == "photograph":
+        image = to_8bit(truth)
+    else:
+        renderer = run.renderer
+        if kept < 1:
+            renderer = Renderer(run.dev, most_opaque(run.model, kept), run.config.raster)
+        image, scale = _rendered(run, renderer, camera, show, early_stop, truth)
+        line += scale
+    if exposure:
+        light = srgb_to_linear(np.arange(256) / 255) * 2.0**exposure
+        image = to_8bit(linear_to_srgb(light))[image]
+    return image, line
+
+
+def _rendered(run, renderer, camera, show, early_stop, truth):
+    """(image, its scale) of what is rendered."""
+    options = {"early_stop": early_stop, "depth_range": run.depth_range(camera)}
+    if show == "fragments":
+        # the whole view, as until="weights" would change the buffers that a training goes on with
+        drawn = renderer.forward(camera, run.gamma, **options)
+        hits = np.diff(drawn.pairs.pixel_offset.get().astype(np.int64))
+        hits = drawn.cropped(hits.reshape(drawn.size))
+        return colour_scale(hits, 0, hits.max(), hits > 0), f"0 to {hits.max()} fragments"
+    picture = renderer.picture(camera, run.gamma, **options)
+    colour, is_known = run.checked(picture.colour), picture.alpha >= LEAST_ALPHA
+    if show == "alpha":
+        return to_8bit(np.repeat(picture.alpha[..., None], 3, axis=2)), ""
+    if show == "depth":
+        centre, radius = run.ball
+        middle = (centre - camera.eye) @ camera.pose[:, 2]
+        low, high = max(middle - radius, 0.0), max(middle + radius, 0.0)
+        return colour_scale(picture.depth, low, high, is_known), f"{low:.3g} to {high:.3g}"
+    if show == "normals":
+        normals = normals_from_depth(np.where(is_known, picture.depth, np.nan), camera)
+        return to_8bit(np.where(np.isnan(normals), DARK, (normals + 1) / 2)), ""
+    if show == "error":
+        return to_8bit(ERROR_GAIN * np.abs(colour - truth)), f", error x{ERROR_GAIN}"
+    return to_8bit(colour), ""
+
+
+def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:
+    """Which of the cameras is nearest to another: by the distance of the eyes, plus the angle
+    between the axes times the eye's distance from the object's centre (3,).
+    """
+    radius = np.linalg.norm(camera.eye - centre)
+    apart = [np.linalg.norm(other.eye - camera.eye) for other in cameras]
+    turned = [np.arccos(np.clip(c.pose[:, 2] @ camera.pose[:, 2], -1, 1)) for c in cameras]
+    return int(np.argmin(np.array(apart) + radius * np.array(turned)))
+
+
+def most_opaque(model: Model, share: float) -> Model:
+    """A copy of a model with that share of its points, in (0, 1], those of the highest opacity, and
+    at least one; it has the same network.
+    """
+    opacity = model.cloud.opacity.get()
+    count = max(1, round(share * len(opacity)))
+    keep = np.sort(np.argsort(-opacity, kind="stable")[:count]).astype(np.uint32)
+    cloud = model.cloud.rows(model.dev, model.dev.upload(keep))
+    return Model(model.dev, model.grid, model.depth_range, cloud, net=model.net)
+
+
+def colour_scale(values: Any, low: float, high: float, is_known: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: viridis from low to high, DARK where no value of (H, W) is known."""
+    place = (np.where(is_known, values, low) - low) / max(high - low, 1e-12)
+    stops = np.linspace(0, 1, len(COLOURS))
+    image = np.stack([np.interp(place, stops, COLOURS[:, i]) for i in range(3)], axis=2)
+    return to_8bit(np.where(is_known[..., None], image, DARK))
+
+
+def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W, 3) float64 unit normals in world axes, towards the camera, of the surface that a depth
+    map (H, W) along the camera's axis shows; NaN where a pixel or a neighbour that is needed has
+    none. Of the two neighbours in each direction the one of the nearer depth is taken, so that
+    edges stay sharp.
+    """
+    positions = depth[..., None] * (camera.rays() @ camera.pose[:, :3])
+
+    def along(axis):
+        steps = np.diff(positions, axis=axis, append=np.nan)
+        before = np.roll(steps, 1, axis)  # whose first is the NaN
+        ahead_jump, before_jump = (np.abs(step[..., 2:]) for step in (steps, before))
+        return np.where(np.isnan(before_jump) | (ahead_jump <= before_jump), steps, before)
+
+    normals = np.cross(along(0), along(1))  # x right, y down: their product points at the camera
+    with np.errstate(invalid="ignore"):
+        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    return normals @ camera.pose[:, :3].T

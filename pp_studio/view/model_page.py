@@ -1,0 +1,280 @@
+"""The page of a model: pictures of it for each tab's camera, the training views as frustums,
+switches, a path of cameras, and the curve of its training.
+
+viser's threads only note what tabs want; draw_next() draws it, in the thread that has the device.
+"""
+
+import io
+import json
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.views import MIN_SIDE, View
+from pp_cl.errors import UserError, name_of
+from pp_cl.run import Run
+from pp_cl.scene.camera_path import through, up_of
+from pp_cl.scene.readers.frame import frame_keys
+from pp_studio.view.drawing import DARK, OWN_CAMERA, SHOWN, draw
+from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
+
+STILL = 0.2  # seconds without movement until the full resolution is drawn
+DRAFT = 4  # times fewer pixels each way while the camera moves
+MOST_PIXELS = 2**23  # of a picture
+SIZES = {"half": 0.5, "as trained": 1.0, "double": 2.0}
+FPS = 30  # of a path, as `pp-cl render` has it
+MOST_ROWS = 500  # of the curve
+LOGGED = ("step", "psnr", "loss")
+BLUE, ORANGE, GREY = "#7fb4ff", "#ffb86b", "#a0a4ab"
+
+
+@dataclass
+class Tab:
+    """A tab of a browser: its camera, with the tab's pixels; when (time.monotonic()) that or a
+    switch last changed; when the last draft was drawn, and the last picture of full size.
+    """
+
+    client: Any
+    camera: Camera
+    moved: float = 0.0
+    drafted: float = 0.0
+    drawn: float = 0.0
+
+
+class ModelPage:
+    """run: may be replaced by that of another checkpoint. views: its training views, none where the
+    photographs are gone. most_pixels: of a picture. is_training: the model changes while it is
+    shown, and has no memory for a copy. woken: is set when a tab wants something.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        run: Run,
+        views: list[View],
+        *,
+        most_pixels: int = MOST_PIXELS,
+        is_training: bool = False,
+    ) -> None:
+        self.run, self.woken = run, threading.Event()
+        self._server, self._views, self._most_pixels = server, views, most_pixels
+        self._tabs: dict[int, Tab] = {}
+        self._wanted: list[Tab] = []  # those that want a PNG file
+        self._keys: list[Camera] = []  # of the path
+        self._space = Space(*run.ball)
+        cameras = [view.camera for view in views] or run.cameras("train")
+        self._focal = float(np.median([camera.fy for camera in cameras]))
+        server.scene.set_up_direction(up_of(cameras))
+        self._space.look_through(cameras[0], server.initial_camera)
+        # who looks through a frustum sees the model, not the photograph in the frustum
+        server.initial_camera.near = 1.1 * FRUSTUM
+        self._frustums = server.scene.add_frame("/views", show_axes=False)
+        images: list[Any] = [thumbnail(view.image) for view in views] or [None] * len(cameras)
+        for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+            frustum = self._space.add_frustum(server, f"/views/{i}", camera, image=image)
+            frustum.on_click(
+                lambda event, c=camera: self._space.look_through(c, event.client.camera)
+            )
+        self._add_switches(run.config.raster.early_stop, is_training)
+        self._add_path_and_curve()
+        server.on_client_connect(self._connected)
+        server.on_client_disconnect(self._disconnected)
+
+    def _add_switches(self, early_stop, is_training):
+        gui = self._server.gui
+        self._status = gui.add_markdown("")
+        self._show = gui.add_dropdown("Show", SHOWN, hint="keys 1 to 7")
+        for i, show in enumerate(SHOWN):
+            command = gui.add_command(f"Show {show}", hotkey=str(i + 1))
+            command.on_trigger(lambda _, show=show: setattr(self._show, "value", show))
+        self._stop = gui.add_slider(
+            "Early stop", min=0.0, max=0.5, step=0.001, initial_value=early_stop
+        )
+        self._kept = gui.add_slider(
+            "Points kept, %", min=1, max=100, step=1, initial_value=100, visible=not is_training
+        )
+        self._exposure = gui.add_slider(
+            "Exposure, stops", min=-3.0, max=3.0, step=0.1, initial_value=0.0
+        )
+        self._size = gui.add_dropdown("Picture size", tuple(SIZES), initial_value="as trained")
+        self._shown = gui.add_checkbox("Training views", True, hint="click one to go there")
+        trained = [(one, one.value) for one in (self._stop, self._kept, self._exposure, self._size)]
+        for handle in (self._show, self._shown, *(one for one, _ in trained)):
+            handle.on_update(self._switched)
+        gui.add_button("As trained").on_click(
+            lambda _: [setattr(handle, "value", value) for handle, value in trained]
+        )
+        gui.add_button("Save picture").on_click(self._want_file)
+
+    def _add_path_and_curve(self):
+        gui = self._server.gui
+        with gui.add_folder("Camera path", expand_by_default=False):
+            gui.add_button("Add this camera").on_click(self._add_key)
+            gui.add_button("Remove the last").on_click(self._remove_key)
+            self._seconds = gui.add_slider("Seconds", min=1, max=60, step=1, initial_value=4)
+            gui.add_button("Save path.json").on_click(self._send_path)
+        self._curve = gui.add_uplot(
+            tuple(np.zeros((len(LOGGED), 0))),
+            (
+                {"label": "step"},
+                {"label": "PSNR", "scale": "dB", "stroke": BLUE},
+                {"label": "loss", "scale": "loss", "stroke": ORANGE},
+            ),
+            scales={"x": {"time": False}, "dB": {}, "loss": {"distr": 3}},  # 3: logarithmic
+            axes=(
+                {"stroke": GREY},
+                {"scale": "dB", "stroke": BLUE},
+                {"scale": "loss", "stroke": ORANGE, "side": 1},  # 1: on the right
+            ),
+            aspect=1.5,
+            visible=False,
+        )
+
+    # ---- what viser's threads call
+
+    async def _connected(self, client):
+        async def moved(seen):
+            if camera := self._space.camera(seen):
+                tab = self._tabs.setdefault(client.client_id, Tab(client, camera))
+                tab.camera, tab.moved = camera, time.monotonic()
+                self.woken.set()
+
+        client.camera.on_update(moved)
+        await moved(client.camera)
+
+    async def _disconnected(self, client):
+        self._tabs.pop(client.client_id, None)
+
+    def _switched(self, _event):
+        self._frustums.visible = self._shown.value and self._show.value not in OWN_CAMERA
+        for tab in list(self._tabs.values()):
+            tab.moved = time.monotonic()
+        self.woken.set()
+
+    def _want_file(self, event):
+        if tab := self._tabs.get(event.client_id):
+            self._wanted.append(tab)
+            self.woken.set()
+
+    def _add_key(self, event):
+        if tab := self._tabs.get(event.client_id):
+            self._keys.append(self._camera(tab))
+            name = f"/path/{len(self._keys)}"
+            self._space.add_frustum(self._server, name, self._keys[-1], color=CHOSEN)
+
+    def _remove_key(self, _event):
+        if self._keys:
+            self._server.scene.remove_by_name(f"/path/{len(self._keys)}")
+            self._keys.pop()
+
+    def _send_path(self, event):
+        if self._keys:
+            frames = through(self._keys, round(FPS * _value(self._seconds)))
+            text = json.dumps({"frames": [frame_keys(camera) for camera in frames]})
+            event.client.send_file_download("path.json", text.encode(), save_immediately=True)
+
+    # ---- what the thread that has the device calls
+
+    def renew(self) -> None:
+        """Have all tabs that rest drawn again, as the model has changed."""
+        for tab in list(self._tabs.values()):
+            tab.drawn = 0.0
+
+    def set_rows(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Draw the curve of the rows of a log, thinned out to about MOST_ROWS."""
+        found = [[row[key] for key in LOGGED] for row in rows if all(key in row for key in LOGGED)]
+        thinned = found[:: 1 + len(found) // MOST_ROWS]
+        self._curve.data = tuple(np.array(thinned, np.float64).reshape(-1, len(LOGGED)).T.copy())
+        self._curve.visible = bool(found)
+
+    def draw_next(self) -> bool:
+        """Draw what a tab waits for, that which has waited longest; whether there was anything."""
+        self.woken.clear()
+        if self._wanted:
+            self._send_picture(self._wanted.pop(0))
+            return True
+        for tab in sorted(self._tabs.values(), key=lambda tab: max(tab.drafted, tab.drawn)):
+            now = time.monotonic()
+            is_moving = now - tab.moved < STILL
+            if is_moving and tab.drafted < tab.moved and self._show.value not in OWN_CAMERA:
+                tab.drafted = now
+            elif not is_moving and tab.drawn < tab.moved:
+                tab.drawn = now
+            else:
+                continue
+            self._send(tab, is_moving)
+            return True
+        return False
+
+    def tell(self, line: str) -> None:
+        """Write the state of the run and a line below it on the page."""
+        step, steps = self.run.header["step"], self.run.config.train.iterations
+        points = self.run.model.cloud.count
+        self._status.content = f"step {step} of {steps}, {points} points\n\n{line}"
+
+    def _camera(self, tab):
+        """Of the picture that fills a tab, with the focal length of the training's images times the
+        size that is chosen; less where the picture would be too large.
+        """
+        camera = tab.camera
+        width, height = camera.width, camera.height
+        scale = min(
+            SIZES.get(self._size.value, 1.0) * self._focal / camera.fy,
+            (self._most_pixels / (width * height)) ** 0.5,
+        )
+        width, height = (max(MIN_SIDE, round(scale * side)) for side in (width, height))
+        return camera.resized(width, height)
+
+    def _image(self, camera):
+        """What draw() makes of it, as the switches say; None where it refuses, and told why."""
+        stop, kept, exposure = map(_value, (self._stop, self._kept, self._exposure))
+        options = {"early_stop": stop, "kept": kept / 100, "exposure": exposure}
+        try:
+            return draw(self.run, self._views, camera, self._show.value, **options)
+        except UserError as error:
+            self.tell(str(error))
+            return None
+
+    def _send(self, tab, is_draft):
+        """Draw the picture that a tab shows behind its frustums."""
+        start, camera = time.perf_counter(), self._camera(tab)
+        if is_draft:
+            most = min(camera.width, camera.height) // MIN_SIDE
+            camera = camera.downscaled(max(1, min(DRAFT, most)))
+        if found := self._image(camera):
+            image, line = found
+            if self._show.value in OWN_CAMERA:
+                image = framed(image, tab.camera.width / tab.camera.height)
+            tab.client.scene.set_background_image(image, "jpeg", jpeg_quality=90)
+            if not is_draft:
+                took = f"{1e3 * (time.perf_counter() - start):.0f} ms on {self.run.dev.name}"
+                self.tell(f"{line}\n\n{image.shape[1]}x{image.shape[0]}, {took}")
+
+    def _send_picture(self, tab):
+        """Draw what a tab shows into a file that its user keeps."""
+        if found := self._image(self._camera(tab)):
+            file = io.BytesIO()
+            Image.fromarray(found[0]).save(file, "PNG")
+            run = name_of(self.run.folder.path)
+            name = f"{run}_step_{self.run.header['step']}_{self._show.value}.png"
+            tab.client.send_file_download(name, file.getvalue(), save_immediately=True)
+
+
+def framed(image: np.ndarray, aspect: float) -> np.ndarray:
+    """The (H, W, 3) uint8 image in the middle of one of this width over height, DARK around it."""
+    height, width = image.shape[:2]
+    across, down = max(round(aspect * height) - width, 0), max(round(width / aspect) - height, 0)
+    whole = np.full((height + down, width + across, 3), 255 * DARK, np.uint8)
+    whole[down // 2 :, across // 2 :][:height, :width] = image
+    return whole
+
+
+def _value(slider):
+    """What a slider says, within its bounds whatever a tab has sent."""
+    return float(np.clip(np.nan_to_num(slider.value), slider.min, slider.max))

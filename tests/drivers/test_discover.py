@@ -1,0 +1,162 @@
+"""Which devices there are, whether they work, and which one is chosen."""
+
+import os
+import re
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pyopencl as cl
+import pytest
+from support.refused import refusing
+
+from pp_cl.drivers import discover
+from pp_cl.drivers.discover import list_devices, mend, open_device, separate_devices
+from pp_cl.drivers.drivers import LEAST_CONSTANT, find_problem
+from pp_cl.engine.device.device import kernel_folder
+from pp_cl.engine.training.loss import TAPS
+
+
+def fake(platform, name, gpu=False, problem=None, index="0:0"):
+    """An entry of list_devices() that is never opened."""
+    kind = cl.device_type.GPU if gpu else cl.device_type.CPU
+    return (
+        index,
+        SimpleNamespace(name=name, platform=SimpleNamespace(name=platform), type=kind),
+        problem,
+    )
+
+
+@pytest.fixture
+def listed(monkeypatch):
+    """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a
+    Device.
+    """
+    monkeypatch.setattr(discover, "Device", lambda d: d)
+    monkeypatch.delenv("PP_DEVICE", raising=False)
+    return lambda *entries: monkeypatch.setattr(discover, "list_devices", lambda **_: list(entries))
+
+
+def test_listed_devices_are_probed(session_device):
+    found = list_devices()
+    (index,) = (i for i, d, p in found if d == session_device.device and p is None)
+    assert len({i for i, _, _ in found}) == len(found)
+    assert open_device(index).device == session_device.device
+
+
+def test_a_gpu_that_works_comes_first(listed):
+    cpu, gpu = fake("PoCL", "cpu"), fake("NVIDIA CUDA", "H200", gpu=True, index="1:0")
+    listed(cpu, gpu)
+    assert open_device() is gpu[1]
+    listed(fake("rusticl", "llvmpipe", gpu=True, problem="does not run: x", index="1:0"), cpu)
+    assert open_device() is cpu[1]
+
+
+CHOICES = {"0:0": 0, "1:0": 1, "1:1": 2, "intel": 1, "Portable": 0, "h200": 2, "cuda": 2}
+# PoCL's devices carry the name of the processor: a whole name goes before a part of another
+CHOICES |= {"Intel(R) Xeon(R)": 1, "xeon": 0}
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("variable", [False, True])
+def test_choice_by_index_and_name(listed, monkeypatch, choice, variable):
+    entries = [
+        fake("Portable Computing Language", "cpu-haswell-Intel(R) Xeon(R)"),
+        fake("Intel(R) OpenCL", "Intel(R) Xeon(R)", index="1:0"),
+        fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1"),
+    ]
+    listed(*entries)
+    monkeypatch.setenv("PP_DEVICE", choice if variable else "0:0")  # an argument comes first
+    assert open_device(None if variable else choice) is entries[CHOICES[choice]][1]
+
+
+def test_what_cannot_be_opened_is_told_and_not_replaced(listed):
+    works = "found 0:0 good (A) works"
+    broken = fake("B", "bad", problem="does not run: no target", index="1:0")
+    listed(fake("A", "good"))
+    with refusing(f"device 'radeon': no such OpenCL device; {works}"):
+        open_device("radeon")
+    listed(fake("A", "good"), broken)
+    wanted = f"({works}; 1:0 bad (B) does not run: no target)"
+    with refusing(f"device 'bad': no working OpenCL device {wanted}: install"):
+        open_device("bad")
+    listed()
+    with refusing("no working OpenCL device (found none): install"):
+        open_device()
+
+
+def test_devices_that_can_work_side_by_side(listed, monkeypatch):
+    """GPUs alone if there are any; what two platforms list under one name is one; a processor is
+    shared by all its platforms.
+    """
+    h200 = [fake("NVIDIA CUDA", "H200", gpu=True, index=f"0:{i}") for i in range(2)]
+    again = [fake("PoCL", "H200 ", gpu=True, index=f"1:{i}") for i in range(2)]
+    broken = fake("C", "other", gpu=True, problem="does not run: x", index="2:0")
+    arc = fake("Intel", "Arc", gpu=True, index="3:0")
+    cpus = [fake("PoCL", "cpu", index="4:0"), fake("Intel", "Xeon", index="5:0")]
+    listed(*cpus, *h200, *again, broken, arc)
+    assert separate_devices() == ["0:0", "0:1", "3:0"]
+    listed(broken, *cpus)
+    assert separate_devices() == ["4:0"]
+    listed(broken)
+    with refusing("no working OpenCL device"):
+        separate_devices()
+    monkeypatch.setenv("PP_DEVICE", "xeon")
+    assert separate_devices() == ["xeon"]
+
+
+@pytest.mark.parametrize(
+    "system, machine, tool, word",
+    [
+        ("linux", "x86_64", "apt-get", "pip install intel-opencl-rt"),
+        ("win32", "AMD64", "", "pip install intel-opencl-rt"),
+        ("linux", "aarch64", "apt-get", "apt install pocl-opencl-icd"),
+        ("linux", "aarch64", "", "conda install"),
+        ("darwin", "arm64", "", "conda install"),
+    ],
+)
+def test_one_command_for_each_system(monkeypatch, system, machine, tool, word):
+    monkeypatch.setattr("sys.platform", system)
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    monkeypatch.setattr("shutil.which", lambda name: name == tool)
+    monkeypatch.setattr(discover, "in_conda", lambda: False)
+    monkeypatch.setattr(discover, "runtime_library", lambda: None)
+    assert f"`{word}" in mend() or f"`sudo {word}" in mend()
+    assert mend().count("`") == 2
+
+
+def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    index = next(i for i, d, _ in list_devices() if d == session_device.device)
+    script = (
+        "import os; from pp_cl.drivers.discover import open_device; "
+        f"open_device({index!r}).program('training/adam'); print(os.environ['XDG_CACHE_HOME'])"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "XDG_CACHE_HOME": str(blocked / "cache")},
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "set XDG_CACHE_HOME to keep them" in ran.stderr
+    assert not os.path.exists(ran.stdout.strip())  # gone with the process
+
+
+def test_a_device_without_room_for_constants_does_not_work():
+    """64 KiB is what OpenCL asks for; 64 bytes are enough."""
+    problem = find_problem(SimpleNamespace(max_constant_buffer_size=63))
+    assert problem == "holds 63 bytes of constants, 64 needed"
+
+
+def test_what_kernels_hold_in_constant_memory():
+    """One table, of the 11 float32 of SSIM's window; no kernel takes a constant argument."""
+    found = [
+        (path.stem, line)
+        for path in sorted(kernel_folder().rglob("*.[ch]*"))
+        for line in path.read_text("utf-8").splitlines()
+        if re.search(r"\bconstant\b", line.partition("//")[0])
+    ]
+    assert [name for name, _ in found] == ["loss"]
+    assert "constant float WINDOW[TAPS]" in found[0][1] and 4 * TAPS <= LEAST_CONSTANT

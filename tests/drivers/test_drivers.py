@@ -1,0 +1,156 @@
+"""Drivers that crash, hang or build nothing are named and hurt nobody; Intel's runtime is found
+beside pp-cl.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pyopencl as cl
+import pytest
+
+from pp_cl.drivers import drivers
+
+POCL = Path("/etc/OpenCL/vendors/pocl.icd")
+COMPILER = shutil.which("cc")
+pytestmark = [
+    pytest.mark.skipif(sys.platform != "linux" or not COMPILER, reason="needs a C compiler, Linux"),
+    pytest.mark.skipif(not POCL.exists(), reason="needs PoCL"),
+]
+
+
+def compiled(library, *flags):
+    """A driver's library of tests/engine/device/icd.c."""
+    source = Path(__file__).with_name("icd.c")
+    subprocess.run([COMPILER, "-shared", "-fPIC", *flags, "-o", library, source], check=True)
+    return library
+
+
+@pytest.fixture
+def vendors(tmp_path, monkeypatch):
+    """A folder with PoCL, to which drivers are added by name and flags; the only one of this
+    machine. Nothing is known of them yet.
+    """
+    folder = tmp_path / "vendors"
+    folder.mkdir()
+    shutil.copy(POCL, folder / "pocl.icd")
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(folder))
+    monkeypatch.setenv("PP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("PP_DEVICE", raising=False)
+
+    def add(name, *flags):
+        library = compiled(tmp_path / f"lib{name}.so", *flags)
+        (folder / f"{name}.icd").write_text(f"{library}\n")
+
+    return add
+
+
+def python(code):
+    """What a fresh process prints, on both streams."""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout + ran.stderr
+
+
+def listed(code="import sys; from pp_cl.cli import main; sys.exit(main(['devices', '--json']))"):
+    """{name of a device or driver: its row} of `pp-cl devices` in a fresh process."""
+    return {os.path.basename(row["name"]): row for row in json.loads(python(code))}
+
+
+def test_a_driver_that_crashes_and_one_that_builds_nothing(vendors):
+    vendors("crash", "-DCRASHES")
+    vendors("broken")
+    found = listed()
+    assert "SIGABRT" in found["crash.icd"]["problem"]
+    assert found["unbuilding"]["problem"].startswith("does not run")
+    assert [row["index"] for row in found.values() if row["problem"] is None]
+    # later processes try nothing and load nothing that hurts; with a new driver they do
+    opened = (
+        "from pp_cl.engine.device import discover, drivers; {} print(discover.open_device().name)"
+    )
+    assert python(opened.format("drivers._start = None;")).strip() in found
+    vendors("other", "-DCRASHES")
+    assert python(opened.format("")).strip() in found
+    assert "other.icd" in (Path(os.environ["PP_CACHE"]) / "drivers.json").read_text()
+
+
+@pytest.mark.slow  # a driver hangs for 20 s before it counts as one that does
+def test_a_driver_that_hangs(vendors):
+    vendors("crash", "-DCRASHES")
+    vendors("hang", "-DHANGS")
+    vendors("broken")
+    start = time.monotonic()
+    found = listed()
+    assert time.monotonic() - start < 30
+    assert {"crash.icd", "hang.icd", "unbuilding"} < set(found)
+    assert "20 seconds" in found["hang.icd"]["problem"]
+    left = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
+    library = str(Path(os.environ["OCL_ICD_VENDORS"]).with_name("libhang.so"))
+    assert not [words for words in left if library in " ".join(words)]
+    assert [row["index"] for row in found.values() if row["problem"] is None]
+
+
+def test_intels_runtime_is_found_beside_pp_cl(tmp_path, monkeypatch):
+    """As pip lays it out, with a driver of the tests in its place; not where drivers are chosen."""
+    compiled(tmp_path / "libintelocl.so")
+    about = tmp_path / "intel_opencl_rt-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Name: intel-opencl-rt\nVersion: 1\n")
+    (about / "RECORD").write_text("libintelocl.so,,\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setenv("PP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("OCL_ICD_VENDORS", raising=False)
+    assert listed()["unbuilding"]["problem"].startswith("does not run")
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(POCL))
+    assert "unbuilding" not in listed()
+
+
+def test_what_was_found_is_kept_and_found_anew_where_its_file_is_damaged(
+    session_device, tmp_path, monkeypatch
+):
+    """Or where it cannot be written, or nothing worked."""
+    shown, probed = drivers.try_drivers(again=True), []
+    monkeypatch.setattr(drivers, "_probe", lambda _: probed.append(0) or shown)
+
+    def tried(cache):
+        monkeypatch.setenv("PP_CACHE", str(cache))
+        drivers._tried.clear()
+        found, count = drivers.try_drivers(), len(probed)
+        rows = {tuple(row[:3]): row[3] for rows in found.values() for row in rows}
+        assert rows[drivers.identity(session_device.device)] is None
+        return count
+
+    assert tried(tmp_path) == tried(tmp_path) == 1
+    file = tmp_path / "drivers.json"
+    key, found = json.loads(file.read_text())
+    broken = {name: [[*row[:3], "broken"] for row in rows] for name, rows in found.items()}
+    contents = [[], {"a": 1}, [key, 1], [key, {"a": [[]]}], [key, broken], ["other", found]]
+    for n, content in enumerate(contents, 2):
+        file.write_text(json.dumps(content))
+        assert tried(tmp_path) == n
+    file.write_text("{")
+    assert tried(tmp_path) == tried(tmp_path) == 8
+    file.write_text("")
+    assert tried(file / "cache") == 9
+
+
+@pytest.mark.parametrize("result", ["wrong", "error"])
+def test_probe_names_the_problem(session_device, monkeypatch, result):
+    change = {"wrong": ("2.0f", "3.0f"), "error": ("2.0f", "undeclared")}
+    monkeypatch.setattr(drivers, "PROBE", drivers.PROBE.replace(*change[result]))
+    problem = drivers.find_problem(session_device.device)
+    assert {"wrong": "computes a wrong result", "error": "does not run: "}[result] in problem
+    assert "\n" not in problem
+
+
+def test_without_a_driver_nothing_is_listed(monkeypatch):
+    def none():
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    assert drivers._platforms({drivers.REST: ""}) == []

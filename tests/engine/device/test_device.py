@@ -1,0 +1,310 @@
+"""A device: its buffers, its errors, its programs and its debug levels."""
+
+import atexit
+import gc
+import re
+import time
+import weakref
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from support.guarded import GuardedDevice
+
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.device import device as device_module
+from pp_cl.engine.device.device import Device, acts_as_cpu, kernel_folder
+from pp_cl.errors import BuildError, UserError
+
+TINY = """
+// One work-item per element: overwrites y with 0 / x.
+kernel void divide(
+    const uint n,              // elements
+    global const float *x,     // (N)
+    global float *y)           // (N)
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    y[i] = 0.0f / x[i];
+}
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """A kernel folder of the test's own."""
+    (tmp_path / "tiny.cl").write_text(TINY)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    return tmp_path
+
+
+def test_a_device_that_nobody_has_is_gone_with_its_memory(session_device):
+    device = Device(session_device.device)
+    device.scratch("mine", 100)
+    device.program("training/adam")
+    gone = weakref.ref(device)
+    del device
+    gc.collect()
+    assert gone() is None
+
+
+# ---- buffers
+
+
+def test_upload_fill_zeros_copy(dev, rng):
+    values = rng.random((16, 31)).T  # float64, not contiguous
+    a, b = dev.upload(values, np.float32), dev.zeros((31, 16))
+    assert np.array_equal(b.get(), np.zeros((31, 16)))
+    dev.copy(b, a)
+    assert np.array_equal(b.get(), values.astype(np.float32))
+    for dtype in (np.uint8, np.int32, np.uint64):
+        c = dev.empty((257,), dtype)
+        dev.fill(c, 7)
+        assert np.array_equal(c.get(), np.full(257, 7, dtype))
+    dev.fill(a, 2.5)
+    assert np.array_equal(a.get(), np.full((31, 16), 2.5))
+    assert np.array_equal(b.get(), values.astype(np.float32))
+    for other in (dev.zeros((30, 16)), dev.zeros((31, 16), np.uint32)):
+        with pytest.raises(ValueError, match="copy"):
+            dev.copy(b, other)
+
+
+def test_zero_size_arrays(dev):
+    a, b = dev.empty((0, 16)), dev.zeros((0, 16))
+    dev.fill(a, 1)
+    dev.copy(a, b)
+    assert a.get().shape == dev.upload(np.empty((0, 16), np.float32)).get().shape == (0, 16)
+
+
+@pytest.mark.parametrize("values", [np.zeros(8, np.float32), np.zeros(9, np.float64)])
+def test_writing_what_does_not_fit(dev, values):
+    for write in (dev.write, dev.send):
+        with pytest.raises(ValueError, match="write"):
+            write(dev.zeros((9,)), values)
+
+
+def test_scratch_is_shared_by_name_and_grows(plain):
+    first = plain.scratch("a", 100, zeros=16)
+    assert not first[:16].get().any()
+    plain.fill(first, 1)
+    assert plain.scratch("a", 50, zeros=16) is first and first.get().all()
+    assert plain.scratch("b", 50) is not first
+    del first
+    assert plain.scratch("a", 101, np.uint32).dtype == np.uint32
+    assert plain.bytes == 4 * (101 + 50) and plain.peak_bytes == plain.bytes
+
+
+def test_memory_is_counted_and_given_back(plain):
+    a = plain.zeros((1000,))
+    b = plain.empty((500, 2), np.uint64)
+    assert plain.bytes == plain.peak_bytes == 4000 + 8000
+    del b
+    assert (plain.bytes, plain.peak_bytes) == (4000, 12000)
+    part = a[:10].reshape(5, 2).view(np.uint32)  # as much as before, whoever holds it
+    del a
+    assert plain.bytes == 4000
+    del part
+    assert (plain.bytes, plain.peak_bytes) == (0, 12000)
+
+
+def test_buffers_are_held_to_the_largest_allocation_and_to_the_memory(plain):
+    plain.info["max_allocation_bytes"], plain.info["memory_bytes"] = 1000, 2200
+    kept = plain.empty((250,))
+    with pytest.raises(UserError, match=r"a buffer of shape \(251,\) needs .*lower --points"):
+        plain.empty((251,))
+    more = plain.empty((250,))
+    with pytest.raises(UserError, match="in use"):
+        plain.upload(np.zeros(51, np.float32))
+    assert plain.bytes == kept.nbytes + more.nbytes
+    plain.empty((50,))
+
+
+def test_a_smaller_largest_allocation_can_be_asked_for(monkeypatch):
+    largest = open_device().info["max_allocation_bytes"]
+    for text, expected in (("0.5", 2**19), ("1e9", largest)):
+        monkeypatch.setenv("PP_MAX_ALLOCATION", text)
+        assert open_device().info["max_allocation_bytes"] == expected
+
+
+@pytest.mark.parametrize(
+    "variable, text",
+    [("PP_MAX_ALLOCATION", t) for t in ("0", "-1", "nan", "much")]
+    + [("PP_DEBUG", t) for t in ("4", "-1", "yes", "1.5")]
+    + [("PP_FORM", "tpu")],
+)
+def test_a_bad_variable_is_one_line(monkeypatch, variable, text):
+    monkeypatch.setenv(variable, text)
+    with pytest.raises(UserError, match=f"^{variable}={text}: "):
+        open_device()
+
+
+def test_a_cpu_works_as_one_unless_told_otherwise(dev, monkeypatch):
+    of_device = bool(dev.device.type & cl.device_type.CPU)
+    monkeypatch.delenv("PP_FORM", raising=False)
+    assert acts_as_cpu(dev.device) == of_device
+    monkeypatch.setenv("PP_FORM", "")
+    assert acts_as_cpu(dev.device) == of_device
+    monkeypatch.setenv("PP_FORM", "gpu")
+    assert not acts_as_cpu(dev.device) and not open_device().is_cpu
+
+
+@pytest.mark.parametrize("error", [cl.MemoryError, cl.RuntimeError, cl.LogicError])
+def test_a_driver_that_gives_up_is_a_user_error(plain, error):
+    """And a wrong call of it keeps its traceback."""
+
+    def refuse(*_):
+        raise error("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
+
+    with pytest.raises(error if error is cl.LogicError else UserError) as caught:
+        plain.attempt("run x.cl:y", refuse, 1)
+    if error is not cl.LogicError:
+        said = r"\S.* cannot run x.cl:y for want of memory, or since the driver ended a kernel \(.*"
+        assert re.match(
+            said + "OUT_OF_RES.*lower --points.*the log of the system", str(caught.value)
+        )
+
+
+def test_fresh_guarded_buffers_are_nan(dev):
+    assert np.isnan(dev.empty((33,)).get()).all()
+    assert (dev.empty((33,), np.uint32).get() == 0xFFFFFFFF).all()
+
+
+# ---- programs and debug levels
+
+
+def test_programs_are_built_once_for_each_define(plain, tiny):
+    assert plain.program("tiny", A=1, B=2) is plain.program("tiny", B=2, A=1)
+    assert plain.program("tiny", A=1) is not plain.program("tiny", A=2)
+
+
+def test_a_build_error_names_file_options_and_cause(plain, tiny):
+    (tiny / "broken.cl").write_text(
+        "kernel void f(\n    global float *x)  // (N)\n{ x[0] = undeclared_thing; }\n"
+    )
+    with pytest.raises(
+        BuildError, match=r"^cl/broken\.cl does not build on .* with .*-DDEGREE=2"
+    ) as error:
+        plain.program("broken", DEGREE=2)
+    assert "undeclared_thing" in error.value.log
+
+
+@pytest.mark.parametrize(
+    ("platform", "kind", "large"),
+    [
+        ("Intel(R) OpenCL Graphics", "GPU", True),
+        ("Intel(R) OpenCL HD Graphics", "GPU", True),
+        ("Intel(R) OpenCL", "CPU", False),
+        ("Apple", "GPU", False),  # which drives Intel's GPUs too, and refuses unknown options
+        ("NVIDIA CUDA", "GPU", False),
+    ],
+)
+def test_intels_gpus_take_more_registers_for_files_that_spill(platform, kind, large):
+    info = {"platform": platform, "type": kind}
+    expected = ("-cl-intel-256-GRF-per-thread",) if large else ()
+    assert device_module.vendor_options(info, "layers/conv_backward_weights") == expected
+    assert device_module.vendor_options(info, "raster/shade") == ()
+    files = device_module.SPILLING_ON_INTEL
+    assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)
+
+
+@pytest.mark.parametrize("said, expected", [(1, True), (0, False), (None, True)])
+def test_only_nvidias_driver_rules_out_a_watchdog(said, expected):
+    class Driver:
+        @property
+        def kernel_exec_timeout_nv(self):
+            if said is None:
+                raise cl.LogicError("clGetDeviceInfo failed: INVALID_VALUE")
+            return said
+
+    assert device_module.has_watchdog(Driver()) is expected
+
+
+def test_a_build_takes_the_options_of_its_vendor(plain, tiny, monkeypatch):
+    monkeypatch.setattr(device_module, "vendor_options", lambda info, name: ("-DDOUBLED=1",))
+    (tiny / "doubled.cl").write_text(
+        "#ifndef DOUBLED\n#error none\n#endif\n"
+        "kernel void f(\n    global float *x)  // (N)\n{ x[0] = 1.0f; }\n"
+    )
+    assert plain.program("doubled").kernels.keys() == {"f"}
+
+
+def test_a_kernel_folder_with_a_space_is_refused(plain, tmp_path, monkeypatch):
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path / "a b")
+    with pytest.raises(UserError, match="a b: .*space"):
+        plain.program("tiny")
+
+
+@pytest.fixture
+def debugged(session_device, tiny, monkeypatch):
+    """Makes a device of a given PP_DEBUG that runs TINY on some values."""
+    made = []
+
+    def make(level, values, guarded=False):
+        monkeypatch.setenv("PP_DEBUG", level)
+        device = (GuardedDevice if guarded else Device)(session_device.device)
+        made.append(device)
+        x = device.upload(np.array(values, np.float32))
+        device.program("tiny").launch("divide", x.size, n=x.size, x=x, y=device.empty(x.shape))
+        device.finish()
+        return device
+
+    yield make
+    for device in made:
+        atexit.unregister(device.print_profile)
+
+
+@pytest.mark.parametrize("level, labels", [("0", []), ("3", ["tiny.cl:divide"])])
+def test_debug_0_measures_nothing_and_3_is_content_with_numbers(debugged, level, labels):
+    assert list(debugged(level, [1, 2, 3])._seconds) == labels
+
+
+@pytest.mark.parametrize("level, label", [("1", "tiny.cl "), ("2", "tiny.cl:divide ")])
+def test_debug_1_times_files_and_2_times_kernels(debugged, monkeypatch, capsys, level, label):
+    printed = []
+    monkeypatch.setattr("atexit.register", printed.append)
+    device = debugged(level, [1, 2, 0])
+    seconds = device._seconds["tiny.cl:divide"]
+    assert len(seconds) == 1
+    assert 0 <= seconds[0] < 10
+    (at_exit,) = printed
+    at_exit()
+    shown = capsys.readouterr()
+    assert "tiny.cl" in shown.err and "built in" in shown.err
+    assert shown.err.splitlines()[-1].startswith(label)
+    assert shown.out == ""
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+@pytest.mark.exact
+def test_debug_3_finds_a_nan(debugged, guarded):
+    with pytest.raises(FloatingPointError, match="tiny.cl:divide: y has 2 NaN or Inf, first at 1"):
+        debugged("3", [1, 0, 2, 0], guarded)
+
+
+@pytest.mark.exact
+def test_debug_3_takes_infinity_where_the_kernel_says_so(debugged, tiny):
+    may = TINY.replace("0.0f /", "1.0f /").replace(
+        "y)           // (N)", "y)  // (N) infinite at 0"
+    )
+    (tiny / "tiny.cl").write_text(may)
+    debugged("3", [1, 0])
+    with pytest.raises(FloatingPointError, match="y has 1 NaN or Inf, first at 0"):
+        debugged("3", [np.nan, 0])
+
+
+# ---- stages
+
+
+def test_stages_are_timed_only_when_asked_for(session_device):
+    device = GuardedDevice(session_device.device)
+    with device.stage("before"):
+        pass
+    with device.timed_stages() as seconds:
+        for _ in range(2):
+            with device.stage("blend"):
+                time.sleep(0.01)
+    with device.stage("after"):
+        pass
+    assert list(seconds) == ["blend"]
+    assert len(seconds["blend"]) == 2
+    assert min(seconds["blend"]) >= 0.01

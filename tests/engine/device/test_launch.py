@@ -1,0 +1,332 @@
+"""Launches, the launcher's refusals, signatures, and the build of every kernel file."""
+
+import tracemalloc
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from support.toy_kernels import SOURCE
+
+from pp_cl.engine.device import device as device_module
+from pp_cl.engine.device.kernel import SCALARS, parse_signatures
+from pp_cl.engine.device.launch import channel_ranges, group_items, group_ranges, lanes, row_parts
+from pp_cl.errors import UserError
+
+KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
+STEMS = sorted(
+    p.relative_to(KERNEL_FOLDER).with_suffix("").as_posix() for p in KERNEL_FOLDER.rglob("*.cl")
+)
+
+
+@pytest.fixture
+def program(dev, tmp_path, monkeypatch):
+    """SOURCE built on the guarded device."""
+    (tmp_path / "toy.cl").write_text(SOURCE)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    dev._programs.pop(("toy", frozenset()), None)
+    yield dev.program("toy")
+    dev._programs.pop(("toy", frozenset()), None)
+
+
+@pytest.fixture
+def rows(dev, rng):
+    """Good arguments of the kernel `rows`, n = 33."""
+    return {
+        "n": 33,
+        "scale": 2.0,
+        "x": dev.upload(rng.random((33, 4)), np.float32),
+        "k": dev.upload(np.arange(3), np.uint32),
+        "y": dev.empty((33, 1)),
+    }
+
+
+# ---- launching
+
+
+def test_a_launch_computes(program, dev, rows):
+    """A letter stands for one size only within a launch; numpy's numbers are taken."""
+    program.launch("rows", (np.uint32(33),), local=(8,), **rows | {"n": np.int64(33)})
+    expected = 2 * rows["x"].get().sum(1) + np.arange(33) % 3
+    np.testing.assert_allclose(rows["y"].get()[:, 0], expected, rtol=1e-6)
+    fewer = rows | {"n": 31, "x": rows["x"][:31], "y": dev.empty((31, 1))}
+    program.launch("rows", 31, **fewer)
+    np.testing.assert_allclose(fewer["y"].get()[:, 0], expected[:31], rtol=1e-6)
+
+
+def test_launches_of_ever_new_sizes_take_no_more_and_more_memory(program, dev):
+    """As in a training, each step of which sees another number of points."""
+    kernel, x, y = program.kernels["rows"], dev.empty((2000, 4)), dev.empty((2000, 1))
+    k = dev.upload(np.arange(3), np.uint32)
+
+    def checked(sizes):
+        for n in sizes:
+            kernel.arguments({"n": n, "scale": 1.0, "x": x[:n], "k": k, "y": y[:n]})
+            kernel.ranges(n, None)
+
+    tracemalloc.start()
+    try:
+        checked(range(1, 300))
+        begin = tracemalloc.get_traced_memory()[0]
+        checked(range(300, 2000))
+        assert tracemalloc.get_traced_memory()[0] - begin < 1700 * 64
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "size, local, enqueued",
+    [
+        (1, None, ((64,), (64,))),
+        (65, None, ((128,), (64,))),
+        (5, 4, ((8,), (4,))),
+        ((17, 5), None, ((32, 8), (16, 4))),
+        ((np.uint32(3), 1, 1), None, ((16, 4, 1), (16, 4, 1))),
+    ],
+)
+def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqueued):
+    seen = []
+    program.kernels["rows"].kernel = lambda queue, *args, **_: seen.append(args[:2])
+    program.launch("rows", size, local=local, **rows)
+    assert seen == [enqueued]
+
+
+def test_a_size_of_zero_launches_nothing(program, rows):
+    program.launch("rows", (4, 0), **rows)
+    assert np.isnan(rows["y"].get()).all()
+
+
+@pytest.mark.parametrize(
+    "has_watchdog, multiply_adds, launched",
+    [
+        (True, 0, [(None, (256,))]),
+        (True, 100, [(None, (256,))]),
+        (True, 101, [((0,), (128,)), ((128,), (128,))]),
+        (True, 1e9, [((64 * i,), (64,)) for i in range(4)]),
+        (False, 1e9, [(None, (256,))]),
+    ],
+)
+def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
+    program, rows, dev, monkeypatch, *, has_watchdog, multiply_adds, launched
+):
+    monkeypatch.setattr(device_module, "MOST_MULTIPLY_ADDS", 100)
+    monkeypatch.setattr(dev, "has_watchdog", has_watchdog)
+    seen, flushed, kernel, queue = [], [], program.kernels["rows"].kernel, dev.queue
+
+    class Watched:
+        def flush(self):
+            flushed.append(len(seen))
+
+    def enqueue(_, size, *args, global_offset):
+        seen.append((global_offset, size))
+        return kernel(queue, size, *args, global_offset=global_offset)
+
+    program.kernels["rows"].kernel = enqueue
+    x = rows["x"].get()
+    n = 200
+    longer = np.resize(x, (n, 4))
+    rows |= {"n": n, "x": dev.upload(longer), "y": dev.empty((n, 1))}
+    with monkeypatch.context() as patch:
+        patch.setattr(dev, "queue", Watched())
+        program.launch("rows", n, multiply_adds=multiply_adds, **rows)
+    assert seen == launched
+    # each part is handed to the system by itself
+    watched = has_watchdog and multiply_adds > 0
+    assert flushed == (list(range(1, len(launched) + 1)) if watched else [])
+    np.testing.assert_allclose(
+        rows["y"].get()[:, 0], 2 * longer.sum(1) + np.arange(n) % 3, rtol=1e-6
+    )
+
+
+INT, UINT = np.zeros(3, np.int32), np.zeros(3, np.uint32)
+# (arguments that are other ones, None: left out; error; message)
+REFUSED = [
+    ({"scale": None}, TypeError, r"missing \['scale'\], unknown \[\]"),
+    ({"z": 1}, TypeError, r"missing \[\], unknown \['z'\]"),
+    ({"k": INT}, TypeError, "k is an array of int32, expected .*uint32"),
+    ({"x": 1.0}, TypeError, "x is a float, expected a device array"),
+    ({"n": UINT}, TypeError, "n = .*is no uint32"),
+    ({"n": 33.0}, TypeError, "n = 33.0 is no uint32"),
+    ({"n": -1}, TypeError, "n = -1 is no uint32"),
+    ({"y": np.zeros(33, "f4")}, ValueError, r"y has shape \(33,\), expected rank 2"),
+    ({"k": UINT.repeat(2)}, ValueError, r"k has shape \(6,\), expected \('3',\)"),
+    ({"n": 32}, ValueError, r"x has shape \(33, 4\), expected .* with N = 32"),
+    ({"y": np.zeros((32, 1), "f4")}, ValueError, "y has shape .* with N = 33"),
+]
+
+
+@pytest.mark.parametrize("change, error, message", REFUSED)
+def test_refused_before_the_enqueue(program, dev, rows, change, error, message):
+    program.launch("rows", 33, **rows)  # a good launch before must not hide a bad one
+    dev.fill(rows["y"], -1)
+    enqueued = []
+    program.kernels["rows"].kernel = lambda *args, **_: enqueued.append(args)
+    ((name, value),) = change.items()
+    rows[name] = dev.upload(value) if isinstance(value, np.ndarray) else value
+    if value is None:
+        del rows[name]
+    with pytest.raises(error, match=f"^toy.cl:rows: {message}"):
+        program.launch("rows", 33, **rows)
+    assert enqueued == []
+
+
+def test_what_is_not_contiguous_is_refused(program, dev, rows):
+    with pytest.raises(ValueError, match="x has shape .*not contiguous"):
+        program.launch("rows", 33, **rows | {"x": dev.zeros((4, 33)).T})
+
+
+FORMULAS = {"offsets": (34,), "halves": (3, 8), "both": (11,), "first": (5,), "second": (7,)}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"offsets": (33,)}, r"offsets has shape \(33,\), expected .* with N\+1 = 34"),
+        ({"halves": (4, 8)}, r"halves .* with \(height-1\)/2 = 3"),
+        ({"halves": (3, 4)}, r"halves .* with WIDTH \* 2 = 8"),
+        ({"both": (12,)}, r"both .* with a \+ B - 1 = 11"),
+        ({"first": (6,)}, r"both .* with a \+ B - 1 = 12"),
+    ],
+)
+def test_a_length_that_is_a_formula_is_checked(dev, tmp_path, monkeypatch, change, message):
+    (tmp_path / "toy.cl").write_text(SOURCE)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    program = dev.program("toy", WIDTH=4)
+    good = {name: dev.zeros(shape) for name, shape in FORMULAS.items()}
+    program.launch("formulas", 1, n=33, height=8, **good)
+    bad = {name: dev.zeros(shape) for name, shape in change.items()}
+    with pytest.raises(ValueError, match=f"^toy.cl:formulas: {message}"):
+        program.launch("formulas", 1, n=33, height=8, **{**good, **bad})
+
+
+def test_a_work_group_larger_than_the_device_runs_is_one_line(program, dev, rows):
+    kernel = program.kernels["rows"]
+    limit, what = kernel.largest_group, cl.kernel_work_group_info.WORK_GROUP_SIZE
+    assert limit == kernel.kernel.get_work_group_info(what, dev.device)
+    program.launch("rows", 33, local=min(64, limit), **rows)
+    with pytest.raises(
+        UserError, match=rf"^toy.cl:rows: a work-group of {2 * limit} work-items, but .* {limit} "
+    ):
+        program.launch("rows", 33, local=2 * limit, **rows)
+
+
+# ---- guards
+
+
+@pytest.mark.parametrize("n", [1, 33, 257])
+def test_a_write_behind_a_buffer_is_caught(program, dev, n):
+    y = dev.zeros((n,))
+    program.launch("behind", 1, n=n, y=y)
+    with pytest.raises(AssertionError, match=f"behind a buffer of {4 * n} bytes"):
+        dev.check()
+
+
+# ---- every kernel file
+
+INFO, ADDRESS = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
+TYPES = {dtype: name for name, dtype in SCALARS.items()}
+
+
+def driver_says(kernel, i):
+    """(name, type, address space, pointer to const) of a parameter, from -cl-kernel-arg-info."""
+    name, kind, space, qualifiers = (
+        kernel.get_arg_info(i, what)
+        for what in (INFO.NAME, INFO.TYPE_NAME, INFO.ADDRESS_QUALIFIER, INFO.TYPE_QUALIFIER)
+    )
+    const = bool(qualifiers & cl.kernel_arg_type_qualifier.CONST)
+    # PoCL renames all built-in functions
+    return name.removeprefix("_cl_"), kind, space, const and space == ADDRESS.GLOBAL
+
+
+def launcher_says(p):
+    """The same from the parsed signature."""
+    kind = TYPES[p.dtype] + (str(p.width) if p.width > 1 else "") + ("*" if p.is_buffer else "")
+    space = ADDRESS.GLOBAL if p.is_buffer else ADDRESS.PRIVATE
+    return p.name, kind, space, p.const and p.is_buffer
+
+
+@pytest.mark.parametrize("stem", STEMS)
+def test_file_builds_alone_and_its_signatures_agree_with_the_driver(dev, stem):
+    source = (KERNEL_FOLDER / f"{stem}.cl").read_text("utf-8")
+    parsed = parse_signatures(source, f"cl/{stem}.cl")
+    assert parsed, "no kernel that the launcher can read"
+    # Intel's runtime has no names for a program out of pyopencl's cache; hence the parser, and this
+    # build without it.
+    options = ["-cl-std=CL1.2", "-cl-kernel-arg-info", "-I", str(KERNEL_FOLDER)]
+    built = cl.Program(dev.context, source).build(options=options, cache_dir=False)
+    assert set(built.kernel_names.split(";")) == set(parsed)
+    for name, parameters in parsed.items():
+        kernel = getattr(built, name)
+        assert [driver_says(kernel, i) for i in range(kernel.num_args)] == [
+            launcher_says(p) for p in parameters
+        ], name
+
+
+LIMITED = {64: [(64,), (16, 4), (16, 4, 1)], 7: [(4,), (2, 2), (2, 2, 1)], 1: [(1,), (1, 1)]}
+
+
+@pytest.mark.parametrize("limit", LIMITED)
+def test_a_default_work_group_fits_the_device(program, monkeypatch, limit):
+    kernel = program.kernels["rows"]
+    monkeypatch.setattr(kernel, "largest_group", limit)
+    monkeypatch.setattr(kernel, "_ranges", {})
+    for group in LIMITED[limit]:
+        rounded, local = kernel.ranges(tuple(5 for _ in group), None)
+        assert local == group
+        assert rounded == tuple(-(-5 // side) * side for side in group)
+
+
+@pytest.mark.parametrize("given", [None, (1, 16, 4)])
+def test_work_groups_may_have_one_dimension_alone(program, monkeypatch, given):
+    kernel = program.kernels["rows"]
+    monkeypatch.setattr(kernel, "most_items", (1024, 1, 1))
+    monkeypatch.setattr(kernel, "_ranges", {})
+    assert kernel.ranges((5, 5, 5), given)[1] == ((16, 1, 1) if given is None else (1, 1, 1))
+
+
+# ---- signatures
+
+
+@pytest.mark.parametrize(
+    "parameters, message",
+    [
+        ("    global float *x)  // no shape", "f.cl: f: buffer 'x' has no shape"),
+        ("    global float *x, const uint n)  // (N)", "one parameter per line"),
+        ("    const size_t n)", "cannot read parameter"),
+        ("    const float4 colour)", "neither a global"),
+        ("    float *x)  // (N)", "neither a global"),
+        ("    global float *x)  // (N**2)", r"f.cl: f: x: 'N\*\*2' is no formula"),
+        ("    global float *x)  // (len(N))", "is no formula"),
+        ("    global float *x)  // (4, N + 1.5)", "is no formula"),
+        ("    global float *x)  // (4, N and C)", "is no formula"),
+        ("    global float *x)  // ((N)", "no shape"),
+    ],
+)
+def test_heads_that_are_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        parse_signatures(f"kernel void f(\n{parameters}\n{{}}", "f.cl")
+
+
+# ---- how much a work-item does
+
+
+def test_lanes_on_cpus_and_gpus(dev, monkeypatch):
+    monkeypatch.setattr(dev, "is_cpu", True)
+    assert (lanes(dev), row_parts(dev)) == (16, 1)
+    # 40 channels: two vectors and a half; pixels in one group
+    assert channel_ranges(dev, 30, 20, 40) == ((3, 20, 30), (1, 16, 4))
+    monkeypatch.setattr(dev, "is_cpu", False)
+    assert (lanes(dev), row_parts(dev)) == (1, 16)
+    # the first dimension, in which neighbours run in step, is that of the channels
+    assert channel_ranges(dev, 30, 20, 40) == ((40, 20, 30), (16, 4, 1))
+
+
+@pytest.mark.parametrize(("largest", "items"), [(1024, 256), (256, 256), (100, 64), (1, 1)])
+def test_groups(largest, items):
+    """A power of two that the device runs; none on CPUs, which take their work-group."""
+    of = SimpleNamespace(is_cpu=False, device=SimpleNamespace(max_work_group_size=largest))
+    assert group_items(of) == items
+    assert group_ranges(of, 7, 16) == (112, 64)
+    of.is_cpu = True
+    assert group_ranges(of, 7, 16) == (7, None)
+    assert group_items(of) == 1

@@ -1,0 +1,195 @@
+"""The three convolutions beyond what the selftest compares with float64: some tiles, other
+launches and blockings, NaN, wrong shapes.
+"""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from support.comparisons import relative_error
+from support.guarded import large
+from support.launches import check_parts
+from support.tiles import pixels_of, random_counts
+
+from pp_cl.bench.conv import Layer
+from pp_cl.engine.layers import conv_direct
+from pp_cl.engine.layers.choice import CPUS, GPU, VARIANTS
+from pp_cl.engine.layers.conv_direct import ConvShape, Direction
+from pp_cl.engine.layers.tiles import all_tiles, some_tiles
+from pp_cl.engine.network.tile_plan import grow
+from pp_cl.selftest.layers import within
+
+CPU = CPUS[16]
+DIRECT, LOCAL, WINOGRAD = (VARIANTS[name] for name in ("direct", "local", "winograd"))
+# (variant, side of the kernel)
+ALL = [
+    pytest.param(variant, k, id=f"{variant.__name__} {k}x{k}")
+    for variant, k in ((DIRECT, 1), (DIRECT, 3), (LOCAL, 1), (LOCAL, 3), (WINOGRAD, 3))
+]
+OF_3X3 = [param for param in ALL if param.values[1] == 3]
+
+
+@pytest.mark.parametrize("variant, k", ALL)
+@pytest.mark.parametrize(
+    "size, co", [((6, 7), 16), *(large(size, 48) for size in ((3, 2), (11, 14), (31, 33), (6, 70)))]
+)
+def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
+    """The bits are those with all tiles; the other tiles of a result keep their NaN. The gradient
+    of a tile that does not count may hold NaN, and so may inputs that no counted gradient sees.
+    """
+    layer = Layer.random(rng, size, (16, 16), co, k)
+    counts = random_counts(rng, *size)
+    tiles, count = some_tiles(dev, size, counts), pixels_of(counts, *size)[..., None]
+    whole, some = layer.computed(dev, variant, CPU), layer.computed(dev, variant, CPU, tiles)
+    for i in (0, 3, 4):  # the output and the gradients of the inputs
+        np.testing.assert_array_equal(some[i], np.where(count > 0, whole[i], np.nan))
+    seen = pixels_of(grow(counts > 0, k // 2), *size)[..., None]
+    parts = [np.where(seen, part, np.float32(np.nan)) for part in layer.parts]
+    poisoned = np.where(count > 0, layer.grad_out, np.float32(np.nan))
+    given = layer.weight, layer.bias
+    actual = Layer(parts, *given, poisoned).computed(dev, variant, CPU, tiles)
+    expected = Layer(layer.parts, *given, layer.grad_out * count).expected
+    for i in (1, 2):  # those of the weights and the bias
+        assert relative_error(actual[i], expected[i]) < 1e-5
+
+
+@pytest.mark.large
+@pytest.mark.parametrize("variant, k", ALL[:4])
+def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, variant, k):
+    """As for a watchdog."""
+    layer = Layer.random(rng, (17, 30), (13,), 64, k)
+    prefix = "conv" if variant is DIRECT else "conv_local"
+    for direction in ("forward", "backward_input", "backward_weights"):
+        launched = check_parts(
+            dev,
+            monkeypatch,
+            f"{prefix}_{direction}",
+            lambda: tuple(layer.computed(dev, variant, GPU)),
+        )
+        assert launched > 1, direction
+
+
+@pytest.mark.parametrize("size, channels", [large((9, 13), 144), large((131, 40), 48)])
+def test_winograds_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch, size, channels):
+    layer = Layer.random(rng, size, (channels,), channels)
+    expected = layer.computed(dev, WINOGRAD, CPU)
+    for units in (1, 3, 100):
+        monkeypatch.setitem(dev.info, "compute_units", units)
+        for actual, same in zip(layer.computed(dev, WINOGRAD, CPU), expected, strict=True):
+            np.testing.assert_array_equal(actual, same)
+
+
+@pytest.mark.parametrize("most", [48, large(128)])
+def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
+    layer = Layer.random(rng, (3, 9), (16,), 32)
+    program = dev.program
+
+    def limited(*args, **defines):
+        found = program(*args, **defines)
+        for kernel in found.kernels.values():
+            patch.setattr(kernel, "largest_group", most)
+        return found
+
+    # first, as sizes that were launched are not checked again
+    with monkeypatch.context() as patch:
+        patch.setattr(dev, "program", limited)
+        results = layer.computed(dev, LOCAL, CPU)
+    for actual, same in zip(results, layer.computed(dev, LOCAL, CPU), strict=True):
+        np.testing.assert_array_equal(actual, same)
+
+
+@pytest.mark.large
+@pytest.mark.parametrize("variant", [DIRECT, LOCAL])
+@pytest.mark.parametrize("most", [20_000, 1])
+def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, variant, most):
+    """Up to a single one."""
+    layer = Layer.random(rng, (33, 10), (16, 20), 48)
+    shape = ConvShape(Direction.BACKWARD_WEIGHTS, 3, (16, 20), 48, (33, 10))
+    parts = variant(dev, CPU, shape).work_shape[0]
+    monkeypatch.setattr(conv_direct, "PARTIAL_FLOATS", most)
+    assert variant(dev, CPU, shape).work_shape[0] < parts
+    results = layer.computed(dev, variant, CPU)
+    for i in (1, 2):
+        assert relative_error(results[i], layer.expected[i]) < 5e-6
+
+
+@pytest.mark.parametrize(
+    "variant, blocking, shape",
+    [
+        pytest.param(variant, blocking, shape, id=f"{name} {shape}")
+        for variant, shapes in (
+            (DIRECT, [((13, 13), (32, 16), 32), ((7, 37), (16,), 48), ((3, 2), (3,), 20)]),
+            (WINOGRAD, [((50, 45), (256,), 80), ((50, 31), (16,), 16), ((13, 13), (32, 16), 32)]),
+        )
+        for name, blocking in (("16 floats", CPUS[16]), ("8 floats", CPUS[8]), ("GPU", GPU))
+        for shape in shapes
+        if variant is DIRECT or blocking is not GPU
+    ],
+)
+@pytest.mark.large
+def test_every_row_of_the_table(dev, rng, variant, blocking, shape):
+    """Images of more tiles than are taken at a time, in no more memory than each row asks for."""
+    layer = Layer.random(rng, *shape)
+    for result in map(within, layer.computed(dev, variant, blocking), layer.expected):
+        assert result.share <= 1
+    dev.check()
+
+
+@pytest.mark.parametrize("variant, k", OF_3X3)
+@pytest.mark.exact
+@pytest.mark.large
+def test_a_relu_hides_no_nan(dev, rng, variant, k):
+    layer = Layer.random(rng, (9, 11), (16,), 16, k)
+    layer.parts[0][4, 5, 6] = np.nan
+    bad = np.isnan(layer.computed(dev, variant, CPU)[0]).all(axis=2)
+    assert bad[3:6, 4:7].all() and not bad[:, 10].any()
+    assert bad.sum() == 9 or variant is WINOGRAD  # more of the tiles that saw it
+
+
+@pytest.mark.parametrize("variant, k", OF_3X3)
+def test_what_does_not_fit_together_is_refused(dev, variant, k):
+    zeros = dev.zeros
+    x, out, bias = zeros((4, 4, 16)), zeros((4, 4, 32)), zeros(32)
+    grown = some_tiles(dev, (4, 8), np.ones((1, 2)))
+    ways = [ConvShape(way, k, (16,), 32, (4, 4)) for way in Direction]
+    to_out, to_x, to_weights = (variant(dev, CPU, shape) for shape in ways)
+    tiles, weight = all_tiles(dev, 4, 4), zeros((2, k, k, 16, 16))
+    weights, flipped = to_out.laid_out(weight), to_x.laid_out(weight)
+    parts = zeros(to_weights.work_shape)
+
+    def forward(sources=(x,), weights=weights, bias=bias, out=out, tiles=tiles):
+        to_out.forward(sources, weights, bias, out, relu=False, tiles=tiles)
+
+    def backward_input(weights=flipped, grad_out=out, grad_x=x, tiles=tiles):
+        to_x.backward_input(weights, grad_out, grad_x, mask=None, tiles=tiles)
+
+    def backward_weights(sources=(x,), grad_out=out, parts=parts, tiles=tiles):
+        to_weights.backward_weights(sources, grad_out, parts, tiles=tiles)
+
+    for call in (forward, backward_input, backward_weights):
+        call()
+    wrong = [
+        partial(forward, (zeros((4, 4, 32)),)),
+        partial(forward, weights=zeros((1, k, k, 16, 16))),
+        partial(forward, bias=zeros(16)),
+        partial(forward, out=zeros((4, 5, 32))),
+        partial(forward, tiles=grown),
+        partial(backward_input, zeros((2, k, k, 16, 16))),
+        partial(backward_input, grad_out=zeros((4, 4, 20))),
+        partial(backward_input, grad_x=zeros((4, 4, 32))),
+        partial(backward_input, tiles=grown),
+        partial(backward_weights, (zeros((4, 4, 32)),)),
+        partial(backward_weights, grad_out=zeros((4, 4, 16))),
+        partial(backward_weights, parts=zeros((1, 1, k * k * 16 + 1, 16))),
+        partial(backward_weights, tiles=grown),
+    ]
+    if variant is WINOGRAD:
+        wrong += [
+            partial(variant, dev, CPU, replace(ways[0], sources=(3,))),
+            partial(variant, dev, CPU, replace(ways[1], co=20)),
+            partial(variant, dev, CPU, replace(ways[1], sources=(8, 32), source=1)),
+        ]
+    for call in wrong:
+        with pytest.raises(ValueError, match="tiles|channels|width"):
+            call()

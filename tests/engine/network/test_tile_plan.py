@@ -1,0 +1,184 @@
+"""The network with fewer tiles, against the one that computes all."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from support.comparisons import relative_error
+
+import pp_cl.engine.network.unet
+from pp_cl.engine.layers.tiles import SIDE, grid_shape
+from pp_cl.engine.network.layers import convolutions, gradient_of, unet_layers
+from pp_cl.engine.network.tile_plan import (
+    LOSS_BORDER,
+    LOSS_RADIUS,
+    gradient_radius,
+    halve,
+    map_tiles,
+    receptive_radius,
+)
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.training.loss import TAPS
+from pp_cl.reference.network import network, network_gradients
+from pp_cl.settings import BLOCKS
+
+BACKGROUND = 1.0  # of a pixel without hits, cl/common.h
+LAYERS = unet_layers((16, 16, 16))
+GRADIENT = np.float32([0.3, -0.2, 0.1])
+SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
+OBJECTS = {  # (rows, columns) that are not background
+    "inside": (slice(60, 81), slice(70, 93)),
+    "across the border": (slice(100, 148), slice(0, 30)),
+    "one corner pixel": (slice(147, 148), slice(179, 180)),
+    "along a border": (slice(0, 4), slice(0, 180)),
+    "nothing": (slice(0, 0), slice(0, 0)),
+    "everywhere": (slice(0, 148), slice(0, 180)),
+}
+# (object, variant, blocks)
+CASES = [
+    *((name, "direct", "double") for name in OBJECTS),
+    *(("inside", "auto", blocks) for blocks in BLOCKS),
+    *(("across the border", "direct", blocks) for blocks in BLOCKS[1:]),
+    ("one corner pixel", "auto", "double"),
+]
+
+
+@pytest.fixture
+def always(monkeypatch):
+    """Choose tiles in small images, too, and however many remain."""
+    monkeypatch.setattr(pp_cl.engine.network.unet, "LEAST_PIXELS", 0)
+    monkeypatch.setattr(pp_cl.engine.network.unet, "MOST_COMPUTED", 1)
+
+
+def scene(rng, place, size=SIZE):
+    """(features, gradient of the image): background and one colour, but for `place` and, in the
+    gradient, another one.
+    """
+    x = np.full((*size, 16), BACKGROUND, np.float32)
+    grad_y = np.full((*size, 3), GRADIENT, np.float32)
+    x[place] = rng.normal(size=x[place].shape)
+    grad_y[place] = rng.normal(size=grad_y[place].shape)
+    grad_y[10:30, 120:150] = rng.normal(size=(20, 30, 3))
+    return x, grad_y
+
+
+def active_tiles(x):
+    """(rows, columns) bool: the tiles of (H, W, C) that are not all background."""
+    return halve((x != BACKGROUND).any(2), 2)
+
+
+def run(dev, net, x, grad_y, *, sparse):
+    """[image, gradient of x, gradients of the parameters] as the device computes them."""
+    other = halve((grad_y != GRADIENT).any(2), 2)
+    plan = net.plan_tiles(x.shape[:2], active_tiles(x), other) if sparse else None
+    x = dev.upload(x)
+    y = net.forward(x, True, plan).get()
+    return [y, net.backward(dev.upload(grad_y)).get(), *[g.get() for g in net.gradients.values()]]
+
+
+@pytest.mark.parametrize("name, variant, blocks", CASES)
+@pytest.mark.exact
+def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
+    x, grad_y = scene(rng, OBJECTS[name])
+    net = UNet(dev, (16, 32, 48), blocks=blocks, seed=1, variant=variant)
+    expected = run(dev, net, x, grad_y, sparse=False)
+    actual = run(dev, net, x, grad_y, sparse=True)
+    device_x = dev.upload(x)
+    plan = net.plan_tiles(SIZE, active_tiles(x))
+    assert (plan.computed_fraction < 0.4) == (name != "everywhere")
+    np.testing.assert_array_equal(net.forward(device_x, False, plan).get(), actual[0])
+    if variant == "direct":  # Winograd mixes the last bits of a tile
+        np.testing.assert_array_equal(actual[0], expected[0])
+    # so through seven layers two of its results differ, on Intel's runtime by up to 1.1e-6
+    for a, b in zip(actual[:2], expected[:2], strict=True):
+        assert np.abs(a - b).max() <= 2e-6 * np.abs(b).max()
+    # sums over 26,640 pixels, added up in another order
+    for a, b in zip(actual[2:], expected[2:], strict=True):
+        assert relative_error(a, b) < 5e-6
+
+
+def test_nan_comes_through(dev, rng, always):
+    x, grad_y = scene(rng, OBJECTS["inside"])
+    x[70, 80, 3] = np.nan
+    net = UNet(dev, (16, 16, 16))
+    expected, actual = (run(dev, net, x, grad_y, sparse=sparse) for sparse in (False, True))
+    assert np.isnan(actual[0][70, 80]).all()
+    assert np.isfinite(actual[0][5, 5]).all()
+    for a, b in zip(actual, expected, strict=True):
+        np.testing.assert_array_equal(np.isnan(a), np.isnan(b))
+
+
+def test_few_tiles_in_large_images_only(dev, rng):
+    net = UNet(dev, (16, 16, 16))
+    for height, end, chosen in ((256, 60, True), (256, 240, False), (252, 60, False)):
+        x = scene(rng, (slice(40, end), slice(40, end)), (height, 256))[0]
+        plan = net.plan_tiles(x.shape[:2], active_tiles(x))
+        assert (plan is not None) == chosen
+        if chosen:
+            assert plan.computed_fraction <= pp_cl.engine.network.unet.MOST_COMPUTED
+
+
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_radius_is_what_a_change_reaches(rng, blocks):
+    """In float64, for a change at every place of a period of the pooling and the border far
+    away.
+    """
+    layers, ones = unet_layers((1, 1, 1), 1, 1, blocks), np.ones((96, 96, 1))
+    parameters = {}
+    for layer in convolutions(layers):
+        parameters[f"{layer.name}.weight"] = rng.uniform(0.5, 1, layer.weight_shape())
+        parameters[f"{layer.name}.bias"] = np.ones(layer.channels)
+    before, reached = network(layers, parameters, ones), Counter()
+    active = {name: values > 0 for name, values in before.items()}
+
+    def reach(name, change, place):
+        scale = 96 // len(change)
+        rows = scale * np.flatnonzero(np.abs(change[..., 0]).max(1) > 1e-9)
+        far = max([place - rows[0], rows[-1] + scale - 1 - place] if len(rows) else [0])
+        reached[name] = max(reached[name], far)
+
+    for place in range(48, 52):
+        impulse = np.zeros_like(ones)
+        impulse[place, place] = 1
+        for name, value in network(layers, parameters, ones + impulse).items():
+            reach(name, value - before[name], place)
+        gradients = network_gradients(layers, parameters, before, active, grad_image=impulse)
+        reach(gradient_of("x"), gradients["x"], place)
+    radius = receptive_radius(layers) | gradient_radius(layers)
+    radius["image"] = radius["out"]
+    for name, far in reached.items():
+        assert far <= radius[name] <= far + 3, name
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("border", [0, 3, 100])
+def test_map_tiles(rng, level, border):
+    height, width = 148, 260
+    shape = grid_shape(height >> level, width >> level)
+    active = rng.random(shape) < 0.3
+    found = map_tiles((height, width), level, active, border)
+    tiles = np.arange(active.size).reshape(shape)
+    assert found.computed.ravel()[found.source.ravel()].all()
+    assert (found.source == tiles)[active].all()
+    assert not active.ravel()[found.source[~active]].any()
+    assert found.count().sum() == active.size
+    assert (found.count()[active] == 1).all()
+    np.testing.assert_array_equal(found.count() > 0, found.computed)
+    side = SIDE << level
+    for place, source in np.ndenumerate(found.source):
+        for index, other, length in zip(
+            place, divmod(source, shape[1]), (height, width), strict=True
+        ):
+            inner = [
+                border * SIDE <= i * side and (i + 1) * side <= length - border * SIDE
+                for i in (index, other)
+            ]
+            assert other == index or all(inner)
+
+
+def test_the_loss_sees_the_border_no_further():
+    """The margin that is compared tile by tile holds what the forward pass and a window of the
+    SSIM's gradient reach.
+    """
+    assert LOSS_RADIUS == 2 * (TAPS // 2)
+    assert receptive_radius(LAYERS)["out"] + LOSS_RADIUS <= LOSS_BORDER

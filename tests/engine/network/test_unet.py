@@ -1,0 +1,162 @@
+"""The network against float64, its buffers, and what is refused."""
+
+import gc
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from support.comparisons import relative_error
+
+from pp_cl.bench.unet import plain_parameters
+from pp_cl.engine.network.layers import (
+    array_shapes,
+    convolutions,
+    lifetimes,
+    multiplications,
+    share_buffers,
+    unet_layers,
+)
+from pp_cl.engine.network.unet import UNet
+from pp_cl.reference.network import network, network_gradients
+
+
+def normal(rng, *shape):
+    return rng.normal(size=shape).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "widths, variant, blocks",
+    [
+        ((16, 32, 48), "direct", "double"),
+        ((16, 32, 48), "winograd", "double"),
+        ((20, 16, 40), "auto", "double"),
+        ((16, 32, 48), "direct", "single"),
+        ((20, 16, 40), "auto", "single"),
+        ((3, 17, 5), "auto", "gated"),
+    ],
+)
+def test_forward_and_backward(dev, rng, widths, variant, blocks):
+    net = UNet(dev, widths, blocks=blocks, seed=1, variant=variant)
+    x, grad_y = normal(rng, 12, 16, 16), normal(rng, 12, 16, 3)
+    parameters = plain_parameters(net, net.parameters)
+    inference = net.forward(dev.upload(x), training=False).get()
+    y = net.forward(dev.upload(x)).get()
+    np.testing.assert_array_equal(inference, y)
+    grad_x = net.backward(dev.upload(grad_y)).get()
+    outputs = network(net.layers, parameters, x)
+    active = {name: values > 0 for name, values in outputs.items()}
+    expected = network_gradients(net.layers, parameters, outputs, active, grad_image=grad_y)
+    assert relative_error(y, outputs["image"]) < 3e-6
+    gradients = plain_parameters(net, net.gradients)
+    for name, array in net.gradients.items():  # the padding is 0
+        assert np.count_nonzero(array.get()) == np.count_nonzero(gradients[name])
+    gradients |= {"x": grad_x}
+    assert gradients.keys() == expected.keys()
+    for name, gradient in gradients.items():
+        assert relative_error(gradient, expected[name]) < 1e-5, name
+
+
+@pytest.mark.parametrize("variant", ["direct", "winograd"])
+def test_frozen_weights_are_laid_out_once(dev, rng, variant):
+    net = UNet(dev, seed=3, variant=variant)
+    small, large = (dev.upload(normal(rng, *size, 16)) for size in ((16, 12), (32, 36)))
+    expected = [net.forward(x, training=False).get() for x in (small, large)]
+    net.freeze()
+    for _ in range(2):
+        for x, image in zip((small, large), expected, strict=True):
+            np.testing.assert_array_equal(net.forward(x, training=False).get(), image)
+    net.parameters["enc1.a.weight"].fill(0)  # forbidden, and unseen where the weights are laid out
+    assert np.array_equal(net.forward(large, training=False).get(), expected[1]) == (
+        variant != "direct"
+    )
+    with pytest.raises(RuntimeError, match="freeze"):
+        net.forward(small)
+
+
+def test_sizes_may_change_between_images(dev, rng):
+    net = UNet(dev, (16, 32, 48), seed=1)
+    for size in ((12, 16), (4, 8), (36, 32)) * 2:
+        x, grad_y = (dev.upload(normal(rng, *size, channels)) for channels in (16, 3))
+        alone = UNet(dev, (16, 32, 48), seed=1)
+        net.forward(dev.zeros((20, 8, 16)), training=False)
+        np.testing.assert_array_equal(net.forward(x).get(), alone.forward(x).get())
+        np.testing.assert_array_equal(net.backward(grad_y).get(), alone.backward(grad_y).get())
+
+
+def test_its_memory_is_free_as_soon_as_it_is_dropped(plain):
+    """Without a garbage collection: compression and benches make one network after another."""
+    x, grad_y = plain.zeros((8, 8, 16)), plain.zeros((8, 8, 3))
+
+    def use(net):
+        net.forward(x, training=False)
+        net.forward(x)
+        net.backward(grad_y)
+
+    use(UNet(plain, (16, 16, 16)))  # what all networks share stays
+    gc.collect()
+    before = plain.bytes
+    gc.disable()
+    try:
+        use(UNet(plain, (16, 16, 16)))
+        assert plain.bytes == before
+    finally:
+        gc.enable()
+
+
+def test_initial_values_are_pytorchs(dev):
+    net = UNet(dev, (16, 32, 64), seed=0)
+    for name, values in plain_parameters(net, net.parameters).items():
+        layer = name.rsplit(".", 1)[0]
+        weight = net.parameters[layer + ".weight"].shape
+        bound = 1 / np.sqrt(weight[3] * weight[1] ** 2)
+        assert np.abs(values).max() <= bound * (1 + 1e-6), name
+        if values.size > 500:
+            assert values.std() == pytest.approx(bound / np.sqrt(3), rel=0.1), name
+
+
+def test_wrong_use_is_refused(dev):
+    net = UNet(dev, (16, 16, 16))
+    with pytest.raises(ValueError, match="\\(10, 8, 16\\)"):
+        net.forward(dev.zeros((10, 8, 16)))
+    with pytest.raises(ValueError, match="4n"):
+        net.forward(dev.zeros((8, 8, 3)))
+    net.forward(dev.zeros((8, 8, 16)), training=False)
+    with pytest.raises(RuntimeError, match="forward"):
+        net.backward(dev.zeros((8, 8, 3)))
+
+
+@pytest.mark.parametrize(
+    "blocks, parameters, operations",
+    [("double", 6_968_579, 966e9), ("single", 3_133_443, 494e9), ("gated", 6_102_275, 978e9)],
+)
+def test_size_of_the_papers_network(blocks, parameters, operations):
+    """The parameters worked out by hand, and the multiplications at 800x800, with the 1x1
+    convolutions before the upsampling.
+    """
+    layers = unet_layers((128, 256, 512), blocks=blocks)
+    shapes = [layer.weight_shape() for layer in convolutions(layers)]
+    assert sum(math.prod(shape) + shape[0] for shape in shapes) == parameters
+    assert multiplications(layers, 800, 800) == pytest.approx(operations, rel=1e-3)
+
+
+@pytest.mark.parametrize("training, most", [(False, 1.5e9), (True, 5e9)])
+def test_memory_of_the_papers_network(training, most):
+    """At 800x800, of what its layers give."""
+    layers = unet_layers((128, 256, 512))
+    buffers = share_buffers(lifetimes(layers, training), array_shapes(layers, (800, 800)))
+    octets = [4 * buffer.floats for buffer in buffers]
+    assert sum(octets) < most and max(octets) <= 1 << 30
+
+
+def test_arrays_of_one_buffer_never_overlap(rng):
+    firsts = np.sort(rng.integers(0, 20, 40))
+    spans = [(i, first, first + rng.integers(0, 6)) for i, first in enumerate(firsts)]
+    shapes = {i: (rng.integers(1, 9), 3) for i in range(40)}
+    buffers = share_buffers(spans, shapes)
+    assert sorted(name for buffer in buffers for name in buffer.names) == list(range(40))
+    assert len(buffers) < 20
+    for buffer in buffers:
+        held = [spans[name] for name in buffer.names]
+        assert all(a[2] < b[1] for a, b in pairwise(held))
+        assert buffer.floats == max(np.prod(shapes[name]) for name in buffer.names)

@@ -1,0 +1,48 @@
+"""Depth of what is seen, against the exact intersection of rays and balls."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pp_cl.engine.raster.depth import depth_forward
+from pp_cl.reference import dense
+from pp_cl.selftest.points import PairedPoints, blend_on_axis, make_camera
+
+
+def test_soft_points_are_balls(dev, rng):
+    """A point's depth is where the pixels' rays enter its ball."""
+    radius = 0.4
+    for position in rng.uniform(-0.5, 0.5, (4, 3)):
+        scene = PairedPoints(dev, make_camera(24, 20), position[None], radius)
+        scene.blend(np.ones(1), 0.1, np.zeros((1, 16)), rule="alpha")
+        arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
+        alpha, depth, median = (array.get().ravel() for array in arrays)
+        ray = dense.rays(scene.camera)
+        centre = dense.camera_space(scene.camera, position[None])[0]
+        along = ray @ centre
+        across = np.linalg.norm(centre - along[:, None] * ray, axis=1)
+        # a pixel's closeness takes its distance at the centre's range, second order in it
+        inside = (alpha > 0) & (across < 0.9 * radius)
+        assert inside.sum() > 10
+        front = (along - np.sqrt(radius**2 - np.minimum(across, radius) ** 2)) * ray[:, 2]
+        np.testing.assert_allclose(depth[inside], front[inside], atol=0.05 * radius)
+        np.testing.assert_allclose(median[inside], depth[inside], rtol=1e-6)
+
+
+def test_a_closeness_that_is_rounded_below_0_has_a_depth(dev):
+    """Of the nearest of two hits, as a GPU's square roots and quotients may round it at the rim."""
+    scene, _ = blend_on_axis(dev, [0.9, 0.5], [1.0, 1.0], 0.1, rule="alpha")
+    hits = scene.pairs.pair_point_closeness.get()
+    hits[0, 1] = np.float32(-(2.0**-23)).view(np.uint32)
+    scene.pairs = replace(scene.pairs, pair_point_closeness=dev.upload(hits))
+    scene.blend([1.0, 1.0], 0.1, np.zeros((2, 16)), rule="alpha")
+    arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
+    assert scene.weight()[0, 0] < 0 and all(np.isfinite(array.get()).all() for array in arrays)
+
+
+@pytest.mark.exact
+def test_a_nan_is_not_hidden(dev):
+    scene, _ = blend_on_axis(dev, [0.9], [np.nan], 0.1, rule="alpha")
+    for array in depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape):
+        assert np.isnan(array.get())

@@ -1,0 +1,115 @@
+"""Hits: those of crops, of miscounts and of long lists; buffers that are reused; the bits."""
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.guarded import large
+
+from pp_cl.bench.spheres import find_all_pairs
+from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.raster.pairs import MOST_PAIRS, find_pairs, room_needed
+from pp_cl.engine.raster.project import FOOTPRINTS
+from pp_cl.reference import dense as oracle
+from pp_cl.selftest.points import PairedPoints, make_camera, make_points
+
+
+def by_point(pairs):
+    """[(pixels, closeness)] of each point."""
+    offsets = pairs.point_offset.get()[1:-1]
+    closeness = pairs.pair_point_closeness.get()[: pairs.total, 1].view(np.float32)
+    pixels = np.split(pairs.pair_pixel.get()[: pairs.total], offsets)
+    return list(zip(pixels, np.split(closeness, offsets), strict=True))
+
+
+@pytest.mark.parametrize("kind", FOOTPRINTS)
+def test_hits_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind):
+    """As where a compiler rounds in one way where hits are counted, in another where they are
+    written: all other points' pairs are what they would be, and no slot is left undefined.
+    """
+    camera, n = make_camera(), 300
+    scene = PairedPoints(dev, camera, make_points(rng, n), 0.1, kind=kind)
+    counts = scene.projected.point_count.get().astype(np.int64)
+    change = np.where(counts > 2, rng.choice([-2, -1, 0, 0, 1, 2], n), 0)
+    assert {*change} == {-2, -1, 0, 1, 2}
+    planted = replace(scene.projected, point_count=dev.upload(counts + change, np.uint32))
+    pairs = find_all_pairs(dev, Buffers(dev), planted, scene.shape)
+    assert pairs.total == (counts + change).sum()
+    for one, other, difference in zip(by_point(scene.pairs), by_point(pairs), change, strict=True):
+        both = min(len(one[0]), len(other[0]))
+        assert len(other[0]) - len(one[0]) == difference
+        assert all(np.array_equal(a[:both], b[:both]) for a, b in zip(one, other, strict=True))
+        assert (other[1][both:] == 0).all()
+    pixels, keys = pairs.pair_pixel.get()[: pairs.total], pairs.pair_key.get()[: pairs.total]
+    assert np.array_equal(np.sort(keys & 0xFFFFFFFF), np.arange(pairs.total))
+    listed = np.diff(pairs.pixel_offset.get().astype(np.int64))
+    assert np.array_equal(listed, np.bincount(pixels, minlength=len(listed)))
+
+
+@pytest.mark.parametrize(
+    "lengths",
+    [
+        (0, 1, 63, 64, 65, 128, 129, 4095, 4096, 4097, 9000),
+        large((70, 262_144, 262_145, 4096, 300_000)),
+    ],
+)
+def test_lists_of_all_lengths_side_by_side_are_sorted(dev, rng, lengths):
+    """About the lengths at which GPUs merge in one pass more."""
+    camera = replace(make_camera(len(lengths), 1), fx=20.0, fy=20.0, cx=len(lengths) / 2, cy=0.5)
+    pixel = rng.permutation(np.repeat(np.arange(len(lengths)), lengths))
+    along = oracle.rays(camera)[pixel] @ camera.pose[:, :3].T
+    positions = camera.eye + rng.uniform(2.2, 5.8, (len(pixel), 1)) * along
+    pairs = PairedPoints(dev, camera, positions, 1e-4, kind="disc").pairs
+    offsets, keys = pairs.pixel_offset.get().astype(np.int64), pairs.pair_key.get()[: pairs.total]
+    assert tuple(np.diff(offsets)) == lengths
+    found = pairs.pair_pixel.get()[(keys & 0xFFFFFFFF).astype(np.int64)]
+    assert np.array_equal(found, np.repeat(np.arange(len(lengths)), lengths))
+    assert len(np.unique(keys & 0xFFFFFFFF)) == pairs.total
+    assert (keys[1:] > keys[:-1])[found[1:] == found[:-1]].all()
+
+
+def bits(pairs):
+    """[arrays] of what is valid of the pairs."""
+    names = ("pair_pixel", "pair_point_closeness", "pair_key")
+    arrays = [getattr(pairs, name).get()[: pairs.total] for name in names]
+    return [*arrays, pairs.point_offset.get(), pairs.pixel_offset.get()]
+
+
+def test_more_room_is_a_number_of_the_kernels():
+    """A quarter more than needed, but no more than uint32 can number."""
+    for total, expected in ((900, 1000), (1001, 1251), (3_500_000_000, MOST_PAIRS)):
+        assert room_needed(SimpleNamespace(capacity=1000, total=total)) == expected
+
+
+def test_buffers_serve_views_of_any_size(dev, rng):
+    few, many = make_points(rng, 31), make_points(rng, 257)
+    buffers = Buffers(dev)
+    for positions, size in ((many, (33, 31)), (few, (5, 9)), (many[:1], (1, 1)), (many, (33, 31))):
+        view = replace(make_camera(*size), cx=size[0] / 2, cy=size[1] / 2)
+        scene = PairedPoints(dev, view, positions, 0.3)
+        used = find_all_pairs(dev, buffers, scene.projected, scene.shape)
+        assert all(map(np.array_equal, bits(scene.pairs), bits(used)))
+
+
+@pytest.mark.large
+def test_work_and_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch):
+    """A unit that read all pairs made 64 units take several times as long in all. The time of
+    all of a CPU's threads, which other programs do not lengthen as they do the clock's.
+    """
+    clock = time.process_time if dev.is_cpu else time.perf_counter
+    camera = replace(make_camera(400, 400), fx=300.0, fy=300.0, cx=200.0, cy=200.0)
+    scene = PairedPoints(dev, camera, make_points(rng, 30_000), 0.1, kind="disc")
+    buffers, seconds = Buffers(dev), {}
+    for units in 5 * [2, 64] + [1, 3, 16, 1000]:
+        monkeypatch.setitem(dev.info, "compute_units", units)
+        dev.queue.finish()
+        start = clock()
+        pairs = find_pairs(dev, buffers, scene.projected, scene.shape, scene.pairs.total)
+        dev.queue.finish()
+        took = clock() - start
+        if units not in seconds:
+            assert all(map(np.array_equal, bits(scene.pairs), bits(pairs)))
+        seconds.setdefault(units, []).append(took)
+    assert min(seconds[64]) < 1.5 * min(seconds[2])

@@ -1,0 +1,151 @@
+"""Views that no photographer takes: from inside the object, of millions of pixels, through
+one huge point.
+"""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.comparisons import relative_error
+
+from pp_cl.bench.spheres import find_all_pairs
+from pp_cl.engine.raster.project import FOOTPRINTS
+from pp_cl.errors import UserError
+from pp_cl.reference import dense as oracle
+from pp_cl.selftest.points import PairedPoints, make_camera
+
+pytestmark = pytest.mark.kernels
+
+
+def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=oracle.DEPTH_RANGE):
+    """A scene's hits, features and gradients against the oracle; returns the scene. Left out are
+    pixels where rounding decides over a hit, or makes up most of a closeness.
+    """
+    # a Gaussian's centre may lie hundreds of pixels beside the image, where float32 rounds it by
+    # 3e-5 of one, and its deviation is half a pixel
+    n, unit = len(positions), 10 if kind == "gaussian" else 1
+    opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
+    scene = PairedPoints(dev, camera, positions, radius, kind=kind, depth_range=depth_range)
+    geometry = oracle.geometry(camera, positions, radius, kind, depth_range=depth_range)
+    hits, clear = scene.hits(), geometry["margin"] > 1e-3
+    assert np.array_equal(hits[clear], geometry["hit"][clear]) and (~clear).mean() < 0.02
+    inner = (geometry["margin"] > 1e-2).all(axis=0)
+    assert inner.mean() > 0.5
+    blend = oracle.blend(geometry | {"hit": hits}, opacity, gamma)
+    features = scene.blend(opacity, gamma, point_features).reshape(-1, 16)
+    assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-4 * unit
+    grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
+    gradients = scene.gradients(grad)
+    expected = oracle.gradients(geometry | {"hit": hits}, blend, point_features, grad)
+    assert relative_error(gradients["features"], expected[0]) < 1e-5 * unit
+    assert relative_error(gradients["opacity"], expected[1]) < 5e-5 * unit
+    return scene
+
+
+@pytest.mark.parametrize("kind", FOOTPRINTS)
+@pytest.mark.parametrize("radius", [0.01, 0.3])
+def test_from_inside_the_object(dev, rng, kind, radius):
+    """Points on all sides, also behind and beside the eye, and very near; an angle of view of 130
+    degrees.
+    """
+    camera = replace(make_camera(28, 20), fx=6.5, fy=6.5)
+    positions = camera.eye + rng.uniform(-1, 1, (400, 3))
+    if kind == "gaussian":  # as wide as the others
+        radius /= oracle.DEVIATIONS
+    scene = check(dev, rng, camera, positions, radius, kind, depth_range=(0.05, 4.0))
+    assert 20 < scene.seen.size < 300
+
+
+@pytest.mark.parametrize("kind", FOOTPRINTS)
+def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
+    """Spheres whose front is just before and just behind `near`, and some that reach beside and
+    behind the eye.
+    """
+    camera = replace(make_camera(24, 24), fx=5.0, fy=5.0)
+    directions = rng.normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radius = np.float32(rng.uniform(0.01, 0.8, 300))
+    front = 0.5 + rng.uniform(-0.1, 0.1, 300)
+    positions = camera.eye + directions * (front + radius)[:, None]
+    scene = check(dev, rng, camera, positions, radius, kind, depth_range=(0.5, 3.0))
+    placed = scene.projected.point_camera.get()
+    left_out = ~(placed[:, 3] >= 0)  # NaN where nothing is known of a point that hits no pixel
+    assert (left_out[front < 0.5 - 1e-4]).all() and (~left_out).sum() > 40
+    assert (placed[~left_out, 2] < radius[~left_out]).any()  # reaches the plane of the eye
+
+
+@pytest.mark.parametrize("kind", ["soft", "sphere"])
+@pytest.mark.parametrize("size", [(1, 1), (3, 257), (64, 48)])
+def test_one_point_over_the_whole_image(dev, rng, kind, size):
+    camera = replace(make_camera(*size), fx=300.0, fy=300.0, cx=size[0] / 2, cy=size[1] / 2)
+    scene = check(dev, rng, camera, camera.eye + 4 * camera.pose[:, 2:3].T, 1.9, kind, gamma=0.5)
+    assert scene.hits().all()
+
+
+@pytest.mark.large
+def test_an_image_of_millions_of_pixels(dev):
+    """4096 x 4096: the corners and the middle are those of small images cut out of it."""
+    side, patch = 4096, 24
+    camera = replace(make_camera(side, side, 3000.0), fy=3000.0, cx=side / 2, cy=side / 2)
+    places = [
+        (0, 0),
+        (side - patch, 0),
+        (0, side - patch),
+        (side - patch, side - patch),
+        (2000, 2040),
+    ]
+    centres = np.array(places)[:, None] + np.random.default_rng(2).uniform(0, patch, (5, 40, 2))
+    slopes = (centres.reshape(-1, 2) - side / 2) / 3000.0
+    rays = np.column_stack([slopes, np.ones(len(slopes))])
+    depth = np.linspace(2.5, 5.5, len(rays))[:, None]
+    positions = (
+        camera.eye
+        + depth * (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ camera.pose[:, :3].T
+    )
+    scene = PairedPoints(dev, camera, positions, 0.004, kind="disc")
+    offsets = scene.pairs.pixel_offset.get().astype(np.int64)
+    points = scene.pairs.pair_point_closeness.get()[:, 0][
+        scene.pairs.pair_key.get()[: scene.pairs.total] & 0xFFFFFFFF
+    ]
+    found = 0
+    for x0, y0 in places:
+        cut = camera.crop(x0, y0, patch, patch)
+        geometry = oracle.geometry(cut, positions, 0.004, "disc")
+        for q in np.flatnonzero((geometry["margin"] > 0.02).all(axis=0)):
+            at = (y0 + q // patch) * side + x0 + q % patch
+            expected = np.flatnonzero(geometry["hit"][:, q])
+            assert set(points[offsets[at] : offsets[at + 1]]) == set(expected)
+            found += len(expected)
+    assert found > 1000
+
+
+@pytest.mark.large
+def test_long_lists_do_not_take_quadratic_time(dev):
+    """Eight times the hits in one pixel, 8 log-ish times the time; 64 if it were quadratic. The
+    best of some runs, by the time of all of a CPU's threads.
+    """
+    clock = time.process_time if dev.is_cpu else time.perf_counter
+    camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)
+
+    def best(n):
+        positions = np.zeros((n, 3))
+        positions[:, 2] = np.random.default_rng(1).permutation(np.linspace(2.2, 5.9, n))
+        scene, seconds = PairedPoints(dev, camera, positions, 0.1), []
+        for _ in range(4):
+            start = clock()
+            find_all_pairs(dev, scene.buffers, scene.projected, scene.shape, scene.pairs.capacity)
+            scene.blend(np.ones(n), 0.05, np.zeros((n, 16)), early_stop=1e-3)
+            seconds.append(clock() - start)
+        return min(seconds)
+
+    assert best(160_000) < 30 * best(20_000)
+
+
+@pytest.mark.large
+def test_more_pairs_than_can_be_numbered(dev):
+    """2^32 - 1 and more pairs: one line, and nothing is written."""
+    camera = replace(make_camera(1024, 1024), fx=9e4, fy=9e4, cx=512.0, cy=512.0)
+    straight = camera.eye + 4 * camera.pose[:, 2:3].T
+    with pytest.raises(UserError, match="--points"):
+        PairedPoints(dev, camera, np.repeat(straight, 4097, axis=0), 1.9)

@@ -1,0 +1,94 @@
+"""Points to camera axes: which are culled, and boxes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.raster import project
+from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
+from pp_cl.reference import dense
+from pp_cl.selftest.points import PairedPoints, make_camera, make_points, some_ids
+
+
+def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
+    camera = replace(make_camera(focal=32.0), pose=np.eye(3, 4), fy=32.0)
+
+    def kept(positions, radius):
+        scene = PairedPoints(dev, camera, positions, radius, depth_range=(2.0, 4.0))
+        return np.isin(np.arange(4), scene.seen).tolist()
+
+    positions = np.array([[0, 0, 2.0], [0, 0, 1.9999], [0, 0, 4.0], [0, 0, 4.0001]])
+    assert kept(positions, 0.0) == [True, False, True, False]
+    assert kept(positions + [0, 0, 0.5], 0.5) == [True, False, True, False]
+
+
+@pytest.mark.parametrize("kind", FOOTPRINTS)
+def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
+    """At most three columns and rows more on each side: a disc's tip may miss all pixel centres."""
+    camera = make_camera()
+    positions, radius = make_points(rng, 400), rng.uniform(0.05, 0.4, 400)
+    if kind == "gaussian":  # as wide as the others
+        radius /= dense.DEVIATIONS
+    scene = PairedPoints(dev, camera, positions, radius, kind=kind)
+    hits = scene.hits().reshape(400, camera.height, camera.width)
+    boxes, compared = scene.projected.point_box.get().astype(int), 0
+    for i in np.flatnonzero(hits.any(axis=(1, 2))):
+        rows, columns = np.nonzero(hits[i])
+        first, last = boxes[i, :2], boxes[i, 2:]
+        least, most = (columns.min(), rows.min()), (columns.max(), rows.max())
+        assert (first <= least).all() and (last >= most).all()
+        assert (first >= np.subtract(least, 3)).all() and (last <= np.add(most, 3)).all()
+        compared += 1
+    assert compared > 200
+
+
+@pytest.mark.parametrize("kind", ["disc", "soft"])
+def test_what_whole_bricks_miss_no_point_of_them_hits(dev, rng, monkeypatch, kind):
+    """Crops at all borders of the points; offsets that move them towards these."""
+    grid = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
+    ids = some_ids(rng, grid, 12_000)
+    offset = rng.choice([-0.5, 0.5], (len(ids), 4)).astype(np.float32)
+    whole = make_camera(320, 240, 400.0)
+
+    def counts(camera):
+        return project_grid(
+            dev,
+            Buffers(dev),
+            kind,
+            dev.upload(camera.packed(dense.DEPTH_RANGE)),
+            dev.upload(grid.packed()),
+            point_id=dev.upload(ids),
+            cloud_offset=dev.upload(offset),
+            radius=0.04,
+        ).point_count.get()
+
+    crops = [whole.crop(x, y, 32, 32) for x in range(0, 320, 32) for y in range(0, 240, 24)]
+    found = [counts(crop) for crop in crops]
+    assert 0.01 < np.mean([(count > 0).mean() for count in found]) < 0.2
+    monkeypatch.setattr(project, "MOST_OFFSET", 1e6)  # bricks reach everywhere
+    assert all(
+        np.array_equal(count, counts(crop)) for count, crop in zip(found, crops, strict=True)
+    )
+    monkeypatch.setattr(project, "MOST_OFFSET", -3.5)  # nowhere beyond their middle
+    culls = dev.is_cpu  # GPUs judge each point alone
+    assert (
+        any((count != counts(crop)).any() for count, crop in zip(found, crops, strict=True))
+        == culls
+    )
+
+
+@pytest.mark.parametrize("deviation, bound", [(0.02, 0.1), (0.1, 0.01), (0.4, 0.01)])
+def test_a_pixel_of_samples_is_nearly_the_mean_of_a_viewers(dev, rng, deviation, bound):
+    """Gaussians of a fifth of a pixel, less than a viewer's, of one and of four."""
+    camera = replace(make_camera(30, 30), samples=3.0)
+    viewer = replace(camera.resized(90, 90), samples=1.0)
+    for position in make_points(rng, 20)[:, None]:
+        scene = PairedPoints(dev, camera, position, deviation, kind="gaussian")
+        exact = dense.geometry(viewer, position, deviation, "gaussian")
+        drawn = np.where(exact["hit"], exact["closeness"], 0).reshape(30, 3, 30, 3)
+        found = scene.geometry()["closeness"].reshape(30, 30)
+        assert found.max() > 0.1
+        np.testing.assert_allclose(found, drawn.mean((1, 3)), atol=bound)

@@ -1,0 +1,170 @@
+"""The stages in their order: whole pictures and their gradients against the float64 twins chained
+together.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.comparisons import relative_error
+from support.models import GRID, make_model
+from support.scenes import ring_cameras
+
+import pp_cl.engine.network.unet
+from pp_cl.bench.unet import plain_parameters
+from pp_cl.engine.raster.weights import BLENDS
+from pp_cl.engine.render import Renderer
+from pp_cl.errors import UserError
+from pp_cl.reference import dense as oracle_raster
+from pp_cl.reference.network import network, network_gradients
+from pp_cl.settings import RasterConfig
+
+GAMMA = 0.03
+
+
+def chained(model, settings, camera):
+    """Float64 (picture, function from its gradient to those of the points' features, of their
+    opacities and of the network) of the padded camera.
+    """
+    padded, _, _ = camera.padded(4)
+    positions, opacity = GRID.positions(model.cloud.ids.get()), model.cloud.opacity.get()
+    sh = np.concatenate([array.get() for array in model.cloud.sh], 1)
+    unit = GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / 4
+    geometry = oracle_raster.geometry(padded, positions, settings.radius * unit, settings.footprint)
+    blend = oracle_raster.blend_by_rule(
+        settings.blend, geometry, opacity, GAMMA, settings.early_stop
+    )
+    shaded = oracle_raster.shade(positions, padded.eye, sh)
+    features = oracle_raster.features(blend, shaded)
+    parameters = plain_parameters(model.net, model.net.parameters)
+    shape = (padded.height, padded.width)
+    layers = model.net.layers
+    outputs = network(layers, parameters, features.reshape(*shape, 16))
+    active = {name: values > 0 for name, values in outputs.items()}
+
+    def backward(grad_picture):
+        grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_picture)
+        grad_features = grad_net.pop("x").reshape(-1, 16)
+        of_points = oracle_raster.gradients(
+            geometry, blend, shaded, grad_features, max_tracked=settings.max_tracked
+        )
+        return *of_points, grad_net
+
+    return outputs["image"], backward
+
+
+SETTINGS = {
+    "soft": {"radius": 0.85},
+    "soft, wide": {"radius": 1.4},
+    "disc": {"footprint": "disc", "radius": 0.0015},
+    "disc, the paper's gradients": {"footprint": "disc", "radius": 0.0015, "max_tracked": 3},
+    "sphere": {"footprint": "sphere", "radius": 0.11},
+    "sphere, Pulsar's gradients": {"footprint": "sphere", "radius": 0.11, "max_tracked": 5},
+}
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("early_stop", [0.0, 0.001])
+@pytest.mark.parametrize("name", SETTINGS)
+def test_picture_and_gradients(dev, rng, name, early_stop, blend):
+    settings = RasterConfig(blend=blend, early_stop=early_stop, **SETTINGS[name])
+    model, camera = make_model(dev, rng), ring_cameras(1, 30)[0].crop(3, 4, 22, 17)
+    renderer = Renderer(dev, model, settings)
+    result = renderer.forward(camera, GAMMA, training=True)
+    picture = result.image.get()
+    expected, backward = chained(model, settings, camera)
+    assert picture.shape == (20, 24, 3) and relative_error(picture, expected) < 1e-5
+
+    grad = rng.normal(size=picture.shape).astype(np.float32)
+    gradients = renderer.backward(result, dev.upload(grad))
+    shaded = result.weights.shaded.get()
+    want_features, want_opacity, want_net = backward(grad)
+    assert np.abs(want_features).max() > 0 and np.abs(want_opacity).max() > 0
+    assert not np.delete(want_features, shaded, axis=0).any()
+    assert not np.delete(want_opacity, shaded).any()
+    features, opacity = gradients.shaded_features.get(), gradients.opacity.get()
+    assert relative_error(features[: len(shaded)], want_features[shaded]) < 5e-5
+    assert relative_error(opacity[: len(shaded)], want_opacity[shaded]) < 5e-5
+    for key, value in plain_parameters(model.net, model.net.gradients).items():
+        assert relative_error(value, want_net[key]) < 5e-5, key
+
+
+def test_padding_does_not_move_the_picture(dev, rng):
+    """A camera whose size is no multiple of 4 shows the same features as the larger one,
+    cropped.
+    """
+    model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
+    renderer = Renderer(dev, model, RasterConfig(radius=0.85))
+    whole = renderer.forward(camera, GAMMA, until="features").features.get()
+    odd = camera.crop(5, 7, 21, 19)
+    assert renderer.render(odd, GAMMA).shape == (19, 21, 3)
+    result = renderer.forward(odd, GAMMA, until="features")
+    left, top = result.offset
+    inner = result.features.get()[top : top + 19, left : left + 21]
+    np.testing.assert_allclose(inner, whole[7:26, 5:26], atol=2e-5)
+
+
+def test_a_view_in_which_few_tiles_could_be_skipped_is_computed_whole(dev, rng, monkeypatch):
+    renderer, camera = (
+        Renderer(dev, make_model(dev, rng), RasterConfig(radius=0.85)),
+        ring_cameras(1, 32)[0],
+    )
+    whole = renderer.render(camera, GAMMA)
+    monkeypatch.setattr(pp_cl.engine.network.unet, "LEAST_PIXELS", 0)
+    monkeypatch.setattr(pp_cl.engine.network.unet, "MOST_COMPUTED", 0)
+    np.testing.assert_array_equal(renderer.render(camera, GAMMA), whole)
+
+
+def test_an_empty_view_is_the_background(dev, rng):
+    model, camera = make_model(dev, rng), ring_cameras(1, 16)[0]
+    away = replace(camera, pose=camera.pose * [-1, 1, -1, 1])  # turned round
+    renderer = Renderer(dev, model, RasterConfig(radius=0.85))
+    result = renderer.forward(away, GAMMA, training=True)
+    np.testing.assert_array_equal(result.features.get(), np.ones((16, 16, 16), np.float32))
+    assert np.isfinite(result.image.get()).all()
+    renderer.backward(result, dev.upload(np.ones((16, 16, 3), np.float32)))
+    assert result.weights.shaded.size == 0
+
+
+def test_a_call_may_see_beyond_the_models_depth_range(dev, rng):
+    model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
+    renderer, far = Renderer(dev, model, RasterConfig(blend="alpha")), model.depth_range[1]
+    back = camera.pose.copy()
+    back[:, 3] -= 2 * far * back[:, 2]
+    away = replace(camera, pose=back)
+    assert renderer.forward(away, GAMMA, until="weights").pairs.total == 0
+    seen = renderer.forward(away, GAMMA, until="weights", depth_range=(far, 4 * far))
+    assert seen.pairs.total > 0
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_early_stop_of_a_call_is_that_of_other_settings(dev, rng, blend):
+    model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
+    settings = RasterConfig(blend=blend, early_stop=0.0)
+    renderer = Renderer(dev, model, settings)
+    exact = renderer.render(camera, GAMMA)
+    lasting = Renderer(dev, model, replace(settings, early_stop=0.2))
+    other = lasting.render(camera, GAMMA)
+    np.testing.assert_array_equal(renderer.render(camera, GAMMA, early_stop=0.2), other)
+    assert (other != exact).any()
+    np.testing.assert_array_equal(lasting.render(camera, GAMMA, early_stop=0.0), exact)
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, blend):
+    settings = RasterConfig(blend=blend, radius=0.85)
+    renderer = Renderer(dev, make_model(dev, rng, 300), settings)
+    near, far = (ring_cameras(1, size)[0] for size in (96, 48))
+    first = renderer.forward(far, GAMMA, until="weights").pairs.capacity
+    dev.reset_peak()
+    second = renderer.forward(near, GAMMA, until="weights").pairs.capacity
+    assert 0 < 2 * first < second
+    assert dev.peak_bytes == dev.bytes
+
+
+def test_an_image_beyond_the_boxes_of_points_is_refused(dev, rng):
+    """Before anything is launched: they would wrap."""
+    camera = replace(ring_cameras(1, 16)[0], width=2**16)
+    renderer = Renderer(dev, make_model(dev, rng), RasterConfig(radius=0.85))
+    with pytest.raises(UserError, match="65536x16 pixels: at most 65535 each way"):
+        renderer.forward(camera, GAMMA)

@@ -1,0 +1,192 @@
+"""Training: it learns, it is deterministic, and a run that was killed ends like one that was
+not.
+"""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from support.checkpoints import load_checkpoint
+from support.refused import failure
+from support.runs import arguments, checkpoint, rows, train_and_interrupt
+
+from pp_cl import load
+from pp_cl.cli import main
+from pp_cl.config import preset
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.training.prune import SPECK
+from pp_cl.session.start import DEMO_NETWORK, begin_network
+
+
+def test_a_run_learns_and_leaves_its_files(finished):
+    log = rows(finished)
+    assert [r["step"] for r in log] == [*range(5, 61, 5), 60] and log[-1]["finished"]
+    losses = [r["loss"] for r in log[:-1]]
+    assert np.mean(losses[-3:]) < 0.6 * losses[0]
+    previews = {p.name for p in (finished / "previews").iterdir()}  # a slow device has one more
+    assert {f"step_0000{n}.png" for n in (15, 30, 45, 60)} <= previews and len(previews) <= 5
+    header, arrays = load_checkpoint(finished / "checkpoint.npz")
+    assert header["finished"] and header["step"] == 60
+    assert Grid.of_header(header["grid"]).in_large_parts(arrays["points.ids"], SPECK).all()
+    assert 0 < len(arrays["points.ids"]) < header["initial_points"]
+    assert not any(name.startswith(("moment", "state", "average")) for name in arrays)
+    assert (np.diff(arrays["points.ids"].astype(np.int64)) > 0).all()
+    assert arrays["points.offset"].any(axis=1).all() and arrays["points.offset"].std() > 0.01
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(scene, finished, tmp_path):
+    assert main(arguments(scene, tmp_path / "again")) == 0
+    assert checkpoint(tmp_path / "again") == checkpoint(finished)
+    assert main(arguments(scene, tmp_path / "other", train__seed=1)) == 0
+    assert checkpoint(tmp_path / "other") != checkpoint(finished)
+
+
+@pytest.mark.parametrize("steps", [25, 59])
+def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
+    scene, finished, tmp_path, monkeypatch, steps
+):
+    train_and_interrupt(scene, tmp_path / "run", steps, monkeypatch)
+    assert main(arguments(scene, tmp_path / "run")) == 0
+    assert checkpoint(tmp_path / "run") == checkpoint(finished)
+    strip = [{k: v for k, v in r.items() if k != "seconds"} for r in rows(tmp_path / "run")]
+    assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
+
+
+@pytest.mark.parametrize("blocks", ["double", "gated"])
+def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
+    scene, tmp_path, monkeypatch, blocks
+):
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    changes = {"network__blocks": blocks, "train__iterations": 80}
+    assert main(arguments(scene, whole, **changes)) == 0
+    losses = [r["loss"] for r in rows(whole)[:-1]]
+    assert np.mean(losses[-3:]) < 0.6 * losses[0]
+    train_and_interrupt(scene, run, 47, monkeypatch, **changes)
+    assert main(["train", scene, "--out", str(run)]) == 0  # the settings are the run's
+    assert checkpoint(run) == checkpoint(whole)
+    told = failure(*arguments(scene, run, network__blocks="single"))
+    assert f"network.blocks is {blocks} there, single asked for" in told
+
+
+def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_path, monkeypatch):
+    """Which it needs no more once it has begun."""
+    run, whole, other = tmp_path / "run", tmp_path / "whole", tmp_path / "other"
+    shutil.copytree(finished, other)
+    given = {"network__rate": "1e-12,1e-12", "train__ema": "false"}
+    assert main([*arguments(scene, whole, **given), "--network", str(other)]) == 0
+    _, expected = load_checkpoint(finished / "checkpoint.npz")
+    _, arrays = load_checkpoint(whole / "checkpoint.npz")
+    for name in (name for name in expected if name.startswith("net.")):
+        np.testing.assert_allclose(arrays[name], expected[name], rtol=0, atol=1e-9)
+    losses = [[r["loss"] for r in rows(out)[:5]] for out in (whole, finished)]
+    assert np.mean(losses[0]) < 0.9 * np.mean(losses[1])
+
+    train_and_interrupt(scene, run, 25, monkeypatch, **given, network__start=other)
+    shutil.rmtree(other)
+    assert main(["train", "--out", str(run)]) == 0
+    assert checkpoint(run) == checkpoint(whole)
+
+    words = arguments(scene, tmp_path / "no", network__widths="16,16,32")
+    assert "other/config.json: No such file" in failure(*words, "--network", other)
+    told = failure(*words, "--network", finished)
+    assert "has network.widths=16,16,16, this training 16,16,32" in told
+    assert not (tmp_path / "no").exists()
+
+
+def test_a_training_begins_with_the_network_of_the_demo(scene, tmp_path):
+    """Which helps."""
+    default = {"network__widths": "32,64,128", "train__iterations": 20}
+    for start in ("demo", "random"):
+        assert main([*arguments(scene, tmp_path / start, **default), "--network", start]) == 0
+    losses = [[r["loss"] for r in rows(tmp_path / start)[:-1]] for start in ("demo", "random")]
+    assert np.mean(losses[0]) < 0.8 * np.mean(losses[1])
+
+
+@pytest.mark.parametrize(
+    "scene, widths, is_taken",
+    [
+        ("/mine", (32, 64, 128), True),
+        ("demo", (32, 64, 128), False),
+        ("/mine", (32, 64, 64), False),
+    ],
+)
+def test_where_the_demos_network_is_taken(dev, scene, widths, is_taken):
+    config = preset("tiny")
+    config.scene.path, config.network.widths = scene, widths
+    net = UNet.of_settings(dev, config.network)
+    random = {name: dev.download(array).copy() for name, array in net.parameters.items()}
+    begin_network(net, config)
+    with np.load(DEMO_NETWORK) as kept:
+        for name, array in net.parameters.items():
+            expected = kept[f"net.{name}"] if is_taken else random[name]
+            np.testing.assert_array_equal(dev.download(array), expected)
+
+
+def test_what_has_a_rate_of_0_is_left_alone(scene, tmp_path, monkeypatch):
+    changes = {"train__sh_rate": "0.5,0.25,0", "train__offset_rate": "0,0"}
+    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch, **changes)
+    _, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
+    assert not arrays["points.sh2"].any() and not arrays["points.offset"].any()
+    assert arrays["points.sh0"].any() and arrays["points.sh1"].any()
+    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path, degree):
+    lower, zero = tmp_path / "lower", tmp_path / "zero"
+    rates = ",".join(["0.5", "0.25", "0.125"][: degree + 1] + ["0"] * (2 - degree))
+    assert main(arguments(scene, lower, points__sh_degree=degree)) == 0
+    assert main(arguments(scene, zero, train__sh_rate=rates)) == 0
+    _, arrays = load_checkpoint(lower / "checkpoint.npz")
+    _, expected = load_checkpoint(zero / "checkpoint.npz")
+    assert set(expected) - set(arrays) == {f"points.sh{d}" for d in range(degree + 1, 3)}
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, expected[name])
+
+
+def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, monkeypatch):
+    """No buffer larger than 200 bytes a point, and pruning in place by many pieces."""
+    changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}
+    assert main(arguments(scene, tmp_path / "free", **changes)) == 0
+    points = load_checkpoint(tmp_path / "free" / "checkpoint.npz")[0]["initial_points"]
+    monkeypatch.setattr("pp_cl.engine.device.buffers.SCRATCH_BYTES", 100_000)
+    monkeypatch.setenv("PP_MAX_ALLOCATION", str(200 * points / 2**20))
+    assert main(arguments(scene, tmp_path / "bounded", **changes)) == 0
+    assert checkpoint(tmp_path / "bounded") == checkpoint(tmp_path / "free")
+    monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
+    assert "at once" in failure(*arguments(scene, tmp_path / "smaller", **changes))
+    assert not (tmp_path / "smaller").exists()
+
+
+def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
+    """The ball fills about half of its box, so 1500 cells hold some 750 points."""
+    monkeypatch.setattr("pp_cl.scene.hull.CELL_CAP", 1500)
+    assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
+    told = re.search(r"^hull: only (\d+) of the 1500 points .*$", capsys.readouterr().out, re.M)
+    assert 500 < int(told[1]) < 1500
+
+
+@pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])
+def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
+    out = tmp_path / "run"
+    changes = {"raster__footprint": footprint, "raster__radius": radius, "train__iterations": 30}
+    changes |= {"raster__max_tracked": 64, "raster__early_stop": 0.001, "train__crop": 0}
+    changes |= {"train__prune_weight": 0}
+    assert main(arguments(scene, out, **changes)) == 0
+    losses = [r["loss"] for r in rows(out)[:-1]]
+    assert losses[-1] < losses[0]
+
+
+def test_the_spread_brings_the_hits_of_a_pixel_together(scene, tmp_path):
+    """Their mean depth and their median depth differ less."""
+    apart = []
+    for weight in (0, 30):
+        out = tmp_path / str(weight)
+        assert main(arguments(scene, out, train__spread_weight=weight)) == 0
+        run = load(out)
+        pictures = [run.render(view.camera) for view in run.scene("test").splits["test"]]
+        seen = [(p.depth[p.alpha > 0.5], p.median_depth[p.alpha > 0.5]) for p in pictures]
+        apart.append(np.mean([np.abs(mean - median).mean() for mean, median in seen]))
+    assert apart[1] < 0.7 * apart[0]

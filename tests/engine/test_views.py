@@ -1,0 +1,92 @@
+"""Views: reduction and its limits, the pixels that show the object."""
+
+import numpy as np
+import pytest
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.views import MASK_THRESHOLD, View, fitting_downscale
+from pp_cl.errors import UserError
+from pp_cl.presets import IMAGE_SIZES
+
+
+@pytest.fixture
+def view():
+    """A view of 70x50 pixels, all transparent."""
+    return View(
+        "a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 50), np.zeros((50, 70, 4), np.uint8)
+    )
+
+
+def test_reduced(view):
+    reduced = view.reduced(3)
+    camera = reduced.camera
+    assert (camera.width, camera.height, camera.fx, camera.cx) == (23, 16, 20, 35 / 3)
+    assert reduced.image is view.image and reduced.stored_camera is view.stored_camera
+    assert reduced.reduced(2).camera == view.camera.downscaled(2)
+
+
+@pytest.mark.parametrize("downscale", (0, -1, 4, 1.5, "2", None))
+def test_reduced_too_far(view, downscale):
+    with pytest.raises(UserError, match=r"--downscale .*from 1 to 3.*70x50 pixels of a\.png"):
+        view.reduced(downscale)
+
+
+def test_image_too_small_for_any_reduction():
+    with pytest.raises(UserError, match=r"a\.png: 70x15 pixels"):
+        View(
+            "a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 15), np.zeros((15, 70, 4), np.uint8)
+        ).reduced(1)
+
+
+@pytest.mark.parametrize("downscale", (1, 2, 3))
+@pytest.mark.parametrize("margin", (0, 2, 100))
+def test_object_bounds_are_the_tightest(view, rng, downscale, margin):
+    """Against a search over the reduced pixels one by one; the image's leftover columns and rows do
+    not count.
+    """
+    for _ in range(5):
+        view.image[..., 3] = rng.integers(0, MASK_THRESHOLD + 1, view.image.shape[:2])
+        view.image[rng.integers(5, 50, 4), rng.integers(9, 70, 4), 3] = MASK_THRESHOLD + 1
+        width, height = 70 // downscale, 50 // downscale
+        hit = [
+            (x, y)
+            for x in range(width)
+            for y in range(height)
+            if view.image[
+                y * downscale : (y + 1) * downscale, x * downscale : (x + 1) * downscale, 3
+            ].max()
+            > MASK_THRESHOLD
+        ]
+        x, y = zip(*hit, strict=True)
+        expected = (
+            max(min(x) - margin, 0),
+            max(min(y) - margin, 0),
+            min(max(x) + 1 + margin, width),
+            min(max(y) + 1 + margin, height),
+        )
+        assert view.reduced(downscale).object_bounds(margin) == expected
+
+
+def test_object_bounds_without_object(view):
+    assert view.reduced(3).object_bounds(5) == (0, 0, 23, 16)
+
+
+@pytest.mark.parametrize(
+    "size, side, expected",
+    [
+        ((800, 800), 200, 4),
+        ((400, 400), 200, 2),
+        ((200, 200), 200, 1),
+        ((48, 48), 200, 1),  # smaller ones are not enlarged
+        ((300, 200), 200, 2),  # 150 is three quarters of 200
+        ((298, 200), 200, 1),
+        ((4032, 3024), 200, 20),
+        ((1000, 40), 200, 2),  # no side below 16 pixels
+        ((10, 10), 200, 1),
+        ((4032, 3024), IMAGE_SIZES["full"], 3),
+        ((1600, 1200), IMAGE_SIZES["full"], 1),
+        ((4032, 3024), IMAGE_SIZES["paper"], 1),
+    ],
+)
+def test_a_preset_takes_the_whole_number_nearest_to_its_size(size, side, expected):
+    assert fitting_downscale(size, side) == expected

@@ -1,0 +1,179 @@
+"""The loss against scikit-image and finite differences, which the selftest compares with float64;
+and what the mask term does to a training.
+"""
+
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+from support.comparisons import relative_error
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl import load
+from pp_cl.cli import main
+from pp_cl.engine.training.loss import Loss
+from pp_cl.errors import Diverged
+from pp_cl.reference import loss as oracle_loss
+from pp_cl.reference.differences import numeric_gradient
+from pp_cl.selftest.case import SIZES
+from pp_cl.selftest.loss import images
+
+
+def run(dev, prediction, target, weight, beta=0.0, **offset):
+    loss = Loss(dev, weight, beta)
+    grad = loss.forward_backward(dev.upload(prediction), dev.upload(target), **offset)
+    return loss.terms.get()[:4], grad.get()
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.05])
+def test_oracle_gradient_is_the_derivative(rng, beta):
+    prediction, target = images(rng, 14, 13)
+    assert np.abs(prediction - target).min() > 1e-6  # else L1 has a kink inside the difference
+    _, grad = oracle_loss.loss(prediction, target, 0.7, beta)
+    some = range(0, prediction.size, 5)  # in all rows, columns and colours
+    numeric = numeric_gradient(
+        lambda p: oracle_loss.loss(p, target, 0.7, beta)[0][0], prediction, 5e-7, some
+    )
+    assert relative_error(grad.ravel()[some], numeric) < 1e-6
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.1])
+def test_a_nan_is_not_hidden(dev, rng, weight):
+    prediction, target = images(rng, 14, 13)
+    prediction[5, 6, 1] = np.nan
+    terms, grad = run(dev, prediction, target, weight, 0.05)
+    assert np.isnan(terms[0]) and np.isnan(grad[5, 6, 1])
+
+
+def test_smooth_l1_is_torchs(rng):
+    """torch.nn.SmoothL1Loss(beta=0.05) of these errors."""
+    error = np.array([0.0, 0.01, -0.05, 0.3]).reshape(1, 4, 1).repeat(3, axis=2)
+    terms, grad = oracle_loss.loss(error, np.zeros_like(error), 0.0, 0.05)
+    assert terms[0] == pytest.approx((0.001 + 0.025 + 0.275) / 4)
+    np.testing.assert_allclose(12 * grad[0, :, 0], [0, 0.2, -1, 1])
+
+
+def test_ssim_is_scikit_images(dev, rng):
+    prediction, target = images(rng, 37, 64)
+    terms, _ = run(dev, prediction, target, 0.2)
+    expected = structural_similarity(
+        prediction.astype(np.float64),
+        target.astype(np.float64),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
+    assert terms[2] == pytest.approx(1 - expected, rel=2e-6)
+
+
+@pytest.mark.parametrize(("left", "top"), [(0, 0), (1, 2), (3, 1)])
+def test_target_inside_a_larger_prediction(dev, rng, left, top):
+    prediction, target = images(rng, 22, 29)
+    expected_terms, expected_grad = run(dev, prediction, target, 0.2)
+    padded = np.full((24, 32, 3), np.nan, np.float32)  # poison: nothing outside may be read
+    inner = np.s_[top : top + 22, left : left + 29]
+    padded[inner] = prediction
+    terms, grad = run(dev, padded, target, 0.2, left=left, top=top)
+    np.testing.assert_array_equal(terms, expected_terms)
+    np.testing.assert_array_equal(grad[inner], expected_grad)
+    grad[inner] = 0
+    assert not grad.any()
+
+
+@pytest.mark.parametrize(("left", "top"), [(4, 0), (0, 3), (-1, 0)])
+def test_refuses_a_target_outside(dev, left, top):
+    with pytest.raises(ValueError, match="reaches outside"):
+        Loss(dev, 0.2).forward_backward(
+            dev.zeros((24, 32, 3)), dev.zeros((22, 29, 3)), left=left, top=top
+        )
+
+
+def test_sizes_may_change_between_calls(dev, rng):
+    loss = Loss(dev, 0.2)
+    for size in [(20, 30), (10, 5), (31, 17), (20, 30)]:
+        prediction, target = images(rng, *size)
+        grad = loss.forward_backward(dev.upload(prediction), dev.upload(target))
+        expected_terms, expected_grad = oracle_loss.loss(prediction, target, 0.2)
+        np.testing.assert_allclose(loss.terms.get()[:4], expected_terms, rtol=2e-6)
+        assert relative_error(grad.get(), expected_grad) < 2e-6
+
+
+def float32_sum(terms, group):
+    """(4,) of terms (M, 4) in float32: member by member of a group, then as a tree."""
+    sums = np.zeros((group, 4), np.float32)
+    for first in range(0, len(terms), group):
+        part = terms[first : first + group]
+        sums[: len(part)] += part
+    while len(sums) > 1:
+        sums = sums[: len(sums) // 2] + sums[len(sums) // 2 :]
+    return sums[0]
+
+
+@pytest.mark.parametrize("m", [*SIZES, 1590])
+@pytest.mark.parametrize("group", [1, 2, 256])
+def test_terms_are_summed_in_a_fixed_order(dev, rng, m, group):
+    terms = rng.uniform(0, 1, (3, m, 4)).astype(np.float32)
+    sums = dev.empty((3, 4))
+    dev.program("training/loss", GROUP=group).launch(
+        "loss_sum", 3 * group, group, rows=3, m=m, terms=dev.upload(terms), sums=sums
+    )
+    assert np.array_equal(sums.get(), [float32_sum(row, group) for row in terms])
+
+
+def test_its_terms_by_name(dev, rng):
+    """As they are when they are asked for, though the next step has begun."""
+    loss, images_of = Loss(dev, 0.2), [images(rng, 20, 31) for _ in range(2)]
+    readings = []
+    for step, (prediction, target) in enumerate(images_of):
+        loss.forward_backward(dev.upload(prediction), dev.upload(target))
+        if step == 0:
+            loss.add("mask", dev.upload([0.25, 0.5], np.float32), 2.0, scale=0.5)
+        readings.append(loss.read(step + 1))
+    for step, (prediction, target) in enumerate(images_of):
+        expected, _ = oracle_loss.loss(prediction, target, 0.2)
+        found = readings[step].get()
+        assert found.pop("loss") == pytest.approx(expected[0] + 0.75 * (step == 0), rel=1e-5)
+        assert found.pop("ssim") == pytest.approx(1 - expected[2], rel=1e-5)
+        assert found.pop("psnr") == pytest.approx(-10 * np.log10(expected[3]), rel=1e-5)
+        assert found == pytest.approx({"l1": expected[1]} | ({} if step else {"mask": 0.375}))
+
+
+@pytest.mark.parametrize(
+    "values, named",
+    [
+        ([np.nan, 0, 0, 0], "loss"),
+        ([np.inf, np.inf, 0, 0], "loss, l1"),
+        ([1e30, 1e30, 0.5, np.inf], "psnr"),  # the mean square overflows before the loss does
+    ],
+)
+def test_terms_that_are_not_finite_are_told_as_often_as_asked(dev, values, named):
+    loss = Loss(dev, 0.2)
+    loss.terms.set(np.float32([*values, 0, 0, 0, 0]))
+    reading = loss.read(7)
+    for _ in range(2):
+        with pytest.raises(Diverged, match=rf"at step 7 \({named}\)$"):
+            reading.get()
+
+
+def test_the_mask_is_learned(tmp_path):
+    """The alpha of the test views is nearer to that of the photographs, and exceeds it less."""
+    scene, errors = write_ball_scene(tmp_path / "ball"), []
+    for weight in (0, 3):
+        out = tmp_path / str(weight)
+        assert main(arguments(scene, out, train__mask_weight=weight)) == 0
+        run = load(out)
+        views = run.scene("test").splits["test"]
+        alphas = [(run.render(view.camera).alpha, reduced_alpha(view)) for view in views]
+        difference = np.array([rendered - given for rendered, given in alphas])
+        errors.append((np.maximum(difference, 0).mean(), np.maximum(-difference, 0).mean()))
+    (excess, shortfall), (excess_left, shortfall_left) = errors
+    assert excess_left < 0.8 * excess and shortfall_left < 0.9 * shortfall
+
+
+def reduced_alpha(view):
+    """(H, W) of the reduced photograph."""
+    k, camera = view.downscale, view.camera
+    alpha = view.image[..., 3].reshape(camera.height, k, camera.width, k)
+    return alpha.mean(axis=(1, 3)) / 255

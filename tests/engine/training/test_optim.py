@@ -1,0 +1,115 @@
+"""What the selftest's cases of Adam, RMSprop and averages leave open."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.comparisons import relative_error
+from support.models import make_model
+
+from pp_cl.engine.raster.points import SH_DEGREES
+from pp_cl.engine.training.optim import Optimiser, adam_update, ema_update
+from pp_cl.engine.training.state import PointState
+from pp_cl.reference import optim
+from pp_cl.selftest.optim import RATES, Cloud, adam_steps, gradients
+
+pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
+
+
+def test_momentum_goes_on_without_a_gradient(dev, rng):
+    """In arrays of any rank, for as long as training takes."""
+    start, slope = rng.standard_normal((2, 3, 11))
+    grads = slope * (0.3 + rng.standard_normal((1000, 3, 11)))
+    grads[2::3] = 0
+    oracle, parameter, _ = adam_steps(dev, start, grads, rate=0.02, eps=1e-8)
+    assert np.abs(oracle.parameter - start).max() > 1
+    assert relative_error(parameter, oracle.parameter) < 1e-5
+
+
+def test_refuses_different_shapes(dev):
+    a, b = dev.zeros((4, 3)), dev.zeros((3, 4))
+    with pytest.raises(ValueError, match="one shape"):
+        adam_update(dev, a, b, {"m": a, "v": a}, step=1, rate=0.1, eps=1e-8)
+    with pytest.raises(ValueError, match="one shape"):
+        ema_update(dev, a, b, 0.5)
+
+
+def test_averages_start_as_copies_and_are_applied_and_released(dev, rng):
+    model = make_model(dev, rng)
+    optimiser = Optimiser(dev, model, PointState(dev, model.cloud))
+    before = dev.bytes
+    learned = model.cloud.learned()
+    for name in ("sh_1", "sh_2a", "sh_2b"):  # these have none
+        learned.pop(name)
+    parameters = learned | model.net.parameters
+    start = {name: array.get() for name, array in parameters.items()}
+    optimiser.update_ema(0.25)  # the first one copies, whatever its weight
+    for array in parameters.values():
+        dev.fill(array, 0)
+    optimiser.update_ema(0.25)
+    assert {name.split(".", 1)[0] for name in optimiser.arrays()} == {"state", "moment", "average"}
+    assert {f"state.a.{name}" for name in learned} < optimiser.arrays().keys()
+    assert "state.a.sh_1" not in optimiser.arrays()
+    optimiser.apply_ema()
+    assert dev.bytes == before
+    for name, array in parameters.items():
+        np.testing.assert_allclose(array.get(), 0.75 * start[name], rtol=1e-6)
+        dev.fill(array, 0)
+    optimiser.apply_ema()  # there are none any more
+    assert not any(array.get().any() for array in parameters.values())
+
+
+def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(rng):
+    """Of the oracle: for one gradient seen from everywhere, v is the mean of those that Adam keeps
+    of the coefficients, and the moves are Adam's with that mean.
+    """
+    directions = rng.standard_normal((20_000, 3))
+    basis = optim.basis(directions, np.zeros(3))
+    grad = 1e-4 * np.ones((len(basis), 16))
+    others = {"offset": np.zeros((len(basis), 4)), "opacity": np.zeros(len(basis))}
+    twin = optim.RmsProp(basis, 0.5, sh=np.zeros((len(basis), 9, 16)), **others)
+    adam = optim.Adam(np.zeros((len(basis), 9, 16)), beta1=0.0)
+    rates = {"sh": np.ones(9), "offset": 0, "opacity": 0}
+    twin.step(1, {"sh": grad} | others, rates, {"sh": 0.0, "offset": 1.0, "opacity": 1.0})
+    adam.step(basis[:, :, None] * grad[:, None], 1.0, 0.0)
+    np.testing.assert_allclose(adam.v[:, :, 0].mean(axis=0), twin.v["sh"][0, 0], rtol=0.03)
+    for degree in SH_DEGREES:
+        of_degree = adam.v[:, degree**2 : (degree + 1) ** 2, 0].mean(axis=1)
+        np.testing.assert_allclose(of_degree, twin.v["sh"][:, 0], rtol=1e-9)  # in every direction
+    shared = np.sqrt(adam.v / twin.v["sh"][:, None])
+    np.testing.assert_allclose(adam.parameter * shared, twin.sh, rtol=1e-9, atol=1e-12)
+
+
+def test_points_without_a_gradient_keep_their_values(dev, rng):
+    cloud, shaded = Cloud(dev, rng, 257), np.arange(0, 257, 2)
+    # all at a bound may stay there
+    cloud.cloud.opacity.set(rng.uniform(0.3, 0.7, 257).astype(np.float32))
+
+    def state():
+        moments = {name: v.get() for name, v in cloud.state.second_moments.items()}
+        return [*cloud.learned().values(), *moments.values(), cloud.state.last_step.get()]
+
+    for _ in range(2):
+        before = state()
+        cloud.step(gradients(rng, 257), shaded)
+        after = state()
+        moved = np.isin(np.arange(257), shaded) & (np.arange(257) % 3 > 0)
+        for new, old in zip(after, before, strict=True):
+            np.testing.assert_array_equal(new[~moved], old[~moved])
+            assert (new[moved] != old[moved]).any()
+        assert (after[-1][moved] == cloud.steps).all()
+    cloud.step(gradients(rng, 257), np.array([], int))
+    for new, old in zip(state(), after, strict=True):
+        np.testing.assert_array_equal(new, old)
+
+
+@pytest.mark.parametrize("rates", [(0.1, 0, 0), (0.1, 0.05, 0), (0, 0.05, 0.02), (0, 0, 0)])
+def test_degrees_at_rate_0_stay(dev, rng, rates):
+    cloud = Cloud(dev, rng, 31)
+    for _ in range(3):
+        cloud.step(gradients(rng, 31), np.arange(31), rates=replace(RATES, sh=rates))
+    found = cloud.learned()["sh"]
+    assert relative_error(found, cloud.twin.sh) < 1e-6
+    for degree, rate in enumerate(rates):
+        part = np.s_[:, degree**2 : (degree + 1) ** 2]
+        assert (found[part] == cloud.start["sh"][part]).all() == (rate == 0)

@@ -1,0 +1,148 @@
+"""pp_cl/engine/training/schedule.py: the values of the formulas, worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pp_cl.config import assign, preset
+from pp_cl.engine.training.crops import BOX_MARGIN, END_SHARE, draw_start
+from pp_cl.engine.training.schedule import (
+    Rates,
+    ema_weight,
+    gamma_at,
+    learning_rate,
+    refine_steps,
+    rising_weight,
+)
+from pp_cl.settings import NetworkConfig, TrainConfig
+
+SH_RATES = [
+    (
+        (0.5, 0.05, 0),
+        {0: 0.5, 250: 0.49428, 500: 0.48862, 1000: 0.4775, 25000: 0.15811, 50000: 0.05},
+    ),
+    (
+        (0.25, 0.025, 500),
+        {0: 0.0025, 250: 0.17548, 500: 0.24431, 1000: 0.23875, 25000: 0.07906, 50000: 0.025},
+    ),
+    (
+        (0.125, 0.0125, 1000),
+        {0: 0.00125, 250: 0.04805, 500: 0.08673, 1000: 0.11937, 25000: 0.03953, 50000: 0.0125},
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "values"), SH_RATES)
+def test_published_rates(arguments, values):
+    first, last, delay_steps = arguments
+    for step, value in values.items():
+        rate = learning_rate(step, 50000, first, last, delay_steps=delay_steps)
+        assert rate == pytest.approx(value, abs=6e-6)
+
+
+def test_rate_stays_after_the_end():
+    assert learning_rate(200, 100, 0.5, 0.05) == pytest.approx(0.05)
+
+
+def test_gamma():
+    gammas = [gamma_at(step, 50000) for step in (0, 25000, 50000)]
+    assert gammas == pytest.approx([0.1, 0.031623, 0.01], abs=5e-7)
+
+
+def test_the_spread_weight_rises_from_nothing():
+    weights = [rising_weight(step, 200, 3.0) for step in range(200)]
+    assert weights[0] == 0 and weights[100] == pytest.approx(1.5) and max(weights) < 3
+    np.testing.assert_allclose(np.diff(weights), 3 / 200)
+
+
+@pytest.mark.parametrize(
+    "shares, iterations, changes, expected",
+    [
+        ("0.33,0.67", 11_000, {}, [3630, 7370]),
+        ("0.33,0.67", 1000, {}, [330, 670]),
+        ("0.33,0.67", 60, {}, [20]),  # 64 times as many points, of which none was pruned
+        ("0.33,0.67", 500, {}, [165]),  # the pruning at 250 finds points that were seen 85 times
+        ("0.33,0.67", 2, {}, [1]),
+        ("0.35,1", 100, {}, [35]),
+        ("0.33,0.67", 60, {"train.prune_weight": 0}, [20, 40]),
+        ("0.5,0.5", 100, {"train.prune_weight": 0}, [50]),
+        ("1,1", 8000, {}, []),
+        ("0,0", 8000, {}, []),  # not known yet
+    ],
+)
+def test_a_refinement_needs_a_pruning_since_the_one_before(shares, iterations, changes, expected):
+    config = preset("tiny")
+    for key, value in {
+        "train.refine_at": shares,
+        "train.iterations": iterations,
+        **changes,
+    }.items():
+        assign(config, key, value, "test")
+    assert refine_steps(config.train) == expected
+
+
+def test_ema_weight():
+    weights = [ema_weight(step, 3500) for step in range(3500)]
+    due = [step for step, weight in enumerate(weights) if weight]
+    assert due == list(range(2975, 3500, 17))
+    assert weights[2975] == 1
+    assert weights[2992] == weights[due[-1]] == pytest.approx(1 - math.exp(-17 / 175))
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 100])
+def test_short_trainings_average_too(steps):
+    weights = [ema_weight(step, steps) for step in range(steps)]
+    assert next(w for w in weights if w) == 1
+    assert all(0 <= w <= 1 for w in weights)
+
+
+@pytest.mark.parametrize(
+    "steps, meant_for, scale", [(100, 1000, 1), (1000, 1000, 1), (9000, 1000, 1 / 3), (9000, 0, 1)]
+)
+def test_what_is_slower_in_longer_trainings(steps, meant_for, scale):
+    settings = TrainConfig(iterations=steps, rate_steps=meant_for)
+    first, last = (Rates.at(step, NetworkConfig(), settings) for step in (0, steps))
+    assert (first.opacity, last.opacity) == pytest.approx((0.03 * scale, 0.01 * scale))
+    assert last.sh == pytest.approx((0.05, 0.025 * scale, 0.0125 * scale))
+    assert (first.network, last.network) == pytest.approx((1e-3, 1e-4))
+
+
+@pytest.mark.parametrize(
+    "low, high, size, limit",
+    [
+        (10, 50, 16, 64),
+        (20, 30, 16, 64),
+        (0, 5, 16, 64),
+        (60, 64, 16, 64),
+        (0, 64, 64, 64),
+        (3, 60, 64, 64),
+    ],
+)
+def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
+    starts = {
+        draw_start(np.random.default_rng(i), low, high, size, limit=limit) for i in range(300)
+    }
+    assert min(starts) >= 0 and max(starts) + size <= limit
+    for start in starts:
+        shown = min(high, start + size) - max(low, start)
+        assert shown == min(size, high - low)
+    assert len(starts) == max(
+        1, min(max(low, high - size), limit - size) - max(min(low, high - size), 0) + 1
+    )
+
+
+@pytest.mark.parametrize(
+    "low, high, size, limit", [(10, 400, 64, 800), (0, 617, 256, 800), (17, 183, 128, 200)]
+)
+def test_a_quarter_of_the_crops_shows_an_end_of_the_object(low, high, size, limit):
+    """Drawn uniformly they would hardly ever; what lies between is seen as often, within a half."""
+    seen, draws = np.zeros(limit), 3000
+    for i in range(draws):
+        start = draw_start(np.random.default_rng(i), low, high, size, limit=limit)
+        seen[start : start + size] += 1 / draws
+    ends = seen[[low + BOX_MARGIN, high - BOX_MARGIN - 1]]
+    assert ends == pytest.approx(END_SHARE, abs=0.03)
+    inner = seen[low + BOX_MARGIN : high - BOX_MARGIN]
+    fair = size / (high - low)
+    assert inner.min() > min(0.5 * fair, END_SHARE - 0.03)

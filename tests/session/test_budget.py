@@ -1,0 +1,99 @@
+"""Trainings that are given minutes: how many steps these allow, and that a run keeps to them."""
+
+import json
+import signal
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.runs import SETTINGS, set_words, spoken
+
+from pp_cl.cli import main
+from pp_cl.engine.step import Trainer
+from pp_cl.engine.training.schedule import refine_steps
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.session.budget import Budget
+from pp_cl.settings import TrainConfig
+
+SMALL = {key: value for key, value in SETTINGS.items() if key != "train.iterations"}
+
+
+def simulated(minutes, refine_at, seconds_of, built=0.0):
+    """(seconds, its TrainConfig, steps of its refinements) of a training whose step lasts
+    seconds_of(share of the steps done, refinements done), after kernels were built.
+    """
+    train = TrainConfig(iterations=8000, minutes=minutes, refine_at=refine_at)
+    budget, step, total, refined = Budget(train, 48 * 200**2), 0, 0.0, []
+    while step < train.iterations:
+        took = seconds_of(step / train.iterations, len(refined)) + built * (step == 0)
+        step, total = step + 1, total + took
+        refined += [step] if step in refine_steps(train) else []
+        budget.plan(step, total, took)
+        assert [at for at in refine_steps(train) if at <= step] == refined
+    return total + 18 * seconds_of(1.0, len(refined)), train, refined
+
+
+@pytest.mark.parametrize("minutes", [1, 5, 60])
+@pytest.mark.parametrize("refine_at", [(1.0, 1.0), (0.35, 1.0), (0.33, 0.67)])
+@pytest.mark.parametrize("dearer", [1.7, 2.3, 3.0])
+def test_the_promise_is_kept_as_fog_clears_and_grids_are_refined(minutes, refine_at, dearer):
+    rng = np.random.default_rng(1)
+
+    def seconds_of(share, level):  # fog makes the first steps dear; others share the machine
+        busy = 2.0 if 0.5 < share < 0.6 else 1.0
+        return 0.05 * dearer**level * (1 + np.exp(-9 * share)) * busy * rng.uniform(0.5, 1.5)
+
+    total, train, refined = simulated(minutes, refine_at, seconds_of, built=10.0)
+    assert 0.8 * 60 * minutes < total < 1.15 * 60 * minutes
+    if minutes > 1:  # else nothing is pruned between two refinements
+        assert len(refined) == sum(share < 1 for share in refine_at)
+    shares = [step / train.iterations for step in refined]
+    assert all(abs(share - asked) < 0.2 for share, asked in zip(shares, refine_at, strict=False))
+
+
+def test_a_training_without_time_ends_soon_and_in_order():
+    _, train, refined = simulated(0.01, (0.33, 0.67), lambda share, level: 1.0)
+    assert train.iterations < 60 and refined
+    assert list(train.refine_at) == sorted(train.refine_at)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock by which each step takes 50 ms: two looks at it are 50 ms apart."""
+    now = [0.0]
+
+    def perf_counter():
+        now[0] += 0.05
+        return now[0]
+
+    monkeypatch.setattr(
+        "pp_cl.session.training.time",
+        SimpleNamespace(perf_counter=perf_counter, monotonic=lambda: 0.0),
+    )
+
+
+def test_a_run_takes_its_minutes_however_often_it_is_stopped(scene, tmp_path, clock, monkeypatch):
+    words = ["train", scene, "--out", str(tmp_path / "run"), "--minutes", "0.1"]
+    words += set_words(SMALL, train__refine_at="0.35,1", points__count=300)
+    folder, train_step = RunFolder(tmp_path / "run"), Trainer.train_step
+    for stopped_at in (5, 30, 100):
+
+        def stepping(self, at=stopped_at):
+            if self.step + 1 == at:
+                signal.raise_signal(signal.SIGINT)
+            return train_step(self)
+
+        monkeypatch.setattr(Trainer, "train_step", stepping)
+        assert main(words) == 130
+    assert main(words) == 0
+    train, last = json.loads(folder.config.read_text())["train"], folder.rows()[-1]
+    assert last["finished"] and 4.5 < last["seconds"] < 7.5
+    assert last["step"] == train["iterations"] and train["minutes"] == 0.1
+    (refined,) = refine_steps(TrainConfig(**train))
+    assert 0.15 < refined / last["step"] < 0.6
+    points = {row["step"]: row["points"] for row in folder.rows()}
+    assert points[refined // 5 * 5] < 600 < points[-(-refined // 5) * 5 + 5]
+    status, lines = spoken(words)
+    assert status == 0 and not lines  # it is finished, and nothing was wrong
+    status, (line,) = spoken([*words, "--iterations", "9"])
+    assert status == 2 and "--minutes" in line

@@ -1,0 +1,226 @@
+"""The memory that a training is said to need against what it allocates, and what is refused."""
+
+import gc
+
+import numpy as np
+import pytest
+from support.refused import failure
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.config import assign, preset, run_config
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.host import resident_bytes
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.network.unet import UNet
+from pp_cl.errors import UserError
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.scene.image_file import Photograph
+from pp_cl.session.memory import GIB, MIB, Room
+from pp_cl.session.training import open_training
+
+GRID = Grid((0, 0, 0), 0.02, (64, 64, 64))
+
+
+@pytest.fixture
+def plain(dev, monkeypatch):
+    """A device of the test's own, in a machine with memory to spare."""
+    gc.collect()  # what earlier tests left in reference cycles would be counted
+    monkeypatch.setattr("pp_cl.session.memory.available_bytes", lambda: 2**45)
+    made = Device(dev.device)
+    made.info |= {"memory_bytes": 2**45, "max_allocation_bytes": 2**45}
+    return made
+
+
+BALL = {"points.count": 4000, "scene.downscale": 1, "network.blocks": "double"}
+
+
+@pytest.mark.parametrize(
+    "size, settings",
+    [
+        (400, {}),
+        (128, BALL | {"train.refine_at": "0.4,1"}),  # to eight times the points
+        (128, BALL | {"raster.footprint": "disc", "raster.radius": 0.1}),
+    ],
+)
+def test_it_is_within_15_percent_of_what_a_training_takes(
+    plain, tmp_path, monkeypatch, size, settings
+):
+    """Without prunings, so that it is known how many points there are; smoothing is due, too."""
+    monkeypatch.setattr("pp_cl.engine.step.SMOOTHING_EVERY", 8)
+    scene = write_ball_scene(tmp_path / "ball", size=size)
+    settings |= {"train.iterations": 24, "train.prune_weight": 0}
+    folder = RunFolder(tmp_path / "run")
+    config = run_config(folder, scene, "tiny", [(*one, "test") for one in settings.items()])
+    training = open_training(plain, folder, config, None)
+    training.run()
+    need = training.room.need
+    assert need.points == training.trainer.model.cloud.count
+    assert 0.85 < need.device / plain.peak_bytes < 1.15
+
+
+def room(dev, base="tiny", images=3, size=(800, 600), **changes):
+    """Of a training with a small network."""
+    config = preset(base)
+    settings = {"network.widths": "16,16,16", "raster.radius": "0.85"} | changes
+    for key, value in settings.items():
+        assign(config, key.replace("__", "."), value, "test")
+    width, height = size
+    camera = Camera(np.eye(3, 4), width, width, width / 2, height / 2, width, height)
+    net = UNet(dev, widths=config.network.widths)
+    return Room(config, net, [Photograph(f"{i}.png", camera) for i in range(images)])
+
+
+def test_each_compute_unit_has_memory_of_its_own(dev, plain, monkeypatch):
+    """Where convolutions transform their tiles; as on a server with 128 cores."""
+    planned, shared, taken = [], [], []
+    for units in (2, 256):
+        made = Device(dev.device)
+        for device in (made, plain):
+            monkeypatch.setitem(device.info, "compute_units", units)
+        net = UNet(made, widths=(32, 64, 128))
+        image = net.forward(made.zeros((128, 128, 16)))
+        net.backward(made.zeros(image.shape))
+        taken.append(made.peak_bytes)
+        shared.append(net.scratch_bytes((128, 128), True))
+        planned.append(needed(plain, size=(128, 128), network__widths="32,64,128").device)
+    assert np.ptp(taken) > 2**28
+    assert np.ptp(shared) == pytest.approx(np.ptp(taken), rel=0.01)
+    assert np.ptp(planned) == pytest.approx(np.ptp(taken), rel=0.01)
+
+
+def needed(dev, base="tiny", points=171_262, step=0, **changes):
+    return room(dev, base, **changes).need_of(GRID, points, (2, 6), step)
+
+
+@pytest.mark.parametrize(
+    "name, shares, first, most",
+    [
+        ("tiny", "1,1", 252_312, 252_312),
+        ("small", "0.35,1", 171_262, 94_523 * 8),
+        ("full", "0.33,0.67", 171_262, 455_094 * 8),
+    ],
+)
+def test_the_points_at_the_peak_are_near_those_of_lego(dev, name, shares, first, most):
+    need = needed(dev, name, first, train__refine_at=shares)
+    assert need.points == pytest.approx(most, rel=0.1)
+
+
+def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
+    once = {"train__refine_at": "0.35,1"}
+    halfway = needed(dev, "small", points=118_025, step=600, **once)
+    assert halfway.points < needed(dev, "small", **once).points  # so it goes on where it began
+    last = needed(dev, "small", points=600_000, step=4000, **once)
+    assert last.points == 600_000
+
+
+def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
+    """Its points are half as wide once, not twice."""
+    made = room(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
+    finer = Grid(GRID.origin, GRID.edge / 2, tuple(2 * n for n in GRID.dims))
+    planned, found = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 7000)
+    assert planned.points == found.points == 160_000
+    assert found.device == pytest.approx(planned.device, rel=0.01)
+
+
+def test_a_grid_is_not_refined_beyond_what_ids_can_number(dev):
+    """Of a thin object, whose few points lie in the largest grid."""
+    made = room(dev, "full", train__refine_at="0.3,0.6")
+    largest, larger = (Grid((0, 0, 0), 1e-3, (n, 512, 512)) for n in (256, 257))
+    made.check_points(largest, 1000, (2, 6))
+    with pytest.raises(UserError, match="train.refine_at"):
+        made.check_points(larger, 1000, (2, 6))
+
+
+def test_photographs_are_counted_as_they_are_kept(dev):
+    sizes = {"size": (4000, 3000), "scene__downscale": "8"}
+    one, many = (needed(dev, images=count, **sizes).host for count in (300, 400))
+    assert many - one == 100 * 500 * 375 * 4
+
+
+# ---- what there is
+
+
+def check(made, points=20_000):
+    made.check_points(GRID, points, (2, 6))
+
+
+def refusal(made, points=20_000):
+    """The one line by which a training is refused; it names what to lower."""
+    with pytest.raises(UserError) as caught:
+        check(made, points)
+    text = str(caught.value)
+    assert all(word in text for word in ("--points", "--downscale", "train.crop"))
+    return text
+
+
+@pytest.mark.parametrize(
+    "what, limit, told",
+    [("device", "memory_bytes", "needs"), ("largest", "max_allocation_bytes", "at once")],
+)
+def test_what_fits_is_accepted_and_a_byte_less_is_not(plain, what, limit, told):
+    plain.info[limit] = getattr(needed(plain, points=20_000), what)
+    check(room(plain))
+    plain.info[limit] -= 1
+    assert told in refusal(room(plain)) and plain.name in refusal(room(plain))
+
+
+def test_the_memory_asked_for(plain):
+    least = needed(plain, points=20_000).device / GIB
+    check(room(plain, train__memory_gib=f"{1.01 * least:.4f}"))
+    text = refusal(room(plain, train__memory_gib=f"{0.8 * least:.3f}"))
+    assert text.startswith(f"--memory {round(0.8 * least, 3)}")
+    assert f"give --memory {np.ceil(100 * least) / 100:g}" in text
+
+
+def test_the_hosts_memory(plain, monkeypatch):
+    """Of photographs and of a CPU's buffers; a system that does not tell refuses nothing."""
+    photographs = {"images": 300, "size": (4000, 3000), "scene__downscale": "1"}
+    available = "pp_cl.session.memory.available_bytes"
+    monkeypatch.setattr(available, lambda: resident_bytes() + GIB)
+    assert "of the host's memory" in refusal(room(plain, **photographs))
+    check(room(plain))
+    monkeypatch.setattr(available, lambda: None)
+    check(room(plain, **photographs))
+
+
+@pytest.mark.parametrize("base", ["tiny", "small", "paper"])
+def test_presets_on_a_device_of_four_gibibytes(plain, base):
+    plain.info |= {"memory_bytes": 4 * GIB, "max_allocation_bytes": 2 * GIB}
+    points = preset(base).points.count
+    if base == "paper":
+        refusal(room(plain, base, network__widths="128,256,512"), points)
+    else:
+        check(room(plain, base), points)
+
+
+def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
+    made = room(plain)
+    plain.info["memory_bytes"] = needed(plain, points=preset("tiny").points.count).device
+    made.check_unseen()
+    plain.info["memory_bytes"] = MIB
+    with pytest.raises(UserError):
+        made.check_unseen()
+
+
+@pytest.mark.slow
+def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, monkeypatch, capsys):
+    """More points are left than they were taken to be."""
+    scene = write_ball_scene(tmp_path / "ball", size=64)
+    settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
+    settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
+    monkeypatch.setattr("pp_cl.session.memory.KEPT_BY_PRUNING", 0.05)
+    monkeypatch.setattr(
+        "pp_cl.session.memory.prunings", lambda train, start, end: int(end > start + 1)
+    )
+    monkeypatch.setattr("pp_cl.drivers.discover.open_device", lambda choice: plain)
+    plain.info["memory_bytes"] = 30 * MIB
+    words = arguments(scene, tmp_path / "run", downscale=1, points__count=5000, **settings)
+
+    told = failure(*words)
+    assert "step 19: to go on with " in told and told.endswith("in another --out")
+    plain.info["memory_bytes"] = GIB
+    assert main(words) == 0
+    assert "resuming at step 19 " in capsys.readouterr().out

@@ -1,0 +1,142 @@
+"""What a training goes on with, and what it refuses: other settings, another scene, checkpoints
+that lack something.
+"""
+
+import itertools
+import json
+import shutil
+
+import pytest
+from support.checkpoints import load_checkpoint
+from support.refused import failure
+from support.runs import arguments, checkpoint, rows, train_and_interrupt
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.engine.step import Trainer
+
+LOOKS = "pp_cl.engine.training.schedule.PRUNE_LOOKS", 4  # points are judged within few steps
+
+
+def test_a_finished_run_is_left_alone(scene, finished, capsys):
+    before = (finished / "checkpoint.npz").stat().st_mtime_ns
+    assert main(arguments(scene, finished)) == 0
+    assert "is finished" in capsys.readouterr().out
+    assert (finished / "checkpoint.npz").stat().st_mtime_ns == before
+
+
+def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, capsys):
+    words = ["train", scene, "--out", str(finished)]
+    assert main(words) == main([*words, "--iterations", "59"]) == 0
+    assert main(["train", "--out", str(finished)]) == 0  # the scene, too
+    assert capsys.readouterr().out.count("is finished (60 steps)") == 3
+    assert failure("train", "--out", finished / "other").startswith("pp-cl: SCENE: ")
+    told = failure(*words, "--points", "1600", "--iterations", "61")
+    assert "points.count is 1500 there, 1600 asked for" in told
+
+
+def measured_psnr(out):
+    """Of the held-out views of a run."""
+    assert main(["eval", str(out)]) == 0
+    return json.loads((out / "eval" / "metrics.json").read_text())["mean"]["psnr"]
+
+
+@pytest.fixture(scope="module")
+def refined(scene, tmp_path_factory):
+    """(Folder of a finished run that was refined once, command line of a longer one)."""
+    out, changes = tmp_path_factory.mktemp("runs") / "refined", {"train__refine_at": "0.35,1"}
+    changes |= {"points__count": 300, "train__checkpoint_every": 3, "train__prune_weight": 0.05}
+    changes["raster__radius"] = 1  # points lie 3 pixels apart
+
+    def words(out, iterations):
+        return arguments(scene, out, downscale=1, train__iterations=iterations, **changes)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(*LOOKS)
+        assert main(words(out, 20)) == 0
+    return out, words
+
+
+@pytest.mark.parametrize("iterations, stop", [(22, 21), (80, 69)])
+def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
+    refined, tmp_path, monkeypatch, capsys, iterations, stop
+):
+    """To averages that are due at once, and to a step by which another refinement would be due."""
+    monkeypatch.setattr(*LOOKS)
+    capsys.readouterr()
+    (whole, stopped), (out, words) = [tmp_path / name for name in ("whole", "stopped")], refined
+    for folder in (whole, stopped):
+        shutil.copytree(out, folder)
+    assert main(words(whole, iterations)) == 0
+    assert "extends a finished training of 20 steps" in capsys.readouterr().out
+    header, _ = load_checkpoint(whole / "checkpoint.npz")
+    assert header["finished"] and (header["step"], header["extended_from"]) == (iterations, 20)
+    config = json.loads((whole / "config.json").read_text())
+    assert config["train"]["iterations"] == iterations
+    log = rows(whole)
+    assert [row["step"] for row in log[:4]] == [5, 10, 15, 20] and log[-2]["step"] == iterations
+    assert all(a["points"] >= b["points"] for a, b in itertools.pairwise(log[3:]))
+    before, after = measured_psnr(out), measured_psnr(whole)
+    assert after > before + (1 if iterations == 80 else -0.5), (before, after)
+    for step in (20, stop):  # before the first step, and later on
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "train_step", interrupted_after(step))
+            assert main(words(stopped, iterations)) == 130
+        assert load_checkpoint(stopped / "checkpoint.npz")[0]["step"] == step
+        assert main(["eval", str(stopped), "--metrics", "psnr"]) == 0
+    assert main(words(stopped, 20)) == 2  # it is on its way to more
+    assert main(words(stopped, iterations)) == 0
+    assert checkpoint(stopped) == checkpoint(whole)
+
+
+def interrupted_after(step, train_step=Trainer.train_step):
+    """A train_step() that is interrupted once so many steps are done."""
+
+    def stopping(self):
+        if self.step == step:
+            raise KeyboardInterrupt
+        return train_step(self)
+
+    return stopping
+
+
+def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path, monkeypatch):
+    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
+    shutil.copytree(scene, tmp_path / "moved")
+    assert main(arguments(str(tmp_path / "moved"), tmp_path / "run")) == 0
+    assert checkpoint(tmp_path / "run") == checkpoint(finished)
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["scene"]["path"] == str(tmp_path / "moved")
+
+
+@pytest.mark.parametrize("steps", [25, 5, 60])
+def test_another_scene_is_refused_at_any_state_of_the_run(scene, tmp_path, monkeypatch, steps):
+    """With a checkpoint, before the first, and when the run is finished."""
+    out, other = tmp_path / "run", write_ball_scene(tmp_path / "other", views=7)
+    if steps == 60:
+        assert main(arguments(scene, out)) == 0
+    else:
+        train_and_interrupt(scene, out, steps, monkeypatch)
+    before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    error = failure(*arguments(other, out))
+    assert ("belongs to another scene" if steps == 25 else "scene.path is ") in error
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
+
+
+@pytest.mark.parametrize("share, stops", [(0.3, (12, 33)), (0.9, (52, 57))])
+def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch, share, stops):
+    """Stopped before and after the refinement, which may come after the averages' beginning."""
+    monkeypatch.setattr(*LOOKS)
+    scene = write_ball_scene(tmp_path / "ball")
+    changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_weight": 0.05}
+    changes["downscale"] = 1
+    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
+    whole = checkpoint(tmp_path / "whole")
+    points = {row["step"]: row["points"] for row in rows(tmp_path / "whole")[:-1]}
+    after = round(60 * share) // 5 * 5 + 5
+    assert points[after] > 4 * points[after - 5]
+    for steps in stops:
+        out = tmp_path / str(steps)
+        train_and_interrupt(scene, out, steps, monkeypatch, **changes)
+        assert main(arguments(scene, out, **changes)) == 0
+        assert checkpoint(out) == whole

@@ -1,0 +1,474 @@
+"""From photographs and films to scenes: known cameras are found, each stage is done once, and what
+goes wrong ends in one line.
+"""
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+from support.runs import spoken
+
+from pp_cl.cli import main
+from pp_cl.drivers.discover import open_device
+from pp_cl.engine.camera import Camera
+from pp_cl.files.image import read_rgba, to_8bit, write_png
+from pp_cl.scene.demo import render
+from pp_cl.scene.distortion import Distortion, undistort
+from pp_cl.scene.load import load_scene, scene_format, scene_frames
+from pp_studio.capture import STAGES, poses
+from pp_studio.capture.features import quiet, verification
+from pp_studio.capture.frames import take_images
+from pp_studio.video import write_video
+from tools.capture_demo import align, cameras, room
+
+colmap = pytest.importorskip("pycolmap")
+SIZE, COUNT = 300, 12
+WRONG = 6.0  # of the true focal length
+
+
+def near():
+    """Cameras around the demo, 10 degrees apart, at several heights and distances."""
+    found = []
+    for i in range(COUNT):
+        turn, height, distance = i * np.pi / 18, 0.25 + 0.1 * (i % 3), 3 + 0.25 * (i % 3)
+        ahead = [np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)]
+        eye, fx = distance * np.array(ahead), cameras(SIZE)[0].fx
+        found.append(Camera.look_at(eye, (0, 0, 0), fx=fx, width=SIZE, height=SIZE))
+    return found
+
+
+@pytest.fixture(scope="module")
+def shot(session_device, tmp_path_factory):
+    """A folder with photographs of the demo in a room, and the folder of their masks."""
+    folder = tmp_path_factory.mktemp("shot")
+    for name in ("photographs", "masks"):
+        (folder / name).mkdir()
+    for i, camera in enumerate(near()):
+        rgba = render(session_device, camera)
+        alpha = rgba[..., 3:] / 255
+        write_png(
+            folder / "photographs" / f"{i:03d}.png",
+            rgba[..., :3] / 255 * alpha + room(camera) * (1 - alpha),
+        )
+        write_png(folder / "masks" / f"{i:03d}.png", rgba[..., 3])
+    return folder / "photographs", folder / "masks"
+
+
+@pytest.fixture(scope="module")
+def captured(shot, tmp_path_factory):
+    """The scene made of them."""
+    scene = tmp_path_factory.mktemp("captured") / "scene"
+    assert capture(shot[0], scene, "--masks", shot[1]) == (0, [])
+    return scene
+
+
+def capture(source, scene, *more):
+    """(exit status, lines on stderr) of the command."""
+    return spoken(["capture", source, "--out", scene, *more])
+
+
+def refused(source, scene, *more, named):
+    """The command ends in one line that names something."""
+    status, lines = capture(source, scene, *more)
+    assert status == 2 and len(lines) == 1 and str(named) in lines[0], lines
+
+
+def found(scene, stage):
+    return json.loads((scene / "capture" / f"{stage}.json").read_text())
+
+
+def changed(scene):
+    """{path: time of its last change} of the scene's files."""
+    return {p: p.stat().st_mtime_ns for p in scene.rglob("*") if p.is_file() and p.name[0] != "."}
+
+
+def off(scene, true=None):
+    """How far the scene's cameras are from the true ones."""
+    placed = [one for split in ("train", "test") for one in scene_frames(scene, split)]
+    places = [int(Path(one.name).stem) for one in placed]
+    return align([one.camera for one in placed], [(true or near())[i] for i in places])
+
+
+def test_photographs_become_a_scene(captured):
+    """Cameras agree with the true ones; the object is upright, in the middle, and of unit size."""
+    assert scene_format(captured) == "transforms" and off(captured).position < 0.03
+    assert off(captured).degrees < 4  # their places on an arc hardly tell how it is turned
+    views = load_scene(captured, ("train", "test")).splits
+    assert (len(views["train"]), len(views["test"])) == (10, 2)
+    box = np.array(json.loads((captured / "transforms.json").read_text())["aabb"])
+    assert np.abs(box).max() == pytest.approx(1) and np.abs(box).min() > 0.3
+    for view in (*views["train"], *views["test"]):
+        rows, columns = np.nonzero(view.image[..., 3] > 127)
+        middle = view.camera.project(np.zeros(3))[:2]
+        assert np.linalg.norm(middle - [columns.mean(), rows.mean()]) < 0.1 * SIZE
+        assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
+
+
+def test_the_scene_states_no_digits_that_threads_decide(captured):
+    """Two captures of 49 photographs differed by 1e-14, which a training makes visible."""
+    decimals = re.findall(r"\.(\d+)", (captured / "transforms.json").read_text())
+    assert max(map(len, decimals)) == 9
+
+
+def test_nothing_in_the_scene_is_distorted(captured):
+    """Images, cameras, masks and what COLMAP's model says of its points are of pinholes."""
+    splits = [scene_frames(captured, split) for split in ("train", "test")]
+    one = splits[0][0]
+    assert not any(view.distortion for split in splits for view in split)
+    model = colmap.Reconstruction(captured / "sparse" / "0")
+    focal, _, cx, cy = model.camera(1).params
+    assert (focal, cx, cy) == pytest.approx((one.camera.fx, one.camera.cx, one.camera.cy))
+    bent = colmap.Reconstruction(captured / "capture" / "model")
+    k1 = bent.camera(1).params[3]
+    assert abs(k1) > 1e-5
+    frame = read_rgba(captured / "capture" / "frames" / Path(one.name).name)
+    straight = undistort(open_device(), frame, one.camera, Distortion(k1))
+    np.testing.assert_array_equal(read_rgba(captured / one.name), straight)
+
+
+def test_images_of_which_few_fit_as_of_a_turned_object_they_are_placed_as_usual(
+    captured, tmp_path, monkeypatch
+):
+    """As pairs with few matches are left out there, which may be all between two rounds."""
+    work, mapped = captured / "capture", poses._mapped
+    taken = found(captured, "frames")["images"]
+    monkeypatch.setattr(
+        poses, "_mapped", lambda *given: [] if given[-1] else mapped(*given[:-1], turns=False)
+    )
+    database, images = work / "database.db", work / "frames"
+    placed = poses.place(database, images, tmp_path / "model", taken, turns=True)
+    assert placed["placed"] == COUNT
+    assert {one.name for one in (tmp_path / "model").iterdir()} >= {"cameras.bin", "images.bin"}
+    assert not (tmp_path / "model" / "usual").exists()
+
+
+def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
+    """That of larger photographs, which EXIF may keep: with it, few images have a place."""
+    work = captured / "capture"
+    database = Path(shutil.copy(work / "database.db", tmp_path))
+    with quiet(database), colmap.Database.open(database) as db:
+        for one in db.read_all_cameras():
+            params = [WRONG * cameras(SIZE)[0].fx, SIZE / 2, SIZE / 2, 0]
+            one.params, one.has_prior_focal_length = params, True
+            db.update_camera(one)
+        db.clear_two_view_geometries()
+        colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
+    taken = found(captured, "frames")["images"]
+    told = poses.place(database, work / "frames", tmp_path / "model", taken, False)
+    assert told["placed"] == COUNT
+    lens = colmap.Reconstruction(tmp_path / "model").cameras.values()
+    assert [one.params[0] for one in lens] == pytest.approx([cameras(SIZE)[0].fx] * len(lens), 0.1)
+
+
+def test_wrong_matches_do_not_pull_at_the_cameras():
+    """One point of twenty is another in each photograph, some pixels away, as in a pattern."""
+    colmap.set_random_seed(0)
+    model = colmap.synthesize_dataset(
+        colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=400)
+    )
+    true = [one.camera for one in poses.photographs(model)]
+    rng = np.random.default_rng(0)
+    for image in model.images.values():
+        for one in image.points2D:
+            if one.has_point3D():
+                one.xy = one.xy + rng.normal(0, 4 if one.point3D_id % 20 == 0 else 0.2, 2)
+    poses.refine(model)
+    found = align([one.camera for one in poses.photographs(model)], true)
+    assert found.position < 0.001 and found.degrees < 0.02
+
+
+def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    words = shot[0], scene, "--masks", shot[1]
+    before = changed(scene)
+    assert capture(*words) == (0, []) and changed(scene) == before
+    for name in ("masks.json", "scene.json"):  # killed before they were written
+        (scene / "capture" / name).unlink()
+    assert capture(*words) == (0, [])
+    after = changed(scene)
+    assert after[scene / "capture" / "poses.json"] == before[scene / "capture" / "poses.json"]
+    assert after[scene / "capture" / "masks.json"] > before[scene / "capture" / "masks.json"]
+    refused(shot[1], scene, named=scene)
+
+
+def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys):
+    """Others redo what depends on them, and say so; a word takes them back."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    words, before = ["capture", str(shot[0]), "--out", str(scene)], changed(scene)
+    assert main(words) == 0 and changed(scene) == before
+    capsys.readouterr()
+    assert main([*words, "--box=-0.5,-0.5,-0.5,0.5,0.5,0.5"]) == 0
+    told = capsys.readouterr().out
+    assert "--box has changed: box and all after it are repeated" in told
+    assert "poses: 12 of 12" in told
+    assert found(scene, "masks")["line"].startswith(f"{COUNT} given")
+    assert main([*words, "--from", "scene"]) == 0
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
+    assert main([*words, "--box", "auto"]) == 0
+    box = json.loads((captured / "transforms.json").read_text())["aabb"]
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == box
+
+
+def test_photographs_that_have_moved_are_the_same(captured, shot, tmp_path):
+    """Where they have the same names, and are not where they were."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    moved, options = shutil.copytree(shot[0], tmp_path / "moved"), scene / "capture/options.json"
+    refused(moved, scene, named="was made from")
+    options.write_text(options.read_text().replace(str(shot[0]), str(tmp_path / "gone")))
+    before = changed(scene)
+    assert capture(moved, scene) == (0, [])
+    assert {path for path, time in changed(scene).items() if before[path] != time} == {options}
+    options.write_text(options.read_text().replace(str(moved), str(tmp_path / "gone")))
+    next(moved.iterdir()).unlink()
+    refused(moved, scene, named="was made from")
+
+
+@pytest.mark.parametrize(
+    "source, words, named",
+    [
+        (None, ("--masks", "mask"), "mask"),
+        (None, ("--masks", "few"), "no mask for 001.png"),
+        (None, ("--mask-command", "no-such-program {image} {mask}"), "no-such-program"),
+        (None, ("--mask-command", "python"), "python"),
+        ("few", ("--from", "frames"), "1 photographs"),
+    ],
+    ids=["no folder", "too few", "no program", "no words", "too few photographs"],
+)
+def test_an_option_that_cannot_do_changes_nothing(
+    captured, shot, tmp_path, monkeypatch, source, words, named
+):
+    """Neither the scene nor the options that are kept for the next capture."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    (tmp_path / "few").mkdir()
+    shutil.copy(shot[0] / "000.png", tmp_path / "few")
+    monkeypatch.chdir(tmp_path)
+    before = changed(scene)
+    refused(source or shot[0], scene, *words, named=named)
+    assert changed(scene) == before
+
+
+def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
+    """Also where its photographs are called like our own folder."""
+    mug = tmp_path / "mug"
+    for name in ("capture", "images", "masks"):
+        (mug / name).mkdir(parents=True)
+    shutil.copy(shot[0] / "000.png", mug / "capture")
+    for name in ("images/0.png", "masks/0.png", "transforms.json", "capture/frames.json"):
+        (mug / name).write_text("mine")
+    before = changed(mug)
+    refused(mug / "capture", mug, named=mug)
+    assert changed(mug) == before
+
+
+@pytest.mark.parametrize("words", [[], *(["--from", stage] for stage in STAGES)])
+def test_what_is_the_users_stays(captured, shot, tmp_path, words):
+    """Files beside those of the capture, and what the user has changed of these, but for masks."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    own = scene / "capture" / "frames" / "003.png"
+    own.write_bytes(own.read_bytes() + b"mine")
+    before = changed(scene)
+    assert capture(shot[0], scene, "--from", "frames") == (
+        2,
+        [f"pp-cl: {own}: pp-cl did not write this, or not as it is now; move it away"],
+    )
+    assert changed(scene) == before
+    shutil.copy(captured / "capture" / "frames" / "003.png", own)
+    kept = {}
+    for folder in [scene, *(path for path in scene.rglob("*") if path.is_dir())]:
+        for name in ("mine.png", ".own", "pairs.txt"):
+            (folder / name).write_text("mine")
+            kept[folder / name] = (folder / name).stat().st_mtime_ns
+    status, lines = capture(shot[0], scene, *words)
+    assert (status, len(lines)) == ((2, 1) if words else (0, 0)), lines
+    assert {path: changed(scene).get(path, kept[path]) for path in kept} == kept
+    assert all(path.read_text() == "mine" for path in kept)
+    assert (scene / "transforms.json").exists()
+
+
+def test_masks_that_the_user_has_mended_are_kept(captured, shot, tmp_path):
+    """And refused by name where their images are made anew; one option replaces them."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    mended = scene / "masks" / "003.png"
+    Image.new("L", (SIZE, SIZE), 255).save(mended)
+    mine = mended.read_bytes()
+    assert capture(shot[0], scene, "--from", "box") == (0, []) and mended.read_bytes() == mine
+    assert found(scene, "masks")["line"].startswith(f"1 kept, {COUNT - 1} given")
+    before = changed(scene)
+    refused(shot[0], scene, "--from", "images", named=mended)
+    assert changed(scene) == before
+    assert capture(shot[0], scene, "--from", "masks", "--replace-masks") == (0, [])
+    assert mended.read_bytes() == (captured / "masks" / "003.png").read_bytes()
+
+
+def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
+    """As they are not taken: the masks that the user has mended would be gone."""
+    scene, later = shutil.copytree(captured, tmp_path / "scene"), shot[0] / "later.jpg"
+    later.touch()
+    try:
+        assert main(["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]) == 0
+    finally:
+        later.unlink()
+    told = f"frames: {COUNT} images (done before; later.jpg came later: --from frames takes all"
+    assert told in capsys.readouterr().out
+
+
+def strangers(files, folder):
+    """Photographs of different things."""
+    for k, file in enumerate(files):
+        colours = np.random.default_rng(k).integers(0, 255, (40, 40, 3), np.uint8)
+        Image.fromarray(colours).resize((SIZE, SIZE), Image.Resampling.BICUBIC).save(
+            folder / file.name
+        )
+
+
+def three(files, folder):
+    for file in files[:3]:
+        shutil.copy(file, folder)
+
+
+def nothing(files, folder):
+    (folder / "notes.txt").write_text("none")
+
+
+@pytest.mark.parametrize("make", [strangers, three, nothing])
+def test_photographs_of_no_use(shot, tmp_path, make):
+    folder, scene = tmp_path / "folder", tmp_path / "scene"
+    folder.mkdir()
+    make(sorted(shot[0].iterdir()), folder)
+    refused(folder, scene, named=tmp_path)
+    assert not (scene / "transforms.json").exists()
+
+
+def test_films(shot, tmp_path):
+    """The sharpest frames are taken; a black film, and a missing one, end in one line."""
+    pytest.importorskip("imageio_ffmpeg")
+    sharp = [np.array(Image.open(file)) for file in sorted(shot[0].iterdir())]
+    soft = [np.array(Image.fromarray(one).filter(ImageFilter.GaussianBlur(3))) for one in sharp]
+    frames = [frame for two in zip(soft, sharp, strict=True) for frame in two] * 10
+    write_video(tmp_path / "film.mp4", frames, 24)  # 240 frames, of which each second one is sharp
+    taken = take_images(tmp_path / "film.mp4", tmp_path / "images")["images"]
+    chosen = [int(one["name"][:6]) for one in taken]
+    assert len(chosen) > 100 and all(number % 2 for number in chosen)
+    black = [to_8bit(np.zeros((64, 96, 3)))] * 30
+    write_video(tmp_path / "black.mp4", black, 24)
+    refused(tmp_path / "black.mp4", tmp_path / "other", named="shows nothing sharp")
+    refused(tmp_path / "missing.mp4", tmp_path / "other", named="missing.mp4")
+
+
+@pytest.mark.unix
+@pytest.mark.slow
+def test_a_full_disk(shot, tmp_path):
+    """The database may not grow: one line that names it; with room again the command goes on."""
+    scene = tmp_path / "scene"
+    words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
+    limited = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (3 << 20, 3 << 20))"
+    code = f"import sys; {limited}; from pp_cl.cli import program; sys.exit(program({words}))"
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    lines = [line for line in ended.stderr.splitlines() if line.startswith("pp-cl")]
+    assert ended.returncode == 2 and len(lines) == 1 and str(scene) in lines[0], ended.stderr
+    assert (scene / "capture" / "frames.json").exists()
+    assert capture(*words[1:2], scene, *words[4:]) == (0, []) and off(scene).position < 0.03
+
+
+@pytest.mark.slow
+def test_half_of_the_images_have_no_place(shot, tmp_path):
+    """They are named, and the scene is made of the others."""
+    folder, scene = tmp_path / "folder", tmp_path / "scene"
+    shutil.copytree(shot[0], folder)
+    names = [f"x{k:02d}.png" for k in range(COUNT)]
+    strangers([Path(name) for name in names], folder)
+    assert capture(folder, scene, "--masks", shot[1]) == (0, [])
+    placed = found(scene, "poses")
+    assert placed["placed"] == COUNT and sorted(placed["unplaced"]) == names
+    assert f"{COUNT} of {2 * COUNT} " in placed["line"] and names[0] in placed["line"]
+    assert off(scene).position < 0.03
+
+
+@pytest.mark.slow
+def test_a_killed_capture_goes_on(shot, tmp_path):
+    """In the middle of three stages; the same command ends with the scene of one that was not."""
+    scene = tmp_path / "scene"
+    words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
+    for begun in ("capture/database.db", "capture/features.json", "images", "masks"):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pp_cl", *words], stdout=subprocess.DEVNULL
+        )
+        while not (scene / begun).exists() and process.poll() is None:
+            time.sleep(0.01)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL, begun
+        assert not (scene / "transforms.json").exists()
+    before = changed(scene)
+    assert capture(*words[1:2], scene, *words[4:]) == (0, [])
+    after = changed(scene)
+    for stage in ("frames", "poses"):
+        file = scene / "capture" / f"{stage}.json"
+        assert after[file] == before[file]
+    assert off(scene).position < 0.03 and len(list((scene / "masks").iterdir())) == COUNT
+
+
+def test_what_the_page_changed_is_obeyed(captured, shot, tmp_path):
+    """A box of the user's becomes the scene's, and a view that was dropped keeps its mask."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    edits = {"box": [[-0.6] * 3, [0.7] * 3], "dropped": ["images/003.png"]}
+    (scene / "pp_cl.json").write_text(json.dumps(edits))
+    assert capture(shot[0], scene, "--masks", shot[1], "--from", "masks") == (0, [])
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == edits["box"]
+    assert len(list((scene / "masks").iterdir())) == COUNT
+    assert found(scene, "masks")["line"].startswith(f"{COUNT - 1} given")
+
+
+def test_each_stage_leaves_a_picture(captured):
+    """But for those whose result is not to be seen."""
+    for stage in ("frames", "poses", "box", "masks"):
+        width, height = Image.open(captured / "capture" / f"{stage}.png").size
+        assert width >= 1000 and height >= 300
+
+
+def turned(dev, folder, steps, wall=None):
+    """Photographs of the demo on a turntable before a wall that stands still, and their masks."""
+    true = cameras(SIZE, "turntable")
+    wall = room(true[0]) if wall is None else wall
+    for name in ("photographs", "masks"):
+        (folder / name).mkdir()
+    for i in steps:
+        rgba = render(dev, true[i])
+        alpha = rgba[..., 3:] / 255
+        photograph = rgba[..., :3] / 255 * alpha + wall * (1 - alpha)
+        write_png(folder / "photographs" / f"{i:03d}.png", photograph)
+        write_png(folder / "masks" / f"{i:03d}.png", rgba[..., 3])
+    return folder / "photographs", folder / "masks"
+
+
+@pytest.mark.parametrize("wall", [None, 0.8])
+def test_an_object_that_turns(dev, tmp_path, wall):
+    """Its cameras are found though its pattern is that of other steps, too. It is noticed, but for
+    a uniform wall.
+    """
+    scene = tmp_path / "scene"
+    photographs, masks = turned(dev, tmp_path, range(14), wall)
+    told = ["--turntable"] if wall else []
+    if wall:  # it is only told when it goes on
+        capture(photographs, scene, "--masks", masks)
+        assert not any((scene / "capture/inside").iterdir())
+    assert capture(photographs, scene, "--masks", masks, *told) == (0, [])
+    assert any((scene / "capture/inside").iterdir()) == bool(wall)
+    assert found(scene, "matches")["turns"] and found(scene, "poses")["placed"] == 14
+    assert off(scene, cameras(SIZE, "turntable")).position < 0.01
+
+
+def test_a_wall_places_no_cameras(dev, tmp_path):
+    """Of an object that turns by too much between its photographs."""
+    scene = tmp_path / "scene"
+    refused(turned(dev, tmp_path, range(0, 72, 8))[0], scene, named=scene)
+    assert found(scene, "matches")["turns"] and (scene / "capture" / "turns").exists()

@@ -1,0 +1,304 @@
+"""Photographs and films as cameras, phones and other programs write them: all are taken, or left
+out with a reason.
+"""
+
+import os
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image, TiffImagePlugin
+from support.profile import display_p3, in_srgb
+
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import write_json
+from pp_cl.files.image import read_rgba
+from pp_cl.files.manifest import begin_manifest
+from pp_studio.capture import frames
+from pp_studio.capture.features import find_features
+from pp_studio.capture.frames import take_images
+from pp_studio.capture.stages import Capture
+from pp_studio.video import write_video
+
+cv2 = pytest.importorskip("cv2")
+MAKER_NOTE, FOCAL = 0x927C, 0x920A
+SIZE = 96, 64
+
+
+@pytest.fixture
+def shots():
+    """Twelve sharp (64, 96, 3) images of which none is like another."""
+    return np.random.default_rng(0).integers(0, 256, (12, *SIZE[::-1], 3), np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """An empty folder of photographs."""
+    (tmp_path / "photographs").mkdir()
+    return tmp_path / "photographs"
+
+
+@pytest.mark.unix
+def test_names_that_are_no_utf_8(shots, folder, tmp_path):
+    """COLMAP takes none; two of them may become one."""
+    for i, image in enumerate(shots):
+        name = b"foto_%c%d.png" % (0xE9 + i % 2, i // 2)
+        Image.fromarray(image).save(folder / os.fsdecode(name))
+    found = take_images(folder, tmp_path / "images")
+    names = [one["name"] for one in found["images"]]
+    assert len({*names}) == len(shots) and all(name.isascii() for name in names)
+
+
+def test_photographs_of_other_programs(shots, folder, tmp_path):
+    """16 bits a channel, CMYK, a TIFF whose tags have no room in a JPEG, EXIF that is broken; the
+    rest of one, and what is there twice, are left out.
+    """
+    heif = pytest.importorskip("pillow_heif")
+    for i, image in enumerate(shots):
+        Image.fromarray(image).save(folder / f"{i:02d}.png")
+    cv2.imwrite(str(folder / "deep.png"), shots[0, ::-1].astype(np.uint16) * 257)
+    Image.fromarray(shots[1, ::-1]).convert("CMYK").save(folder / "print.jpg")
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[34377] = bytes(100_000)  # Photoshop's
+    Image.fromarray(shots[2, ::-1]).save(folder / "layers.tif", tiffinfo=tags)
+    for i, name in enumerate(("a.avif", "b.bmp", "c.jfif"), 4):
+        Image.fromarray(shots[i, ::-1]).save(folder / name)
+    heif.from_pillow(Image.fromarray(shots[7, ::-1])).save(folder / "d.heic")
+    exif = Image.Exif()
+    exif[frames.ORIENTATION] = 6
+    exif.get_ifd(frames.EXIF).update({FOCAL: 4.2, MAKER_NOTE: b"x" * 60_000})
+    Image.fromarray(shots[3, ::-1]).save(folder / "turned.jpg", exif=exif)
+    content = (folder / "turned.jpg").read_bytes()
+    (folder / "broken.jpg").write_bytes(content[:30] + b"\xff" * 40 + content[70:])
+    (folder / "cut off.jpg").write_bytes(content[: len(content) - 3000])
+    Image.fromarray(shots[11]).save(folder / "11b.png")
+    taken = take_images(folder, tmp_path / "images")
+    made = {one["source"]: one for one in taken["images"]}
+    assert {"deep.png", "print.jpg", "layers.tif", "turned.jpg"} <= set(made)
+    assert {"a.avif", "b.bmp", "c.jfif", "d.heic"} <= set(made)
+    left_out = {one["source"]: one["reason"] for one in taken["left_out"]}
+    assert left_out.keys() - {"broken.jpg"} == {"cut off.jpg", "11b.png"}
+    assert left_out["11b.png"] == "shows the same as 11.png"
+    for one in made.values():
+        size = read_rgba(tmp_path / "images" / one["name"]).shape[1::-1]
+        assert size == tuple(one["size"]) == (SIZE if one["source"] != "turned.jpg" else SIZE[::-1])
+    copy = Image.open(tmp_path / "images" / made["turned.jpg"]["name"]).getexif()
+    assert copy.get(frames.ORIENTATION, 1) == 1
+    assert copy.get_ifd(frames.EXIF)[FOCAL] == pytest.approx(4.2)
+
+
+def test_colours_of_another_profile_become_srgb(folder, tmp_path):
+    """Also of photographs that are turned."""
+    pytest.importorskip("pillow_heif")
+    noise = np.random.default_rng(0).integers(-9, 10, (12, 48, 64, 1))
+    for i, one in enumerate(noise):
+        image = Image.fromarray(([200, 90, 60] + one).astype(np.uint8))
+        exif = Image.Exif()
+        exif[frames.ORIENTATION] = 6 if i % 2 else 1
+        image.save(folder / f"{i}.png", icc_profile=display_p3(), exif=exif)
+    with pytest.warns(UserWarning, match="colour profile of their own are read as sRGB"):
+        taken = take_images(folder, tmp_path / "images")
+    assert len(taken["images"]) == 12
+    for one in taken["images"]:
+        image = read_rgba(tmp_path / "images" / one["name"])
+        is_turned = int(one["source"].removesuffix(".png")) % 2
+        assert image.shape[:2] == ((64, 48) if is_turned else (48, 64))
+        assert np.abs(image[..., :3].mean((0, 1)) - in_srgb([200, 90, 60])).max() < 3
+
+
+def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
+    """A cut-out may still hold the wall behind the object."""
+    pycolmap = pytest.importorskip("pycolmap")
+    sharp = np.kron(shots, np.ones((1, 4, 4, 1), np.uint8))
+    alpha = np.zeros((*sharp.shape[1:3], 1), np.uint8)
+    alpha[60:190, 100:300] = 255
+    for i, image in enumerate(sharp):
+        Image.fromarray(np.dstack([image, alpha])).save(folder / f"{i:02d}.png")
+    capture = Capture(tmp_path / "scene", {"source": str(folder)}, lambda line: None)
+    capture.options = {"source": str(folder), "turntable": False}
+    capture.work.mkdir(parents=True)
+    write_json(capture.work / "frames.json", take_images(folder, capture.frames))
+    capture._features()
+    with pycolmap.Database.open(capture.database) as db:
+        for image in db.read_all_images():
+            x, y = db.read_keypoints(image.image_id)[:, :2].T
+            assert len(x) > 50 and x.min() > 99 and x.max() < 301 and y.min() > 59 and y.max() < 191
+
+
+def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
+    """EXIF tells of the sensor as it was before they were cropped to a square and reduced: 5184 by
+    3456 pixels, of which 5728 are an inch. COLMAP would begin with 46 / 25.4 * 5728 = 10374 pixels.
+    """
+    pytest.importorskip("pillow_heif")
+    pycolmap = pytest.importorskip("pycolmap")
+    sensor = dict(zip(frames.SENSOR, (5184, 3456, 5728.0, 2), strict=True))
+    lens = {FOCAL: 46.0}
+    whole = dict(zip(frames.SENSOR, (64, 64, 30.0, 2), strict=True))
+    told = [lens | sensor, lens | whole, lens, lens | sensor | {FOCAL: 0.0}]
+    told += [lens | sensor | {frames.SENSOR[3]: 7}, lens | sensor | {frames.FOCAL_35: 50}]
+    for i, image in enumerate(shots):
+        exif = Image.Exif()
+        exif.get_ifd(frames.EXIF).update(told[i] if i < len(told) else {})
+        Image.fromarray(image).resize((64, 64)).save(folder / f"{i:02d}.jpg", exif=exif)
+    taken = take_images(folder, tmp_path / "images")["images"]
+    focal = 46 / 25.4 * 5728 * 64 / 3456
+    assert [one["focal"] for one in taken] == [pytest.approx(focal)] + [None] * (len(shots) - 1)
+    database = tmp_path / "database.db"
+    find_features(database, tmp_path / "images", taken[:1])
+    with pycolmap.Database.open(database) as db:
+        (camera,) = db.read_all_cameras()
+    assert camera.params == pytest.approx([focal, 32, 32, 0])
+
+
+def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
+    """As matches and poses depend on the numbers; the second takes longest."""
+    pycolmap = pytest.importorskip("pycolmap")
+    taken = [{"name": f"{i}.png", "lens": "", "size": (600, 600), "focal": None} for i in range(9)]
+    taken[0]["size"] = 304, 600
+    for i, one in enumerate(taken):
+        values = rng.integers(0, 256, (75, 75), np.uint8) if i == 1 else np.full((75, 75), 100 + i)
+        pixels = np.kron(values, np.ones((8, 8))).astype(np.uint8)
+        Image.fromarray(pixels[:, : one["size"][0]]).save(tmp_path / one["name"])
+    found = find_features(tmp_path / "database.db", tmp_path, taken)
+    assert list(found) == [one["name"] for one in taken] and found["1.png"] > 100
+    with pycolmap.Database.open(tmp_path / "database.db") as db:
+        assert db.num_frames() == db.num_images() == 9 and db.num_cameras() == 2
+        ids = [db.read_image_with_name(one["name"]).image_id for one in taken]
+    assert ids == list(range(1, 10))
+
+
+def test_names_that_colmap_can_list(shots, tmp_path):
+    """Without spaces or a leading #, each once whatever the case of its letters."""
+    pytest.importorskip("pillow_heif")
+    names = ["#a.png", "_a.png", "b c.png", "b  c.png", "b_c.png", "B_C.PNG", "d.png", "d.jpg"]
+    for name, image in zip([*names, "e.png"], shots, strict=False):
+        Image.fromarray(image).save(tmp_path / name)
+    taken = [one["name"].lower() for one in take_images(tmp_path, tmp_path / "images")["images"]]
+    assert len({name.rpartition(".")[0] for name in taken}) == len(names) + 1
+    assert not any(" " in name or name.startswith("#") for name in taken)
+
+
+@pytest.fixture
+def film(shots, tmp_path):
+    """A film of 48 frames."""
+    pytest.importorskip("imageio_ffmpeg")
+    write_video(tmp_path / "film.webm", [np.roll(one, k, 0) for one in shots for k in range(4)], 24)
+    return tmp_path / "film.webm"
+
+
+def remade(film, name, *options):
+    """The film written anew by ffmpeg."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *options[:-1], "-i", film]
+    target = film.with_name(name)
+    with target.open("wb") as file:
+        subprocess.run([*command, *options[-1], "pipe:1"], stdout=file, check=True)
+    return target
+
+
+def test_a_film_that_states_no_length(film, tmp_path):
+    """As browsers record them."""
+    live = remade(film, "live.webm", ["-c", "copy", "-f", "webm", "-live", "1"])
+    whole, found = (take_images(one, tmp_path / one.stem)["images"] for one in (film, live))
+    assert [one["name"] for one in found] == [one["name"] for one in whole] and len(found) > 40
+
+
+def test_a_film_that_is_shown_turned(film, tmp_path, caplog):
+    """As phones make them: upright, without a word of ffmpeg's."""
+    fragments = ["-c:v", "libx264", "-f", "mp4", "-movflags", "frag_keyframe+empty_moov"]
+    flat = remade(film, "flat.mp4", fragments)
+    turned = remade(flat, "turned.mp4", "-display_rotation", "90", ["-c", "copy", *fragments[2:]])
+    found = take_images(turned, tmp_path / "images")["images"]
+    assert {tuple(one["size"]) for one in found} == {SIZE[::-1]} and not caplog.records
+
+
+def display(colour, transfer):
+    """Signal in [0, 1] of BT.2020 by which a display in HLG or PQ shows an sRGB colour, white at
+    203 candela per square metre (BT.2100, BT.2408).
+    """
+    level = np.asarray(colour) / 255
+    light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    light = light @ np.array(
+        [[0.6274, 0.0691, 0.0164], [0.3293, 0.9195, 0.0880], [0.0433, 0.0114, 0.8956]]
+    )
+    if transfer == "smpte2084":
+        power = (light * 203 / 10_000) ** 0.1593017578125
+        return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+    light = light * 203 / 1000
+    scene = light * (light @ [0.2627, 0.678, 0.0593])[..., None] ** (1 / 1.2 - 1)
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    dark = np.sqrt(3 * np.minimum(scene, 1 / 12))
+    return np.where(scene <= 1 / 12, dark, a * np.log(np.maximum(12 * scene - b, 1e-9)) + c)
+
+
+@pytest.mark.parametrize(
+    "transfer, primaries, off",
+    [("smpte2084", "bt2020", 5), ("arib-std-b67", "bt2020", 12), ("smpte2084", "unknown", 5)],
+)
+def test_a_film_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primaries, off):
+    """10 bits of BT.2020, as phones make them; other programs leave its primaries to be guessed.
+    Off by what HLG's system gamma, which ffmpeg applies to each channel, makes of colours; without
+    tone mapping they are washed out, by 30 and more.
+    """
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    colours = np.array([(180, 120, 60), (90, 140, 180), (128, 128, 128), (60, 100, 50)], np.uint8)
+    frames_ = [
+        np.kron(np.roll(colours, i, 0).reshape(2, 2, 3), np.ones((60, 80, 1))) for i in range(12)
+    ]
+    raw = b"".join(
+        (np.clip(display(one, transfer), 0, 1) * 65535 + 0.5).astype("<u2").tobytes()
+        for one in frames_
+    )
+    tags = f"color_primaries={primaries}:color_trc={transfer}:colorspace=bt2020nc:range=tv"
+    film = tmp_path / "film.mov"
+    subprocess.run(
+        [
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo"),
+            *("-pix_fmt", "rgb48le", "-s", "160x120", "-r", "24", "-i", "-", "-vf"),
+            "scale=out_color_matrix=bt2020:out_range=tv,format=yuv420p10le,setparams=" + tags,
+            *("-c:v", "libx265", "-x265-params", "log-level=error", str(film)),
+        ],
+        input=raw,
+        check=True,
+    )
+    found = take_images(film, tmp_path / "images")["images"]
+    for one in found:
+        image = read_rgba(tmp_path / "images" / one["name"])[..., :3].astype(float)
+        true = frames_[int(one["name"][:6])]
+        assert np.abs(image.mean((0, 1)) - true.mean((0, 1))).max() < off
+        for row, column in ((30, 40), (30, 120), (90, 40), (90, 120)):
+            assert np.abs(image[row, column] - true[row, column]).max() < 2 * off
+
+
+def test_what_is_no_film_is_one_line_without_the_programs_banner(tmp_path):
+    (tmp_path / "film.mov").write_bytes(b"no film" * 100)
+    with pytest.raises(
+        UserError, match=r"cannot be read as a video \(Error opening input"
+    ) as caught:
+        take_images(tmp_path / "film.mov", tmp_path / "images")
+    assert "ffmpeg version" not in str(caught.value)
+
+
+def test_photographs_of_several_rounds(shots, tmp_path):
+    """In a folder each, beside some at the top, without leading zeros; masks, raw files and what
+    the program has made are none.
+    """
+    places = [f"{i}.png" for i in (1, 2, 9, 10)]
+    places += [f"{place}/{i}.png" for place in ("low", "high/1") for i in (8, 9, 10, 11)]
+    for place, image in zip(places, shots, strict=True):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(tmp_path / place)
+    for place in ("masks/1.png", "scene/images/1.png", ".hidden/1.png"):
+        (tmp_path / place).parent.mkdir(parents=True)
+        Image.fromarray(shots[0]).save(tmp_path / place)
+    (tmp_path / "low/7.DNG").write_bytes(b"raw")
+    begin_manifest(tmp_path / "scene")
+    taken = take_images(tmp_path, tmp_path / "scene/capture")
+    ordered = [*places[:4], *places[8:], *places[4:8]]
+    assert [one["source"] for one in taken["images"]] == ordered
+    names = [one["name"] for one in taken["images"]]
+    assert names == sorted(names) and names[3] == "000010.png"
+    assert len({one["lens"] for one in taken["images"]}) == 3, "a lens each"
+    [raw] = taken["left_out"]
+    assert raw["source"] == "low/7.DNG" and "is raw" in raw["reason"]

@@ -1,0 +1,499 @@
+"""Masks of photographs with known cameras, from each of their sources."""
+
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import (
+    binary_closing,
+    binary_dilation,
+    binary_erosion,
+    binary_opening,
+    gaussian_filter,
+)
+from support.refused import refusing
+from support.scenes import ball_image, ring_cameras
+
+from pp_cl.engine.camera import Camera
+from pp_cl.errors import UserError
+from pp_cl.files.image import read_mask, read_rgba
+from pp_cl.scene.demo import ANGLE, OBJECT_BOX, demo_mesh, render
+from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.outline import OUTLINE
+from tools.capture_demo import ROOM, cameras, room
+
+pytest.importorskip("cv2")
+
+from pp_studio.capture import backdrop, cut
+from pp_studio.capture.box import MARGIN
+from pp_studio.capture.masks import mask_file, picture, program_words, write_masks
+from pp_studio.capture.window import Window, window
+
+SIZE, VIEWS = 96, 12
+SCREEN = (20, 200, 60)
+WALL = [0.25, 0.55, 0.3]  # its mean colour
+
+
+class Capture:
+    """An object before walls of noise: photographs in a folder, true masks, sparse points.
+
+    views: (camera, (H, W, 4) uint8) pairs. surface: (N, 3). spoil: changes the first photograph.
+    wall: gives the colours behind the object in a camera's image; else the noise of each differs.
+    """
+
+    def __init__(self, folder, views, box, surface, spoil=None, wall=None):
+        rng = np.random.default_rng(3)
+        self.folder, self.box = folder, 1.06 * np.array(box)
+        (folder / "images").mkdir(parents=True)
+        self.truth, self.photographs, self.seen = [], [], []
+        on_wall = rng.normal(size=(2000 if wall else 600, 3))
+        on_wall *= ROOM / np.linalg.norm(on_wall, axis=1, keepdims=True)
+        self.points, self.count = np.concatenate([surface, on_wall]), len(surface)
+        for i, (camera, image) in enumerate(views):
+            rgba = image / 255
+            noise = gaussian_filter(rng.uniform(0, 1, rgba[..., :3].shape), (1.5, 1.5, 0))
+            behind = wall(camera) if wall else 1.2 * (noise - noise.mean()) + WALL
+            photograph = rgba[..., :3] * rgba[..., 3:] + behind * (1 - rgba[..., 3:])
+            if i == 0 and spoil:
+                spoil(photograph)
+            one = Photograph(f"images/{i:02d}.png", camera)
+            Image.fromarray(np.uint8(255 * np.clip(photograph, 0, 1))).save(folder / one.name)
+            self.photographs.append(one)
+            self.truth.append(rgba[..., 3] > 0.5)
+            whole = Window("", photograph, camera, (0, 0, SIZE, SIZE))
+            found, rows, columns = whole.inside(self.points)
+            is_shown = self.truth[-1][rows, columns] == (found < self.count)
+            self.seen.append(found[is_shown & (rng.uniform(size=len(found)) < 0.5)])
+
+    def write(self, **options):
+        """The line of write_masks."""
+        line, _, self.box = write_masks(
+            self.folder, self.photographs, self.box, self.points, self.seen, **options
+        )
+        return line
+
+    def agreement(self):
+        """(V,) intersection over union of each mask with the true one."""
+        found = [read_mask(self.file(i)) > 127 for i in range(len(self.truth))]
+        pairs = zip(found, self.truth, strict=True)
+        return np.array([(a & b).sum() / (a | b).sum() for a, b in pairs])
+
+    def file(self, number):
+        """The mask of a photograph."""
+        return mask_file(self.folder, self.photographs[number].name)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Votes that take no time."""
+    monkeypatch.setattr(cut, "CELLS", 48**3)
+
+
+def ball(folder, spoil=None):
+    """A Capture of a ball that is not green."""
+    cameras = ring_cameras(VIEWS, SIZE)
+    views = [(camera, ball_image(camera) * np.uint8([1, 0, 1, 1])) for camera in cameras]
+    surface = np.random.default_rng(5).normal(size=(200, 3))
+    surface *= 0.78 / np.linalg.norm(surface, axis=1, keepdims=True)
+    return Capture(folder, views, [[-0.8] * 3, [0.8] * 3], surface, spoil)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A Capture whose masks are not known."""
+    return ball(tmp_path / "scene")
+
+
+def given_masks(capture, folder):
+    """A folder of the true masks, named like the photographs."""
+    folder.mkdir()
+    for one, mask in zip(capture.photographs, capture.truth, strict=True):
+        Image.fromarray(np.uint8(255 * mask)).save(folder / Path(one.name).name)
+    return folder
+
+
+def test_the_object_is_cut_out_of_any_background(capture):
+    """From sparse points alone."""
+    line = capture.write()
+    assert f"{VIEWS} cut out" in line
+    assert capture.agreement().min() > 0.95
+    assert len(np.unique(read_mask(capture.file(0)))) > 4, "no soft border"
+
+
+def test_a_box_that_cuts_the_object_grows(capture):
+    """Where it has no points, and but for what it stands on."""
+    whole, cut_off = capture.box.copy(), capture.box.copy()
+    cut_off[1, [0, 2]] = 0.4
+    capture.box = cut_off
+    held = (capture.points[: capture.count] < cut_off[1]).all(1)
+    kept = np.append(held, np.ones(len(capture.points) - capture.count, bool))
+    capture.seen = [seen[kept[seen]] for seen in capture.seen]
+    capture.write()
+    assert capture.agreement().min() < 0.8 and (capture.box == cut_off).all()
+    for i in range(VIEWS):
+        capture.file(i).unlink()
+    capture.write(grows=True)
+    assert capture.agreement().min() > 0.95
+    assert (capture.box[1, [0, 2]] > 0.8).all() and capture.box[0, 2] == cut_off[0, 2]
+    assert (np.abs(capture.box) < 1.3 * whole[1]).all()
+
+
+def test_what_lies_around_the_object_is_no_seed(capture):
+    """Labels on the table are on nobody's side, so that colours decide."""
+    reach = 0.78 * (1 + 2 * MARGIN * np.sqrt(3))  # as find_world() has it around the ball
+    box = np.array([[-reach] * 3, [reach] * 3])
+    lying, own = [0.7, 0, -0.75], [0, 0, 0.5]
+    one = window(np.zeros((SIZE, SIZE, 3), np.uint8), capture.photographs[0], box)
+    points, both = np.array([lying, own]), np.array([0, 1])
+    labels = cut._seeds(one, box, points, np.array([True, True]), both)
+    _, rows, columns = one.inside(points)
+    assert labels[rows[0], columns[0]] != cut.cv2.GC_FGD
+    assert labels[rows[1], columns[1]] == cut.cv2.GC_FGD
+
+
+def test_thin_parts_and_gaps_are_told_by_the_wall(dev, tmp_path):
+    """The demo's spokes are a pixel wide here, and masks by colour lose them or fill the gaps."""
+    around = [one.with_angle(1.6 * ANGLE) for one in cameras(4 * SIZE, "turntable")]
+    views = [(one, render(dev, one)) for one in around[: 2 * VIEWS : 2]]
+    middle, wall = np.zeros((1, 3)), lambda camera: room(camera, (1.0, 2.0))
+    capture = Capture(tmp_path / "scene", views, OBJECT_BOX, middle, wall=wall)
+    windows = []
+    for one in capture.photographs:
+        windows.append(window(read_rgba(capture.folder / one.name)[..., :3], one, capture.box))
+    truth = [
+        one.reduced(np.uint8(mask)) > 0 for one, mask in zip(windows, capture.truth, strict=True)
+    ]
+    surely = [binary_opening(mask, iterations=3) for mask in truth]
+    filled = [binary_closing(mask, iterations=3) for mask in truth]
+
+    def flat(images):
+        return np.concatenate([one.ravel() for one in images])
+
+    def odds(masks):
+        for one, mask in zip(windows, masks, strict=True):
+            one.mask = mask
+        differences = backdrop.differences(windows, capture.points[capture.count :])
+        beside = [~mask for mask in masks]
+        return flat(backdrop.evidence(differences, beside, surely))
+
+    of_thin, of_filled, shown = odds(surely), odds(filled), flat(truth)
+    assert (of_thin[shown & ~flat(surely)] > cut.STANDS_OUT).mean() > 0.8
+    assert (of_thin[~shown] < 0).mean() > 0.95
+    beside = ~flat([binary_dilation(mask) for mask in truth])
+    assert (of_filled[flat(filled) & beside] < cut.IS_WALL).mean() > 0.8
+
+
+def turned(folder, views, box, surface, wall):
+    """A Capture of an object that turns, whose wall has no points, as it stands still."""
+    capture = Capture(folder, views, box, surface, wall=wall)
+    capture.points = capture.points[: capture.count]
+    capture.seen = [seen[seen < capture.count] for seen in capture.seen]
+    return capture
+
+
+def test_an_object_that_turns_is_told_from_the_wall(dev, tmp_path):
+    """Which shows between the demo's rings in every photograph."""
+    around = cameras(2 * SIZE, "turntable")
+    views = [(one, render(dev, one)) for one in around[::2]]
+    surface, still = demo_mesh(dev, 64)[0][::20], room(around[0])
+    capture = turned(tmp_path / "scene", views, OBJECT_BOX, surface, lambda _: still)
+    capture.write(turns=True)
+    assert capture.agreement().min() > 0.915
+
+
+def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
+    """A plain ball upon one with a pattern, before a camera at each of two heights."""
+    middle, views, plain = np.array([0, 0, 1.05]), [], []
+    for camera in ring_cameras(2 * VIEWS, SIZE, distance=6.0):
+        image = ball_image(camera)
+        from_below = replace(camera, pose=camera.pose - np.outer(middle, [0, 0, 0, 1]))
+        plain.append(ball_image(from_below, 0.35)[..., 3] > 0)
+        image[plain[-1]] = [60, 30, 40, 255]
+        views.append((camera, image))
+
+    def wall(camera):
+        noise = np.random.default_rng(int(100 * camera.eye[2])).uniform(0, 1, (SIZE, SIZE, 3))
+        return 1.2 * (gaussian_filter(noise, (1.5, 1.5, 0)) - 0.5) + WALL
+
+    box = [[-0.8, -0.8, -0.8], [0.8, 0.8, 1.4]]
+    capture = turned(tmp_path / "scene", views, box, np.zeros((1, 3)), wall)
+    windows, masks = [], []
+    for one, *images in zip(capture.photographs, capture.truth, plain, strict=True):
+        windows.append(window(read_rgba(capture.folder / one.name)[..., :3], one, capture.box))
+        masks.append([windows[-1].reduced(np.uint8(image)) > 0 for image in images])
+        windows[-1].mask = masks[-1][0]
+    beside = [~binary_dilation(mask, iterations=3) for mask, _ in masks]
+    for found, (mask, same), out in zip(
+        backdrop.differences(windows, capture.points, beside), masks, beside, strict=True
+    ):
+        assert (found[out] <= backdrop.SLIGHT).all()
+        assert (found[mask & ~binary_dilation(same, iterations=2)] > 50).all()
+        assert (found[binary_erosion(same, iterations=2)] == backdrop.UNSEEN).all()
+
+
+def share_held(capture, place, wanted):
+    """Of the pixels in a place of the first photograph that show the object, or do not: those that
+    the mask holds, first without votes, then with them.
+    """
+    shares = []
+    for rounds in (0, cut.ROUNDS):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(cut, "ROUNDS", rounds)
+            capture.write()
+        chosen = capture.truth[0][place] == wanted
+        shares.append((read_mask(capture.file(0)) > 127)[place][chosen].mean())
+        for number in range(VIEWS):
+            capture.file(number).unlink()
+    return shares
+
+
+def test_the_other_views_carve_what_one_takes_for_the_object(tmp_path):
+    """What looks like the object stands beside it in one photograph."""
+    place = np.s_[20:40, 16:40]
+
+    def bystander(photograph):
+        photograph[place] = photograph[38:58, 36:60]
+
+    capture = ball(tmp_path / "scene", bystander)
+    capture.seen[0] = capture.seen[0][capture.seen[0] < capture.count]  # it hides the wall
+    alone, voted = share_held(capture, place, wanted=False)
+    assert alone > 0.5
+    assert voted < 0.6 * alone
+
+
+def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
+    """A stain of the wall's colour in the middle of the object in one photograph."""
+    place = np.s_[40:56, 40:56]
+
+    def stain(photograph):
+        photograph[place] = WALL
+
+    capture = ball(tmp_path / "scene", stain)
+    capture.seen[0] = capture.seen[0][capture.seen[0] >= capture.count]
+    alone, voted = share_held(capture, place, wanted=True)
+    assert alone < 0.2
+    assert voted > 0.8
+
+
+def test_small_regions_beside_the_object_go():
+    mask = np.zeros((60, 80), bool)
+    mask[10:50, 10:40] = True
+    parts = mask.copy()
+    parts[20:30, 50:60] = True  # a part of the object
+    stained = parts.copy()
+    stained[40:43, 70:73] = True
+    np.testing.assert_array_equal(cut.without_islands(stained), parts)
+    assert not cut.without_islands(np.zeros((3, 4), bool)).any()
+
+
+def test_what_is_there_is_kept_and_helps(capture):
+    """A second start makes what is missing, the same but for what the kept masks change."""
+    capture.write()
+    first, mask = capture.agreement(), capture.file(3).read_bytes()
+    capture.file(5).unlink()
+    line = capture.write()
+    assert f"{VIEWS - 1} kept" in line
+    assert "1 cut out" in line
+    assert capture.file(3).read_bytes() == mask
+    assert capture.agreement()[5] > first[5] - 0.05
+
+
+def test_a_mask_that_the_user_has_written_has_the_shape_of_its_image(capture):
+    """Of another size it is resized, of another shape it is named."""
+    capture.write()
+    with Image.open(capture.file(3)) as mask:
+        mask.resize((SIZE // 2, SIZE // 2)).save(capture.file(3))
+    with pytest.warns(UserWarning, match="masks are resized"):
+        assert "kept" in capture.write()
+    with pytest.warns(UserWarning, match="masks are resized"):
+        picture(capture.folder, capture.photographs)
+    Image.fromarray(np.zeros((SIZE, SIZE // 2), np.uint8)).save(capture.file(3))
+    with pytest.raises(UserError, match="make it the image's size"):
+        capture.write()
+
+
+def test_given_masks_come_first(capture, tmp_path):
+    """They are those of the photographs before their distortion was removed, and named like them or
+    like their sources, as spaces are none of COLMAP's.
+    """
+    folder, names = given_masks(capture, tmp_path / "given"), []
+    (folder / "03.png").rename(folder / "my photo (3).png")
+    sources = {"03.png": "my photo (3).JPG"}
+
+    def fitted(name, mask):
+        names.append(name)
+        return mask[::-1]
+
+    assert f"{VIEWS} given" in capture.write(given=folder, sources=sources, fitted=fitted)
+    capture.truth = [mask[::-1] for mask in capture.truth]
+    assert (capture.agreement() == 1).all() and len(set(names)) == VIEWS
+
+
+def test_masks_that_contradict_the_others_are_named(capture, tmp_path):
+    """One is shifted by a third of the image."""
+    folder = given_masks(capture, tmp_path / "given")
+    wrong = np.roll(capture.truth[4], SIZE // 3, axis=1)
+    Image.fromarray(np.uint8(255 * wrong)).save(folder / "04.png")
+    assert "04.png" in capture.write(given=folder)
+
+
+def test_a_given_mask_that_is_missing_is_named(capture, tmp_path):
+    """Before anything is cut."""
+    folder = given_masks(capture, tmp_path / "given")
+    (folder / "07.png").unlink()
+    with pytest.raises(UserError, match=r"07\.png"):
+        capture.write(given=folder)
+    assert not capture.file(7).exists()
+
+
+def test_alpha_is_the_mask(capture):
+    """Of photographs that have one."""
+    for one, mask in zip(capture.photographs, capture.truth, strict=True):
+        rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
+        Image.fromarray(np.dstack([rgb, np.uint8(255 * mask)])).save(capture.folder / one.name)
+    assert f"{VIEWS} of their alpha" in capture.write()
+    assert (capture.agreement() == 1).all()
+
+
+def before_a_screen(capture):
+    """Give all photographs a green background."""
+    for one, mask in zip(capture.photographs, capture.truth, strict=True):
+        rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
+        rgb[~mask] = SCREEN
+        Image.fromarray(rgb).save(capture.folder / one.name)
+
+
+def test_a_uniform_background_shows_through_gaps(dev, tmp_path):
+    """Of the demo, whose rings enclose most of it."""
+    around = cameras(2 * SIZE, "turntable")[:: 72 // VIEWS]
+    views = [(one, render(dev, one)) for one in around]
+    surface = demo_mesh(dev, 64)[0][::20]
+    capture = turned(tmp_path / "scene", views, OBJECT_BOX, surface, room)
+    before_a_screen(capture)
+    assert f"{VIEWS} before a uniform background" in capture.write()
+    assert capture.agreement().min() > 0.9
+
+
+def test_spots_of_the_backgrounds_colour_are_no_gaps(capture):
+    """One on the ball is seen from a few sides, but the others see the ball behind it."""
+    before_a_screen(capture)
+    spotted = 0
+    for one in capture.photographs:
+        spot = one.camera.project(np.array([[0.75, 0.1, 0.25]]))
+        if spot[2][0] < np.linalg.norm(one.camera.eye) - 0.6:
+            x, y = (int(place[0]) for place in spot[:2])
+            rgb = np.array(Image.open(capture.folder / one.name))
+            rgb[y - 3 : y + 4, x - 3 : x + 4] = SCREEN
+            Image.fromarray(rgb).save(capture.folder / one.name)
+            spotted += 1
+    assert f"{VIEWS} before a uniform background" in capture.write()
+    assert spotted == 3 and (capture.agreement() > 0.99).all()
+
+
+PROGRAM = """
+import sys
+from PIL import Image
+mask = Image.open(sys.argv[1]).convert("L").point(lambda v: 255 if v > 90 else 0)
+mask.save(sys.argv[2])
+"""
+
+
+def program(tmp_path, text):
+    """The command of a Python program in a folder whose name has a space."""
+    file = tmp_path / "a program" / "mask.py"
+    file.parent.mkdir()
+    file.write_text(text)
+    return f"{shlex.quote(sys.executable)} {shlex.quote(str(file))} {{image}} {{mask}}"
+
+
+def test_a_program_makes_the_masks(capture, tmp_path):
+    """It is given each photograph and where to write; the alpha of a cut-out is the mask."""
+    capture.photographs, capture.seen = capture.photographs[:2], capture.seen[:2]
+    cut_out = "cut = Image.open(sys.argv[1]).convert('RGB')\ncut.putalpha(mask)\ncut.save"
+    text = PROGRAM.replace("mask.save", cut_out)
+    assert "2 by the program" in capture.write(command=program(tmp_path, text))
+    gray = np.array(Image.open(capture.folder / "images/01.png").convert("L"))
+    assert (read_mask(capture.file(1)) == np.where(gray > 90, 255, 0)).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("import sys\nprint('x', file=sys.stderr)\nsys.exit('no weights')", "no weights"),
+        ("", "00.png"),
+        (PROGRAM.replace("mask.save", "mask.crop((0, 0, 9, 9)).save"), "size"),
+        (PROGRAM.replace("mask.save(", "open('/dev/null', 'w') and open("), "00.png"),
+    ],
+)
+def test_a_program_that_fails_is_named(capture, tmp_path, text, said):
+    """With the photograph and its last word."""
+    with refusing("00.png", said):
+        capture.write(command=program(tmp_path, text))
+    assert not capture.file(0).exists()
+
+
+@pytest.mark.parametrize("command", ["", "rembg {image}", "rembg '{image} {mask}"])
+def test_a_command_that_cannot_be_one_is_refused(command):
+    """Before anything is read."""
+    with pytest.raises(UserError, match="--mask-command"):
+        program_words(command)
+
+
+BOXES = {
+    "nothing in it": [[2.0, 2.0, 2.0], [2.1, 2.1, 2.1]],
+    "flat things on its floor alone": [[-0.8, -0.8, 0.76], [0.8, 0.8, 1.6]],
+    "no photograph shows it": [[0, 0, 40.0], [1, 1, 41.0]],
+}
+
+
+@pytest.mark.parametrize("case", BOXES)
+def test_a_box_without_an_object_is_refused(capture, case):
+    """There is nothing to begin with."""
+    capture.box = np.array(BOXES[case])
+    with pytest.raises(UserError, match="--box"):
+        capture.write()
+
+
+def test_a_photograph_beside_the_object_has_an_empty_mask(capture):
+    """As films have them, where they begin or end; the others are cut out all the same."""
+    one = capture.photographs[3]
+    eye, ahead = 3 * one.camera.eye, one.camera.pose[:, 2] + 0.84 * one.camera.pose[:, 0]
+    camera = Camera.look_at(eye, eye + ahead, fx=one.camera.fx, width=SIZE, height=SIZE)
+    capture.photographs[3] = replace(one, camera=camera)
+    line = capture.write()
+    assert f"1 empty, as the object is outside, {VIEWS - 1} cut out" in line
+    assert not read_mask(capture.file(3)).any()
+    assert np.delete(capture.agreement(), 3).min() > 0.9
+
+
+def test_the_picture_shows_outlines(capture, tmp_path):
+    """In a colour that the photographs lack, the named ones first."""
+    capture.write(given=given_masks(capture, tmp_path / "given"))
+    first = [capture.photographs[7].name]
+    sheet = picture(capture.folder, capture.photographs, first)
+    assert (sheet == OUTLINE).all(2).sum() > 12 * SIZE
+    alone = picture(capture.folder, capture.photographs[7:8])
+    height, width = alone.shape[:2]
+    assert (sheet[:height, :width] == alone).all()
+
+
+@pytest.mark.parametrize(
+    "system, command, program",
+    [
+        ("nt", r"C:\tools\rembg.exe {image} {mask}", r"C:\tools\rembg.exe"),
+        ("nt", r'"C:\my tools\rembg.exe" i {image} {mask}', r"C:\my tools\rembg.exe"),
+        ("nt", r"C:\O'Neil\rembg.exe {image} {mask}", r"C:\O'Neil\rembg.exe"),
+        ("posix", """'"rembg"' i {image} {mask}""", '"rembg"'),
+        ("posix", r"/my\ tools/rembg i {image} {mask}", "/my tools/rembg"),
+        ("posix", "'/my tools/rembg' i {image} {mask}", "/my tools/rembg"),
+    ],
+)
+def test_the_program_of_a_command_on_each_system(monkeypatch, system, command, program):
+    monkeypatch.setattr("pp_studio.capture.masks.os", SimpleNamespace(name=system))
+    words = program_words(command)
+    assert words[0] == program and words[-2:] == ["{image}", "{mask}"]

@@ -1,0 +1,55 @@
+"""The command pp-cl export: what it writes where, and one line for whatever is wrong."""
+
+import json
+import shutil
+
+import pytest
+from support.runs import train_and_interrupt
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_studio.export import FORMATS
+
+
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory):
+    """A run that was interrupted."""
+    folder = tmp_path_factory.mktemp("export")
+    scene = write_ball_scene(folder / "ball", views=6, size=40)
+    with pytest.MonkeyPatch.context() as patch:
+        train_and_interrupt(scene, folder / "run", 20, patch)
+    return folder / "run"
+
+
+@pytest.fixture
+def copied(unfinished, tmp_path):
+    """A copy of it, in a folder whose name is no UTF-8, and whose scene is gone."""
+    run = tmp_path / "run \udcff"
+    shutil.copytree(unfinished, run)
+    config = json.loads((run / "config.json").read_text())
+    config["scene"]["path"] = "/nowhere/at/all"
+    (run / "config.json").write_text(json.dumps(config))
+    return run
+
+
+# so little training shows no surface; tests/studio/export/test_formats.py writes a mesh
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "mesh"])
+def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(name, copied, capsys):
+    assert main(["export", str(copied), "--format", name]) == 0
+    written, said = copied / "export" / FORMATS[name][0], capsys.readouterr()
+    shown = ascii(str(written)).strip("'")
+    assert written.exists() and f"wrote {shown}: " in said.out
+    assert "unfinished, step 20 of 60" in said.out
+    # it has neither a scene's test views, nor the photographs that splats are fitted to
+    assert ("/nowhere/at/all" in said.err) == (name == "scene" or name.startswith("splat"))
+    there = [path.name for path in written.parent.iterdir() if path.name[0] != "."]
+    assert there == [written.name]
+
+
+def test_out_says_where(copied, tmp_path, capsys):
+    out = tmp_path / "a.ply"
+    assert main(["export", str(copied), "--format", "ply", "--out", str(out)]) == 0
+    whole = out.stat().st_size
+    words = ["--format", "ply", "--out", str(out), "--min-weight", "0.3"]
+    assert main(["export", str(copied), *words]) == 0
+    assert out.stat().st_size < whole and not (copied / "export").exists()

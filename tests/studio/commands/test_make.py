@@ -1,0 +1,135 @@
+"""`pp-cl make`: what is left is done, and a folder tells of it."""
+
+import json
+import re
+import shutil
+
+import pytest
+from support.runs import spoken
+
+from pp_cl.cli import main
+from pp_cl.files.atomic import write_json
+from pp_cl.files.image import read_rgba
+from pp_cl.files.manifest import begin_manifest
+from pp_studio.capture import STAGES
+from pp_studio.commands import make
+
+
+@pytest.fixture(scope="module")
+def made(runs, tmp_path_factory):
+    """(scene, what was made of it) of a ball."""
+    scene = runs.ball(views=12, size=32)
+
+    def make(folder):
+        status, lines = spoken(["make", scene, "--out", folder / "out", "--minutes", "0.1"])
+        assert status == 0, lines
+
+    folder = tmp_path_factory.mktemp("make") / "out"
+    return scene, shutil.copytree(runs.made("make", make) / "out", folder)
+
+
+def test_the_page_links_what_is_there(made):
+    _, folder = made
+    page = (folder / "index.html").read_text("utf-8")
+    named = set(re.findall(r'(?:src|href|content)="([\w.]+\.\w+)"', page))
+    assert named == {"model.html", "film.mp4", "splat.ply", "views.png", "thumbnail.png"}
+    assert all((folder / name).stat().st_size > 0 for name in named)
+    assert "<title>out</title>" in page and "<!--" not in page
+    assert "PSNR, dB" in page and "the training has not seen" in page
+    assert read_rgba(folder / "thumbnail.png").shape == (315, 600, 4)
+
+
+def test_the_same_command_does_only_what_is_left(made, capsys):
+    scene, folder = made
+    checkpoint = (folder / "run/checkpoint.npz").read_bytes()
+    (folder / "index.html").unlink()
+    made = [(folder / name).stat().st_mtime_ns for name in ("film.mp4", "splat.ply")]
+    assert main(["make", scene, "--out", str(folder)]) == 0
+    assert "is finished" in capsys.readouterr().out
+    assert made == [(folder / name).stat().st_mtime_ns for name in ("film.mp4", "splat.ply")]
+    assert (folder / "index.html").exists()
+    assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
+    status, lines = spoken(["make", scene, "--out", folder, "--minutes", "7"])
+    assert status == 2 and "train.minutes is 0.1 there, 7.0 asked for" in lines[-1]
+
+
+def test_a_folder_that_has_moved_goes_on(made, tmp_path):
+    """With its scene."""
+    scene, folder = made
+    shutil.copytree(scene, tmp_path / "scene")
+    shutil.copytree(folder, tmp_path / "out")
+    (tmp_path / "out/index.html").unlink()
+    status, lines = spoken(["make", tmp_path / "scene", "--out", tmp_path / "out"])
+    assert status == 0, lines
+    stored = json.loads((tmp_path / "out/run/config.json").read_text())
+    assert stored["scene"]["path"] == str(tmp_path / "scene")
+
+
+def test_what_is_not_its_own_stays(made, tmp_path):
+    scene, folder = made
+    (tmp_path / "mine.txt").write_text("mine")
+    status, lines = spoken(["make", scene, "--out", tmp_path])
+    assert status == 2 and "holds other files" in lines[-1]
+    page = folder / "index.html"
+    page.write_text(page.read_text("utf-8") + "mine", "utf-8")
+    status, lines = spoken(["make", scene, "--out", folder])
+    assert status == 2 and "index.html: pp-cl did not write this" in lines[-1]
+    assert page.read_text("utf-8").endswith("mine")
+
+
+class Enough(Exception):
+    """The steps are known."""
+
+
+@pytest.mark.parametrize(
+    "words, preset",
+    [
+        ([], "small"),
+        (["--minutes", "3"], "tiny"),
+        (["--minutes", "60"], "full"),
+        (["--preset", "tiny"], "tiny"),
+    ],
+)
+def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
+    """With what is known of them; the preset follows from the minutes."""
+    steps = []
+
+    def step(name, *given):
+        steps.append((name, given))
+        for stage in STAGES if name == "capture" else ():
+            write_json(found / f"{stage}.json", {"line": f"{stage} done"})
+        if name == "train":
+            raise Enough
+
+    monkeypatch.setattr(make, "_step", step)
+    photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
+    photographs.mkdir()
+    found.mkdir(parents=True)
+    begin_manifest(tmp_path / "out")
+    hints = ["--turntable", "--masks", "M", "--box=-1,-1,-1,1,1,2"]
+    with pytest.raises(Enough):
+        spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])
+    scene, box = str(tmp_path / "out/scene"), "--box=-1.0,-1.0,-1.0,1.0,1.0,2.0"
+    minutes = words[1] if "--minutes" in words else "20"
+    assert steps == [
+        ("capture", (str(photographs), "--out", scene, "--turntable", "--masks", "M", box)),
+        (
+            "train",
+            (scene, "--out", str(tmp_path / "out/run"), "--preset", preset, "--minutes", minutes),
+        ),
+    ]
+
+
+def test_hints_of_photographs_are_refused_for_a_scene(made, tmp_path):
+    scene, _ = made
+    status, lines = spoken(["make", scene, "--out", tmp_path / "new", "--turntable"])
+    assert status == 2 and "--turntable" in lines[-1] and not (tmp_path / "new").exists()
+    status, lines = spoken(["make", tmp_path / "none", "--out", tmp_path / "new"])
+    assert status == 2 and "give photographs, a video or a scene" in lines[-1]
+
+
+def test_what_a_capture_has_found_is_told(tmp_path):
+    (tmp_path / "capture").mkdir()
+    for stage in STAGES:
+        write_json(tmp_path / f"capture/{stage}.json", {"line": f"{stage} done"})
+    assert make._captured(tmp_path) == [f"{stage}: {stage} done" for stage in list(STAGES)[:-1]]

@@ -1,0 +1,153 @@
+"""`pp-cl render`: films and frames as asked for, what is taken up again, what is refused."""
+
+import json
+import shutil
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import OpenEXR
+import pytest
+from filelock import FileLock
+from support.refused import failure
+
+from pp_cl.cli import main
+from pp_cl.files.image import read_rgba
+from pp_studio.export import film
+
+
+@pytest.fixture(scope="module")
+def trained(finished):
+    """Folder of a small run, as text."""
+    return str(finished)
+
+
+def test_a_film_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp_path, capsys):
+    film = tmp_path / "new" / "film.mp4"
+    words = ["render", trained, "--out", str(film), "--seconds", "0.5", "--fps", "12"]
+    assert main([*words, "--size", "48x32"]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == f"wrote {film}"
+    assert list(film.parent.iterdir()) == [film]
+    with imageio.get_reader(str(film)) as read:
+        data = read.get_meta_data()
+        assert data["size"] == (48, 32) and data["fps"] == 12
+        frames = [frame.astype(int) for frame in read.iter_data()]
+    assert len(frames) == 6 and np.abs(frames[0] - frames[3]).max() > 20
+
+
+@pytest.mark.parametrize("suffix", ["gif", "webp"])
+def test_a_film_whose_frames_would_fill_the_memory_is_not_begun(trained, tmp_path, suffix):
+    """Pillow keeps them all: 200 of 960x540 took 450 MB as WebP, with imageio 46 as MP4."""
+    out = tmp_path / f"film.{suffix}"
+    words = ("render", trained, "--out", out, "--seconds", "60", "--size", "1920x1080")
+    assert "--format mp4" in failure(*words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypatch):
+    words = ["render", trained, "--out", str(tmp_path / "film.gif"), "--seconds", "1", "--fps", "4"]
+    write, done = film.write_png, []
+
+    def stopping(path, image):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        write(path, image)
+        done.append(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(film, "write_png", stopping)
+        assert main(words) == 130
+    assert not (tmp_path / "film.gif").exists()
+    with FileLock(done[0].parent / ".pp-cl.lock"):
+        assert "film.gif.frames: another process" in failure(*words)
+    assert main(words) == 0
+    assert "rendered 2 of 4 frames" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [tmp_path / "film.gif"]
+    assert main([*words, "--background", "black"]) == 0  # a film is made anew
+    assert "rendered 4 of 4 frames" in capsys.readouterr().out
+    done[0].parent.mkdir()
+    (done[0].parent / ".mine.png").write_bytes(b"mine")
+    assert main(words) == 0 and (done[0].parent / ".mine.png").read_bytes() == b"mine"
+    with imageio.get_reader(str(tmp_path / "film.gif")) as read:
+        assert read.get_length() == 4
+
+
+def test_sizes_have_folders_of_their_own_and_need_no_scene(trained):
+    """The run's name is no UTF-8, and its scene is gone."""
+    run = Path(trained)
+    run = shutil.copytree(run, run.with_name("run \udcff"))
+    config = json.loads((run / "config.json").read_text())
+    config["scene"]["path"] = "/nowhere/at/all"
+    (run / "config.json").write_text(json.dumps(config))
+    words = ["render", str(run), "--seconds", "0.1", "--fps", "10"]
+    for more in ([], ["--size", "32x32"], ["--format", "png"], ["--path", "spiral"]):
+        assert main([*words, *more]) == 0
+    names = {path.name for path in (run / "render").iterdir() if path.name[0] != "."}
+    assert names == {"orbit_24x24.mp4", "orbit_32x32.mp4", "orbit_24x24", "spiral_24x24.mp4"}
+    assert "/nowhere" in failure(*words[:2], "--path", "test")
+    assert "choose another" in failure(*words[:2], "--format", "exr")
+
+
+def test_an_empty_folder_that_one_is_in_takes_frames(trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", trained, "--path", "test", "--out", "."]) == 0
+    names = {path.name for path in tmp_path.iterdir() if path.name[0] != "."}
+    assert names == {"00000.png", "00001.png", "frames.json"}
+
+
+def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys):
+    words = ["render", trained, "--out", str(tmp_path / "o"), "--seconds", "1", "--fps", "4"]
+    assert main(words) == 0
+    whole = {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()}
+    (tmp_path / "o" / "00002.png").unlink()
+    (tmp_path / "o" / ".00003.png.999999999.pp-cl.tmp").write_bytes(b"half")
+    capsys.readouterr()
+    assert main(words) == 0
+    assert "rendered 1 of 4 frames" in capsys.readouterr().out
+    assert {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()} == whole
+    told = failure(*words, "--background", "black")
+    assert "holds frames of another model, path or style" in told
+    assert {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()} == whole
+
+
+def test_transparent_frames_and_colours(trained, tmp_path):
+    words = ["render", trained, "--path", "test", "--format", "png"]
+    images = {}
+    for name in ("transparent", "black", "0,255,0"):
+        out = str(tmp_path / name)
+        assert main([*words, "--background", name, "--out", out]) == 0
+        images[name] = read_rgba(tmp_path / name / "00000.png").astype(int)
+    alpha = images["transparent"][..., 3]
+    assert alpha.min() == 0 and alpha.max() > 200
+    nothing = alpha == 0
+    assert (images["0,255,0"][nothing][:, :3] == (0, 255, 0)).all()
+    assert (images["black"][nothing][:, :3] == 0).all()
+    green = images["0,255,0"][..., 1] - images["black"][..., 1]
+    assert np.abs(green - (255 - alpha)).max() <= 2
+
+
+def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
+    words = ["render", trained, "--path", "test", "--format", "exr", "--features", "--samples", "4"]
+    assert main([*words, "--out", str(tmp_path / "e")]) == 0
+    file = OpenEXR.File(str(tmp_path / "e" / "00000.exr"), separate_channels=True)
+    channels = {name: channel.pixels for name, channel in file.channels().items()}
+    assert len(channels) == 6 + 16 and channels["R"].shape == (24, 24)
+    there = channels["A"] > 0.5
+    distance = 4.0  # of the cameras from the ball's centre
+    assert there.any() and (np.abs(channels["Z"][there] - distance) < 1).all()
+    assert np.isinf(channels["Z"][channels["A"] == 0]).all()
+
+
+def test_cameras_of_a_file(trained, tmp_path):
+    words = ["--path", str(tmp_path / "path.json"), "--size", "32x32"]
+    (tmp_path / "path.json").write_text(
+        '{"camera_path": [{"fov": 40, "camera_to_world": [1,0,0,0, 0,1,0,0, 0,0,1,4, 0,0,0,1]}]}'
+    )
+    assert main(["render", trained, *words, "--out", str(tmp_path / "file.gif")]) == 0
+    assert (tmp_path / "file.gif").exists()
+
+
+def test_a_path_of_no_frame_is_refused(trained):
+    """Four seconds at a frame in ten."""
+    told = failure("render", trained, "--fps", "0.1")
+    assert "--seconds 4: 0.4 frames at 0.1 a second; ask for 1 to" in told

@@ -1,0 +1,63 @@
+"""The mesh lies on the ball, and reads back as it was."""
+
+import numpy as np
+import pytest
+import trimesh
+from support.gltf import glb
+
+from pp_cl.errors import UserError
+from pp_studio.export import mesh as module
+from pp_studio.export.gltf import gltf_colours
+from pp_studio.export.mesh import coloured_mesh, surface, write_mesh
+
+RADIUS = 0.8  # of the ball
+
+
+@pytest.fixture(scope="module")
+def mesh(run):
+    return coloured_mesh(run)
+
+
+def test_it_is_the_ball(run, mesh):
+    distance = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
+    assert np.median(distance) < 1.5 * run.model.grid.edge
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert made.is_watertight
+    assert made.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.25)  # faces look outwards
+
+
+def test_vertices_have_the_colours_of_the_ball_there(mesh):
+    expected = 255 * (0.5 + 0.4 * np.sin(4 * mesh.vertices + [0, 1, 2]))  # support/scenes.py
+    high = mesh.vertices[:, 2] > 0  # which the cameras see well
+    assert np.median(np.abs(mesh.colours - expected)[high]) < 30
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
+    path = tmp_path / f"a.{suffix}"
+    write_mesh(path, mesh)
+    read = trimesh.load(path, process=False)
+    if suffix == "glb":
+        (read,) = read.geometry.values()
+        colours = read.visual.vertex_attributes["color"]
+        assert np.array_equal(colours, gltf_colours(mesh.colours))
+        header, stored = glb(path)
+        outwards = read.vertices / np.linalg.norm(read.vertices, axis=1)[:, None]
+        assert np.median((stored["NORMAL"] * outwards).sum(1)) > 0.9
+        assert header["materials"] == [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
+    else:
+        assert np.array_equal(read.visual.vertex_colors[:, :3], mesh.colours)
+    assert np.array_equal(np.float32(read.vertices), mesh.vertices)
+    assert np.array_equal(read.faces, mesh.faces)
+
+
+def test_a_box_in_which_no_face_lies_is_one_line(run, mesh):
+    around = 0.01 * run.model.grid.edge * np.array([[-1], [1]])
+    with pytest.raises(UserError, match="--box: holds no whole face"):
+        surface(run, mesh.vertices[0] + around)
+
+
+def test_no_surface_is_one_line(run, monkeypatch):
+    monkeypatch.setattr(module, "fuse", lambda grid, _: np.ones(grid.dims[::-1]))
+    with pytest.raises(UserError, match="show no surface"):
+        surface(run)

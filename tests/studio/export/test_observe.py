@@ -1,0 +1,70 @@
+"""What a view's blend weights say of its points, as a matrix."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from support.models import blend_matrix, drawn_alone
+
+from pp_cl.run import load_run
+from pp_studio.export.observe import observe
+
+
+def check(run):
+    for seen in observe(run, run.cameras("test"), "test"):
+        matrix, weights = blend_matrix(seen), seen.point_weights()
+        assert matrix.shape == (30 * 30, run.model.cloud.count) and weights.max() > 0.1
+        assert matrix.sum(0) == pytest.approx(weights, abs=1e-5)
+        alpha = run.render(seen.camera).alpha.ravel()
+        missing = alpha - matrix.sum(1)
+        stopped = missing > 1e-5
+        assert stopped.any() and (alpha[stopped] == 1).all()
+        assert missing.min() > -1e-5 and missing.max() < run.config.raster.early_stop
+
+
+def test_rows_sum_to_alpha_up_to_an_early_stop_and_columns_to_the_points_weights(run):
+    check(run)
+
+
+def test_dropped_hits_are_no_part_of_it(run_folder, session_device, tmp_path):
+    shutil.copytree(run_folder, tmp_path / "run")
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    config["raster"]["early_stop"] = 0.3
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    run = load_run(session_device, tmp_path / "run")
+    camera = run.cameras("test")[0]
+    whole = load_run(session_device, run_folder)
+    (seen,), (all_seen,) = (list(observe(r, [camera], "")) for r in (run, whole))
+    assert 0 < blend_matrix(seen).nnz < blend_matrix(all_seen).nnz
+    check(run)
+
+
+def test_it_blends_what_the_rasteriser_blends(run):
+    camera = run.cameras("test")[0]
+    (seen,) = observe(run, [camera], "test")
+    matrix = blend_matrix(seen)
+    raster = run.renderer.forward(camera, run.gamma, until="features")
+    shaded = raster.weights.shaded.get()
+    points = np.zeros((run.model.cloud.count, 16), np.float32)
+    points[shaded] = raster.shaded_features.get()[: len(shaded)]
+    blended = matrix @ points + (1 - matrix.sum(1))[:, None]  # the background's features are 1
+    features = run.render(camera, features=True).features.reshape(-1, 16)
+    assert blended == pytest.approx(features, abs=1e-4)
+
+
+def test_blending_and_gathering_are_the_matrix_and_its_transpose(run, rng):
+    for seen in observe(run, run.cameras("test"), "test", blending=True):
+        matrix = blend_matrix(seen)
+        colours, values = rng.normal(size=(run.model.cloud.count, 3)), rng.normal(size=(900, 3))
+        assert seen.gathered(values) == pytest.approx((matrix.T @ values)[seen.shaded], abs=1e-5)
+        blended, rest = seen.blended(colours[seen.shaded])
+        assert blended == pytest.approx(matrix @ colours, abs=1e-5)
+        assert rest == pytest.approx(1 - matrix.sum(1), abs=1e-5)
+
+
+def test_views_are_observed_one_at_a_time(run, monkeypatch):
+    drawn = drawn_alone(monkeypatch, run.renderer)
+    for seen in observe(run, run.cameras("train"), "test"):
+        assert blend_matrix(seen).nnz
+    assert len(drawn) == len(run.cameras("train"))

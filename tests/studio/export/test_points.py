@@ -1,0 +1,87 @@
+"""Each point has the colour of the view in which it weighs most; the files hold what went in."""
+
+import numpy as np
+import plyfile
+import pytest
+
+from pp_cl.errors import UserError
+from pp_cl.files.image import to_8bit
+from pp_studio.export.gltf import gltf_colours
+from pp_studio.export.observe import observe
+from pp_studio.export.points import coloured_points, write_ply
+
+
+@pytest.fixture(scope="module")
+def points(run):
+    return coloured_points(run)
+
+
+def test_colours_are_those_of_the_best_view(run, points):
+    cameras = run.cameras("train")
+    weights = np.stack([seen.point_weights() for seen in observe(run, cameras, "")])
+    images = [to_8bit(run.render(camera).rgba()[..., :3]) for camera in cameras]
+    positions = run.model.positions()
+    assert points.rows.tolist() == np.flatnonzero(weights.max(0) > 0).tolist()
+    for row, colour in list(zip(points.rows, points.colours, strict=True))[::40]:
+        best = weights[:, row].argmax()
+        camera = cameras[best]
+        x, y, z = camera.pose[:, :3].T @ (positions[row] - camera.eye)
+        column = min(max(int(camera.fx * x / z + camera.cx), 0), 29)
+        line = min(max(int(camera.fy * y / z + camera.cy), 0), 29)
+        assert colour.tolist() == images[best][line, column].tolist()
+    assert points.weight == pytest.approx(weights.max(0)[points.rows])
+    assert points.positions == pytest.approx(positions[points.rows], abs=1e-6)
+    assert (points.opacity == run.model.cloud.opacity.get()[points.rows]).all()
+
+
+def test_points_of_little_weight_are_left_out(run, points):
+    some = coloured_points(run, min_weight=0.3)
+    assert some.rows.tolist() == points.rows[points.weight > 0.3].tolist()
+    assert 0 < len(some.rows) < len(points.rows)
+
+
+def test_no_points_are_one_line(run):
+    with pytest.raises(UserError, match="--min-weight 1000: no point weighs more"):
+        coloured_points(run, min_weight=1000)
+
+
+@pytest.fixture(scope="module")
+def written(run, tmp_path_factory):
+    """(file, points)."""
+    path, points = tmp_path_factory.mktemp("ply") / "a.ply", coloured_points(run, min_weight=0.05)
+    write_ply(path, points, run.model.cloud)
+    return path, points
+
+
+def test_the_ply_reads_back_by_plyfile(run, written):
+    path, points = written
+    data = plyfile.PlyData.read(str(path))
+    vertex = data["vertex"]
+    assert not data.text and data.byte_order == "<" and len(vertex) == len(points.rows)
+    for axis, name in enumerate(("x", "y", "z")):
+        assert vertex[name].dtype == "f4" and (vertex[name] == points.positions[:, axis]).all()
+    for channel, name in enumerate(("red", "green", "blue")):
+        assert vertex[name].dtype == "u1" and (vertex[name] == points.colours[:, channel]).all()
+    assert (vertex["point_opacity"] == points.opacity).all()
+    assert (vertex["weight"] == points.weight).all()
+    offset = run.model.cloud.offset.get()[points.rows, 3]
+    spacings = vertex["radius"] / run.model.grid.edge / run.config.raster.radius
+    assert np.log(spacings) == pytest.approx(offset, abs=1e-5)
+    stored = run.model.cloud.arrays(run.dev)
+    by_degree = [stored[f"points.sh{degree}"].get()[points.rows] for degree in range(3)]
+    for c in range(16):
+        for degree in (0, 1, 2):
+            for k in range(2 * degree + 1):
+                assert (vertex[f"feature_{c}_{degree}_{k}"] == by_degree[degree][:, k, c]).all()
+    assert len(vertex.properties) == 9 + 9 * 16
+    comments = " ".join(data.comments)
+    for name in ("red, green, blue:", "weight:", "point_opacity:", "radius:", "feature_C_D_K:"):
+        assert name in comments
+
+
+def test_colours_are_in_linear_light():
+    srgb = np.repeat(np.uint8([[0], [10], [128], [255]]), 3, axis=1)
+    # IEC 61966-2-1: 10 is on its straight part
+    expected = [0, round(10 / 12.92), round(255 * ((128 / 255 + 0.055) / 1.055) ** 2.4), 255]
+    assert gltf_colours(srgb)[:, 0].tolist() == expected
+    assert (gltf_colours(srgb)[:, 3] == 255).all()

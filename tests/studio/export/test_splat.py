@@ -1,0 +1,198 @@
+"""Splat files: the layout that others read, and what they show when drawn as others draw them."""
+
+from dataclasses import replace
+from unittest.mock import Mock
+
+import gsply
+import numpy as np
+import plyfile
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from support.gltf import glb
+from support.splats import colours, draw_splats, read_splats
+
+from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
+from pp_cl.files.image import to_8bit
+from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.scene.camera_path import up_of
+from pp_studio.export import gaussians
+from pp_studio.export.gaussians import DEVIATION, fit_gaussians
+from pp_studio.export.splat import (
+    Y_DOWN,
+    Y_UP,
+    splats,
+    upright,
+    write_splat_glb,
+    write_splat_ply,
+    write_splat_spz,
+)
+
+# of the training code of 3D Gaussian splatting, for its degree 3
+LAYOUT = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+LAYOUT += [*(f"f_rest_{i}" for i in range(45)), "opacity", *(f"scale_{i}" for i in range(3))]
+LAYOUT += [f"rot_{i}" for i in range(4)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def steps():
+    """As many as make them look like the run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gaussians, "STEPS", 400)
+        yield
+
+
+@pytest.fixture(scope="module")
+def y_up(run, steps):
+    """(table, origin)."""
+    return splats(run, upright(run, Y_UP), 90)
+
+
+@pytest.fixture(scope="module")
+def ply(run, steps, tmp_path_factory):
+    path = tmp_path_factory.mktemp("splat") / "a.ply"
+    write_splat_ply(path, splats(run, upright(run, Y_DOWN), 90)[0])
+    return path
+
+
+def turned(run, camera):
+    """The camera in the world of the .ply."""
+    up = up_of(run.cameras("train"))
+    turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
+    return replace(camera, pose=turn @ camera.pose)
+
+
+def test_the_header_is_that_of_the_training_code(ply):
+    header = ply.read_bytes().partition(b"end_header\n")[0].decode().splitlines()
+    count = len(plyfile.PlyData.read(str(ply))["vertex"])
+    assert header == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment Vertical axis: y",
+        f"element vertex {count}",
+        *(f"property float {name}" for name in LAYOUT),
+    ]
+
+
+def test_what_is_no_colour(run, ply):
+    vertex, found = plyfile.PlyData.read(str(ply))["vertex"], read_splats(ply)
+    up, grid = up_of(run.cameras("train")), run.model.grid
+    turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
+    vertices = grid.positions(run.model.cloud.ids.get())
+    apart = cKDTree(vertices).query(found["positions"] @ turn, p=np.inf)[0]
+    assert apart.max() < (MOST_OF_GAUSSIANS + 1e-4) * grid.edge
+    assert 0.3 * len(vertices) < len(apart) <= len(vertices)
+    assert turn @ up == pytest.approx([0, -1, 0])
+    assert found["opacity"].min() > 1 / 255 and found["opacity"].max() < 0.991
+    size = np.linalg.eigvalsh(found["covariance"]) ** 0.5
+    size /= DEVIATION * run.config.raster.radius * grid.edge
+    assert size.min() > 0.02 and size.max() < 2 * np.exp(MOST_OF_GAUSSIANS)
+    assert np.median(size[:, 2] / size[:, 0]) > 1.1  # none of them stayed a ball
+    assert all((vertex[f"n{axis}"] == 0).all() for axis in "xyz")
+
+
+def likeness(run, path, scale):
+    """PSNR of test views that are drawn in windows of `scale` times their size."""
+    found, measured = read_splats(path), []
+    for camera in run.cameras("test"):
+        large = turned(run, camera.resized(scale * camera.width, scale * camera.height))
+        blocks = draw_splats(found, large).reshape(camera.height, scale, camera.width, scale, 3)
+        measured.append(psnr(to_8bit(blocks.mean((1, 3))), to_8bit(run.render(camera).colour)))
+    return np.mean(measured)
+
+
+def test_gaussians_look_like_the_run_in_the_window_that_they_are_for(run, ply, tmp_path):
+    small = tmp_path / "small.ply"
+    write_splat_ply(small, splats(run, upright(run, Y_DOWN), 30)[0])
+    assert likeness(run, ply, 3) > 37
+    assert likeness(run, small, 1) > 37 and likeness(run, ply, 1) < 30
+
+
+def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monkeypatch):
+    """And to as many renderings between them if they are few; to renderings alone where exposures
+    differ, or where the scene is gone.
+    """
+    monkeypatch.setattr(gaussians, "Trainer", fitted := Mock(side_effect=InterruptedError))
+
+    def views(window=30):
+        with pytest.raises(InterruptedError):
+            fit_gaussians(run, window)
+        return fitted.call_args[0][3]
+
+    photographs, found = run.scene("train").splits["train"], views()
+    assert len(found) == 2 * len(photographs)
+    with monkeypatch.context() as patch:  # for a window that is smaller than the images
+        for module in ("scene.views", "export.gaussians"):
+            patch.setattr(f"pp_cl.{module}.MIN_SIDE", 8)
+        assert {view.camera.width for view in views(15)} == {15}
+    for one, other in zip(photographs, found, strict=False):
+        assert one.name == other.name and (one.image == other.image).all()
+    rendered = [view.image.shape for view in run.rendered(run.photographs("train"), opaque=True)]
+    assert [view.image.shape for view in found[len(photographs) :]] == rendered
+    with monkeypatch.context() as patch:
+        patch.setattr(gaussians, "ENOUGH", len(photographs))
+        assert [view.name for view in views()] == [view.name for view in photographs]
+    monkeypatch.setitem(run.header, "left_out", [found[0].name])
+    assert [view.name for view in views()][:2] == [found[1].name, found[2].name]
+    monkeypatch.setitem(run.header, "exposed", True)
+    assert [view.image.shape for view in views()] == 2 * rendered
+    monkeypatch.delitem(run.header, "exposed")
+    monkeypatch.setattr(run.config.scene, "path", "gone")
+    with pytest.warns(UserWarning, match="renderings of the training views alone: gone"):
+        assert [view.image.shape for view in views()] == 2 * rendered
+
+
+def test_the_spz_says_the_same_with_y_up(y_up, ply, tmp_path):
+    """To its bits: half a deviation of a place, 1/255 of an opacity, exp(1/32) of a deviation,
+    5/128 of a harmonic.
+    """
+    table, _ = y_up
+    write_splat_spz(tmp_path / "a.spz", table)
+    found = gsply.read_spz(tmp_path / "a.spz")
+    smallest = float(table["deviations"].max(1).min())
+    assert found.means == pytest.approx(table["position"], abs=0.51 * smallest)
+    assert 1 / (1 + np.exp(-found.opacities)) == pytest.approx(table["opacity"], abs=3e-3)
+    assert found.scales == pytest.approx(np.log(table["deviations"]), abs=0.04)
+    same = np.abs((found.quats * table["turn"]).sum(1)) / np.linalg.norm(found.quats, axis=1)
+    assert same.min() > 0.999  # the cosine of half an angle
+    assert found.sh0 == pytest.approx(table["harmonics"][:, 0], abs=0.02)
+    rest = table["harmonics"][:, 1:].clip(-127 / 128, 127 / 128)  # what 8 bits hold
+    assert np.abs(found.shN - rest).max() < 0.0392
+    assert (tmp_path / "a.spz").stat().st_size < ply.stat().st_size / 9
+
+
+def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
+    table, origin = y_up
+    write_splat_glb(tmp_path / "a.glb", table, origin)
+    gltf, arrays = glb(tmp_path / "a.glb")
+    (primitive,) = gltf["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0 and gltf["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert primitive["extensions"]["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+    }
+    prefix, found = "KHR_gaussian_splatting:", read_splats(ply)
+    flip = np.array([1, -1, -1])  # half a turn around x
+    assert arrays["POSITION"] * flip == pytest.approx(found["positions"], abs=1e-5)
+    assert gltf["accessors"][0]["max"] == pytest.approx(arrays["POSITION"].max(0))
+    assert arrays[prefix + "OPACITY"][:, 0] == pytest.approx(found["opacity"], abs=1e-5)
+    axes = Rotation.from_quat(arrays[prefix + "ROTATION"]).as_matrix()
+    axes *= arrays[prefix + "SCALE"][:, None]
+    covariance = flip[:, None] * (axes @ axes.transpose(0, 2, 1)) * flip
+    assert covariance == pytest.approx(found["covariance"], abs=1e-6 * covariance.max())
+    names = [(d, k) for d in range(3) for k in range(2 * d + 1)]
+    harmonics = np.stack([arrays[f"{prefix}SH_DEGREE_{d}_COEF_{k}"] for d, k in names], 1)
+    assert len(arrays) == 5 + 9
+    towards = rng.normal(size=(len(harmonics), 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    ours, theirs = colours(harmonics, towards), colours(found["harmonics"], towards * flip)
+    assert ours == pytest.approx(theirs, abs=1e-4)
+
+
+def test_programs_that_draw_points_read_the_glb(y_up, tmp_path):
+    table, origin = y_up
+    write_splat_glb(tmp_path / "a.glb", table, origin)
+    (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
+    assert isinstance(cloud, trimesh.PointCloud) and len(cloud.vertices) == len(table)
+    assert cloud.colors.shape == (len(table), 4)

@@ -1,0 +1,26 @@
+"""One small run for the tests of the viewer, and a server."""
+
+import pytest
+
+from pp_studio.view.server import started
+
+
+@pytest.fixture(scope="session")
+def trained(runs, scene, tmp_path_factory):
+    """Folder of a finished run of the ball, 24 x 24 pixels; not to be changed."""
+    return runs.trained(tmp_path_factory.mktemp("viewed") / "run", scene, train__iterations=40)
+
+
+@pytest.fixture
+def copied(trained, tmp_path):
+    """A copy of that run, for tests that change it."""
+    for name in ("config.json", "checkpoint.npz", "log.jsonl"):
+        (tmp_path / name).write_bytes((trained / name).read_bytes())
+    return tmp_path
+
+
+@pytest.fixture
+def served():
+    """(viser's server with an empty page, its address)."""
+    with started("test", port=0) as found:
+        yield found

@@ -1,0 +1,289 @@
+"""A run and a training as tabs see them, without a browser."""
+
+import contextlib
+import io
+import json
+import os
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.scenes import ring_cameras
+from support.viewing import drawing, tab, wait
+
+from pp_cl.config import load_config
+from pp_cl.files.image import to_8bit
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.scene.readers.camera_file import read_cameras
+from pp_cl.session.training import open_training
+from pp_studio.view.drawing import draw
+from pp_studio.view.model_page import STILL, ModelPage, framed
+from pp_studio.view.run_view import RunView, shown_training
+
+CAMERA = ring_cameras(3, 48)[2]
+
+
+@pytest.fixture
+def view(served, dev, copied):
+    """The small run, loaded; its pictures are larger than it was trained, as JPEG loses less."""
+    found = RunView(served[0], dev, RunFolder(copied))
+    found.look()
+    found.page._focal = 2 * CAMERA.fy
+    return found
+
+
+@contextlib.contextmanager
+def looking(view, address, camera=CAMERA):
+    """A Tab at a camera, of whose pictures none is drawn yet."""
+    with tab(address) as opened:
+        opened.look(camera, view.page._space)
+        wait(lambda: any(np.allclose(t.camera.eye, camera.eye) for t in view.page._tabs.values()))
+        yield opened
+
+
+def drawn(view):
+    """Draw what is wanted until nothing is, a while after the last movement."""
+    time.sleep(1.5 * STILL)
+    while view.page.draw_next():
+        pass
+
+
+def like(view, camera, **look):
+    """Whether a picture is what draw() gives, but for what JPEG takes."""
+    expected, _ = draw(view.page.run, view.page._views, camera, **look)
+    return lambda image: image.shape == expected.shape and np.abs(image - expected).mean() < 4
+
+
+def test_a_moving_camera_gets_drafts_and_one_at_rest_the_full_picture(view, served, monkeypatch):
+    with looking(view, served[1]) as opened:
+        monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)
+        assert view.page.draw_next() and not view.page.draw_next()
+        assert opened.picture().shape == (24, 24, 3)
+        monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
+        assert view.page.draw_next() and not view.page.draw_next()
+        opened.picture(like(view, CAMERA.resized(96, 96)))
+        view.page.renew()
+        assert view.page.draw_next()
+
+
+def test_the_size_follows_the_training_and_has_a_bound(view, served):
+    with looking(view, served[1]) as opened:
+        for size, side in (("double", 192), ("half", 48)):
+            opened.set("Picture size", size)
+            wait(lambda size=size: view.page._size.value == size)
+            drawn(view)
+            opened.picture(lambda image, side=side: len(image) == side)
+        view.page._most_pixels = 20 * 20
+        opened.set("Picture size", "double")
+        wait(lambda: view.page._size.value == "double")
+        drawn(view)
+        opened.picture(lambda image: len(image) == 20)
+
+
+def test_switches_change_what_is_drawn(view, served):
+    camera = CAMERA.resized(96, 96)
+    changes = (
+        ("Show depth", True, {"show": "depth"}),
+        ("Exposure, stops", -2.0, {"show": "depth", "exposure": -2.0}),
+        ("As trained", True, {"show": "depth"}),
+        ("Show", "colour", {}),
+        ("Points kept, %", 20, {"kept": 0.2}),
+        ("Points kept, %", -7, {"kept": 0.01}),  # what no slider says
+    )
+    checks = [like(view, camera, **look) for _, _, look in changes]
+    with looking(view, served[1]) as opened, drawing(view.page):
+        for (label, value, _), check in zip(changes, checks, strict=True):
+            if label == "Show depth":  # a key
+                opened.send("CommandTriggerMessage", uuid=opened.handles[label]["uuid"])
+            else:
+                opened.set(label, value)
+            opened.picture(check)
+
+
+def test_a_photograph_is_shown_in_the_middle_and_without_frustums(view, served):
+    wide = replace(CAMERA, width=96, cx=48)
+    with looking(view, served[1], wide) as opened:
+        opened.set("Show", "photograph")
+        opened.receive(
+            "SetSceneNodeVisibilityMessage",
+            lambda m: (m["name"], m["visible"]) == ("/views", False),
+        )
+        drawn(view)
+        photograph, _ = draw(view.page.run, view.page._views, wide, "photograph")
+        image = opened.picture(lambda image: image.shape == (24, 48, 3))
+        assert np.abs(image[:, 12:36] - photograph.astype(int)).mean() < 10
+        assert np.abs(image[:, :8] - (23, 24, 27)).max() < 30
+    np.testing.assert_array_equal(framed(photograph, 0.5)[12:36], photograph)
+
+
+def test_a_click_goes_to_a_view(view, served):
+    goal = view.page._views[4].camera
+    with looking(view, served[1]) as opened:
+        opened.click("/views/4")
+        found = opened.receive("SetCameraPositionMessage", lambda m: not m["initial"])
+        np.testing.assert_allclose(view.page._space.world(found["position"]), goal.eye, atol=1e-5)
+
+
+def test_the_picture_is_saved_as_it_is(view, served):
+    with looking(view, served[1]) as opened, drawing(view.page):
+        opened.set("Save picture", True)
+        name, content = opened.file()
+    image = np.array(Image.open(io.BytesIO(content)))
+    assert name == f"{view._folder.path.name}_step_40_colour.png"
+    rendering = to_8bit(view.page.run.render(CAMERA.resized(96, 96)).colour)
+    assert np.abs(image - rendering.astype(int)).max() <= 1  # the camera came by float64 words
+
+
+def test_a_path_is_one_that_render_takes(view, served, tmp_path):
+    keys = ring_cameras(3, 48)
+    with tab(served[1]) as opened:
+        for i, camera in enumerate((*keys, keys[0])):
+            opened.look(camera, view.page._space)
+            eye = camera.eye
+            wait(lambda: view.page._tabs)
+            wait(lambda eye=eye: np.allclose(next(iter(view.page._tabs.values())).camera.eye, eye))
+            opened.set("Add this camera", True)
+            wait(lambda i=i: len(view.page._keys) == i + 1)
+        opened.set("Remove the last", True)
+        wait(lambda: len(view.page._keys) == 3)
+        opened.set("Seconds", 2)
+        wait(lambda: view.page._seconds.value == 2)
+        opened.set("Save path.json", True)
+        name, content = opened.file()
+    (tmp_path / name).write_bytes(content)
+    cameras = read_cameras(tmp_path / name)
+    assert len(cameras) == 60
+    np.testing.assert_allclose(cameras[0].pose, keys[0].pose, atol=1e-6)
+    np.testing.assert_allclose(cameras[-1].pose, keys[2].pose, atol=1e-6)
+    assert {(c.width, c.height) for c in cameras} == {(cameras[0].width,) * 2}
+    np.testing.assert_allclose(cameras[30].fx / cameras[30].width, CAMERA.fx / 48)
+
+
+def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
+    with looking(view, served[1]) as one, looking(view, served[1]) as other:
+        wait(lambda: len(view.page._tabs) == 2)
+        drawn(view)
+        assert one.picture().shape == other.picture().shape
+        other.look(CAMERA, view.page._space)
+    wait(lambda: not view.page._tabs)
+    assert not view.page.draw_next()
+
+
+def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copied):
+    whole = (copied / "checkpoint.npz").read_bytes()
+    (copied / "checkpoint.npz").unlink()
+    view = RunView(served[0], dev, RunFolder(copied))
+    view.look()
+    assert "waiting" in view.told.content and view.page is None
+    (copied / "checkpoint.npz").write_bytes(whole[:-100])
+    view.look()
+    assert "corrupt" in view.told.content and view.page is None
+    (copied / "checkpoint.npz").write_bytes(whole)
+    view.look()
+    assert view.told.content == ""
+    first = view.page.run
+    with looking(view, served[1]):
+        drawn(view)
+        view.look()
+        assert view.page.run is first and not view.page.draw_next()
+        os.utime(copied / "checkpoint.npz", ns=(1, 1))
+        view.look()
+        assert view.page.run is not first and view.page.draw_next()
+        (copied / "checkpoint.npz").write_bytes(whole[:-100])
+        second = view.page.run
+        view.look()
+        assert "corrupt" in view.told.content and view.page.run is second
+
+
+def test_the_curve_follows_the_log(view, copied):
+    lines = (copied / "log.jsonl").read_text().splitlines(keepends=True)
+    steps = view.page._curve.data[0]
+    assert len(steps) == len(lines) - 1 and view.page._curve.visible  # the last says "finished"
+    (copied / "log.jsonl").write_text(lines[0] + lines[1][:9])
+    view.look()
+    assert view.page._curve.data[0].tolist() == steps[:1].tolist()
+    row = json.loads(lines[0])
+    view.page.set_rows([row | {"step": step} for step in range(1600)])
+    assert len(view.page._curve.data[0]) == 400
+
+
+def test_a_run_whose_photographs_are_gone_is_still_shown(served, dev, copied):
+    config = json.loads((copied / "config.json").read_text())
+    config["scene"]["path"] = "/nowhere/at/all"
+    (copied / "config.json").write_text(json.dumps(config))
+    view = RunView(served[0], dev, RunFolder(copied))
+    view.look()
+    assert "/nowhere/at/all" in view.told.content
+    with looking(view, served[1]) as opened:
+        drawn(view)
+        assert (opened.picture() < 200).any()
+        assert len([node for node in opened.nodes.values() if "fov" in node["props"]]) == 8
+        opened.set("Show", "error")
+        wait(lambda: view.page._show.value == "error")
+        drawn(view)
+        assert "photographs are not there" in view.page._status.content
+
+
+@pytest.fixture
+def training(dev, scene, tmp_path, runs):
+    """A training of 40 steps in the folder run; what it leaves alone is in the folder alone."""
+    alone = runs.trained(tmp_path / "alone", scene, train__iterations=40)
+    config = load_config(alone / "config.json")
+    return open_training(dev, RunFolder(tmp_path / "run"), config, None)
+
+
+def test_a_watched_training_has_the_same_bits(training, tmp_path):
+    cameras, pictures = ring_cameras(5, 96), []
+    with shown_training(training) as (address, on_step), tab(address) as opened:
+        page = page_of(on_step)
+
+        def follow(step, row):
+            opened.look(cameras[step % 5], page._space)
+            opened.set("Show", page._show.options[step // 3 % 7])
+            deadline = time.monotonic() + 0.1
+            while time.monotonic() < deadline:
+                on_step(step, row)
+                time.sleep(0.01)
+            pictures.append(page.run.header["step"])
+
+        training.run(follow)
+        shapes = {opened.picture().shape[:2] for _ in range(3)}
+    assert pictures == list(range(1, 41)) and max(map(max, shapes)) <= 48
+    assert arrays(tmp_path / "run") == arrays(tmp_path / "alone")
+
+
+def page_of(on_step) -> ModelPage:
+    return next(
+        c.cell_contents for c in on_step.__closure__ if isinstance(c.cell_contents, ModelPage)
+    )
+
+
+def arrays(folder):
+    with np.load(folder / "checkpoint.npz") as stored:
+        return {name: stored[name].tobytes() for name in stored.files if stored[name].ndim}
+
+
+def test_a_page_that_fails_does_not_end_a_training(training, monkeypatch):
+    monkeypatch.setattr(ModelPage, "draw_next", lambda self: 1 / 0)
+    with shown_training(training) as (_, on_step):
+        with pytest.warns(UserWarning, match="division"):
+            on_step(1, None)
+        on_step(2, None)
+
+
+def test_a_training_keeps_two_thirds_of_the_time(training, monkeypatch):
+    times = []
+
+    def draw_next(self):
+        times.append(time.monotonic())
+        time.sleep(0.05)
+        return True
+
+    monkeypatch.setattr(ModelPage, "draw_next", draw_next)
+    with shown_training(training) as (_, on_step):
+        end = time.monotonic() + 1
+        while time.monotonic() < end:
+            on_step(1, None)
+    assert 2 <= len(times) <= 7 and np.diff(times).min() > 0.149

@@ -1,0 +1,345 @@
+"""Checkpoints of runs: what a training writes is what is expected; anything else is refused in one
+line that names the file, whoever reads it, before memory is taken for it.
+"""
+
+import io
+import shutil
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from support.checkpoints import (
+    HEADER,
+    ONE,
+    STEP,
+    STEPS,
+    contents,
+    header_text,
+    ids,
+    load_checkpoint,
+    refusal,
+    settings,
+    write_run,
+)
+from support.refused import failure
+from support.runs import arguments, train_and_interrupt
+
+from pp_cl.checkpoint import load_run_state, stored_forms
+from pp_cl.config import load_config
+from pp_cl.engine.training.exposure import decided_at
+from pp_cl.errors import UserError
+from pp_cl.files.checkpoint import FORMAT, save_checkpoint
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import load_run
+from pp_studio.view.drawing import draw
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run's folder that does not exist yet."""
+    return RunFolder(tmp_path / "run")
+
+
+@pytest.fixture
+def config():
+    return settings()
+
+
+def rewritten(path, change, form=zipfile.ZIP_STORED):
+    """Write the members of a checkpoint anew: change({name: bytes}) -> the same."""
+    with zipfile.ZipFile(path) as old:
+        members = {entry.filename: old.read(entry) for entry in old.infolist()}
+    with zipfile.ZipFile(path, "w", form) as new:
+        for name, data in change(members).items():
+            new.writestr(name, data)
+
+
+def npy(array, **options):
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
+
+
+# ---- whole ones
+
+
+@pytest.mark.parametrize("step", [1, STEP, 51, 59, STEPS])
+def test_what_fits_is_read_as_it_was_written(folder, config, step):
+    header, arrays = contents(config, step)
+    write_run(folder, config, header, arrays)
+    found_header, found = load_run_state(folder, load_config(folder.config))
+    assert found_header == {"format": FORMAT, **header} and found.keys() == arrays.keys()
+    for name, array in arrays.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+@pytest.mark.parametrize(
+    "every, changes",
+    [
+        (10, {}),
+        (53, {}),  # the averages have begun
+        (53, {"train__ema": "false", "train__exposure": "off"}),
+        (53, {"points__sh_degree": 0, "network__blocks": "gated"}),
+        (10, {"points__sh_degree": 1, "network__widths": "16,24,40"}),
+        (30, {}),  # gains are not yet decided on
+        (53, {"train__refine_at": "0.5,1", "downscale": 1}),
+    ],
+)
+def test_a_training_writes_what_is_expected(scene, tmp_path, monkeypatch, every, changes):
+    folder = RunFolder(tmp_path / "run")
+    changes = {"points__count": 300, "train__checkpoint_every": every, **changes}
+    train_and_interrupt(scene, folder.path, 58, monkeypatch, **changes)
+    header, arrays = load_checkpoint(folder.checkpoint)
+    assert header["step"] == {10: 50, 53: 53, 30: 30}[every]
+    config, n = load_config(folder.config), len(arrays["points.ids"])
+    undecided = config.train.exposure == "auto" and header["step"] < decided_at(0, 8)
+    expected = stored_forms(config, n, header["step"], gains=8 if undecided else 0)
+    assert {name: (a.shape, a.dtype) for name, a in arrays.items()} == expected
+    load_run_state(folder, load_config(folder.config))
+
+
+# ---- broken headers
+
+HEADERS = {
+    "far before near": {"depth_range": [6.0, 2.0]},
+    "depth of NaN": {"depth_range": [2.0, float("nan")]},
+    "depth of texts": {"depth_range": ["2", "6"]},
+    "no vertices": {"grid": HEADER["grid"] | {"dims": [9, 8, 0]}},
+    "dims that are no whole numbers": {"grid": HEADER["grid"] | {"dims": [9.0, 8, 7]}},
+    "more vertices than ids": {"grid": HEADER["grid"] | {"dims": [2**20, 2**20, 2]}},
+    "a grid without an edge": {"grid": {"origin": [0, 0, 0], "dims": [9, 8, 7]}},
+    "a list for a grid": {"grid": [1, 2]},
+    "step as a text": {"step": "50"},
+    "step past the end": {"step": 10**9},
+    "step of true": {"step": True},
+    "finished of 1": {"finished": 1},
+    "extended from a step to come": {"extended_from": STEP + 1},
+    "a view left out that it never had": {"left_out": ["nobody"]},
+    "all views left out": {"left_out": [name for name, _ in HEADER["views"]]},
+    "fewer points at the start than now": {"initial_points": 4},
+    "views of nothing": {"views": []},
+    "a camera of zeros": {"views": [["r_0.png", "A" * 192]]},
+    "an unknown key": {"col\nour\x1b[31m": 1},
+    "another format": {"format": FORMAT - 1},
+}
+
+
+@pytest.mark.parametrize("change", HEADERS.values(), ids=HEADERS)
+def test_a_header_that_no_training_writes_is_refused(folder, config, change):
+    header, arrays = contents(config)
+    write_run(folder, config, header | change, arrays)
+    refusal(folder, config)
+
+
+def test_a_header_that_lacks_a_key_is_refused(folder, config):
+    header, arrays = contents(config)
+    del header["grid"]
+    write_run(folder, config, header, arrays)
+    assert "its header lacks grid" in refusal(folder, config)
+
+
+@pytest.mark.parametrize("text", [b"[]", b"", b"\xff\xfe{}", header_text()[:80], b"[" * 10**5])
+def test_a_header_of_other_text_is_refused(folder, config, text):
+    write_run(folder, config, *contents(config))
+    header = npy(np.frombuffer(text, np.uint8))
+    rewritten(folder.checkpoint, lambda members: members | {"header.npy": header})
+    refusal(folder, config)
+
+
+# ---- broken arrays
+
+
+ARRAYS = {
+    "ids reversed": ("points.ids", lambda a: a[::-1].copy(), "ascending order"),
+    "ids equal": ("points.ids", lambda a: np.full_like(a, 7), "ascending order"),
+    "ids outside": ("points.ids", lambda a: np.append(a[:-1], ids(9 * 8 * 7)), "vertices"),
+    "ids in two columns": ("points.ids", lambda a: a.reshape(20, 2), "expected 1 to 50 points"),
+    "no points": ("points.ids", lambda a: a[:0], "expected 1 to 50 points"),
+    "no ids": ("points.ids", None, "points.ids is missing"),
+    "opacity of NaN": ("points.opacity", lambda a: a * np.float32("nan"), "NaN or Inf"),
+    "colours of doubles": ("points.sh1", lambda a: a.astype(float), "float64 (40, 3, 16)"),
+    "no degree 2": ("points.sh2", None, "points.sh2 is missing, expected float32 (40, 5, 16)"),
+    "moments of fewer": ("state.v.sh", lambda a: a[1:], "state.v.sh is float32 (39, 16)"),
+    "an average too early": ("average.out.bias", ONE, "holds average.out.bias"),
+    "texts": ("net.out.bias", lambda a: np.array(["x"] * 16), "net.out.bias is <U1"),
+}
+
+
+@pytest.mark.parametrize("name, change, told", ARRAYS.values(), ids=ARRAYS)
+def test_an_array_that_cannot_be_is_refused(folder, config, name, change, told):
+    header, arrays = contents(config)
+    if change is None:
+        del arrays[name]
+    else:
+        arrays[name] = change(arrays[name]) if callable(change) else change
+    write_run(folder, config, header, arrays)
+    assert told in refusal(folder, config)
+
+
+@pytest.mark.parametrize("name", ["average.out.bias", "state.a.opacity"])
+def test_averages_are_there_once_they_have_begun(folder, config, name):
+    header, arrays = contents(config, 55)
+    del arrays[name]
+    write_run(folder, config, header, arrays)
+    assert f"{name} is missing" in refusal(folder, config)
+
+
+def test_a_finished_run_holds_no_state_and_an_unfinished_one_does(folder, config):
+    whole, model = contents(config)[1], contents(config, STEPS)[1]
+    write_run(folder, config, contents(config, STEPS)[0], whole)
+    assert "which does not belong" in refusal(folder, config)
+    write_run(folder, config, contents(config)[0], model)
+    assert "is missing" in refusal(folder, config)
+
+
+def test_coefficients_of_16_bits_are_those_of_a_finished_run_in_all_degrees(folder, config):
+    header, arrays = contents(config, STEPS)
+    for degree in range(3):
+        arrays[f"points.sh{degree}"] = arrays[f"points.sh{degree}"].astype(np.float16)
+        write_run(folder, config, header, arrays)
+        if degree < 2:
+            assert f"points.sh{degree + 1} is float32" in refusal(folder, config)
+    assert load_run_state(folder, config)[1]["points.sh2"].dtype == np.float16
+    header, arrays = contents(config)
+    arrays |= {name: a.astype(np.float16) for name, a in arrays.items() if "points.sh" in name}
+    write_run(folder, config, header, arrays)
+    assert "points.sh0 is float16" in refusal(folder, config)
+
+
+# ---- files that are not whole: refused before memory is taken for them
+
+
+def bomb(path):
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("bomb.npy", npy(np.zeros(2**24)))
+
+
+def claimed(path):
+    """4 GiB in the directory, of which there is nothing."""
+    data = path.read_bytes()
+    place = data.rindex(b"PK\x01\x02")
+    size = (2**32 - 2).to_bytes(4, "little") * 2
+    path.write_bytes(data[: place + 20] + size + data[place + 28 :])
+
+
+def with_member(name, data):
+    return lambda path: rewritten(path, lambda members: members | {name: data})
+
+
+def with_shape(new):
+    """Change the text of the opacities' own header, of the same length."""
+    name = "points.opacity.npy"
+    return lambda path: rewritten(path, lambda m: m | {name: m[name].replace(b"(40,)", new)})
+
+
+FILES = {
+    "text": lambda path: path.write_text("hello"),
+    "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "an empty zip": lambda path: rewritten(path, lambda members: {}),
+    "a readme": with_member("README.txt", b"hello"),
+    "a pickle": with_member("x.npy", npy(np.array([{}], object), allow_pickle=True)),
+    "a header of numbers": with_member("header.npy", npy(np.zeros(5))),
+    "fewer values than said": with_shape(b"(41,)"),
+    "less than none": with_shape(b"(-4,)"),
+    "brackets": with_shape(b"((((("),
+    "a bomb": bomb,
+    "4 GiB claimed": claimed,
+}
+
+
+@pytest.mark.parametrize("damage", FILES.values(), ids=FILES)
+def test_a_file_that_cannot_be_is_refused_before_memory_is_taken(folder, config, damage):
+    write_run(folder, config, *contents(config))
+    damage(folder.checkpoint)
+    refusal(folder, config)  # what is imported on the way is not counted below
+    tracemalloc.start()
+    try:
+        refusal(folder, config)
+        assert tracemalloc.get_traced_memory()[1] < 2**21
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_file_that_may_not_be_read_is_not_called_corrupt(folder, config, monkeypatch):
+    write_run(folder, config, *contents(config))
+
+    def refused(*_args, **_named):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(zipfile, "ZipFile", refused)
+    line = refusal(folder, config)
+    assert "cannot be read (Permission denied)" in line and "delete" not in line
+
+
+# ---- whoever reads it
+
+
+@pytest.fixture(scope="module")
+def trained(scene, finished, tmp_path_factory):
+    """(folder of a finished run, of one interrupted at step 20)."""
+    young = tmp_path_factory.mktemp("runs") / "young"
+    with pytest.MonkeyPatch.context() as patch:
+        train_and_interrupt(scene, young, 25, patch)
+    return finished, young
+
+
+def test_every_reader_says_the_same(scene, trained, tmp_path):
+    finished, young = (tmp_path / name for name in ("run", "young"))
+    for old, new in zip(trained, (finished, young), strict=True):
+        shutil.copytree(old, new)
+        header, arrays = load_checkpoint(new / "checkpoint.npz")
+        header.pop("format")
+        arrays["points.ids"] = arrays["points.ids"][::-1].copy()
+        save_checkpoint(new / "checkpoint.npz", header, arrays)
+    run, out = str(finished), str(tmp_path / "out")
+    commands = [
+        ["eval", run],
+        ["info", run, "--picture", str(tmp_path / "a.png")],
+        ["render", run, "--out", out, "--format", "png"],
+        ["export", run, "--format", "ply", "--out", f"{out}.ply"],
+        arguments(scene, finished),
+        arguments(scene, young),
+    ]
+    for words in commands:
+        file = (young if str(young) in words else finished) / "checkpoint.npz"
+        expected = f"pp-cl: {file}: points.ids are no vertices of its grid in ascending order"
+        assert failure(*words).startswith(expected), words
+
+
+def overflow(path):
+    """Make the weights of a checkpoint so large that its network computes NaN."""
+    header, arrays = load_checkpoint(path)
+    header.pop("format")
+    for name, array in arrays.items():
+        if name.startswith("net.") and name.endswith("weight"):
+            array[...] = np.where(np.arange(array.size).reshape(array.shape) % 2, 1e30, -1e30)
+    save_checkpoint(path, header, arrays)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["eval"],
+        ["render", "--out", "frames", "--format", "png", "--seconds", "0.1", "--size", "24x24"],
+        ["export", "--format", "ply", "--out", "a.ply"],
+        ["export", "--format", "scene", "--out", "views"],
+        ["export", "--format", "mesh", "--out", "mesh.ply"],
+        ["export", "--format", "html", "--out", "page.html"],
+    ],
+)
+def test_finite_weights_that_overflow_are_one_line(trained, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(trained[0], "run")
+    overflow(tmp_path / "run" / "checkpoint.npz")
+    told = failure(words[0], "run", *words[1:])
+    assert "run/checkpoint.npz: its parameters are too large, the image holds NaN" in told
+
+
+def test_a_model_that_overflows_is_told_by_the_viewer(trained, dev, tmp_path):
+    shutil.copytree(trained[0], tmp_path / "run")
+    overflow(tmp_path / "run" / "checkpoint.npz")
+    run = load_run(dev, tmp_path / "run")
+    with pytest.raises(UserError, match="the image holds NaN"):
+        draw(run, [], run.cameras("train")[0])
