@@ -1,4 +1,4 @@
-"""What is made of photographs and of runs: scenes, videos, pages, splats, meshes, a viewer, sweeps."""
+"""What is made of photographs and runs: scenes, videos, pages, splats, meshes, a viewer, sweeps."""
 
 from pp_studio.export.formats import export as export_run
 

@@ -331,8 +331,8 @@ class UNet:
         corner: Sequence[int],
     ) -> Callable[[], np.ndarray | None]:
         """A function that returns gradient_tiles of plan_tiles() for a step with this target,
-        (h, w, 3) float32, whose corner lies at (left, top) of the image of `size`. It is called once the
-        device has been waited for anyway, so that looking at the target costs no wait of its own.
+        (h, w, 3) float32, whose corner lies at (left, top) of the image of `size`. It is called
+        once the device has been waited for anyway: looking at the target costs no wait.
 
         ignored: (h, w) bool, the pixels that say nothing, if there are any. They are white in the
         target, but their gradient is another than the background's.
