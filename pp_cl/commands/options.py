@@ -142,14 +142,16 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
     """
 
     def target(text):
-        if text in known:
-            raise argparse.ArgumentTypeError(f"{text}: is a word of the command; write ./{text}")
         if text == "-":
             return sys.stdout
-        file = output_file()(text)  # which refuses pipes, that reading would wait for
-        if _holds_else_than_json(file):
-            raise argparse.ArgumentTypeError(f"{text}: is there, and no JSON; name another file")
-        return file
+        is_of_command = text in known or os.path.isdir(text)
+        # output_file() refuses pipes, that reading would wait for
+        if is_of_command or _holds_else_than_json(output_file()(text)):
+            raise argparse.ArgumentTypeError(
+                f"{quoted(text)}: no JSON may be written there; name another FILE, or write what the"
+                " command works on before --json"
+            )
+        return text
 
     parser.add_argument(
         "--json",
@@ -201,12 +203,18 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 def add_metrics(parser: argparse.ArgumentParser) -> None:
     """Add --metrics."""
+
+    def names(text):
+        if os.path.exists(text):
+            raise argparse.ArgumentTypeError(f"{quoted(text)}: write it before --metrics")
+        return words(METRICS)(text)
+
     parser.add_argument(
         "--metrics",
         nargs="?",
         const=",".join(METRICS),
         default="psnr,ssim",
-        type=words(METRICS),
+        type=names,
         metavar="A,B",
         help="out of psnr, ssim, lpips; without names all three (default psnr,ssim)",
     )

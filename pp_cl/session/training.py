@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pp_cl.checkpoint import load_run_state, opened_run
-from pp_cl.config import load_config, refuse_setting, run_config
+from pp_cl.config import configure, load_config, refuse_setting, run_config
 from pp_cl.drivers.discover import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
@@ -362,7 +362,7 @@ def train_scene(
     settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
     folder = RunFolder(out)
     given = [(*s, "settings") for s in settings.items()]
-    config = run_config(folder, str(scene), preset, given, extends=True)
+    config = run_config(folder, str(scene), preset, given)
     stored, dev = stored_state(folder, config), open_device(device)
     if not is_finished(stored, config):
         open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
@@ -379,15 +379,15 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     folder.check_usable()
     stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
     if folder.config.exists() and (stored is None or is_finished(stored, config)):
-        path, now = load_config(folder.config).scene.path, config.scene.path
-        if path != now:
+        there, now = load_config(folder.config), config.scene.path
+        if there.scene.path != now:
             listed = [] if stored is None else scene_frames(now, edited=False)
             if stored is None or difference(stored[0], learned(stored[0], listed), []):
-                refuse_setting(folder, "scene.path", path, now)
-            folder.configure(config.to_json())
+                refuse_setting(folder, "scene.path", there.scene.path, now)
+            folder.configure(configure(there, now).to_json())
     return stored
 
 
 def is_finished(stored: Stored | None, config: Config) -> bool:
-    """Whether there is a checkpoint and it is of the last step."""
-    return stored is not None and stored[0]["step"] == config.train.iterations
+    """Whether there is a checkpoint, and no step is left to train after it."""
+    return stored is not None and stored[0]["step"] >= config.train.iterations

@@ -94,9 +94,6 @@ REFUSED = [
     ("bench train --plot b.png", "--plot"),
     ("export run other --format html", "other"),
     ("export run other --format gallery", "other"),
-    # an option that is wrong, behind a word that may stand alone
-    ("eval --metrics run --splt test", "--splt"),
-    ("info --json run --pictur a.png", "--pictur"),
     ("export run --format html --min-weight 1", "--min-weight"),
     ("export run --format html --box 0,0,0,1,1,1", "--box"),
     ("export run --format scene --axes viewer", "--axes"),
