@@ -148,8 +148,8 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
         # output_file() refuses pipes, that reading would wait for
         if is_of_command or _holds_else_than_json(output_file()(text)):
             raise argparse.ArgumentTypeError(
-                f"{quoted(text)}: no JSON may be written there; name another FILE, or write what the"
-                " command works on before --json"
+                f"{quoted(text)}: no JSON may be written there; name another FILE, or write what"
+                " the command works on before --json"
             )
         return text
 
