@@ -30,7 +30,6 @@ from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
-from pp_cl.scene.hull import agreeing
 from pp_cl.scene.identity import difference, identity, learned
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.load import (
@@ -38,7 +37,6 @@ from pp_cl.scene.load import (
     list_split,
     measured_split,
     open_scene,
-    scene_box,
     scene_frames,
 )
 from pp_cl.session.budget import Budget
@@ -253,16 +251,14 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     """
     check_target(folder.config)
     folder.check_pictures(0)
-    net = UNet.of_settings(dev, config.network, seed=config.train.seed)
-    begin_network(net, config)
+    net = begin_network(dev, config)
     listing = list_split(config.scene.path)
     room = Room(config, net, listing.photographs)
     room.check_unseen()
     views, info, kept = _read_views(dev, folder, config, listing)
 
     start = time.perf_counter()
-    agreement = agreeing(dev, views, scene_box(config))
-    hull, depth_range = fitting_hull(dev, config, agreement, room)
+    agreement, hull, depth_range = fitting_hull(dev, config, views, room)
     seconds = time.perf_counter() - start
     picture = picture_of_masks(dev, views, hull, agreement.left_out)
 
