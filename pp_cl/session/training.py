@@ -373,9 +373,10 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     note of where its scene is now. Raises UserError for a folder or checkpoint that does not fit.
     """
     folder.check_usable()
-    stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
-    if folder.config.exists() and (stored is None or is_finished(stored, config)):
-        there, now = load_config(folder.config), config.scene.path
+    there = load_config(folder.config) if folder.config.exists() else config
+    stored = load_run_state(folder, there) if folder.checkpoint.exists() else None
+    if stored is None or is_finished(stored, config):
+        now = config.scene.path
         if there.scene.path != now:
             listed = [] if stored is None else scene_frames(now, edited=False)
             if stored is None or difference(stored[0], learned(stored[0], listed), []):
