@@ -215,7 +215,7 @@ def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, m
     monkeypatch.setattr(
         "pp_cl.session.memory.prunings", lambda train, start, end: int(end > start + 1)
     )
-    monkeypatch.setattr("pp_cl.drivers.discover.open_device", lambda choice: plain)
+    monkeypatch.setattr("pp_cl.drivers.open_device", lambda choice: plain)
     plain.info["memory_bytes"] = 30 * MIB
     words = arguments(scene, tmp_path / "run", downscale=1, points__count=5000, **settings)
 

@@ -11,7 +11,7 @@ import pyopencl as cl
 import pytest
 from support.guarded import GuardedDevice
 
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.device import device as device_module
 from pp_cl.engine.device.device import Device, acts_as_cpu, kernel_folder
 from pp_cl.errors import BuildError, UserError

@@ -17,7 +17,7 @@ from PIL import Image, ImageFilter
 from support.runs import spoken
 
 from pp_cl.cli import main
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import read_rgba, to_8bit, write_png
 from pp_cl.scene.demo import render
