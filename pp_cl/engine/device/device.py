@@ -44,6 +44,15 @@ SPILLING_ON_INTEL = frozenset(
     )
 )
 
+# bytes of the host that a driver's compiler takes until all kernels of a training are built, by
+# platform; one that is not listed is taken for the one that takes the most
+COMPILER_BYTES = {"Portable Computing Language": 80 * 2**20, "Intel(R) OpenCL": 620 * 2**20}
+
+
+def compiler_bytes(info: dict[str, Any]) -> int:
+    """Of the host, which the driver's compiler takes in a training. info: of describe()."""
+    return COMPILER_BYTES.get(info["platform"], max(COMPILER_BYTES.values()))
+
 
 def vendor_options(info: dict[str, Any], name: str) -> tuple[str, ...]:
     """Options of cl/<name>.cl on devices of one vendor. info: of describe()."""
