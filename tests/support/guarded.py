@@ -98,13 +98,13 @@ class TracedDevice(GuardedDevice):
                 self.queue, (array.nbytes,), None, array.data, value.data, np.uint32(value.nbytes)
             )
 
-    def copy_rows(self, target, start, source, count):
-        """As Device.copy_rows."""
+    def copy(self, target, source, start=0):
+        """As Device.copy."""
         row_bytes = source[:1].nbytes
-        if count:
+        if source.size:
             self._copy_kernel(
                 self.queue,
-                (count * row_bytes,),
+                (source.nbytes,),
                 None,
                 target.data,
                 np.uint32(start * row_bytes),

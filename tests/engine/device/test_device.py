@@ -64,7 +64,7 @@ def test_upload_fill_zeros_copy(dev, rng):
     dev.fill(a, 2.5)
     assert np.array_equal(a.get(), np.full((31, 16), 2.5))
     assert np.array_equal(b.get(), values.astype(np.float32))
-    for other in (dev.zeros((30, 16)), dev.zeros((31, 16), np.uint32)):
+    for other in (dev.zeros((32, 16)), dev.zeros((31, 15)), dev.zeros((31, 16), np.uint32)):
         with pytest.raises(ValueError, match="copy"):
             dev.copy(b, other)
 
