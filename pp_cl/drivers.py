@@ -31,7 +31,6 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.kernel import quiet_compiler
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import cache_folder, make_cache_folder, write_json
-from pp_cl.files.untrusted import read_regular
 
 RUNTIME = "intel-opencl-rt"  # Intel's CPU runtime, which the extra `cpu` brings
 RUNTIME_LIBRARIES = ("libintelocl.so", "intelocl64.dll")
@@ -39,7 +38,6 @@ CHOSEN = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH")  # where users name drivers
 REST = "the system's OpenCL drivers"  # where nobody tells them apart before they are loaded
 SECONDS = 20  # of a driver: a first build takes 1 to 2, several times as long on a busy machine
 BEGINS = "pp-cl begins with "  # the line of report() before it tries a driver
-MOST_BYTES = 2**20  # of a file with what was found
 TEMPORARY_CACHE = "pp-cl-cache-"
 UNSEEN = "was not seen when its driver was tried"
 
@@ -232,7 +230,7 @@ def find_drivers() -> dict[str, str]:
         places.append(Path(cl.__file__).parent / ".libs")
         for icd in (icd for place in places if place for icd in sorted(place.glob("*.icd"))):
             with suppress(OSError, ValueError):
-                drivers[str(icd)] = read_regular(icd, 4096).strip()
+                drivers[str(icd)] = icd.read_text("utf-8").strip()
     runtime = None if chosen else runtime_library()
     if not drivers and not (runtime and sys.platform == "linux"):
         drivers = {chosen or REST: ""}
@@ -286,7 +284,7 @@ def _kept_in(drivers):
 def _read(path):
     """What was found before; {} if nothing worked, without the file, or if it is damaged."""
     try:
-        found = json.loads(read_regular(path, MOST_BYTES))
+        found = json.loads(path.read_text("utf-8"))
         works = any(problem is None for _, _, _, problem in found["devices"])
         return found if works and isinstance(found["left_out"], dict) else {}
     except (OSError, ValueError, TypeError, LookupError):

@@ -71,8 +71,7 @@ def view_table(
         return table | {"pair_gradient": ((pairs, 2), np.float32)}
     table["shaded_features"] = (visible, 16), np.float32
     if training:
-        backward = visible, pixels, pairs, settings.blend, settings.footprint
-        table |= blend_backward_table(*backward)
+        table |= blend_backward_table(visible, pixels, pairs, settings.blend, settings.footprint)
     return table
 
 

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
+import numpy as np
+
 from pp_cl.engine.device.buffers import PIECE_BYTES, grown, table_bytes
 from pp_cl.engine.device.device import compiler_bytes
 from pp_cl.engine.device.host import available_bytes, resident_bytes
@@ -149,13 +151,21 @@ class Room:
         footprints, pixels of an image.
         """
         raster, train, n = self._raster, self._train, stretch.points
-        crop = self._size(stretch.refinements, crop_side(train.crop, stretch.refinements))
-        image = self._size(0, 0)
+        crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
+        image = self._padded_size(0, 0)
         pairs = grown(0, round(n * min(footprint_pixels(radius), math.prod(image))))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
         share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(image))
-        in_crop = math.prod(crop), round(share * pairs), round(share * visible)
-        in_image = math.prod(image), pairs, visible
+        of_step = view_table(
+            raster,
+            n,
+            math.prod(crop),
+            round(share * pairs),
+            round(share * visible),
+            training=True,
+        )
+        of_preview = view_table(raster, n, math.prod(image), pairs, visible)
+        of_pruning = view_table(raster, n, math.prod(image), pairs, 0, until="weights")
 
         held = [
             PointCloud.table(n, sh_blocks(self._points.sh_degree)),
@@ -164,21 +174,21 @@ class Room:
             smoothing_table(n if train.sh_smoothing > 0 else 0),
             self._net.table(crop, image),
             network_state_table(self._net.all_parameters.size, stretch.is_averaged),
-            loss_table(self.dev, crop, crop, has_ssim=train.ssim_weight > 0),
-            {"photograph": ((self._image,), "u1")},
+            loss_table(self.dev, crop, crop, train.ssim_weight),
+            {"photograph": ((self._image,), np.uint8)},
         ]
         taking_turns = [
-            [view_table(raster, n, *in_crop, training=True), target_table(crop)],
-            [view_table(raster, n, *in_image), target_table(image)],
+            [of_step, target_table(crop)],
+            [of_preview, target_table(image)],
         ]
         if stretch.refinements == 0 and train.prune_weight > 0:
-            taking_turns.append([view_table(raster, n, *in_image, until="weights")])
+            taking_turns.append([of_pruning])
         device = _bytes(held) + max(map(_bytes, taking_turns))
         tables = [*held, *(table for turn in taking_turns for table in turn)]
         largest = max(table_bytes({"": row}) for table in tables for row in table.values())
         return Need(device, n, largest, n * REFINING_BYTES if stretch.refinements else 0)
 
-    def _size(self, halvings, side):
+    def _padded_size(self, halvings, side):
         """(height, width) of a crop of the largest photograph, in whole multiples of what the
         network needs; side 0: of the whole image.
         """

@@ -18,11 +18,11 @@ FURTHER = ("mask", "spread")  # terms that not every training has
 
 
 def loss_table(
-    dev: Device, size: tuple[int, int], padded: tuple[int, int], *, has_ssim: bool
+    dev: Device, size: tuple[int, int], padded: tuple[int, int], ssim_weight: float
 ) -> Table:
-    """The buffers of Loss for a target of size (height, width) in a larger prediction."""
+    """The buffers of Loss for a target of size (height, width) in a prediction of a larger one."""
     height, width = size
-    values = lanes_of_loss(dev)
+    values, has_ssim = lanes_of_loss(dev), ssim_weight != 0 and min(size) >= TAPS
     window_rows = height - TAPS + 1 if has_ssim else 0
     blocks = (-(-3 * width // 16) * 16 + MARGIN) // values  # vectors in a scratch row
     return {
@@ -66,9 +66,8 @@ class Loss:
         """
         corner = corner_of(prediction.shape, target.shape, left, top)
         (height, width, _), pw, b = target.shape, prediction.shape[1], self._buffers
-        has_ssim = self.ssim_weight != 0 and min(height, width) >= TAPS
         padded = prediction.shape[0], prediction.shape[1]
-        b.require(loss_table(self.dev, (height, width), padded, has_ssim=has_ssim))
+        b.require(loss_table(self.dev, (height, width), padded, self.ssim_weight))
         window_rows, _, blocks, _ = b.moments.shape
         program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
         program.launch(
