@@ -88,7 +88,7 @@ def test_a_driver_that_hangs(vendors):
     vendors("broken")
     start = time.monotonic()
     found = listed()
-    assert time.monotonic() - start < 30
+    assert time.monotonic() - start < 60  # 20 for the one, then all others again
     assert {"crash.icd", "hang.icd", "unbuilding"} < set(found)
     assert "20 seconds" in found["hang.icd"]["problem"]
     left = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
