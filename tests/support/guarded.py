@@ -24,6 +24,11 @@ def large(*values):
     return pytest.param(*values, marks=pytest.mark.large)
 
 
+def slow(*values):
+    """Arguments of a test that others show in part: `make test-slow` runs them."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 class GuardedDevice(Device):
     """A Device whose fresh buffers hold NaN (0xff bytes) and are followed by canary bytes that
     check() compares.
