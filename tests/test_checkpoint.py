@@ -28,11 +28,8 @@ from support.runs import arguments, train_and_interrupt
 from pp_cl.checkpoint import load_run_state, stored_forms
 from pp_cl.config import load_config
 from pp_cl.engine.training.exposure import decided_at
-from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import FORMAT, save_checkpoint
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import load_run
-from pp_studio.view.drawing import draw
 
 
 @pytest.fixture
@@ -335,11 +332,3 @@ def test_finite_weights_that_overflow_are_one_line(trained, tmp_path, monkeypatc
     overflow(tmp_path / "run" / "checkpoint.npz")
     told = failure(words[0], "run", *words[1:])
     assert "run/checkpoint.npz: its parameters are too large, the image holds NaN" in told
-
-
-def test_a_model_that_overflows_is_told_by_the_viewer(trained, dev, tmp_path):
-    shutil.copytree(trained[0], tmp_path / "run")
-    overflow(tmp_path / "run" / "checkpoint.npz")
-    run = load_run(dev, tmp_path / "run")
-    with pytest.raises(UserError, match="the image holds NaN"):
-        draw(run, [], run.cameras("train")[0])

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 from support.models import drawn_alone
 from support.refused import failure
-from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl import load
@@ -136,20 +135,6 @@ def test_published_rows_are_printed_beside_what_compares(run, tmp_path, capsys, 
         assert len(result["published"]) == 5
         assert ("reduced 2 times" in result["published_differs"]) == (not compares)
         assert ("PlenopticPoints" in capsys.readouterr().out) == compares
-
-
-def test_an_unfinished_run_is_marked(tmp_path, capsys, monkeypatch):
-    scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
-    train_and_interrupt(scene, out, 15, monkeypatch)
-    capsys.readouterr()
-    assert main(["eval", str(out), "--metrics", "psnr"]) == 0
-    assert f"{out} (2 views, unfinished, step 10)" in capsys.readouterr().out
-    assert main(["info", str(out)]) == 0
-    assert "(unfinished, at step 10)" in capsys.readouterr().out
-    assert main(arguments(scene, out)) == 0 and main(["eval", str(out), "--metrics", "psnr"]) == 0
-    capsys.readouterr()
-    assert main(["info", str(out)]) == 0
-    assert "(unfinished" not in capsys.readouterr().out
 
 
 def test_an_evaluation_is_written_elsewhere_on_request(run, tmp_path, capsys):

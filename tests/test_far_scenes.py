@@ -62,15 +62,6 @@ def test_exact_moves_give_the_same_bits(at_origin, by, tmp_path):
     assert header["depth_range"] == expected["depth_range"]
 
 
-def test_refined_grids_give_the_same_bits_too(tmp_path):
-    changes = {"train__refine_at": "0.5,1.0", "points__count": 400}
-    (_, first, *_), (_, second, *_) = (
-        trained(tmp_path / str(i), by, unit=UNIT, **changes) for i, by in enumerate((NEAR, FAR))
-    )
-    assert first.keys() == second.keys()
-    assert all(np.array_equal(first[name], second[name]) for name in first)
-
-
 @pytest.fixture(scope="module")
 def far_run(tmp_path_factory, session_device):
     folder = tmp_path_factory.mktemp("far")

@@ -44,7 +44,6 @@ from pp_cl.engine.grid import Grid
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_mask, read_rgba
 from pp_cl.files.run_folder import Log, RunFolder
-from pp_cl.metrics.compare import compare
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
@@ -54,7 +53,7 @@ from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
 from pp_cl.settings import Config, every_setting
-from pp_studio.sweep.plan import Job, plan, read_varied
+from pp_studio.sweep.plan import Job
 from pp_studio.sweep.result import finished_row
 
 MOST_MEMORY = 2**26  # bytes of pixels that a small file may unfold to without a word
@@ -344,21 +343,6 @@ def test_a_log(world, data):
             strict_json(run.log)
 
 
-@fuzzed()
-@given(data=st.data())
-def test_metrics(world, data):
-    """Read by info, and by a sweep that goes on."""
-    with world.watched() as folder:
-        run = world.run(folder)
-        damage.damage_file(data.draw, run.metrics("test"))
-        tell(run)
-        row = taken(lambda: finished_row(job(world, run)))
-        if row:
-            json.dumps(row, allow_nan=False)
-            check_finite(**{name: row[name] for name in ("psnr", "ssim", "points")})
-            assert isinstance(row["device"], str)
-
-
 # --------------------------------------------------------------------------------------------------
 
 
@@ -385,41 +369,6 @@ def test_a_mesh(world, data):
             assert 0 < surface.count <= 2000
             assert found.pop("points") == 9**3
             assert all(0 <= share <= 1 for share in found.values())
-
-
-@fuzzed()
-@given(data=st.data())
-def test_pictures_to_compare(world, data):
-    draw = data.draw
-    with world.watched() as folder:
-        height, width = one(draw, (16, 16), (1, 1), (6, 6), (11, 11), (13, 40))
-        noise = np.random.default_rng(0).integers(0, 256, (4, height, width, 3)).astype(np.uint8)
-        for i, pixels in enumerate(noise[: one(draw, 2, 3, 4)]):
-            (folder / "ab"[i % 2]).mkdir(exist_ok=True)
-            Image.fromarray(pixels).save(folder / "ab"[i % 2] / f"{i // 2}.png")
-        damage.damage_file(draw, one(draw, *sorted((folder / "a").iterdir())))
-        result = taken(lambda: compare(folder / "a", folder / "b"))
-        for row in [result["mean"], *result["per_image"]] if result else ():
-            check_finite(psnr=row["psnr"], ssim=row["ssim"])
-            assert -1 <= row["ssim"] <= 1
-
-
-varied = st.tuples(keys, st.sampled_from(["=", "=", ""]), damage.words).map("".join)
-scenes = st.sampled_from([None, None, "demo", "DEMO"]) | damage.words
-
-
-@fuzzed()
-@given(
-    st.lists(varied, max_size=2),
-    st.lists(scenes, min_size=1, max_size=2),
-)
-def test_a_sweep(world, varied, scenes):
-    with world.watched() as folder:
-        scenes, out = [scene or str(world.scene()) for scene in scenes], folder / "out"
-        jobs = taken(lambda: plan(scenes, out, [0, 1], read_varied(varied))) or []
-        for one_job in jobs:
-            assert os.path.realpath(one_job.folder).startswith(os.path.realpath(out) + "/")
-        assert len({one_job.folder for one_job in jobs}) == len(jobs)
 
 
 @fuzzed(2)
@@ -461,16 +410,3 @@ def test_a_command_line(world, data):
         for option in draw(st.lists(options, max_size=2)):
             words += [option] if rarely(draw) else [option, draw(damage.words)]
         command(draw(damage.words) if rarely(draw, 20) else name, *words, *ENDING.get(name, ()))
-
-
-@fuzzed()
-@given(data=st.data())
-def test_a_variable_of_the_environment(world, data):
-    name = one(data.draw, "PP_DEVICE", "PP_DEBUG", "PP_MAX_ALLOCATION", "PP_CACHE", "PP_FORM")
-    places = st.sampled_from(["/proc/nothing", "/dev/null", "a b", "relative", "/"])
-    text = data.draw(places | damage.words).replace("\0", "")
-    text = text.encode("utf-8", "ignore").decode()[:30_000]  # what a system takes
-    with world.watched() as folder, pytest.MonkeyPatch.context() as patch:
-        words = ["eval", world.run(folder)] if data.draw(st.booleans()) else ["devices"]
-        patch.setenv(name, text)
-        command(*words)

@@ -121,21 +121,6 @@ def test_a_scene_says_what_is_in_it(scene, facts):
     assert (np.abs(hull["box"]) < 1.5 * BALL).all()
 
 
-def test_a_scene_in_lines_and_the_preset_of_its_hull(scene, capsys):
-    assert main(["info", scene, "--preset", "full"]) == 0
-    text = capsys.readouterr().out
-    points = int(text.split("hull")[1].split()[0])
-    assert 170_000 <= points <= 174_000
-    for part in ("train 8, test 2", "10 of 48x48", "100% of the training views", "(estimated)"):
-        assert part in text
-    assert "-0.000" not in text
-
-
-def test_a_scene_takes_settings(tmp_path, facts):
-    path = write_ball_scene(tmp_path / "large", views=3, size=400)
-    assert facts(path, "--set", "scene.downscale=4")["downscale"] == 4
-
-
 def test_a_scene_without_masks_or_hull_has_a_picture(tmp_path, facts, capsys):
     scene = Path(write_ball_scene(tmp_path / "ball", views=5))
     *others, path = (scene / "train").iterdir()
@@ -176,13 +161,6 @@ def test_the_picture_draws_the_points_around_the_object(scene, is_run, tmp_path,
         assert off.max() < 5  # the masks' margins, and a point's width
         directions = np.arctan2(y, x)[np.abs(off) < 5] / (2 * np.pi) * 24
         assert set(np.floor(directions)) == set(range(-12, 12))
-
-
-def test_the_demo_is_a_scene_too(facts, monkeypatch):
-    monkeypatch.setattr("pp_cl.scene.demo.TRAIN_VIEWS", 6)
-    found = facts("demo")
-    assert found["format"] == "demo" and found["splits"] == {"train": 6, "test": 16}
-    assert found["downscale"] == 2 and found["distances"] == pytest.approx([3.4, 3.4])
 
 
 def test_a_broken_evaluation_is_one_line(finished, tmp_path):

@@ -109,12 +109,6 @@ def test_memory_is_planned_for_the_largest(dev, scene):
     assert mixed == turned and 0.9 * largest.device < mixed.device <= largest.device
 
 
-def test_info_lists_the_sizes(scene, capsys, tmp_path):
-    assert main(["info", scene, "--picture", str(tmp_path / "a.png")]) == 0
-    said = capsys.readouterr().out
-    assert all(f"4 of {w}x{h}" in said for w, h in SIZES)
-
-
 def test_pictures_of_different_sizes_lie_in_equal_cells():
     images = [np.full((h, w, 3), i, np.uint8) for i, (w, h) in enumerate(SIZES)]
     picture = tiles(images, 2)

@@ -9,7 +9,7 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.commands.compare_mesh import mesh_shape, run_shape
+from pp_cl.commands.compare_mesh import run_shape
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
@@ -61,21 +61,6 @@ def test_a_refined_run_is_compared_on_its_last_grid(dev, scene, mesh, tmp_path):
     assert facts["grid"] == {"dims": [2 * n for n in hull.grid.dims], "edge": hull.grid.edge / 2}
     assert facts["before"]["points"] == 8 * len(hull.ids) > facts["after"]["points"]
     assert facts["before"]["recall"] > 0.8
-
-
-def test_a_run_that_was_extended_is_compared_as_before(dev, scene, mesh, tmp_path):
-    """In so many steps from the start, its grid would have been refined."""
-    changes = {"train__refine_at": "0.3,1", "points__count": 300, "train__prune_every": 15}
-    out = train(scene, tmp_path / "run", **changes)
-    before = run_shape(dev, RunFolder(out), mesh, 1000)["before"]
-    assert main(["train", "--out", str(out), "--iterations", "80"]) == 0
-    assert run_shape(dev, RunFolder(out), mesh, 1000)["before"] == before
-
-
-def test_a_mesh_alone(dev, mesh):
-    coarse, fine = (mesh_shape(dev, mesh, edge, 100_000)["surface"] for edge in (0.2, 0.1))
-    assert 3 < fine / coarse < 5
-    assert mesh_shape(dev, mesh, 0.1, 100_000)["grid"]["edge"] == 0.1
 
 
 def test_another_scene_is_noticed(dev, mesh, trained, tmp_path):

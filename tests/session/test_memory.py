@@ -187,16 +187,6 @@ def test_the_hosts_memory(plain, monkeypatch):
     check(room(plain, **photographs))
 
 
-@pytest.mark.parametrize("base", ["tiny", "small", "paper"])
-def test_presets_on_a_device_of_four_gibibytes(plain, base):
-    plain.info |= {"memory_bytes": 4 * GIB, "max_allocation_bytes": 2 * GIB}
-    points = preset(base).points.count
-    if base == "paper":
-        refusal(room(plain, base, network__widths="128,256,512"), points)
-    else:
-        check(room(plain, base), points)
-
-
 def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
     made = room(plain)
     plain.info["memory_bytes"] = needed(plain, points=preset("tiny").points.count).device

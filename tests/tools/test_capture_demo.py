@@ -6,19 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pp_cl.files.image import read_rgba
-from tools.capture_demo import align, cameras, write_photographs
+from tools.capture_demo import align, cameras
 
 pytestmark = pytest.mark.slow
-
-
-def test_photographs_and_masks(dev, tmp_path):
-    write_photographs(dev, tmp_path / "a", 64)
-    names = sorted(file.name for file in (tmp_path / "a" / "images").iterdir())
-    assert len(names) == 64 and names[0] == "000.png"
-    image = read_rgba(tmp_path / "a" / "images" / "007.png")
-    mask = read_rgba(tmp_path / "a" / "masks" / "007.png")[..., 0]
-    assert (image[..., 3] == 255).all() and 0.02 < (mask > 127).mean() < 0.5
 
 
 def test_cameras_are_compared_up_to_a_similarity(rng):

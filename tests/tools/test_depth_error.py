@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from pp_cl.scene.demo import demo_frames, demo_mesh
-from tools.depth_error import DemoSurface, near_share, overlap
+from tools.depth_error import DemoSurface
 
 pytestmark = pytest.mark.slow
 
@@ -28,10 +28,3 @@ def test_the_depth_is_where_rays_meet_the_mesh(dev, rng):
     assert agree.mean() > 0.95 and np.isfinite(exact).sum() > 5
     both = np.isfinite(exact) & np.isfinite(found)
     assert np.median(np.abs(exact[both] - found[both])) < 0.004  # the mesh's edge is 0.0075
-
-
-def test_measures():
-    exact = np.array([[1.0, 2.0], [3.0, np.inf]])
-    seen = np.isfinite(exact)
-    assert near_share(exact + [[0.1, 0.3], [-0.1, 0]], exact, seen, 0.2) == 2 / 3
-    assert overlap(np.array([[1, 1, 0]], bool), np.array([[0, 1, 1]], bool)) == 1 / 3

@@ -105,35 +105,3 @@ def test_settings_and_commands_are_complete():
     assert all(f"| `{key}` |" in TABLES["settings"] for key, _, _ in every_setting(Config()))
     assert all(f"## pp-cl {name}\n" in TABLES["commands"] for name in COMMANDS)
     assert "- `--seed N`: " in TABLES["commands"]
-
-
-def test_it_writes_what_changed_and_nothing_else(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(TOOL, "digest", lambda: "0123")
-    (tmp_path / "docs" / "results").mkdir(parents=True)
-    (tmp_path / "docs" / "results" / "times.json").write_text(json.dumps(RESULTS))
-    readme = tmp_path / "README.md"
-    readme.write_text("before\n\n<!-- table: times -->\nold\n<!-- end table -->\nafter\n")
-    (tmp_path / "docs" / "other.md").write_text("| a | b |\n")
-    assert TOOL.main(tmp_path) == 0
-    assert capsys.readouterr().out == "wrote README.md\n"
-    assert readme.read_text() == (
-        f"before\n\n<!-- table: times -->\n\n{TABLE}\n\n<!-- end table -->\nafter\n"
-    )
-    assert TOOL.main(tmp_path) == 0
-    assert capsys.readouterr().out == ""
-
-
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ("<!-- table: nobody -->\n<!-- end table -->\n", "nobody.json"),
-        ("<!-- table: times -->\n| a |\n", "lacks"),
-        ("| a |\n<!-- end table -->\n", "lacks"),
-    ],
-)
-def test_bad_markers(text, word, tmp_path, capsys):
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "README.md").write_text(text)
-    assert TOOL.main(tmp_path) == 2
-    assert word in capsys.readouterr().err
-    assert (tmp_path / "README.md").read_text() == text

@@ -7,7 +7,7 @@ from pp_cl.engine.device.buffers import gather_rows
 from pp_cl.engine.device.device import Device, kernel_folder
 from pp_cl.engine.device.kernel import parse_signatures
 from tools import gpu_check
-from tools.gpu_check import TARGETS, Build, check, complaints, main, missing
+from tools.gpu_check import TARGETS, Build, check, complaints, missing
 
 CPU_FILES = {"layers/winograd", "layers/winograd_backward_weights", "layers/winograd_transform"}
 PTXAS = """ptxas info    : Compiling entry function 'one' for 'sm_90'
@@ -70,21 +70,6 @@ def test_what_compilers_say(target, tmp_path, text, macros, found):
     (tmp_path / "x.cl").write_text(text)
     lines = check(target, Build("x", macros), {"k"})
     assert bool(lines) == bool(found) and all(found in line for line in lines)
-
-
-def test_a_missing_compiler_is_named_and_the_rest_checked(monkeypatch, capsys):
-    monkeypatch.setattr(gpu_check, "find", lambda name: name if name == "ocloc" else None)
-    monkeypatch.setattr(gpu_check, "unpack_missing", lambda: "no apt-get here")
-    monkeypatch.setattr(gpu_check, "record", lambda: {Build("a", ()): {"one"}})
-    monkeypatch.setattr(gpu_check, "compile_build", lambda *_: "")
-    assert main(["--targets", "sm_90,dg2"]) == 2
-    out, err = capsys.readouterr()
-    assert "sm_90 is not checked: clang-19 is missing" in err and "no apt-get here" in err
-    assert out == "1 builds for dg2: 0 complaints\n"
-    monkeypatch.setattr(gpu_check, "compile_build", lambda *_: OCLOC)
-    assert main(["--targets", "dg2"]) == 1
-    monkeypatch.setattr(gpu_check, "record", lambda: {Build("a", ()): {"other"}})
-    assert main(["--targets", "dg2"]) == 0
 
 
 def test_what_is_built_and_launched_is_recorded():

@@ -2,11 +2,9 @@
 tables; a training and its evaluation become a row.
 """
 
-from functools import partial
-
 import pytest
 
-from tools import docs_tables, provenance
+from tools import docs_tables
 from tools import results as TOOL
 
 ROW = {"name": "lego", "size": "200x200", "preset": "tiny", "steps": 300, "views": 200}
@@ -37,17 +35,6 @@ FOUND |= {"rasteriser": [TOOL.by_stage(RASTER)], "network": [NET], "memory": [ME
 FOUND |= {"pytorch": [TORCH], "stages": dict.fromkeys(TOOL.STEPS, STEP)}
 
 
-def test_what_was_found_is_kept_until_the_code_changes(tmp_path, monkeypatch):
-    calls, kept = [], tmp_path / "kept"
-    monkeypatch.setattr(TOOL, "PARTS", {"a": lambda _: calls.append(1) or {"n": len(calls)}})
-    TOOL.begin(kept, "one")
-    assert TOOL.measure(kept, "a") == TOOL.measure(kept, "a") == {"n": 1}
-    TOOL.begin(kept, "one")
-    assert TOOL.measure(kept, "a") == {"n": 1}
-    TOOL.begin(kept, "two")
-    assert TOOL.measure(kept, "a") == {"n": 2}
-
-
 def test_tables_and_plots(tmp_path):
     about = dict.fromkeys(("commit", "date", "machine", "decides"), "1")
     for contents in TOOL.tables(FOUND).values():
@@ -60,35 +47,9 @@ def test_tables_and_plots(tmp_path):
     assert len({*tmp_path.glob("*.png")}) == 4
 
 
-def test_another_kind_has_the_tables_of_what_was_measured(tmp_path, monkeypatch):
-    about = dict.fromkeys(("commit", "date", "machine", "decides"), "1")
-    monkeypatch.setattr(TOOL, "RESULTS", results := tmp_path / "results")
-    monkeypatch.setattr(TOOL, "ROOT", tmp_path)
-    monkeypatch.setattr(TOOL, "PARTS", {name: lambda _, n=name: FOUND[n] for name in FOUND})
-    monkeypatch.setattr(TOOL, "origin", lambda: about)
-    for part in ("lego_300", "network"):
-        monkeypatch.setattr("sys.argv", ["results", "--kind", "avx2", "--only", part])
-        assert TOOL.main() == 0
-    found = docs_tables.read_results(results)
-    assert found.keys() == {"avx2/trainings", "avx2/network"}
-    assert found["avx2/trainings"]["rows"] == [ROW] and found["avx2/network"]["rows"] == [NET]
-    assert (tmp_path / "runs" / "results-avx2" / "lego_300.json").exists()
-    assert len(provenance.older(results, "2")) == 2
-
-
 @pytest.mark.slow
 def test_a_training_becomes_a_row(tmp_path):
     row = TOOL.train(TOOL.Training("demo", "demo", "tiny", 4), tmp_path)
     assert row.keys() == ROW.keys()
     assert (row["size"], row["steps"], row["views"]) == ("200x200", 4, 16)
     assert row["psnr"] > 5 and row["minutes"] > 0 and row["points"] > 1000
-
-
-def test_a_program_that_fails_is_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(TOOL, "ROOT", tmp_path)
-    fails = partial(TOOL.run_program, *TOOL.PP_CL, "eval", "/no")
-    monkeypatch.setattr(TOOL, "PARTS", {"a": lambda _: fails()})
-    monkeypatch.setattr(TOOL, "origin", lambda: {"commit": "one"})
-    monkeypatch.setattr("sys.argv", ["results"])
-    assert TOOL.main() == 2
-    assert "/no/config.json" in capsys.readouterr().err

@@ -4,36 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from pp_cl.bench.conv import Layer, UploadedLayer, layer_errors
+from pp_cl.bench.conv import Layer, layer_errors
 from pp_cl.engine.layers.choice import OFFERED, VARIANTS, blocking_of, device_class
 from tools import tune as TOOL
-
-
-@pytest.mark.usefixtures("cpu_form")
-def test_the_fastest_candidates_make_the_row(dev, rng, monkeypatch, capsys):
-    """As if fewer accumulators, and four tiles of one group together, were faster."""
-    tried = []
-
-    def runner(conv, variant, direction, blocking):
-        tried.append((variant, direction, blocking))
-        return lambda: blocking
-
-    def interleave(runs):
-        """{name: [milliseconds]}."""
-        return {
-            name: [run().accumulators + 100 * (run().winograd != (64, 4))]
-            for name, run in runs.items()
-        }
-
-    monkeypatch.setattr(UploadedLayer, "runner", runner)
-    monkeypatch.setattr(TOOL, "interleave", interleave)
-    found = TOOL.tuned(dev, [UploadedLayer(dev, Layer.random(rng, (8, 8), (16,), 16))])
-    assert found.winograd == (64, 4) and found.accumulators == 4
-    assert found.direct == TOOL.CANDIDATES["CPU"][2][2][0]["direct"]
-    assert {direction for _, direction, _ in tried} == {*TOOL.IMAGES, *TOOL.WEIGHTS}
-    assert len(capsys.readouterr().out.splitlines()) == sum(
-        len(candidates) for _, _, candidates in TOOL.CANDIDATES["CPU"]
-    )
 
 
 @pytest.mark.slow

@@ -56,21 +56,6 @@ def test_packed_arrays(dev, rng):
     assert before < dev.bytes < used
 
 
-def test_packed_arrays_are_there_after_memory_was_short(dev, monkeypatch):
-    """Of the same rows again."""
-    packed, row = PackedArrays(dev), [((9,), np.float32)]
-
-    def refuse(*_):
-        raise UserError("no memory")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.engine.device.buffers.packed_arrays", refuse)
-        with pytest.raises(UserError):
-            packed.send(row, [np.zeros(9, np.float32)])
-    [array] = packed.send(row, [np.ones(9, np.float32)])
-    assert (array.get() == 1).all()
-
-
 def test_a_reading_is_what_the_kernels_before_it_left(dev, rng):
     """Whatever is enqueued after it."""
     first, second = (rng.normal(size=257).astype(np.float32) for _ in range(2))

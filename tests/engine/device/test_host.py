@@ -1,8 +1,6 @@
 """The memory of the machine, as Linux and a container tell it."""
 
-import ctypes
 import mmap
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from pp_cl.engine.device import host
 from pp_cl.engine.device.device import Device
 
 MIB = 2**20
-THP = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 
 
 @pytest.fixture
@@ -65,18 +62,6 @@ def test_this_machine():
     assert host.available_bytes() > host.resident_bytes()
 
 
-def asked_bytes():
-    """Memory of this process for which huge pages were asked for."""
-    found = size = 0
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        words = line.split()
-        if words[0] == "Size:":
-            size = 1024 * int(words[1])
-        elif words[0] == "VmFlags:" and "hg" in words:
-            found += size
-    return found
-
-
 def test_large_buffers_of_a_cpu_ask_for_huge_pages(monkeypatch):
     asked = []
     monkeypatch.setattr(
@@ -86,11 +71,3 @@ def test_large_buffers_of_a_cpu_ask_for_huge_pages(monkeypatch):
     held = [dev.empty((size,), np.uint8) for size in (MIB, 64 * MIB)]
     assert [nbytes for _, nbytes in asked] == [64 * MIB] * dev.is_cpu
     assert all(place for place, _ in asked), held
-
-
-@pytest.mark.skipif(not THP.exists(), reason="no huge pages")
-def test_memory_that_asks_for_huge_pages_is_marked():
-    memory = mmap.mmap(-1, 64 * MIB, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    before = asked_bytes()
-    host.ask_for_huge_pages(ctypes.addressof(ctypes.c_char.from_buffer(memory)), 64 * MIB)
-    assert asked_bytes() - before > 63 * MIB

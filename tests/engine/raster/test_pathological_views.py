@@ -2,14 +2,12 @@
 one huge point.
 """
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.bench.spheres import find_all_pairs
 from pp_cl.engine.raster.project import FOOTPRINTS
 from pp_cl.errors import UserError
 from pp_cl.reference import dense as oracle
@@ -118,28 +116,6 @@ def test_an_image_of_millions_of_pixels(dev):
             assert set(points[offsets[at] : offsets[at + 1]]) == set(expected)
             found += len(expected)
     assert found > 1000
-
-
-@pytest.mark.large
-def test_long_lists_do_not_take_quadratic_time(dev):
-    """Eight times the hits in one pixel, 8 log-ish times the time; 64 if it were quadratic. The
-    best of some runs, by the time of all of a CPU's threads.
-    """
-    clock = time.process_time if dev.is_cpu else time.perf_counter
-    camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)
-
-    def best(n):
-        positions = np.zeros((n, 3))
-        positions[:, 2] = np.random.default_rng(1).permutation(np.linspace(2.2, 5.9, n))
-        scene, seconds = PairedPoints(dev, camera, positions, 0.1), []
-        for _ in range(4):
-            start = clock()
-            find_all_pairs(dev, scene.buffers, scene.projected, scene.shape, scene.pairs.capacity)
-            scene.blend(np.ones(n), 0.05, np.zeros((n, 16)), early_stop=1e-3)
-            seconds.append(clock() - start)
-        return min(seconds)
-
-    assert best(160_000) < 30 * best(20_000)
 
 
 @pytest.mark.large

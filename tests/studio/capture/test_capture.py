@@ -135,22 +135,6 @@ def test_nothing_in_the_scene_is_distorted(captured):
     np.testing.assert_array_equal(read_rgba(captured / one.name), straight)
 
 
-def test_images_of_which_few_fit_as_of_a_turned_object_they_are_placed_as_usual(
-    captured, tmp_path, monkeypatch
-):
-    """As pairs with few matches are left out there, which may be all between two rounds."""
-    work, mapped = captured / "capture", poses._mapped
-    taken = found(captured, "frames")["images"]
-    monkeypatch.setattr(
-        poses, "_mapped", lambda *given: [] if given[-1] else mapped(*given[:-1], turns=False)
-    )
-    database, images = work / "database.db", work / "frames"
-    placed = poses.place(database, images, tmp_path / "model", taken, turns=True)
-    assert placed["placed"] == COUNT
-    assert {one.name for one in (tmp_path / "model").iterdir()} >= {"cameras.bin", "images.bin"}
-    assert not (tmp_path / "model" / "usual").exists()
-
-
 @pytest.mark.slow
 def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
     """That of larger photographs, which EXIF may keep: with it, few images have a place."""
@@ -428,13 +412,6 @@ def test_what_the_page_changed_is_obeyed(captured, shot, tmp_path):
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == edits["box"]
     assert len(list((scene / "masks").iterdir())) == COUNT
     assert found(scene, "masks")["line"].startswith(f"{COUNT - 1} given")
-
-
-def test_each_stage_leaves_a_picture(captured):
-    """But for those whose result is not to be seen."""
-    for stage in ("frames", "poses", "box", "masks"):
-        width, height = Image.open(captured / "capture" / f"{stage}.png").size
-        assert width >= 1000 and height >= 300
 
 
 def turned(dev, folder, steps, wall=None):

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.ndimage import (
-    binary_closing,
     binary_dilation,
     binary_erosion,
-    binary_opening,
     gaussian_filter,
 )
 from support.refused import refusing
@@ -22,15 +20,13 @@ from support.scenes import ball_image, ring_cameras
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_mask, read_rgba
-from pp_cl.scene.demo import ANGLE, OBJECT_BOX, demo_mesh, render
+from pp_cl.scene.demo import OBJECT_BOX, demo_mesh, render
 from pp_cl.scene.image_file import Photograph
-from pp_cl.scene.outline import OUTLINE
 from tools.capture_demo import ROOM, cameras, room
 
 pytest.importorskip("cv2")
 
 from pp_studio.capture import backdrop, cut
-from pp_studio.capture.box import MARGIN
 from pp_studio.capture.masks import mask_file, picture, program_words, write_masks
 from pp_studio.capture.window import Window, window
 
@@ -144,51 +140,6 @@ def test_a_box_that_cuts_the_object_grows(capture):
     assert (np.abs(capture.box) < 1.3 * whole[1]).all()
 
 
-def test_what_lies_around_the_object_is_no_seed(capture):
-    """Labels on the table are on nobody's side, so that colours decide."""
-    reach = 0.78 * (1 + 2 * MARGIN * np.sqrt(3))  # as find_world() has it around the ball
-    box = np.array([[-reach] * 3, [reach] * 3])
-    lying, own = [0.7, 0, -0.75], [0, 0, 0.5]
-    one = window(np.zeros((SIZE, SIZE, 3), np.uint8), capture.photographs[0], box)
-    points, both = np.array([lying, own]), np.array([0, 1])
-    labels = cut._seeds(one, box, points, np.array([True, True]), both)
-    _, rows, columns = one.inside(points)
-    assert labels[rows[0], columns[0]] != cut.cv2.GC_FGD
-    assert labels[rows[1], columns[1]] == cut.cv2.GC_FGD
-
-
-def test_thin_parts_and_gaps_are_told_by_the_wall(dev, tmp_path):
-    """The demo's spokes are a pixel wide here, and masks by colour lose them or fill the gaps."""
-    around = [one.with_angle(1.6 * ANGLE) for one in cameras(4 * SIZE, "turntable")]
-    views = [(one, render(dev, one)) for one in around[: 2 * VIEWS : 2]]
-    middle, wall = np.zeros((1, 3)), lambda camera: room(camera, (1.0, 2.0))
-    capture = Capture(tmp_path / "scene", views, OBJECT_BOX, middle, wall=wall)
-    windows = []
-    for one in capture.photographs:
-        windows.append(window(read_rgba(capture.folder / one.name)[..., :3], one, capture.box))
-    truth = [
-        one.reduced(np.uint8(mask)) > 0 for one, mask in zip(windows, capture.truth, strict=True)
-    ]
-    surely = [binary_opening(mask, iterations=3) for mask in truth]
-    filled = [binary_closing(mask, iterations=3) for mask in truth]
-
-    def flat(images):
-        return np.concatenate([one.ravel() for one in images])
-
-    def odds(masks):
-        for one, mask in zip(windows, masks, strict=True):
-            one.mask = mask
-        differences = backdrop.differences(windows, capture.points[capture.count :])
-        beside = [~mask for mask in masks]
-        return flat(backdrop.evidence(differences, beside, surely))
-
-    of_thin, of_filled, shown = odds(surely), odds(filled), flat(truth)
-    assert (of_thin[shown & ~flat(surely)] > cut.STANDS_OUT).mean() > 0.8
-    assert (of_thin[~shown] < 0).mean() > 0.95
-    beside = ~flat([binary_dilation(mask) for mask in truth])
-    assert (of_filled[flat(filled) & beside] < cut.IS_WALL).mean() > 0.8
-
-
 def turned(folder, views, box, surface, wall):
     """A Capture of an object that turns, whose wall has no points, as it stands still."""
     capture = Capture(folder, views, box, surface, wall=wall)
@@ -279,17 +230,6 @@ def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
     alone, voted = share_held(capture, place, wanted=True)
     assert alone < 0.2
     assert voted > 0.8
-
-
-def test_small_regions_beside_the_object_go():
-    mask = np.zeros((60, 80), bool)
-    mask[10:50, 10:40] = True
-    parts = mask.copy()
-    parts[20:30, 50:60] = True  # a part of the object
-    stained = parts.copy()
-    stained[40:43, 70:73] = True
-    np.testing.assert_array_equal(cut.without_islands(stained), parts)
-    assert not cut.without_islands(np.zeros((3, 4), bool)).any()
 
 
 def test_what_is_there_is_kept_and_helps(capture):
@@ -470,17 +410,6 @@ def test_a_photograph_beside_the_object_has_an_empty_mask(capture):
     assert f"1 empty, as the object is outside, {VIEWS - 1} cut out" in line
     assert not read_mask(capture.file(3)).any()
     assert np.delete(capture.agreement(), 3).min() > 0.9
-
-
-def test_the_picture_shows_outlines(capture, tmp_path):
-    """In a colour that the photographs lack, the named ones first."""
-    capture.write(given=given_masks(capture, tmp_path / "given"))
-    first = [capture.photographs[7].name]
-    sheet = picture(capture.folder, capture.photographs, first)
-    assert (sheet == OUTLINE).all(2).sum() > 12 * SIZE
-    alone = picture(capture.folder, capture.photographs[7:8])
-    height, width = alone.shape[:2]
-    assert (sheet[:height, :width] == alone).all()
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """`pp-cl make`: what is left is done, and a folder tells of it."""
 
-import json
 import re
 import shutil
 
@@ -11,10 +10,8 @@ from pp_cl.cli import main
 from pp_cl.files.atomic import write_json
 from pp_cl.files.image import read_rgba
 from pp_cl.files.manifest import begin_manifest
-from pp_cl.run import load
 from pp_studio.capture import STAGES
 from pp_studio.commands import make
-from pp_studio.export.result import write_result
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +52,6 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
     assert status == 2 and "train.minutes is 0.1 there, 7.0 asked for" in lines[-1]
 
 
-def test_a_folder_that_has_moved_goes_on(made, tmp_path):
-    """With its scene."""
-    scene, folder = made
-    shutil.copytree(scene, tmp_path / "scene")
-    shutil.copytree(folder, tmp_path / "out")
-    (tmp_path / "out/index.html").unlink()
-    status, lines = spoken(["make", tmp_path / "scene", "--out", tmp_path / "out"])
-    assert status == 0, lines
-    stored = json.loads((tmp_path / "out/run/config.json").read_text())
-    assert stored["scene"]["path"] == str(tmp_path / "scene")
-
-
 def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, monkeypatch):
     _, folder = made
     assert main(["info", str(folder)]) == 0
@@ -81,17 +66,6 @@ def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, mo
     with pytest.raises(AttributeError):  # of what is not there to serve
         main(["view", str(folder), "--port", "0"])
     assert shown[0].path == folder / "run"
-
-
-def test_the_page_has_every_metric_that_was_measured(made):
-    _, folder = made
-    file = folder / "run" / "eval" / "metrics.json"
-    kept = file.read_text()
-    found = json.loads(kept)
-    file.write_text(json.dumps(found | {"mean": found["mean"] | {"lpips": 0.1234}}))
-    write_result(load(folder / "run"), "test", folder, "film.mp4")
-    file.write_text(kept)
-    assert "<td>LPIPS</td><td>0.1234</td>" in (folder / "index.html").read_text("utf-8")
 
 
 def test_what_is_not_its_own_stays(made, tmp_path):
@@ -155,10 +129,3 @@ def test_hints_of_photographs_are_refused_for_a_scene(made, tmp_path):
     assert status == 2 and "--turntable" in lines[-1] and not (tmp_path / "new").exists()
     status, lines = spoken(["make", tmp_path / "none", "--out", tmp_path / "new"])
     assert status == 2 and "give photographs, a video or a scene" in lines[-1]
-
-
-def test_what_a_capture_has_found_is_told(tmp_path):
-    (tmp_path / "capture").mkdir()
-    for stage in STAGES:
-        write_json(tmp_path / f"capture/{stage}.json", {"line": f"{stage} done"})
-    assert make._captured(tmp_path) == [f"{stage}: {stage} done" for stage in list(STAGES)[:-1]]

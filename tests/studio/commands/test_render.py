@@ -138,15 +138,6 @@ def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
     assert np.isinf(channels["Z"][channels["A"] == 0]).all()
 
 
-def test_cameras_of_a_file(trained, tmp_path):
-    words = ["--path", str(tmp_path / "path.json"), "--size", "32x32"]
-    (tmp_path / "path.json").write_text(
-        '{"camera_path": [{"fov": 40, "camera_to_world": [1,0,0,0, 0,1,0,0, 0,0,1,4, 0,0,0,1]}]}'
-    )
-    assert main(["render", trained, *words, "--out", str(tmp_path / "file.gif")]) == 0
-    assert (tmp_path / "file.gif").exists()
-
-
 def test_a_path_of_no_frame_is_refused(trained):
     """Four seconds at a frame in ten."""
     told = failure("render", trained, "--fps", "0.1")

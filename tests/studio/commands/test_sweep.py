@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 from support.checkpoints import load_checkpoint
-from support.refused import failure
 from support.scenes import write_ball_scene
 from support.sweeps import jobs_of, pretend, words_of
 
@@ -67,13 +66,6 @@ def test_a_finished_sweep_needs_no_dask(tmp_path, capsys, nothing_starts):
     assert "| demo |      2 | 21.50" in capsys.readouterr().out
     stored = json.loads((out / "sweep.json").read_text())
     assert [row["folder"] for row in stored["runs"]] == ["demo/seed-1", "demo/seed-2"]
-
-
-def test_dask_is_missing(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.delitem(sys.modules, "pp_studio.sweep.cluster", raising=False)
-    told = failure(*words_of(["demo"], tmp_path / "out"))
-    assert "pip install dask distributed" in told
 
 
 # ---- whole sweeps

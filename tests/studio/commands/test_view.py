@@ -10,7 +10,6 @@ import urllib.error
 import urllib.request
 
 import pytest
-from support.guarded import slow
 from support.refused import failure
 from support.runs import arguments
 from support.scenes import write_ball_scene
@@ -75,22 +74,6 @@ def test_a_scene_is_shown_from_the_background_of_a_shell(tmp_path):
         assert process.communicate(timeout=SECONDS) == ("", "")
     finally:
         process.kill()
-
-
-@pytest.mark.unix
-@pytest.mark.parametrize("host", [slow("localhost"), "0.0.0.0", slow("::")])  # noqa: S104
-def test_the_address_of_a_host_works(begun, host):
-    """Whichever of its numbers the name of this machine stands for; only others' reach warns."""
-    process = started(begun, "--host", host, "--port", "0")
-    try:
-        address = process.stdout.readline().split()[1]
-        if host != "::":  # the name of this machine may stand for no address of IPv6
-            assert status(address) == 200
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=SECONDS)
-    finally:
-        process.kill()
-    assert ("nothing is encrypted" in err) == (host != "localhost")
 
 
 def test_a_busy_port_is_one_line_and_status_2(begun):

@@ -37,13 +37,6 @@ def test_a_path_may_be_a_text_and_a_format_that_there_is_not_is_one_line(run, tm
         export(run, "obj", tmp_path / "a.obj")
 
 
-def test_a_scene_can_be_given_its_folder(run, tmp_path):
-    (tmp_path / "empty").mkdir()
-    path = check_target("scene", tmp_path, tmp_path / "empty")
-    assert export(run, "scene", path) == "12 train views, 2 test views"
-    assert len(load_scene(path, ("test",)).splits["test"]) == 2
-
-
 @pytest.mark.parametrize("name", ["ply", "mesh", "textured", "splat"])
 def test_a_box_holds_a_part_and_axes_turn_it(name, run, tmp_path):
     box, places = (-1, -1, -1, 1, 1, 0.25), {}

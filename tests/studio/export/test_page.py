@@ -14,12 +14,11 @@ from support.models import blend_matrix
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
-from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import load_run
 from pp_studio.export.harmonics import basis
 from pp_studio.export.observe import directions, observe
-from pp_studio.export.page import POINT, check_drawable, pack, page_text, write_gallery
+from pp_studio.export.page import POINT, check_drawable, page_text, write_gallery
 
 
 @pytest.fixture(scope="module")
@@ -77,16 +76,6 @@ def test_points_are_kept_to_within_a_step(run, page):
     assert opacity == pytest.approx(run.model.cloud.opacity.get(), abs=0.6 / 65535)
     growth = rows["radius"] / 255 - 0.5
     assert growth == pytest.approx(run.model.cloud.offset.get()[:, 3], abs=0.6 / 255)
-
-
-def test_coefficients_are_kept_to_within_a_step(run, rng):
-    known = rng.normal(size=(run.model.cloud.count, 9, 3)).astype(np.float32)
-    rows, low, span = pack(run, known)
-    values = rows["colour"].reshape(-1, 9, 3)
-    found = low[:, None] + span[:, None] * (values / np.float32(255))
-    inside = (known > low[:, None]) & (known < (low + span)[:, None])
-    assert 0.99 < inside.mean() < 1
-    assert np.abs(found - known)[inside].max() <= span.max() / 255 * 0.51
 
 
 def test_what_it_keeps_shows_what_the_run_shows(run, page):
@@ -170,15 +159,6 @@ def test_footprints_are_never_smaller_than_a_pixel(run, page):
     assert np.abs(drawn - predicted(run, page, far)).max() <= 3
 
 
-def test_footprints_grow_where_the_object_is_larger_than_in_training(run, page):
-    """They close gaps: the page covers more than the rasteriser does."""
-    far = run.cameras("test")[0]
-    near = replace(far, fx=2 * far.fx, fy=2 * far.fy)
-    script = f"ppcl.setCamera({page_camera(near)}); return ppcl.canvas.toDataURL();"
-    drawn = image_of(ask(page, script)).astype(int)
-    assert np.mean(drawn < 250) > np.mean(predicted(run, page, near) < 250)
-
-
 CONTROLS = """
     const seen = [], see = () => { ppcl.show(); seen.push(ppcl.canvas.toDataURL()); };
     const send = (type, x, y, more) => ppcl.canvas.dispatchEvent(new PointerEvent(
@@ -221,41 +201,6 @@ def test_mouse_and_keys_move_the_camera(page):
     assert rise[0] - rise[1] == pytest.approx(20 / 200, abs=1e-4)
 
 
-PINCH = """
-    const seen = [], see = () => { ppcl.show(); seen.push(ppcl.canvas.toDataURL()); };
-    const send = (type, id, x) => ppcl.canvas.dispatchEvent(new PointerEvent(
-        type, { pointerId: id, pointerType: "touch", clientX: x, clientY: 100, bubbles: true }));
-    see();
-    send("pointerdown", 1, 100); send("pointerdown", 2, 140);
-    send("pointermove", 2, 180); see();
-    send("pointerup", 2, 180); send("pointermove", 1, 120); see();
-    ppcl.canvas.dispatchEvent(new MouseEvent("dblclick")); see();
-    return { seen, address: location.hash };"""
-
-
-def test_fingers_move_the_camera(page):
-    found = ask(page, PINCH)
-    assert len(set(found["seen"])) == 3 and found["seen"][0] == found["seen"][3]
-    eye, target = (in_address(found, name) for name in ("eye", "target"))
-    header = kept(page)[0]
-    first = np.linalg.norm(np.subtract(header["eye"], header["centre"]))
-    assert np.linalg.norm(eye - target) == pytest.approx(first / 2, rel=1e-4)
-
-
-def test_a_phone_shows_the_whole_object(page):
-    script = "ppcl.show(); return ppcl.canvas.toDataURL();"
-    image = image_of(ask(page, script, "#w=60&h=130"))
-    assert image.shape == (130, 60, 3) and image.min() < 200
-    assert image[:, [0, -1]].min() > 200 and image[[0, -1]].min() > 200
-
-
-def test_it_says_what_it_is(run, page):
-    text = page.read_text("utf-8")
-    visible = re.search(r"<header>(.*)</header>", text)[1]
-    assert "<b>run</b>" in visible and f"{run.model.cloud.count:,} points" in visible
-    assert "og:image" not in text  # nobody knows the address of one
-
-
 def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):
     assert write_gallery(tmp_path / "all", [run, run]) == 2
     names = {path.name for path in (tmp_path / "all").iterdir()}
@@ -269,13 +214,6 @@ def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):
         still = read_rgba(tmp_path / "all" / f"{stem}.png")
         assert still.shape[:2] == (315, 600) and still[..., :3].min() < 200
         assert still[:, [0, -1], :3].min() > 200
-
-
-def test_names_in_a_gallery_differ_whatever_their_case(run, tmp_path):
-    others = [replace(run, folder=RunFolder(tmp_path / name)) for name in ("RUN", "Index")]
-    assert write_gallery(tmp_path / "all", [run, *others]) == 3
-    names = [path.name.lower() for path in (tmp_path / "all").iterdir()]
-    assert len({*names}) == len(names) == 2 * 3 + 1
 
 
 def test_the_runs_name_is_text(run_folder, session_device, tmp_path):

@@ -7,7 +7,6 @@ import gsply
 import numpy as np
 import plyfile
 import pytest
-import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from support.gltf import glb
@@ -188,11 +187,3 @@ def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     ours, theirs = colours(harmonics, towards), colours(found["harmonics"], towards * flip)
     assert ours == pytest.approx(theirs, abs=1e-4)
-
-
-def test_programs_that_draw_points_read_the_glb(y_up, tmp_path):
-    table, origin = y_up
-    write_splat_glb(tmp_path / "a.glb", table, origin)
-    (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
-    assert isinstance(cloud, trimesh.PointCloud) and len(cloud.vertices) == len(table)
-    assert cloud.colors.shape == (len(table), 4)

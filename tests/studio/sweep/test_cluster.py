@@ -1,12 +1,10 @@
 """Dask as a sweep uses it: who listens where, and what it says of tasks that fail."""
 
-import errno
 import os
 import re
 import signal
 import sys
 from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import psutil
 import pytest
@@ -55,17 +53,6 @@ def test_workers_have_devices_of_their_own_and_listen_on_loopback_alone():
     assert not any(psutil.pid_exists(pid) for pid in pids - {os.getpid()})
 
 
-def test_workers_that_do_not_start_are_one_line(monkeypatch):
-    """As where a process may open few files, of which each worker takes a dozen."""
-
-    def failing(**_):
-        raise RuntimeError("Nanny failed to start.") from OSError(errno.EMFILE, "Too many files")
-
-    monkeypatch.setattr(cluster, "LocalCluster", failing)
-    with refusing("workers", "Too many files"), cluster.local_client(1):
-        pass
-
-
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "what://127.0.0.1:1"])
 def test_nobody_at_the_address(monkeypatch, address):
     monkeypatch.setattr(cluster, "ANSWER", 1)
@@ -73,31 +60,8 @@ def test_nobody_at_the_address(monkeypatch, address):
         pass
 
 
-@pytest.mark.parametrize(
-    "threads, waited, words",
-    [
-        ({"w0": 1, "w1": 4}, None, ["several runs", "--nthreads 1"]),
-        ({}, TimeoutError, ["no Dask scheduler with workers"]),
-    ],
-)
-def test_workers_that_a_sweep_cannot_use(monkeypatch, threads, waited, words):
-    client = MagicMock()
-    client.__enter__.return_value = client
-    client.nthreads.return_value, client.wait_for_workers.side_effect = threads, waited
-    monkeypatch.setattr(cluster, "Client", lambda *_, **__: client)
-    with refusing("--scheduler tcp://s", *words), cluster.client_of("tcp://s"):
-        pass
-
-
 def future(status, exception=None):
     return SimpleNamespace(status=status, exception=lambda: exception)
-
-
-def test_tasks_that_end_without_a_row(tmp_path):
-    (job,) = jobs_of(["demo"], tmp_path)
-    row = cluster._row(future("error", ValueError("odd\nmore")), job)
-    assert row["error"] == f"odd more; see {job.log}"
-    assert "scheduler is gone" in cluster._row(future("cancelled"), job)["error"]
 
 
 @pytest.fixture
@@ -147,12 +111,6 @@ def test_what_goes_wrong_is_the_rows_error(job, monkeypatch, error, said):
     assert cluster.run_job(job, None, lambda: False)["error"].startswith(said)
     log = job.log.read_text()
     assert "said meanwhile\n" in log and ("Traceback" in log) == ("see" in said)
-
-
-def test_a_worker_that_does_not_see_the_folder(job):
-    job.log.parent.rmdir()
-    error = cluster.run_job(job, None, lambda: False)["error"]
-    assert str(job.log) in error and "workers must see" in error
 
 
 def test_a_scene_that_cannot_be_measured_is_not_trained(tmp_path):

@@ -53,17 +53,3 @@ def test_a_measurement_that_is_not_whole_is_made_again(job):
         assert finished_row(job) is None
     file.write_text(whole)
     assert finished_row(job)["psnr"] == 21.5
-
-
-def test_more_metrics_than_asked_for_are_left_out(job, tmp_path):
-    pretend(job, 21.5)
-    (fewer,) = jobs_of(["demo"], tmp_path / "out", [4], metrics=["psnr"])
-    assert "ssim" not in finished_row(fewer) and finished_row(fewer)["psnr"] == 21.5
-    (more,) = jobs_of(["demo"], tmp_path / "out", [4], metrics=["psnr", "lpips"])
-    assert finished_row(more) is None
-
-
-def test_a_lost_log_leaves_the_seconds_unknown(job):
-    pretend(job, 21.5)
-    RunFolder(job.folder).log.unlink()
-    assert finished_row(job)["seconds"] is None

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pp_studio.sweep.table import markdown, overall_means, scene_means, write_tables
+from pp_studio.sweep.table import markdown, write_tables
 
 
 def row(scene, seed, psnr=None, ssim=0.5, points=100, seconds=1.0, *, setting=None, error=None):
@@ -22,37 +22,6 @@ ROWS = [
     row("b", 1, 31.0, 0.25, points=11, seconds=10.0),
     row("b", 2),
 ]
-
-
-def test_settings_are_kept_apart():
-    rows = [
-        row(scene, 0, psnr, setting={"points.count": count})
-        for scene, count, psnr in [("a", "5", 1.0), ("a", "6", 2.0), ("b", "5", 3.0)]
-    ]
-    means = scene_means(rows)
-    assert [(m["scene"], m["settings"]["points.count"]) for m in means] == [
-        ("a", "5"),
-        ("a", "6"),
-        ("b", "5"),
-    ]
-    assert [
-        (m["settings"]["points.count"], m["scenes"], m["psnr"]) for m in overall_means(means)
-    ] == [
-        ("5", 2, 2.0),
-        ("6", 1, 2.0),
-    ]
-
-
-def test_a_scene_without_a_good_run_has_no_numbers_and_is_counted_as_missing():
-    means = scene_means([row("a", 1, 20.0), row("b", 1)])
-    assert "psnr" not in means[1] and means[1]["failed"] == 1
-    (overall,) = overall_means(means)
-    assert (overall["scenes"], overall["missing"], overall["psnr"]) == (1, 1, 20.0)
-
-
-def test_unknown_seconds_make_no_mean():
-    (mean,) = scene_means([row("a", 1, 20.0), row("a", 2, 22.0, seconds=None)])
-    assert "seconds" not in mean and mean["psnr"] == 21.0
 
 
 def test_the_table_as_text():

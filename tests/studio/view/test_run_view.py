@@ -5,7 +5,6 @@ import io
 import json
 import os
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.session.training import open_training
 from pp_studio.view.drawing import draw
-from pp_studio.view.model_page import STILL, ModelPage, framed
+from pp_studio.view.model_page import STILL, ModelPage
 from pp_studio.view.run_view import RunView, shown_training
 
 CAMERA = ring_cameras(3, 48)[2]
@@ -68,20 +67,6 @@ def test_a_moving_camera_gets_drafts_and_one_at_rest_the_full_picture(view, serv
         assert view.page.draw_next()
 
 
-def test_the_size_follows_the_training_and_has_a_bound(view, served):
-    with looking(view, served[1]) as opened:
-        for size, side in (("double", 192), ("half", 48)):
-            opened.set("Picture size", size)
-            wait(lambda size=size: view.page._size.value == size)
-            drawn(view)
-            opened.picture(lambda image, side=side: len(image) == side)
-        view.page._most_pixels = 20 * 20
-        opened.set("Picture size", "double")
-        wait(lambda: view.page._size.value == "double")
-        drawn(view)
-        opened.picture(lambda image: len(image) == 20)
-
-
 def test_switches_change_what_is_drawn(view, served):
     camera = CAMERA.resized(96, 96)
     changes = (
@@ -100,30 +85,6 @@ def test_switches_change_what_is_drawn(view, served):
             else:
                 opened.set(label, value)
             opened.picture(check)
-
-
-def test_a_photograph_is_shown_in_the_middle_and_without_frustums(view, served):
-    wide = replace(CAMERA, width=96, cx=48)
-    with looking(view, served[1], wide) as opened:
-        opened.set("Show", "photograph")
-        opened.receive(
-            "SetSceneNodeVisibilityMessage",
-            lambda m: (m["name"], m["visible"]) == ("/views", False),
-        )
-        drawn(view)
-        photograph, _ = draw(view.page.run, view.page._views, wide, "photograph")
-        image = opened.picture(lambda image: image.shape == (24, 48, 3))
-        assert np.abs(image[:, 12:36] - photograph.astype(int)).mean() < 10
-        assert np.abs(image[:, :8] - (23, 24, 27)).max() < 30
-    np.testing.assert_array_equal(framed(photograph, 0.5)[12:36], photograph)
-
-
-def test_a_click_goes_to_a_view(view, served):
-    goal = view.page._views[4].camera
-    with looking(view, served[1]) as opened:
-        opened.click("/views/4")
-        found = opened.receive("SetCameraPositionMessage", lambda m: not m["initial"])
-        np.testing.assert_allclose(view.page._space.world(found["position"]), goal.eye, atol=1e-5)
 
 
 def test_the_picture_is_saved_as_it_is(view, served):
@@ -195,18 +156,6 @@ def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copie
         second = view.page.run
         view.look()
         assert "corrupt" in view.told.content and view.page.run is second
-
-
-def test_the_curve_follows_the_log(view, copied):
-    lines = (copied / "log.jsonl").read_text().splitlines(keepends=True)
-    steps = view.page._curve.data[0]
-    assert len(steps) == len(lines) - 1 and view.page._curve.visible  # the last says "finished"
-    (copied / "log.jsonl").write_text(lines[0] + lines[1][:9])
-    view.look()
-    assert view.page._curve.data[0].tolist() == steps[:1].tolist()
-    row = json.loads(lines[0])
-    view.page.set_rows([row | {"step": step} for step in range(1600)])
-    assert len(view.page._curve.data[0]) == 400
 
 
 def test_a_run_whose_photographs_are_gone_is_still_shown(served, dev, copied):

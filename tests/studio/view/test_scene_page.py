@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from support.refused import failure
 from support.viewing import tab, wait
 
-from pp_cl.files.image import ORIENTATION
 from pp_cl.scene.load import scene_frames
 from pp_studio.view.scene_page import DROPPED, ScenePage, hull_points
 
@@ -70,17 +68,6 @@ def test_a_view_of_two_splits_is_listed_once(served, folder):
     assert len(names) == len(set(names)) == 10
 
 
-def test_a_photograph_that_exif_turns_is_upright(served, folder):
-    file, turned = folder / "transforms_train.json", Image.Exif()
-    name = scene_frames(folder)[0].name
-    data = json.loads(file.read_text())
-    data["frames"][0] |= {"w": 48, "h": 36}
-    file.write_text(json.dumps(data))
-    turned[ORIENTATION] = 6
-    Image.new("RGBA", (36, 48)).save(folder / name, exif=turned)
-    assert ScenePage(served[0], folder)._read(name).shape == (36, 48, 3)
-
-
 def test_a_box_is_set_dragged_and_removed(page, opened, folder):
     opened.set("From", [-1, -1, -1])
     opened.set("To", [1, 1, 2])
@@ -128,11 +115,6 @@ def test_one_view_of_each_split_stays(page, opened, folder):
     opened.set("Drop", True)
     told(opened, "no view of split train would be left")
     assert edits(folder) == {"dropped": names[1:]}
-
-
-def test_a_click_chooses_a_view(page, opened):
-    opened.click("/views/train/r_5.png")
-    opened.receive("GuiUpdateMessage", lambda m: m["updates"].get("value") == "train/r_5.png")
 
 
 def test_a_broken_file_is_told(page, opened, folder):

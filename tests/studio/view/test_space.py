@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.scenes import ring_cameras
 
-from pp_studio.view.space import Space, thumbnail
+from pp_studio.view.space import Space
 
 SPACE = Space(np.array([1e6, 2.0, -3.0]), 1e-3)
 CAMERA = replace(ring_cameras(3, 48)[1].moved(SPACE.centre), height=40, cy=20)
@@ -68,11 +68,3 @@ def test_who_looks_through_a_camera_sees_its_axis(served):
     np.testing.assert_allclose(forward, CAMERA.pose[:, 2], atol=1e-9)
     assert abs(forward @ tab.look_at) < 1e-6 * np.linalg.norm(tab.position)
     np.testing.assert_allclose(np.tan(tab.fov / 2), 20 / CAMERA.fy)
-
-
-def test_a_thumbnail_is_small_and_over_white():
-    image = np.zeros((512, 1024, 4), np.uint8)
-    image[:, 512:] = (255, 0, 0, 255)
-    small = thumbnail(image)
-    assert small.shape == (128, 256, 3)
-    assert (small[:, :120] == 255).all() and (small[:, 136:] == (255, 0, 0)).all()
