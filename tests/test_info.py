@@ -146,12 +146,9 @@ def outlined(path, tile):
     return (read_rgba(path)[y : y + 48, x : x + 48, :3] == OUTLINE).all(-1)
 
 
-@pytest.mark.parametrize("is_run", [False, True])
-def test_the_picture_draws_the_points_around_the_object(scene, is_run, tmp_path, capsys):
-    path, subject = tmp_path / "points.png", scene
-    if is_run:
-        subject = tmp_path / "run"
-        assert main(arguments(scene, subject, train__iterations=2, train__prune_weight=0)) == 0
+def test_the_picture_draws_the_points_around_the_object(scene, tmp_path, capsys):
+    path, subject = tmp_path / "points.png", tmp_path / "run"
+    assert main(arguments(scene, subject, train__iterations=2, train__prune_weight=0)) == 0
     assert main(["info", str(subject), "--picture", str(path)]) == 0
     assert f"wrote {path}" in capsys.readouterr().out
     radius = BALL / math.sqrt(16 - BALL**2) * 24 / math.tan(0.35)  # of the ball, in pixels

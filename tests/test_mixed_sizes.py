@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from support.guarded import slow
 from support.refused import failure
 from support.runs import arguments, checkpoint, train_and_interrupt
 from support.scenes import ball_image, ring_cameras
@@ -42,19 +41,16 @@ def scene(tmp_path_factory):
     return str(folder)
 
 
-@pytest.fixture(
-    scope="module", params=[24, slow(0), slow(64)], ids=["crops", "whole", "larger crops"]
-)
-def trained(request, scene, tmp_path_factory):
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("mixed") / "run"
-    assert main(arguments(scene, out, 1, train__crop=request.param)) == 0
+    assert main(arguments(scene, out, 1)) == 0
     return out
 
 
 def test_a_training_learns_and_resumes_to_the_same_bytes(scene, trained, tmp_path, monkeypatch):
-    crop = json.loads((trained / "config.json").read_text())["train"]["crop"]
-    train_and_interrupt(scene, tmp_path / "run", 33, monkeypatch, downscale=1, train__crop=crop)
-    assert main(arguments(scene, tmp_path / "run", 1, train__crop=crop)) == 0
+    train_and_interrupt(scene, tmp_path / "run", 33, monkeypatch, downscale=1)
+    assert main(arguments(scene, tmp_path / "run", 1)) == 0
     assert checkpoint(tmp_path / "run") == checkpoint(trained)
     psnr = [row["psnr"] for row in RunFolder(trained).rows() if "psnr" in row]
     assert psnr[-1] > psnr[0] + 3

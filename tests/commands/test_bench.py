@@ -43,6 +43,18 @@ def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
     assert lines[0].split()[1:5] == ["enc0.a", "8x8x16x16x3", "forward", first["variant"]]
     assert f"{first['rel_l2']:.1e}" in lines[0] and "GFLOP/s" in lines[0]
     assert sum("grid" in line and "weights" in line for line in lines) == 8
+    for row in rows:
+        if row["bench"] == "conv":
+            height, width, ci, co, k = row["shape"]
+            operations = 2e-6 * k * k * ci * co * height * width
+            assert row["rel_l2"] < 1e-5 and row["gflops"] == pytest.approx(operations / row["ms"])
+        elif row["bench"] == "unet":
+            assert 0 < row["rel_l2"] < 10 * 2e-6 and row["max_err"] > 0  # ten layers
+        elif row["bench"] == "raster":
+            assert row["forward_ms"] + row["backward_ms"] == pytest.approx(
+                sum(row["stages_ms"].values())
+            )
+            assert 0 < row["shaded"] <= row["points"] and 0 < row["max_err"] < 1e-4
 
 
 def test_a_step_on_a_small_scene(tmp_path, capsys):

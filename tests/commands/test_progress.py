@@ -1,8 +1,6 @@
 """What a training shows while it runs, on a terminal and elsewhere."""
 
 import io
-import os
-from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
@@ -61,21 +59,3 @@ def test_a_terminal_has_one_line(training, monkeypatch):
     last = text.rstrip("\n").rpartition("\r")[2]
     assert last.startswith("100%|") and " 400/400, " in last and "step/s, 00:00 left" in last
     assert last.rstrip().endswith(", PSNR 27.31 (test 25.50), 1200 points, 1.50 GiB")
-
-
-@pytest.mark.unix
-def test_a_terminal_that_tells_no_size_shows_the_line(training, monkeypatch):
-    import pty
-
-    """As those of containers and of `script` do, whose size is 0 x 0."""
-    master, slave = pty.openpty()
-    monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
-    with open(slave, "w") as stream, progress.Progress(training, stream) as follower:
-        for step in range(101, 105):
-            follower(step, ROW)
-    text = b""
-    with suppress(OSError):  # nobody writes any more
-        while piece := os.read(master, 10_000):
-            text += piece
-    os.close(master)
-    assert b"104/400" in text and b"PSNR 27.3" in text

@@ -29,21 +29,8 @@ def test_a_preset_reduces_large_images_and_says_so(tmp_path, capsys):
     chosen = f"{line} for the preset tiny (--downscale 1 keeps them)"
     assert chosen in trained_lines(capsys, scene, "--out", out)
     assert json.loads((out / "config.json").read_text())["scene"]["downscale"] == 2
-    assert line in trained_lines(capsys, scene, "--out", tmp_path / "a", "--downscale", "2")
     given = ("--set", "scene.downscale=1")
     assert "images: 400x400" in trained_lines(capsys, scene, "--out", tmp_path / "b", *given)
-
-
-def test_a_run_keeps_the_size_of_its_images(tmp_path, capsys, monkeypatch):
-    """Also one of before, whose images were not reduced unless it was told to."""
-    scene, out = write_ball_scene(tmp_path / "ball", size=300), tmp_path / "run"
-    words = arguments(scene, out, downscale=1, train__iterations=6)
-    with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.session.training.Training._after_step", _interrupting)
-        assert main(words) == 130
-    capsys.readouterr()
-    assert main(["train", scene, "--out", str(out)]) == 0
-    assert "images: 300x300" in capsys.readouterr().out.splitlines()
 
 
 def test_memory_and_what_is_left_out_are_a_line_each(tmp_path, capsys):
@@ -52,15 +39,6 @@ def test_memory_and_what_is_left_out_are_a_line_each(tmp_path, capsys):
     lines = trained_lines(capsys, scene, "--out", tmp_path / "a", *refined)
     assert sum(line.startswith("refinements: 1 of the 2 ") for line in lines) == 1
     assert sum(line.startswith("memory") for line in lines) == 1 and len(lines) < 9
-
-
-def _interrupting(*_):
-    raise KeyboardInterrupt
-
-
-@pytest.mark.parametrize("preset, expected", [("tiny", 2), ("small", 1), ("full", 1), ("paper", 1)])
-def test_the_demo_is_reduced_by_the_same_rule(tmp_path, preset, expected):
-    assert run_config(RunFolder(tmp_path / "run"), "demo", preset).scene.downscale == expected
 
 
 def failing_step(self):
@@ -82,26 +60,6 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
     assert not (out / "previews" / "step_000001.png").exists()
     told = failure(*arguments(scene, out, **words), "--preset", "tiny")
     assert "preset is small there" in told
-
-
-def test_a_start_without_a_checkpoint_keeps_what_is_not_said_anew(tmp_path, monkeypatch):
-    scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
-    with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
-        main(arguments(scene, folder.path, network__rate="100,100"))
-    config = run_config(folder, scene, None, [("network.rate", "1e-3,1e-4", "--set")])
-    assert config.network.rate == (1e-3, 1e-4)
-    assert (config.scene.downscale, config.points.count, config.train.crop) == (2, 1500, 24)
-
-
-def test_iterations_take_the_place_of_minutes_that_came_to_nothing(tmp_path, monkeypatch):
-    scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
-    words = ["train", scene, "--out", str(folder.path), "--minutes", "0.1", "--points", "300"]
-    with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
-        assert main(words) == 2
-    config = run_config(folder, scene, None, [("train.iterations", "40", "--iterations")])
-    assert (config.train.iterations, config.train.minutes) == (40, 0)
 
 
 def test_what_a_training_has_decided_is_decided_anew(tmp_path, monkeypatch):

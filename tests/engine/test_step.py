@@ -8,7 +8,6 @@ import shutil
 import numpy as np
 import pytest
 from support.checkpoints import load_checkpoint
-from support.guarded import slow
 from support.refused import failure
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
@@ -55,12 +54,9 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
 
 
-@pytest.mark.parametrize("blocks", [slow("double"), "gated"])
-def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
-    scene, tmp_path, monkeypatch, blocks
-):
+def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(scene, tmp_path, monkeypatch):
     whole, run = tmp_path / "whole", tmp_path / "run"
-    changes = {"network__blocks": blocks, "train__iterations": 80}
+    changes = {"network__blocks": "gated", "train__iterations": 80}
     assert main(arguments(scene, whole, **changes)) == 0
     losses = [r["loss"] for r in rows(whole)[:-1]]
     assert np.mean(losses[-3:]) < 0.6 * losses[0]
@@ -68,7 +64,7 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     assert main(["train", scene, "--out", str(run)]) == 0  # the settings are the run's
     assert checkpoint(run) == checkpoint(whole)
     told = failure(*arguments(scene, run, network__blocks="single"))
-    assert f"network.blocks is {blocks} there, single asked for" in told
+    assert "network.blocks is gated there, single asked for" in told
 
 
 def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_path, monkeypatch):
@@ -134,15 +130,13 @@ def test_what_has_a_rate_of_0_is_left_alone(scene, tmp_path, monkeypatch):
     assert main(arguments(scene, tmp_path / "run", **changes)) == 0
 
 
-@pytest.mark.parametrize("degree", [0, slow(1)])
-def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path, degree):
+def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path):
     lower, zero = tmp_path / "lower", tmp_path / "zero"
-    rates = ",".join(["0.5", "0.25", "0.125"][: degree + 1] + ["0"] * (2 - degree))
-    assert main(arguments(scene, lower, points__sh_degree=degree)) == 0
-    assert main(arguments(scene, zero, train__sh_rate=rates)) == 0
+    assert main(arguments(scene, lower, points__sh_degree=0)) == 0
+    assert main(arguments(scene, zero, train__sh_rate="0.5,0,0")) == 0
     _, arrays = load_checkpoint(lower / "checkpoint.npz")
     _, expected = load_checkpoint(zero / "checkpoint.npz")
-    assert set(expected) - set(arrays) == {f"points.sh{d}" for d in range(degree + 1, 3)}
+    assert set(expected) - set(arrays) == {"points.sh1", "points.sh2"}
     for name, array in arrays.items():
         np.testing.assert_array_equal(array, expected[name])
 

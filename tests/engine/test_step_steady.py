@@ -81,8 +81,6 @@ class Recorder:
     "name, planned",
     [
         ("tiny", False),
-        ("paper", True),
-        ("tiny", True),
         ("tiny, ignored pixels", False),
         ("paper", False),
         ("paper, crops", True),
@@ -120,21 +118,3 @@ def test_the_end_holds_no_view_beside_another(dev, scene, tmp_path, monkeypatch)
     monkeypatch.setattr(trainer, "_keep", keeping)
     trainer.finish()
     assert len(drawn) == len(trainer.views)
-
-
-def test_planned_steps_learn_the_same(dev, scene, tmp_path, monkeypatch):
-    """Gradients of the first step, with background tiles left out and without."""
-    found = []
-    for planned in (False, True):
-        monkeypatch.setattr(pp_cl.engine.network.unet, "LEAST_PIXELS", 0 if planned else 10**9)
-        monkeypatch.setattr(pp_cl.engine.network.unet, "MOST_COMPUTED", 2)
-        trainer = make_trainer(dev, scene, tmp_path / str(planned), "tiny")
-        assert trainer.model.net.is_planned((48, 48)) == planned
-        terms = trainer.train_step().get()
-        gradients = {name: g.get() for name, g in trainer.model.net.gradients.items()}
-        found.append((terms, gradients))
-    (terms, gradients), (planned_terms, planned_gradients) = found
-    assert planned_terms == pytest.approx(terms, rel=1e-5)
-    for name, gradient in gradients.items():
-        scale = np.abs(gradient).max()
-        assert np.abs(planned_gradients[name] - gradient).max() <= 1e-4 * scale, name

@@ -7,7 +7,7 @@ from PIL import Image
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.metrics.compare import compare, read_over_white
-from pp_cl.metrics.psnr_ssim import Metrics, mean
+from pp_cl.metrics.psnr_ssim import Metrics
 
 
 @pytest.fixture
@@ -26,15 +26,6 @@ def test_two_images(folders):
     result = compare(pred, truth, ("psnr", "ssim"))
     expected = Metrics(None, ("psnr", "ssim"))(read_over_white(pred), read_over_white(truth))
     assert result == {"mean": expected, "per_image": [{"name": "a.png", **expected}]}
-
-
-def test_two_folders_by_name(folders):
-    pred, truth = folders
-    result = compare(str(pred), str(truth), ("psnr",))
-    assert [row["name"] for row in result["per_image"]] == ["a.png", "b.png"]
-    for row in result["per_image"]:
-        assert row == compare(pred / row["name"], truth / row["name"], ("psnr",))["per_image"][0]
-    assert result["mean"] == mean(result["per_image"])
 
 
 def test_every_image_of_a_folder_is_compared_or_refused(folders):

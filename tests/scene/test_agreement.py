@@ -37,8 +37,7 @@ def test_a_hull_of_one_point_is_looked_at():
     assert disagreements(ball_views(8), np.stack([CENTRE, CENTRE])) == []
 
 
-@pytest.mark.parametrize("count", [24, 60])
-@pytest.mark.parametrize("bad", [0, 5])
+@pytest.mark.parametrize("count, bad", [(24, 0), (60, 5)])
 def test_a_shifted_mask_is_named(dev, count, bad):
     views = ball_views(count)
     views[bad] = shifted(views[bad], 0.15)

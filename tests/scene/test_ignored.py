@@ -125,11 +125,6 @@ def test_the_network_learns_the_same_where_tiles_are_left_out(dev, monkeypatch, 
     assert np.linalg.norm(whole - planned) < 1e-5 * np.linalg.norm(whole)
 
 
-def test_without_masks_they_have(tmp_path, expected):
-    scene = with_hand(tmp_path / "scene", (0, 200, 0, 0))
-    assert not same(trained(scene, tmp_path / "run", []), expected)
-
-
 def test_the_lens_moves_them_as_it_moves_the_image(tmp_path):
     """What is beside them is as without the hand, but for the ringing of the spline."""
     scene = with_hand(tmp_path / "scene", (255, 0, 90, 255))

@@ -96,19 +96,6 @@ def needed(dev, base="tiny", points=171_262, step=0, **changes):
     return room(dev, base, **changes).need_of(GRID, points, (2, 6), step)
 
 
-@pytest.mark.parametrize(
-    "name, shares, first, most",
-    [
-        ("tiny", "1,1", 252_312, 252_312),
-        ("small", "0.35,1", 171_262, 94_523 * 8),
-        ("full", "0.33,0.67", 171_262, 455_094 * 8),
-    ],
-)
-def test_the_points_at_the_peak_are_near_those_of_lego(dev, name, shares, first, most):
-    need = needed(dev, name, first, train__refine_at=shares)
-    assert need.points == pytest.approx(most, rel=0.1)
-
-
 def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
     once = {"train__refine_at": "0.35,1"}
     halfway = needed(dev, "small", points=118_025, step=600, **once)

@@ -110,11 +110,13 @@ def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path,
 
 
 @pytest.mark.parametrize("steps", [25, 5, 60])
-def test_another_scene_is_refused_at_any_state_of_the_run(scene, tmp_path, monkeypatch, steps):
+def test_another_scene_is_refused_at_any_state_of_the_run(
+    runs, scene, tmp_path, monkeypatch, steps
+):
     """With a checkpoint, before the first, and when the run is finished."""
     out, other = tmp_path / "run", write_ball_scene(tmp_path / "other", views=7)
     if steps == 60:
-        assert main(arguments(scene, out)) == 0
+        runs.trained(out, scene)
     else:
         train_and_interrupt(scene, out, steps, monkeypatch)
     before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
@@ -123,19 +125,17 @@ def test_another_scene_is_refused_at_any_state_of_the_run(scene, tmp_path, monke
     assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
 
 
-@pytest.mark.parametrize("share, stops", [(0.3, (12, 33)), (0.9, (52, 57))])
-def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch, share, stops):
-    """Stopped before and after the refinement, which may come after the averages' beginning."""
+def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch):
+    """Stopped before and after the refinement, which comes after the averages' beginning."""
     monkeypatch.setattr(*LOOKS)
     scene = write_ball_scene(tmp_path / "ball")
-    changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_weight": 0.05}
+    changes = {"train__refine_at": "0.9,1", "points__count": 300, "train__prune_weight": 0.05}
     changes["downscale"] = 1
     assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
     whole = checkpoint(tmp_path / "whole")
     points = {row["step"]: row["points"] for row in rows(tmp_path / "whole")[:-1]}
-    after = round(60 * share) // 5 * 5 + 5
-    assert points[after] > 4 * points[after - 5]
-    for steps in stops:
+    assert points[55] > 4 * points[50]
+    for steps in (52, 57):
         out = tmp_path / str(steps)
         train_and_interrupt(scene, out, steps, monkeypatch, **changes)
         assert main(arguments(scene, out, **changes)) == 0

@@ -68,13 +68,6 @@ def test_upload_fill_zeros_copy(dev, rng):
             dev.copy(b, other)
 
 
-def test_zero_size_arrays(dev):
-    a, b = dev.empty((0, 16)), dev.zeros((0, 16))
-    dev.fill(a, 1)
-    dev.copy(a, b)
-    assert a.get().shape == dev.upload(np.empty((0, 16), np.float32)).get().shape == (0, 16)
-
-
 @pytest.mark.parametrize("values", [np.zeros(8, np.float32), np.zeros(9, np.float64)])
 def test_writing_what_does_not_fit(dev, values):
     for write in (dev.write, dev.send):
@@ -211,15 +204,6 @@ def test_only_nvidias_driver_rules_out_a_watchdog(said, expected):
             return said
 
     assert device_module.has_watchdog(Driver()) is expected
-
-
-def test_a_build_takes_the_options_of_its_vendor(plain, tiny, monkeypatch):
-    monkeypatch.setattr(device_module, "vendor_options", lambda info, name: ("-DDOUBLED=1",))
-    (tiny / "doubled.cl").write_text(
-        "#ifndef DOUBLED\n#error none\n#endif\n"
-        "kernel void f(\n    global float *x)  // (N)\n{ x[0] = 1.0f; }\n"
-    )
-    assert plain.program("doubled").kernels.keys() == {"f"}
 
 
 def test_a_kernel_folder_with_a_space_is_refused(plain, tmp_path, monkeypatch):

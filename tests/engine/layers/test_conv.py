@@ -31,9 +31,7 @@ OF_3X3 = [param for param in ALL if param.values[1] == 3]
 
 
 @pytest.mark.parametrize("variant, k", ALL)
-@pytest.mark.parametrize(
-    "size, co", [((6, 7), 16), *(large(size, 48) for size in ((3, 2), (11, 14), (31, 33), (6, 70)))]
-)
+@pytest.mark.parametrize("size, co", [((6, 7), 16), large((31, 33), 48)])
 def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
     """The bits are those with all tiles; the other tiles of a result keep their NaN. The gradient
     of a tile that does not count may hold NaN, and so may inputs that no counted gradient sees.
@@ -70,7 +68,7 @@ def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, variant,
         assert launched > 1, direction
 
 
-@pytest.mark.parametrize("size, channels", [large((9, 13), 144), large((131, 40), 48)])
+@pytest.mark.parametrize("size, channels", [large((131, 40), 48)])
 def test_winograds_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch, size, channels):
     layer = Layer.random(rng, size, (channels,), channels)
     expected = layer.computed(dev, WINOGRAD, CPU)
@@ -80,15 +78,14 @@ def test_winograds_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch, si
             np.testing.assert_array_equal(actual, same)
 
 
-@pytest.mark.parametrize("most", [48, large(128)])
-def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
+def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch):
     layer = Layer.random(rng, (3, 9), (16,), 32)
     program = dev.program
 
     def limited(*args, **defines):
         found = program(*args, **defines)
         for kernel in found.kernels.values():
-            patch.setattr(kernel, "largest_group", most)
+            patch.setattr(kernel, "largest_group", 48)
         return found
 
     # first, as sizes that were launched are not checked again

@@ -81,11 +81,6 @@ def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
     assert np.isnan(highest.get()[point])
 
 
-def test_a_softmax_has_no_spread(dev, rng):
-    with pytest.raises(ValueError, match="spread"):
-        Blended(dev, rng).gradients(spread_weight=1.0)
-
-
 def test_the_softmax_by_hand(dev):
     """0.04 units of depth are one e-fold at gamma = 0.01 and a range of 4; the exponent scales with
     the opacity, so a near faint point does not hide a far opaque one: this is no alpha

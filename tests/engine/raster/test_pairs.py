@@ -1,6 +1,5 @@
 """Hits: those of crops, of miscounts and of long lists; buffers that are reused; the bits."""
 
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -94,22 +93,10 @@ def test_buffers_serve_views_of_any_size(dev, rng):
 
 
 @pytest.mark.large
-def test_work_and_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch):
-    """A unit that read all pairs made 64 units take several times as long in all. The time of
-    all of a CPU's threads, which other programs do not lengthen as they do the clock's.
-    """
-    clock = time.process_time if dev.is_cpu else time.perf_counter
+def test_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch):
     camera = replace(make_camera(400, 400), fx=300.0, fy=300.0, cx=200.0, cy=200.0)
     scene = PairedPoints(dev, camera, make_points(rng, 30_000), 0.1, kind="disc")
-    buffers, seconds = Buffers(dev), {}
-    for units in 5 * [2, 64] + [1, 3, 16, 1000]:
+    for units in (1, 3, 16, 1000):
         monkeypatch.setitem(dev.info, "compute_units", units)
-        dev.queue.finish()
-        start = clock()
-        pairs = find_pairs(dev, buffers, scene.projected, scene.shape, scene.pairs.total)
-        dev.queue.finish()
-        took = clock() - start
-        if units not in seconds:
-            assert all(map(np.array_equal, bits(scene.pairs), bits(pairs)))
-        seconds.setdefault(units, []).append(took)
-    assert min(seconds[64]) < 1.5 * min(seconds[2])
+        pairs = find_pairs(dev, Buffers(dev), scene.projected, scene.shape, scene.pairs.total)
+        assert all(map(np.array_equal, bits(scene.pairs), bits(pairs)))

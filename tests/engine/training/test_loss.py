@@ -45,14 +45,6 @@ def test_a_nan_is_not_hidden(dev, rng, weight):
     assert np.isnan(terms[0]) and np.isnan(grad[5, 6, 1])
 
 
-def test_smooth_l1_is_torchs(rng):
-    """torch.nn.SmoothL1Loss(beta=0.05) of these errors."""
-    error = np.array([0.0, 0.01, -0.05, 0.3]).reshape(1, 4, 1).repeat(3, axis=2)
-    terms, grad = oracle_loss.loss(error, np.zeros_like(error), 0.0, 0.05)
-    assert terms[0] == pytest.approx((0.001 + 0.025 + 0.275) / 4)
-    np.testing.assert_allclose(12 * grad[0, :, 0], [0, 0.2, -1, 1])
-
-
 def test_ssim_is_scikit_images(dev, rng):
     prediction, target = images(rng, 37, 64)
     terms, _ = run(dev, prediction, target, 0.2)

@@ -24,7 +24,7 @@ from pp_cl.files.image import read_rgba, to_8bit, write_png
 from pp_cl.scene.demo import render
 from pp_cl.scene.distortion import Distortion, undistort
 from pp_cl.scene.load import load_scene, scene_format, scene_frames
-from pp_studio.capture import STAGES, poses
+from pp_studio.capture import poses
 from pp_studio.capture.features import quiet, verification
 from pp_studio.capture.frames import take_images
 from pp_studio.video import write_video
@@ -254,8 +254,7 @@ def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
     assert changed(mug) == before
 
 
-@pytest.mark.parametrize("words", [[], *(slow(["--from", stage]) for stage in STAGES)])
-def test_what_is_the_users_stays(captured, shot, tmp_path, words):
+def test_what_is_the_users_stays(captured, shot, tmp_path):
     """Files beside those of the capture, and what the user has changed of these, but for masks."""
     scene = shutil.copytree(captured, tmp_path / "scene")
     own = scene / "capture" / "frames" / "003.png"
@@ -272,8 +271,9 @@ def test_what_is_the_users_stays(captured, shot, tmp_path, words):
         for name in ("mine.png", ".own", "pairs.txt"):
             (folder / name).write_text("mine")
             kept[folder / name] = (folder / name).stat().st_mtime_ns
-    status, lines = capture(shot[0], scene, *words)
-    assert (status, len(lines)) == ((2, 1) if words else (0, 0)), lines
+    for words, ended in (([], (0, 0)), (["--from", "images"], (2, 1))):
+        status, lines = capture(shot[0], scene, *words)
+        assert (status, len(lines)) == ended, lines
     assert {path: changed(scene).get(path, kept[path]) for path in kept} == kept
     assert all(path.read_text() == "mine" for path in kept)
     assert (scene / "transforms.json").exists()
@@ -324,7 +324,7 @@ def nothing(files, folder):
     (folder / "notes.txt").write_text("none")
 
 
-@pytest.mark.parametrize("make", [strangers, three, nothing])
+@pytest.mark.parametrize("make", [slow(strangers), three, nothing])
 def test_photographs_of_no_use(shot, tmp_path, make):
     folder, scene = tmp_path / "folder", tmp_path / "scene"
     folder.mkdir()
@@ -429,7 +429,8 @@ def turned(dev, folder, steps, wall=None):
     return folder / "photographs", folder / "masks"
 
 
-@pytest.mark.parametrize("wall", [None, slow(0.8)])
+@pytest.mark.slow
+@pytest.mark.parametrize("wall", [None, 0.8])
 def test_an_object_that_turns(dev, tmp_path, wall):
     """Its cameras are found though its pattern is that of other steps, too. It is noticed, but for
     a uniform wall.

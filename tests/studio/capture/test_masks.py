@@ -148,6 +148,7 @@ def turned(folder, views, box, surface, wall):
     return capture
 
 
+@pytest.mark.slow
 def test_an_object_that_turns_is_told_from_the_wall(dev, tmp_path):
     """Which shows between the demo's rings in every photograph."""
     around = cameras(2 * SIZE, "turntable")

@@ -9,7 +9,7 @@ from support.scenes import ring_cameras
 from pp_cl.engine.grid import Grid
 from pp_cl.files.picture import Picture
 from pp_studio.export import fusion
-from pp_studio.export.fusion import box_around, fuse
+from pp_studio.export.fusion import fuse
 
 RADIUS = 0.8
 GRID = Grid((-1.0, -1.05, -1.1), 0.06, (34, 36, 38))
@@ -56,10 +56,3 @@ def test_a_ray_that_slips_through_hollows_nothing(views):
     inside = radii() < RADIUS - 4 * GRID.edge
     assert (fuse(GRID, broken)[inside] < 0).all()
     assert (fuse(GRID, broken, hidden=0.0)[inside] > 0).any()
-
-
-def test_the_box_holds_the_points_and_a_margin():
-    box = box_around(GRID, GRID.ids(np.array([[3, 5, 7], [10, 5, 9]])))
-    assert box.dims == (8 + 4, 1 + 4, 3 + 4)
-    first = np.asarray(GRID.origin) + GRID.edge * (np.array([3, 5, 7]) - 2)
-    assert np.asarray(box.origin) == pytest.approx(first)

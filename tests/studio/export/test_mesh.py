@@ -51,12 +51,6 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
     assert np.array_equal(read.faces, mesh.faces)
 
 
-def test_a_box_in_which_no_face_lies_is_one_line(run, mesh):
-    around = 0.01 * run.model.grid.edge * np.array([[-1], [1]])
-    with pytest.raises(UserError, match="--box: holds no whole face"):
-        surface(run, mesh.vertices[0] + around)
-
-
 def test_no_surface_is_one_line(run, monkeypatch):
     monkeypatch.setattr(module, "fuse", lambda grid, _: np.ones(grid.dims[::-1]))
     with pytest.raises(UserError, match="show no surface"):

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from support.models import blend_matrix, drawn_alone
+from support.models import blend_matrix
 
 from pp_cl.run import load_run
 from pp_studio.export.observe import observe
@@ -61,10 +61,3 @@ def test_blending_and_gathering_are_the_matrix_and_its_transpose(run, rng):
         blended, rest = seen.blended(colours[seen.shaded])
         assert blended == pytest.approx(matrix @ colours, abs=1e-5)
         assert rest == pytest.approx(1 - matrix.sum(1), abs=1e-5)
-
-
-def test_views_are_observed_one_at_a_time(run, monkeypatch):
-    drawn = drawn_alone(monkeypatch, run.renderer)
-    for seen in observe(run, run.cameras("train"), "test"):
-        assert blend_matrix(seen).nnz
-    assert len(drawn) == len(run.cameras("train"))

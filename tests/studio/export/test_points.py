@@ -34,12 +34,6 @@ def test_colours_are_those_of_the_best_view(run, points):
     assert (points.opacity == run.model.cloud.opacity.get()[points.rows]).all()
 
 
-def test_points_of_little_weight_are_left_out(run, points):
-    some = coloured_points(run, min_weight=0.3)
-    assert some.rows.tolist() == points.rows[points.weight > 0.3].tolist()
-    assert 0 < len(some.rows) < len(points.rows)
-
-
 def test_no_points_are_one_line(run):
     with pytest.raises(UserError, match="--min-weight 1000: no point weighs more"):
         coloured_points(run, min_weight=1000)

@@ -1,7 +1,5 @@
 """Which runs a sweep has, and where."""
 
-from pathlib import Path
-
 import pytest
 from support.refused import refusing
 from support.sweeps import jobs_of
@@ -69,17 +67,6 @@ def test_what_tells_runs_apart_cannot_be_set(tmp_path, key):
         jobs_of(["demo"], tmp_path, varied=varied, given=given)
 
 
-def test_each_setting_has_a_folder_of_its_own_in_the_sweeps(tmp_path, scenes):
-    """And none where nothing is varied."""
-    values = ["a/b", "a:b", "..", "a b"]
-    jobs = jobs_of(scenes[:1], tmp_path, varied={"scene.masks": values})
-    parents = {Path(job.folder).parent for job in jobs}
-    assert len(parents) == len(values) and {p.parent for p in parents} == {tmp_path / "a"}
-    (job,) = jobs_of(scenes[:1], tmp_path, [3])
-    assert job.folder == str(tmp_path / "a" / "seed-3")
-    assert job.log == tmp_path / "a" / "seed-3.log"
-
-
 def test_scenes_that_cannot_be_told_apart(tmp_path, scenes):
     for name in ("a", "A", "demo"):
         (tmp_path / "other" / name).mkdir(parents=True)
@@ -88,8 +75,3 @@ def test_scenes_that_cannot_be_told_apart(tmp_path, scenes):
             jobs_of([scenes[0], other], tmp_path)
     with refusing("two runs"):
         jobs_of(["demo", tmp_path / "other" / "demo"], tmp_path)
-
-
-def test_a_scene_that_is_not_there(tmp_path):
-    with refusing(tmp_path / "none", "no such"):
-        jobs_of([tmp_path / "none"], tmp_path)

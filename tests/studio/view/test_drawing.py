@@ -13,7 +13,6 @@ from pp_studio.view.drawing import (
     SHOWN,
     colour_scale,
     draw,
-    most_opaque,
     nearest_view,
     normals_from_depth,
 )
@@ -62,19 +61,6 @@ def test_fragments_are_those_of_the_pairs(run):
     np.testing.assert_array_equal(image, colour_scale(hits, 0, hits.max(), hits > 0))
 
 
-def test_the_most_opaque_points_are_kept(run):
-    opacity, ids = run.model.cloud.opacity.get(), run.model.cloud.ids.get()
-    fewer = most_opaque(run.model, 0.25)
-    kept = fewer.cloud.opacity.get()
-    assert len(kept) == round(0.25 * len(opacity))
-    assert kept.min() >= np.sort(opacity)[-len(kept)]
-    rows = np.searchsorted(ids, fewer.cloud.ids.get())
-    for whole, part in zip(run.model.cloud.sh, fewer.cloud.sh, strict=True):
-        np.testing.assert_array_equal(part.get(), whole.get()[rows])
-    np.testing.assert_array_equal(run.model.cloud.opacity.get(), opacity)
-    assert most_opaque(run.model, 1e-9).cloud.count == 1
-
-
 def test_the_nearest_view_counts_place_and_direction():
     cameras, centre = ring_cameras(6, 48), np.zeros(3)
     assert [nearest_view(cameras, camera, centre) for camera in cameras] == list(range(6))
@@ -98,14 +84,3 @@ def test_normals_stay_sharp_at_an_edge_and_end_where_depth_does():
     lone = np.full((48, 48), np.nan)
     lone[3, 4] = 2
     assert np.isnan(normals_from_depth(lone, CAMERA)).all()
-
-
-def test_exposure_doubles_the_light(run):
-    def light(image):
-        return ((image / 255 + 0.055) / 1.055) ** 2.4
-
-    before, bright = (draw(run, [], CAMERA, exposure=stops)[0] for stops in (0, 1))
-    known = (before > 40) & (bright < 255)
-    assert known.sum() > 20
-    np.testing.assert_allclose(light(bright)[known], 2 * light(before)[known], rtol=0.03)
-    assert (draw(run, [], CAMERA, exposure=6)[0][before > 60] == 255).all()

@@ -177,8 +177,8 @@ def test_a_run_whose_photographs_are_gone_is_still_shown(served, dev, copied):
 
 @pytest.fixture
 def training(dev, scene, tmp_path, runs):
-    """A training of 40 steps in the folder run; what it leaves alone is in the folder alone."""
-    alone = runs.trained(tmp_path / "alone", scene, train__iterations=40)
+    """A training of 15 steps in the folder run; what it leaves alone is in the folder alone."""
+    alone = runs.trained(tmp_path / "alone", scene, train__iterations=15)
     config = load_config(alone / "config.json")
     return open_training(dev, RunFolder(tmp_path / "run"), config, None)
 
@@ -199,7 +199,7 @@ def test_a_watched_training_has_the_same_bits(training, tmp_path):
 
         training.run(follow)
         shapes = {opened.picture().shape[:2] for _ in range(3)}
-    assert pictures == list(range(1, 41)) and max(map(max, shapes)) <= 48
+    assert pictures == list(range(1, 16)) and max(map(max, shapes)) <= 48
     assert arrays(tmp_path / "run") == arrays(tmp_path / "alone")
 
 
