@@ -15,8 +15,8 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.commands.info_facts import LEAST_WIDTH
-from pp_cl.files.contact_sheet import GAP, HEADER
 from pp_cl.files.image import read_rgba
+from pp_cl.files.sheets import GAP, HEADER
 from pp_cl.scene.outline import OUTLINE
 from pp_cl.scene.overview import BOX, CAMERA
 

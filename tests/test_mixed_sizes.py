@@ -12,9 +12,9 @@ from pp_cl.cli import main
 from pp_cl.config import assign, preset
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.views import View
-from pp_cl.files.contact_sheet import GAP, tiles
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.files.sheets import GAP, tiles
 from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import load_scene, scene_frames
 from pp_cl.scene.readers.transforms import write_scene

@@ -18,13 +18,13 @@ from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement, disagreements
-from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.edits import read_edits
+from pp_cl.scene.gaze import looked_at, up_of
 from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
 from pp_cl.scene.identity import kept_views
 from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
-from pp_cl.scene.overview import overview
+from pp_cl.scene.overview import draw_overview
 from pp_cl.scene.sparse import sparse_points
 from pp_cl.session.start import first_hull
 
@@ -211,7 +211,7 @@ def scene_picture(
     sheet = picture(dev, views, hull, found)
     cameras = [view.stored_camera for view in views]
     width = max(LEAST_WIDTH, sheet.shape[1])
-    drawn = overview(cameras, box and np.array(box), points, colours, width)
+    drawn = draw_overview(cameras, box and np.array(box), points, colours, width)
     rows = [
         np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
         for part in (drawn, sheet)

@@ -14,7 +14,7 @@ from pp_cl.errors import UserError
 # A line of JSON [path in the folder, SHA-256] for each file, in the order of writing; null stands
 # for a file that changes in place. Lines are added before a file gets its name, and stay: a kill in
 # between leaves a line too much, which says nothing of a file of others.
-NAME = ".pp-cl-files.jsonl"
+MANIFEST = ".pp-cl-files.jsonl"
 # of what is being written, with the number of its process
 TEMPORARY = re.compile(r"\..+\.(\d+)\.pp-cl\.tmp(\..*)?", re.DOTALL)
 AT_ONCE = 2**20  # bytes that are read
@@ -24,12 +24,12 @@ def begin_manifest(folder: Path) -> None:
     """Make a folder, where it is missing, one that the program fills."""
     folder.mkdir(parents=True, exist_ok=True)
     if not has_manifest(folder):
-        (folder / NAME).touch()
+        (folder / MANIFEST).touch()
 
 
 def has_manifest(folder: Path) -> bool:
     """Whether the program fills the folder."""
-    return (folder / NAME).is_file()
+    return (folder / MANIFEST).is_file()
 
 
 def note(file: Path, path: Path) -> None:
@@ -60,7 +60,7 @@ def ours(paths: Iterable[Path]) -> list[Path]:
         if home is None or path.is_symlink() or not path.is_file():
             continue
         if home not in known:
-            known[home] = set((home / NAME).read_bytes().splitlines())
+            known[home] = set((home / MANIFEST).read_bytes().splitlines())
         lines = {_line(home, path, None), _line(home, path, _digest(path))}
         if lines & known[home]:
             found.append(path)
@@ -117,12 +117,12 @@ def _line(home, path, digest):
 
 def _add(home, entries):
     """Add the (path, digest) that are not there yet."""
-    before = (home / NAME).read_bytes()
+    before = (home / MANIFEST).read_bytes()
     known = set(before.splitlines())
     new = [line for entry in entries if (line := _line(home, *entry)) not in known]
     if new:
         cut = not before.endswith(b"\n") and before  # a line of a process that was killed
-        with open(home / NAME, "ab") as file:
+        with open(home / MANIFEST, "ab") as file:
             file.write(b"".join(line + b"\n" for line in [b""] * bool(cut) + new))
             file.flush()
             os.fsync(file.fileno())

@@ -69,9 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the run, say what was written."""
-    from pp_cl.drivers.discover import open_device
-    from pp_cl.files.run_folder import RunFolder
-    from pp_cl.run import load_run
+    from pp_cl import RunFolder, load, open_device
     from pp_studio.export.formats import check_target, export
     from pp_studio.export.length import set_length
 
@@ -91,7 +89,7 @@ def run(options: argparse.Namespace) -> None:
     device = open_device(options.device)
 
     def loaded(folder):
-        run = load_run(device, folder, scene=options.scene)
+        run = load(folder, device, scene=options.scene)
         if not run.header["finished"]:
             print(
                 f"{folder}: unfinished, step {run.header['step']} of"

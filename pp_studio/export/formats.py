@@ -10,13 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.engine.views import View
+from pp_cl import Run
+from pp_cl.engine import View
 from pp_cl.errors import UserError, require
-from pp_cl.evaluate import image_files
-from pp_cl.files.atomic import check_file, check_new_folder, write_text
-from pp_cl.files.manifest import begin_manifest, check_ours
-from pp_cl.run import Run
-from pp_cl.scene.readers.transforms import write_scene
+from pp_cl.files import (
+    begin_manifest,
+    check_file,
+    check_new_folder,
+    check_ours,
+    image_files,
+    write_text,
+)
+from pp_cl.scene import write_scene
 from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.length import metres_per_unit

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pp_cl.files.contact_sheet import GAP, HEADER, comparison, contact_sheet
+from pp_cl.files.sheets import GAP, HEADER, comparison, contact_sheet
 
 
 def tile(picture, row, column, height, width):
