@@ -144,7 +144,7 @@ def _parse(argv):
     """The options. Where the words make no sense otherwise, the word after --json or --metrics is
     what the command works on, as in `pp-cl info --json RUN`.
     """
-    parser, errors = _parser(), []
+    parser, errors = _parser(argv[:1]), []
     for alone in ((), ("--json",), ("--metrics",), tuple(ALONE)):
         words = list(argv)
         for i, (word, value) in enumerate(pairwise(argv)):
@@ -159,7 +159,8 @@ def _parse(argv):
     raise (unknown or errors)[0]
 
 
-def _parser():
+def _parser(first):
+    """The parser of the command that the first word names, else of all. first: [] or [word]."""
     parser = _Parser(
         prog="pp-cl",
         description="Reconstruct an object from photographs with OpenCL.",
@@ -167,8 +168,8 @@ def _parser():
     )
     parser.add_argument("--version", action="version", version=f"pp-cl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
-    for name, path in COMMANDS.items():
-        module = importlib.import_module(path)
+    for name in first if {*first} <= COMMANDS.keys() and first else COMMANDS:
+        module = importlib.import_module(COMMANDS[name])
         command = commands.add_parser(
             name,
             help=module.HELP,

@@ -19,6 +19,10 @@ from pp_cl.presets import IMAGE_SIZES, PRESETS
 from pp_cl.scene.load import scene_frames
 from pp_cl.settings import FORMAT, Config, sections
 
+# what other packages may use; docs/api.md lists it
+__all__ = ["PRESETS", "assign", "configure", "field_of", "load_config"]
+__all__ += ["preset", "preset_downscale", "run_config"]
+
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder

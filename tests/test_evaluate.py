@@ -73,7 +73,6 @@ def test_what_an_earlier_evaluation_left_goes_with_the_next(run):
     own.unlink()
 
 
-
 def changed_scene(run, tmp_path, split, name):
     """(copy of the run's scene in which a pixel of a photograph differs)."""
     scene = json.loads((run / "config.json").read_text())["scene"]["path"]

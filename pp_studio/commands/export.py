@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Write the run, say what was written."""
     from pp_cl import RunFolder, load, open_device
-    from pp_studio.export.formats import check_target, export
+    from pp_studio.export.formats import check_target, export_run
     from pp_studio.export.length import set_length
 
     name, folder = options.format, Path(options.run_folders[0])
@@ -102,7 +102,7 @@ def run(options: argparse.Namespace) -> None:
     if ends:
         unit = set_length(run, *ends)
         print(f"a unit of the scene is {unit:.6g} m")
-    written = export(
+    written = export_run(
         run,
         name,
         path,

@@ -58,7 +58,7 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
     return path
 
 
-def export(
+def export_run(
     run: Run,
     name: str,
     path: Path | str,
