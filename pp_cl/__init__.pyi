@@ -1,5 +1,5 @@
-from .drivers.discover import open_device as open_device
-from .drivers.discover import separate_devices as separate_devices
+from .drivers import open_device as open_device
+from .drivers import separate_devices as separate_devices
 from .engine.camera import Camera as Camera
 from .errors import UserError as UserError
 from .evaluate import evaluate_run as evaluate_run

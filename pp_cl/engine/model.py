@@ -15,6 +15,8 @@ from pp_cl.engine.network.means import Means
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 
+REFINING_BYTES = 320  # of the host, which refining takes for each point before it
+
 
 class Model:
     """Points and network on a device.
