@@ -92,9 +92,9 @@ kernel void conv_forward(
     const int relu,                  // negative results become 0
     global const float *x,           // (height, width, c1)
     global const float *x2,          // (height, width, ?)
-    global const float16 *weight,    // (blocks, KERNEL_SIZE, KERNEL_SIZE, c1 + c2, 16)
-    global const float16 *bias,      // (?)
-    global const float *tile_count,  // (?, ?) 0 = not computed
+    global const float16 *weight,    // ((co+15)/16, KERNEL_SIZE, KERNEL_SIZE, c1 + c2, 16)
+    global const float16 *bias,      // ((co+15)/16*16)
+    global const float *tile_count,  // ((height+3)/4, (width+3)/4) 0 = not computed
     global float *out)               // (height, width, co)
 {
     const int tile_x = get_global_id(0) * PIXELS, y = get_global_id(1),
@@ -141,9 +141,9 @@ kernel void conv_backward_input(
     const int co,
     const int masked,
     global const float *x,           // (height, width, c)
-    global const float16 *flipped,   // (blocks, KERNEL_SIZE, KERNEL_SIZE, co, 16)
+    global const float16 *flipped,   // ((c+15)/16, KERNEL_SIZE, KERNEL_SIZE, co, 16)
     global const float *grad_out,    // (height, width, co)
-    global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
+    global const float *tile_count,  // ((height+3)/4, (width+3)/4) 0 = not computed
     global float *grad_x)            // (height, width, c)
 {
     const int tile_x = get_global_id(0) * PIXELS, y = get_global_id(1),

@@ -63,8 +63,8 @@ kernel void conv_backward_weights(
     const int rows,
     global const float *x,           // (height, width, c)
     global const float *grad_out,    // (height, width, co)
-    global const float *tile_count,  // (?, ?) of grad_out, 0 = not read
-    global float16 *partial)  // (...) at least (parts, co / 16 rounded up, K * K * ci + 1, 16)
+    global const float *tile_count,  // ((height+3)/4, (width+3)/4) 0 = not read
+    global float16 *partial)  // (?, (co+15)/16, KERNEL_SIZE*KERNEL_SIZE*ci+1, 16) of each part
 {
     const int groups = c / CI_GROUP, item = get_global_id(0), blocks = (co + 15) / 16;
     const int block = get_global_id(1), part = get_global_id(2);

@@ -137,8 +137,8 @@ kernel void conv_local_forward(
     const int relu,               // negative results become 0
     global const float *x,        // (height, width, c1)
     global const float *x2,       // (height, width, ?)
-    global const float4 *weight,  // (blocks, KERNEL_SIZE, KERNEL_SIZE, c1 + c2, 16)
-    global const float4 *bias,    // (?)
+    global const float4 *weight,  // ((co+15)/16, KERNEL_SIZE, KERNEL_SIZE, c1 + c2, 16)
+    global const float4 *bias,    // ((co+15)/16*16)
     global const int *tile_list,  // (?) height, width, number, tiles
     global float *out)            // (height, width, co)
 {
@@ -179,7 +179,7 @@ kernel void conv_local_backward_input(
     const int co,
     const int masked,
     global const float *x,         // (height, width, c)
-    global const float4 *flipped,  // (blocks, KERNEL_SIZE, KERNEL_SIZE, co, 16)
+    global const float4 *flipped,  // ((c+15)/16, KERNEL_SIZE, KERNEL_SIZE, co, 16)
     global const float *grad_out,  // (height, width, co)
     global const int *tile_list,   // (?) height, width, number, tiles
     global float *grad_x)          // (height, width, c)

@@ -60,8 +60,8 @@ kernel void conv_local_backward_weights(
     global const float *x,           // (height, width, c)
     global const float *grad_out,    // (height, width, co)
     global const int *tile_list,     // (?) height, width, number, tiles
-    global const float *tile_count,  // (?, ?) of grad_out
-    global float4 *partial)  // (...) at least (parts, co / 16 rounded up, K * K * ci + 1, 16)
+    global const float *tile_count,  // ((height+3)/4, (width+3)/4) of grad_out
+    global float4 *partial)  // (?, (co+15)/16, KERNEL_SIZE*KERNEL_SIZE*ci+1, 16) of each part
 {
     local float4 values[STAGE * SPAN * SPAN * CI_QUADS];
     local float4 grads[STAGE * SIDE * SIDE * QUADS];
@@ -137,8 +137,8 @@ kernel void conv_local_backward_bias(
     const int parts,
     global const float *grad_out,    // (height, width, co)
     global const int *tile_list,     // (?) height, width, number, tiles
-    global const float *tile_count,  // (?, ?) of grad_out
-    global float *partial)           // (...) as above
+    global const float *tile_count,  // ((height+3)/4, (width+3)/4) of grad_out
+    global float *partial)           // (?, (co+15)/16, per_block+1, 16)
 {
     const int channel = get_global_id(0), part = get_global_id(1), blocks = (co + 15) / 16;
     if (channel >= blocks * 16 || part >= parts) return;

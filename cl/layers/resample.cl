@@ -11,8 +11,8 @@ kernel void avgpool2_forward(
     const int h,  // of out
     const int w,
     const int c,
-    global const float *x,           // (?, ?, c) twice the height and width of out
-    global const float *tile_count,  // (?, ?) of out, 0 = not computed
+    global const float *x,           // (2*h, 2*w, c)
+    global const float *tile_count,  // ((h+3)/4, (w+3)/4) of out, 0 = not computed
     global float *out)               // (h, w, c)
 {
     const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
@@ -34,10 +34,10 @@ kernel void avgpool2_backward(
     const int w,
     const int c,
     const int masked,
-    global const float *x,           // (?, ?, c) read only if masked
+    global const float *x,           // (2*h, 2*w, c) read only if masked
     global const float *grad_out,    // (h, w, c)
-    global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
-    global float *grad_x)            // (?, ?, c)
+    global const float *tile_count,  // ((2*h+3)/4, (2*w+3)/4) of grad_x, 0 = not computed
+    global float *grad_x)            // (2*h, 2*w, c)
 {
     const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
               count = c - first;
@@ -87,8 +87,8 @@ kernel void upsample2_forward(
     const int w,
     const int c,
     global const float *x,           // (h, w, c)
-    global const float *tile_count,  // (?, ?) of out, 0 = not computed
-    global float *out)               // (?, ?, c)
+    global const float *tile_count,  // ((2*h+3)/4, (2*w+3)/4) of out, 0 = not computed
+    global float *out)               // (2*h, 2*w, c)
 {
     const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
               count = c - first;
@@ -118,8 +118,8 @@ kernel void upsample2_backward(
     const int h,  // of x
     const int w,
     const int c,
-    global const float *grad_out,    // (?, ?, c) twice the height and width of x
-    global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
+    global const float *grad_out,    // (2*h, 2*w, c)
+    global const float *tile_count,  // ((h+3)/4, (w+3)/4) of grad_x, 0 = not computed
     global float *grad_x)            // (h, w, c)
 {
     const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),

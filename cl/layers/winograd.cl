@@ -152,8 +152,8 @@ kernel void winograd_forward(
     const int relu,                // negative results become 0
     global const float *x,         // (height, width, c1)
     global const float *x2,        // (height, width, ?)
-    global const float16 *weight,  // (...) transformed, laid out as winograd.h says
-    global const float16 *bias,    // (?)
+    global const float16 *weight,  // (36*(c1*co+c2*co+16)) transformed, as winograd.h says
+    global const float16 *bias,    // (co)
     global const int *tile_list,   // (?)
     global float *out,             // (height, width, co)
     global float16 *scratch)       // (...) COUNTERS + work-items * SLICE(c1 + c2, co)
@@ -169,7 +169,7 @@ kernel void winograd_backward_input(
     const int co,
     const int masked,
     global const float *x,          // (height, width, c)
-    global const float16 *flipped,  // (...) transformed weights, laid out as winograd.h says
+    global const float16 *flipped,  // (36*(c*co+16)) transformed, as winograd.h says
     global const float *grad_out,   // (height, width, co)
     global const int *tile_list,    // (?) of grad_x
     global float *grad_x,           // (height, width, c)

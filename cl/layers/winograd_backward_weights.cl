@@ -151,8 +151,8 @@ kernel void winograd_backward_weights(
     global const float *x2,          // (height, width, ?)
     global const float *grad_out,    // (height, width, co)
     global const int *tile_list,     // (?) of grad_out
-    global const float *tile_count,  // (?, ?) of grad_out
-    global float16 *partial,         // (...) at least (tile_parts, co / 16, 9 * (c1 + c2) + 1, 16)
+    global const float *tile_count,  // ((height+3)/4, (width+3)/4) of grad_out
+    global float16 *partial,         // (?, co/16, 9*(c1+c2)+1, 16) of each of tile_parts
     global float16 *scratch)         // (...) COUNTERS + work-items * SLICE(ci_part)
 {
     const int tiles = tile_list[2], ci = c1 + c2;
