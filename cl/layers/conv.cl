@@ -5,7 +5,7 @@
 // registers. For each input channel it loads K weight vectors per block and PIXELS + K - 1
 // scalars, and does K * BLOCKS * PIXELS vector multiply-adds with them. PIXELS and BLOCKS are
 // chosen so that accumulators and weights fit a device's registers (Blocking in
-// pp_cl/engine/layers/conv_direct.py).
+// pp_cl/engine/layers/conv.py).
 #include "common.h"
 #include "layers/tiles.h"
 #include "vector.h"
