@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import PackedArrays, packed_arrays
+from pp_cl.engine.device.buffers import PackedArrays, Table, packed_arrays, table_bytes
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out, work_shape
 from pp_cl.engine.layers.conv import (
@@ -95,14 +95,19 @@ class Workspace:
                 floats = math.prod(maps[name])
                 self.arrays[name] = self._buffers[i][:floats].reshape(maps[name])
         self.convs = net.convolutions(size, training)
-        shapes = {key: work_shape(conv.variant, conv.shape) for key, conv in self.convs.items()}
-        needed = {key: (shape, np.float32) for key, shape in shapes.items() if shape}
+        needed = _work_rows(self.convs)
         whole, arrays = packed_arrays(net.dev, [*needed.values()])
         self.work = whole.view(np.float32)
         for key, array in zip(needed, arrays, strict=True):
             self.convs[key].work = array
         self.all_tiles = plan_all(net.dev, net.layers, size)
         self.size = size
+
+
+def _work_rows(convs):
+    """{key: (shape, dtype)} of the arrays that convolutions take beside a layer's own."""
+    shapes = {key: work_shape(conv.variant, conv.shape) for key, conv in convs.items()}
+    return {key: (shape, np.float32) for key, shape in shapes.items() if shape}
 
 
 class UNet:
@@ -339,18 +344,19 @@ class UNet:
                 found[layer.name, direction, source] = conv
         return found
 
-    def work_bytes(self, size: Size, training: bool) -> int:
-        """Of the arrays that the convolutions of images of a size take beside a layer's own: the
-        weights as kernels read them, and the parts of the gradients.
+    def table(self, crop: Size, image: Size) -> Table:
+        """The arrays of a network that is trained on crops of one size and renders images of
+        another: its parameters, the feature maps and work of both passes, and the scratch memory
+        that their convolutions share, which grows with the device's compute units.
         """
-        convs = self.convolutions(size, training).values()
-        shapes = (work_shape(conv.variant, conv.shape) for conv in convs)
-        return sum(4 * math.prod(shape) for shape in shapes if shape)
-
-    def scratch_bytes(self, size: Size, training: bool) -> int:
-        """Of the memory that the convolutions of images of a size share, which grows with the
-        device's compute units.
-        """
-        convs = self.convolutions(size, training).values()
-        shared = (scratch_floats(conv) for conv in convs if conv.variant == "winograd")
-        return 4 * max(shared, default=0)
+        whole = self.all_parameters.shape, np.float32
+        table: Table = {"parameters": whole, "gradients": whole}
+        scratch = [0]
+        for training, size in ((True, crop), (False, image)):
+            convs, maps = self.convolutions(size, training), array_shapes(self.layers, size)
+            shared = share_buffers(lifetimes(self.layers, training), maps)
+            table |= {f"{training} {i}": ((b.floats,), np.float32) for i, b in enumerate(shared)}
+            table[f"{training} work"] = (table_bytes(_work_rows(convs)),), np.uint8
+            transformed = [conv for conv in convs.values() if conv.variant == "winograd"]
+            scratch += map(scratch_floats, transformed)
+        return table | {"scratch": ((max(scratch),), np.float32)}
