@@ -51,11 +51,8 @@ kernel void alpha_weights(
             const uint2 hit = hits[j];
             const float d = as_float(hit.y);
             float alpha = o[j] * d;
-            bool shows = true;
-            if (FOOTPRINT == GAUSSIAN) {
-                shows = !(alpha < LEAST_ALPHA);
-                alpha = !shows ? 0.0f : alpha > MOST_ALPHA ? MOST_ALPHA : alpha;
-            }
+            const bool shows = !(alpha < LEAST_ALPHA);
+            alpha = !shows ? 0.0f : alpha > MOST_ALPHA ? MOST_ALPHA : alpha;
             pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
             if (SLOPES) pixel_slope[i] = shows ? T * d : 0.0f;
             point_is_shaded[hit.x] = 1;
