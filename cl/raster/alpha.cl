@@ -43,11 +43,11 @@ kernel void alpha_weights(
             pair_point_closeness + (uint)pair_key[min(i + HITS_AHEAD, pixel_offset[hw] - 1)]);
         uint2 hits[BATCH];
         float o[BATCH];
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             hits[j] = pair_point_closeness[(uint)pair_key[j == 0 ? i : min(i + j, end - 1)]];
             o[j] = opacity[hits[j].x];
         }
-        UNROLLED for (uint j = 0; j < BATCH && i < end && T >= early_stop; j++, i++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH && i < end && T >= early_stop; j++, i++) {
             const uint2 hit = hits[j];
             const float d = as_float(hit.y);
             float alpha = o[j] * d;

@@ -52,13 +52,13 @@ kernel void blend_forward(
         float b[BATCH];
         floats feature[BATCH];
         bool listed = true;
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             const ulong entry = j == 0 || i + j < end ? pixel_entry[i + j] : NONE;
             listed = listed && (uint)entry != NONE;
             b[j] = listed ? upper_float(entry) : 0.0f;
             feature[j] = listed ? load_part(shaded_features, point_slot[(uint)entry]) : 0.0f;
         }
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             sum += b[j] * feature[j];
             weights += b[j];
         }
@@ -131,7 +131,7 @@ kernel void alpha_gradient(
     for (uint i = end; i > begin;) {
         ulong key[BATCH];
         float weight[BATCH], slope[BATCH], of_point[BATCH];
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             const uint at = i - begin > j ? i - 1 - j : begin;
             const ulong entry = pixel_entry[at];
             key[j] = pair_key[at];
@@ -139,7 +139,7 @@ kernel void alpha_gradient(
             slope[j] = pixel_slope[at];
             of_point[j] = dot16(G, shaded_features[point_slot[(uint)entry]]);
         }
-        UNROLLED for (uint j = 0; j < BATCH && i > begin; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH && i > begin; j++) {
             i--;
             const float b = weight[j];
             float own = of_point[j];

@@ -1,12 +1,17 @@
 // Footprints: which pixels points cover, their closeness d there (1 in the centre, 0 at the rim)
 // and their depth. Each kind of point is a header with the same three functions:
 //
-// footprints_box()  pixels that may be hit, along each axis
+// footprints_box()  their shape, and the pixels that they may hit: the first and last along x and
+//                   y; false if none of those that are kept hits any
 // footprints_rim()  what follows from place and shape for all pixels
-// footprints_hit()  whether one pixel is hit, with d and depth
+// footprints_hit()  whether they hit a pixel (px, py) each, with d and depth
 //
-// Beside them stand surface_range(), for depth.cl, and the constants of blending and shading; and,
-// where points learn offsets, the gradients of these for offset.cl.
+// Beside them a header has surface_range() for depth.cl, the distance from the eye where a ray meets
+// the surface for which a point stands, and constants of blending and shading; where points learn
+// offsets, also the gradients of these for offset.cl.
+//
+// Counting (project.cl) and filling (pairs.cl) must find the same hits, so no compiler may round
+// here in one way and there in another: FP_CONTRACT is OFF in what leads to a hit.
 #ifndef PP_FOOTPRINT_H
 #define PP_FOOTPRINT_H
 
@@ -50,10 +55,16 @@ typedef struct {
     int columns, rows;    // of the widest and the highest box
 } Footprints;
 
+// How they cover a pixel each.
+typedef struct {
+    ints hit;  // lanes that hit are not 0
+    floats closeness, depth;
+} Coverage;
+
 // Fills in `columns` and `rows`.
 ALWAYS_INLINE void footprints_measure(Footprints *f) {
     f->columns = f->rows = 0;
-    UNROLLED for (uint j = 0; j < LANES; j++) {
+    GPU_UNROLLED_FOR (uint j = 0; j < LANES; j++) {
         f->columns = max(f->columns, f->box[2][j] - f->box[0][j] + 1);
         f->rows = max(f->rows, f->box[3][j] - f->box[1][j] + 1);
     }
@@ -99,15 +110,6 @@ ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
     return x * x + y * y + z * z;
 }
 
-// Whether pixel (column, row) of each box lies in it, and where it is in the image.
-ALWAYS_INLINE ints
-pixel_of_box(const Footprints *f, const int column, const int row, floats *px, floats *py) {
-    const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
-    *px = LANED(convert_float)(x);
-    *py = LANED(convert_float)(y);
-    return x <= LANES_FROM(f->box[2]) && y <= LANES_FROM(f->box[3]);
-}
-
 #if FOOTPRINT == DISC
 #include "raster/footprint/disc.h"
 #elif FOOTPRINT == SOFT
@@ -117,5 +119,14 @@ pixel_of_box(const Footprints *f, const int column, const int row, floats *px, f
 #else
 #include "raster/footprint/gaussian.h"
 #endif
+
+// Tests pixel (column, row) of each point's box.
+ALWAYS_INLINE Coverage
+footprints_test(const Footprints *f, const Rim *rim, const int column, const int row) {
+    const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
+    Coverage c = footprints_hit(f, rim, LANED(convert_float)(x), LANED(convert_float)(y));
+    c.hit &= x <= LANES_FROM(f->box[2]) & y <= LANES_FROM(f->box[3]);
+    return c;
+}
 
 #endif

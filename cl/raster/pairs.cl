@@ -26,7 +26,7 @@ ALWAYS_INLINE Footprints footprints_load(
         place[1][j] = at.y;
         place[2][j] = at.z;
         place[3][j] = at.w;
-        for (uint k = 0; k < SHAPE; k++)
+        GPU_UNROLLED_FOR (uint k = 0; k < SHAPE; k++)
             shape[k][j] = point_shape[SHAPE * i + k];
         f.box[0][j] = box.x;
         f.box[1][j] = box.y;
@@ -37,7 +37,7 @@ ALWAYS_INLINE Footprints footprints_load(
     f.y = LANES_FROM(place[1]);
     f.z = LANES_FROM(place[2]);
     f.t = LANES_FROM(place[3]);
-    for (uint k = 0; k < SHAPE; k++)
+    GPU_UNROLLED_FOR (uint k = 0; k < SHAPE; k++)
         f.shape[k] = LANES_FROM(shape[k]);
     footprints_measure(&f);
     return f;
@@ -81,11 +81,10 @@ kernel void pairs_fill(
         uint offset[CELLS], hits[LANES];
         uints found = 0;
         for (uint k = 0; k < CELLS && row < f.rows; k++) {
-            floats d, z;
-            const ints hit = footprints_hit(&cam, &f, &rim, column, row, &d, &z);
-            found |= select((uints)(0), (uints)(1u << k), hit);
-            LANES_INTO(closeness[k], d);
-            LANES_INTO(depth[k], z);
+            const Coverage c = footprints_test(&f, &rim, column, row);
+            found |= select((uints)(0), (uints)(1u << k), c.hit);
+            LANES_INTO(closeness[k], c.closeness);
+            LANES_INTO(depth[k], c.depth);
             offset[k] = row * cam.width + column;
             if (++column == f.columns) {
                 column = 0;

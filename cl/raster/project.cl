@@ -54,45 +54,48 @@ ALWAYS_INLINE bool project(
 ALWAYS_INLINE ints count_hits(const Camera *cam, const Footprints *f) {
     const Rim rim = footprints_rim(cam, f);
     ints hits = 0;
-    floats closeness, depth;
     for (int row = 0; row < f->rows; row++)
         for (int column = 0; column < f->columns; column++)
-            hits += footprints_hit(cam, f, &rim, column, row, &closeness, &depth) & 1;
+            hits += footprints_test(f, &rim, column, row).hit & 1;
     return hits;
 }
 
-// Writes the camera-space positions of `count` points from `first` on, their shapes, boxes and
-// numbers of hits; of points of which none hits a pixel, only these numbers.
-ALWAYS_INLINE void store_points(
+// Projects `count` points and writes them from `first` on: positions in camera axes, shapes, boxes
+// and numbers of hits; of points of which none hits a pixel, only these numbers.
+ALWAYS_INLINE void project_points(
     const Camera *cam,
-    const Footprints *f,
-    const bool any_hit,
+    const floats x,
+    const floats y,
+    const floats z,
+    const floats radius,
+    const floats form[FORM],
     const uint first,
     const uint count,
     global float4 *point_camera,
     global float *point_shape,
     global ushort4 *point_box,
     global uint *point_count) {
-    if (!any_hit) {
+    Footprints f;
+    if (!project(cam, x, y, z, radius, form, &f)) {
         for (uint j = 0; j < count; j++)
             point_count[first + j] = 0;
         return;
     }
     float place[4][LANES], shape[SHAPE][LANES];
     int hits[LANES];
-    LANES_INTO(place[0], f->x);
-    LANES_INTO(place[1], f->y);
-    LANES_INTO(place[2], f->z);
-    LANES_INTO(place[3], f->t);
-    for (uint k = 0; k < SHAPE; k++)
-        LANES_INTO(shape[k], f->shape[k]);
-    LANES_INTO(hits, count_hits(cam, f));
+    LANES_INTO(place[0], f.x);
+    LANES_INTO(place[1], f.y);
+    LANES_INTO(place[2], f.z);
+    LANES_INTO(place[3], f.t);
+    GPU_UNROLLED_FOR (uint k = 0; k < SHAPE; k++)
+        LANES_INTO(shape[k], f.shape[k]);
+    LANES_INTO(hits, count_hits(cam, &f));
     for (uint j = 0; j < count; j++) {
         const uint i = first + j;
         point_camera[i] = (float4)(place[0][j], place[1][j], place[2][j], place[3][j]);
-        for (uint k = 0; k < SHAPE; k++)
+        GPU_UNROLLED_FOR (uint k = 0; k < SHAPE; k++)
             point_shape[SHAPE * i + k] = shape[k][j];
-        point_box[i] = (ushort4)(f->box[0][j], f->box[1][j], f->box[2][j], f->box[3][j]);
+        point_box[i] = (ushort4)(f.box[0][j], f.box[1][j], f.box[2][j], f.box[3][j]);
         point_count[i] = hits[j];
     }
 }
@@ -155,7 +158,7 @@ kernel void project_grid(
     for (uint j = 0; j < LANES; j++) {
         const size_t row = first + min(j, count - 1);
         id[j] = point_id[row];
-        for (uint k = 0; k < 3 + FORM; k++)
+        GPU_UNROLLED_FOR (uint k = 0; k < 3 + FORM; k++)
             offset[k][j] = cloud_offset[OFFSETS * row + k];
     }
     // as grid_vertex() has it
@@ -167,18 +170,16 @@ kernel void project_grid(
     const uints j = BRICK * y + (ids >> BRICK_BITS & (BRICK - 1));
     const uints k = BRICK * z + (ids >> 2 * BRICK_BITS & (BRICK - 1));
     floats form[FORM];
-    for (uint number = 0; number < FORM; number++) {
+    GPU_UNROLLED_FOR (uint number = 0; number < FORM; number++) {
         const floats learned = LANES_FROM(offset[3 + number]);
         form[number] = radius * (number < LOGS ? exp(learned) : learned);
     }
-    Footprints f;
-    const bool any_hit = project(
+    project_points(
         &cam, grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0])),
         grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1])),
         grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])),
-        LOGS == 1 ? form[0] : radius, form, &f);
-    store_points(
-        &cam, &f, any_hit, first, count, point_camera, point_shape, point_box, point_count);
+        LOGS == 1 ? form[0] : radius, form, first, count, point_camera, point_shape, point_box,
+        point_count);
 }
 
 // One work-item per LANES spheres: reads their positions and radii, writes the same as
@@ -207,11 +208,9 @@ kernel void project_spheres(
     }
     const floats radii = LANES_FROM(radius);
     floats form[FORM];
-    for (uint k = 0; k < FORM; k++)
+    GPU_UNROLLED_FOR (uint k = 0; k < FORM; k++)
         form[k] = k < LOGS ? radii : 0.0f;
-    Footprints f;
-    const bool any_hit =
-        project(&cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), radii, form, &f);
-    store_points(
-        &cam, &f, any_hit, first, count, point_camera, point_shape, point_box, point_count);
+    project_points(
+        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), radii, form, first, count, point_camera,
+        point_shape, point_box, point_count);
 }

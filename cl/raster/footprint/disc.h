@@ -3,16 +3,8 @@
 
 #define surface_range(range, shape, d) (range)
 
-ALWAYS_INLINE ints footprints_hit(
-    const Camera *cam,
-    const Footprints *f,
-    const Rim *rim,
-    const int column,
-    const int row,
-    floats *closeness,
-    floats *depth) {
-    floats across2, m2;
-    *closeness = 1.0f;
-    *depth = f->t;
-    return disc_hit(cam, f, rim, column, row, &across2, &m2);
+ALWAYS_INLINE Coverage
+footprints_hit(const Footprints *f, const Rim *rim, const floats px, const floats py) {
+    floats distance2;
+    return (Coverage){disc_hit(f, rim, px, py, &distance2), (floats)(1.0f), f->t};
 }

@@ -92,23 +92,13 @@ ALWAYS_INLINE Rim footprints_rim(const Camera *cam, const Footprints *f) {
     return rim;
 }
 
-ALWAYS_INLINE ints footprints_hit(
-    const Camera *cam,
-    const Footprints *f,
-    const Rim *rim,
-    const int column,
-    const int row,
-    floats *closeness,
-    floats *depth) {
+ALWAYS_INLINE Coverage
+footprints_hit(const Footprints *f, const Rim *rim, const floats px, const floats py) {
 #pragma OPENCL FP_CONTRACT OFF
-    floats px, py;
-    const ints inside = pixel_of_box(f, column, row, &px, &py);
     const floats dx = px + 0.5f - rim->u, dy = py + 0.5f - rim->v;
     const floats sx = f->shape[0] * dx + f->shape[1] * dy, sy = f->shape[2] * dy;
     const floats s2 = sx * sx + sy * sy;
-    *closeness = f->shape[3] * exp(-0.5f * s2);
-    *depth = f->z;
-    return inside && s2 < DEVIATIONS * DEVIATIONS;
+    return (Coverage){s2 < DEVIATIONS * DEVIATIONS, f->shape[3] * exp(-0.5f * s2), f->z};
 }
 
 // d = exp(-|s|^2 / 2), s = W e with e from the centre u to the pixel; S = (W^T W)^-1 is the covariance

@@ -58,6 +58,7 @@ typedef struct {
     // reciprocals, since dividing 16 lanes by one number is slower than multiplying them
     floats per_reach;
     float per_fx, per_fy;
+    float left, top;  // from the principal point to the centre of pixel (0, 0), pixels
 } Rim;
 
 // 1 / a to half an ulp, by a step of Newton's: a GPU's division may be off by 2.5, which shifts all
@@ -77,49 +78,26 @@ ALWAYS_INLINE Rim footprints_rim(const Camera *cam, const Footprints *f) {
     rim.per_reach = 1.0f / rim.reach;
     rim.per_fx = reciprocal(cam->fx);
     rim.per_fy = reciprocal(cam->fy);
+    rim.left = 0.5f - cam->cx;
+    rim.top = 0.5f - cam->cy;
     return rim;
 }
 
-// Whether pixel (column, row) of each box lies in it, with the ray (mx, my, 1) through its centre and
-// the ray's squared length.
-ALWAYS_INLINE ints ray_of_box(
-    const Camera *cam,
-    const Footprints *f,
-    const Rim *rim,
-    const int column,
-    const int row,
-    floats *mx,
-    floats *my,
-    floats *m2) {
-#pragma OPENCL FP_CONTRACT OFF
-    floats px, py;
-    const ints inside = pixel_of_box(f, column, row, &px, &py);
-    *mx = (px + (0.5f - cam->cx)) * rim->per_fx;
-    *my = (py + (0.5f - cam->cy)) * rim->per_fy;
-    *m2 = *mx * *mx + *my * *my + 1.0f;
-    return inside;
-}
-
-// Whether the rays pass the centres within `reach`; their squared distances are across2 / m2.
+// Whether the rays (mx, my, 1) through pixels, of the squared length m2, pass the centres within
+// `reach`; writes the squared distances.
 //
 // Differs from Pulsar, whose distance from the ray is that at the centre's range, whose depth is
 // that of the sphere's front, up to a radius nearer, and whose d varies within every footprint of
 // at least a pixel.
-ALWAYS_INLINE ints disc_hit(
-    const Camera *cam,
-    const Footprints *f,
-    const Rim *rim,
-    const int column,
-    const int row,
-    floats *across2,
-    floats *m2) {
+ALWAYS_INLINE ints
+disc_hit(const Footprints *f, const Rim *rim, const floats px, const floats py, floats *distance2) {
 #pragma OPENCL FP_CONTRACT OFF
-    floats mx, my;
-    const ints inside = ray_of_box(cam, f, rim, column, row, &mx, &my, m2);
+    const floats mx = (px + rim->left) * rim->per_fx, my = (py + rim->top) * rim->per_fy;
+    const floats m2 = mx * mx + my * my + 1.0f;
     const floats ex = f->y - f->z * my, ey = f->z * mx - f->x, ez = f->x * my - f->y * mx;
-    *across2 = square(ex, ey, ez);
-    return inside && *across2 < rim->reach * rim->reach * *m2 &&
-           f->x * mx + f->y * my + f->z > 0.0f;
+    const floats across2 = square(ex, ey, ez);
+    *distance2 = across2 / m2;
+    return across2 < rim->reach * rim->reach * m2 && f->x * mx + f->y * my + f->z > 0.0f;
 }
 
 #endif

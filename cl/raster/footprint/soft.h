@@ -1,20 +1,12 @@
 // The soft disc (ours): d falls linearly from the centre to the rim.
 #include "raster/footprint/round.h"
 
-ALWAYS_INLINE ints footprints_hit(
-    const Camera *cam,
-    const Footprints *f,
-    const Rim *rim,
-    const int column,
-    const int row,
-    floats *closeness,
-    floats *depth) {
+ALWAYS_INLINE Coverage
+footprints_hit(const Footprints *f, const Rim *rim, const floats px, const floats py) {
 #pragma OPENCL FP_CONTRACT OFF
-    floats across2, m2;
-    const ints hit = disc_hit(cam, f, rim, column, row, &across2, &m2);
-    *closeness = 1.0f - sqrt(across2 / m2) * rim->per_reach;
-    *depth = f->t;
-    return hit;
+    floats distance2;
+    const ints hit = disc_hit(f, rim, px, py, &distance2);
+    return (Coverage){hit, 1.0f - sqrt(distance2) * rim->per_reach, f->t};
 }
 
 // The surface is that of the ball. d: at the rim a rounding below 0.
