@@ -17,12 +17,10 @@ from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.errors import UserError
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
-# of lists_by_bucket.cl
 BUCKETS = 256  # of pairs, at most, which CPUs sort side by side
 MOST_CHUNKS = 64  # of pairs, which CPUs put into buckets side by side
-# of lists_by_key.cl
-RUN = 64  # keys ranked at once by comparing all with all; longer lists are merged
-LONG_LIST = RUN * RUN  # keys of lists that are merged in more than one pass
+RUN = 64  # keys that GPUs rank at once by comparing all with all; longer lists are merged
+LONG_LIST = RUN * RUN  # keys of lists that they merge in more than one pass
 
 
 @dataclass(frozen=True)
@@ -92,9 +90,6 @@ def find_pairs(
     b.require(pairs_table(n, pixels, room))
     exclusive_scan(dev, points.point_count, b.point_offset)
     count = read_total(dev, b.point_offset)
-    point_key, make_lists = (
-        (b.pair_key, _list_by_bucket) if dev.is_cpu else (b.pair_scratch, _list_by_key)
-    )
     dev.program("raster/pairs", LANES=lanes(dev), **footprint_macros(points.footprint)).launch(
         "pairs_fill",
         -(-n // lanes(dev)),
@@ -107,9 +102,10 @@ def find_pairs(
         point_offset=b.point_offset,
         pair_pixel=b.pair_pixel,
         pair_point_closeness=b.pair_point_closeness,
-        point_key=point_key,
+        point_key=b.pair_key if dev.is_cpu else b.pair_scratch,
     )
-    make_lists(dev, b, n, pixels, room)
+    list_keys = _list_by_bucket if dev.is_cpu else _list_by_key
+    list_keys(dev, b, n, pixels, room)
     return Pairs(
         points.footprint,
         count,
@@ -134,14 +130,8 @@ def _list_by_bucket(dev, b, n, pixels, room):
     }
     filled = {"n": n, "p": room, "point_offset": b.point_offset, **shared}
     program.launch("pairs_bucket_sizes", chunks, local=1, **filled)
-    program.launch(
-        "pairs_bucket",
-        chunks,
-        local=1,
-        point_key=b.pair_key,
-        bucket_key=b.pair_scratch,
-        **filled,
-    )
+    keys = {"point_key": b.pair_key, "bucket_key": b.pair_scratch}
+    program.launch("pairs_bucket", chunks, local=1, **keys, **filled)
     program.launch(
         "pairs_list",
         ((pixels - 1) >> stretch) + 1,
@@ -159,26 +149,13 @@ def _list_by_key(dev, b, n, pixels, room):
     program = dev.program("raster/lists_by_key", RUN=RUN)
     b.require({"pixel_count": ((pixels,), np.uint32)})
     dev.fill(b.pixel_count, 0)
-    program.launch(
-        "pairs_count",
-        room,
-        n=n,
-        p=room,
-        point_offset=b.point_offset,
-        pair_pixel=b.pair_pixel,
-        pixel_count=b.pixel_count,
-    )
+    filled = {"n": n, "p": room, "point_offset": b.point_offset, "pair_pixel": b.pair_pixel}
+    program.launch("pairs_count", room, pixel_count=b.pixel_count, **filled)
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     shared = {"p": room, "hw": pixels, "pair_pixel": b.pair_pixel, "pixel_offset": b.pixel_offset}
     keys, other = b.pair_key, b.pair_scratch
-    program.launch(
-        "pairs_scatter",
-        room,
-        point_key=other,
-        pixel_count=b.pixel_count,
-        pair_key=keys,
-        **shared,
-    )
+    counted = {"point_key": other, "pixel_count": b.pixel_count}
+    program.launch("pairs_scatter", room, pair_key=keys, **counted, **shared)
     program.launch("pairs_sort_runs", room, pair_key=keys, sorted=other, **shared)
 
     def merge(source, target, width, group, least):

@@ -42,18 +42,13 @@ class ProjectedPoints:
     radius: float = 0.0
 
 
-def shape_width(footprint: str) -> int:
-    """Numbers in a row of ProjectedPoints.point_shape."""
-    return 4 if footprint == "gaussian" else 1
-
-
 def projection_table(n: int, footprint: str = "soft") -> Table:
     """The buffers for n points."""
     return {
         "point_camera": ((n, 4), np.float32),
         "point_box": ((n, 4), np.uint16),
         "point_count": ((n,), np.uint32),
-        "point_shape": ((n, shape_width(footprint)), np.float32),
+        "point_shape": ((n, footprint_macros(footprint)["SHAPE"]), np.float32),
     }
 
 
@@ -62,7 +57,7 @@ def footprint_macros(footprint: str) -> dict[str, int]:
     return {
         "FOOTPRINT": FOOTPRINTS.index(footprint),
         "OFFSETS": offset_width(footprint),
-        "SHAPE": shape_width(footprint),
+        "SHAPE": 4 if footprint == "gaussian" else 1,
     }
 
 
