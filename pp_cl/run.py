@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from pp_cl.checkpoint import load_run_state
 from pp_cl.config import configure, load_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.model import Model
@@ -146,20 +146,18 @@ class Run:
         shifts = (np.arange(side) + 0.5) / side - 0.5
         depths = self.depth_range(camera)
         picture = mean_picture(
-            self._sample(camera.shifted(dx, dy), depths, features) for dy in shifts for dx in shifts
+            rendered_picture(
+                self.renderer,
+                camera.shifted(dx, dy),
+                self.gamma,
+                with_features=features,
+                depth_range=depths,
+            )
+            for dy in shifts
+            for dx in shifts
         )
         self.checked(picture.colour)
         return picture
-
-    def _sample(self, camera, depth_range, with_features):
-        """The picture of one sample of each pixel."""
-        dev = self.dev
-        result = self.renderer.forward(camera, self.gamma, depth_range=depth_range)
-        with dev.stage("depth"):
-            arrays = depth_forward(dev, result.points, result.pairs, result.weights, result.size)
-        alpha, depth, median = (result.cropped(dev.download(array)) for array in arrays)
-        features = result.cropped(dev.download(result.features)) if with_features else None
-        return Picture(result.clamped(), alpha, depth, median, features=features)
 
     def checked(self, image: np.ndarray) -> np.ndarray:
         """An image of the run. Raises UserError naming the checkpoint where it holds NaN: finite
@@ -183,6 +181,25 @@ class Run:
 
 def _over_white(picture):
     return np.pad(picture.colour, ((0, 0), (0, 0), (0, 1)), constant_values=1)
+
+
+def rendered_picture(
+    renderer: Renderer,
+    camera: Camera,
+    gamma: float,
+    *,
+    with_features: bool = False,
+    **options: Any,
+) -> Picture:
+    """Colour, alpha and depth of a camera; with its features where asked for. options: of
+    Renderer.forward().
+    """
+    dev, result = renderer.dev, renderer.forward(camera, gamma, **options)
+    with dev.stage("depth"):
+        arrays = depth_forward(dev, result.points, result.pairs, result.weights, result.size)
+    alpha, depth, median = (result.cropped(dev.download(array)) for array in arrays)
+    features = result.cropped(dev.download(result.features)) if with_features else None
+    return Picture(result.clamped(), alpha, depth, median, features=features)
 
 
 def scene_is_there(path: str) -> bool:

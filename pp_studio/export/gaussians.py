@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -71,6 +72,11 @@ class Means:
     def is_planned(size: tuple[int, int]) -> bool:
         """See UNet: no tiles are left out."""
         return False
+
+    @staticmethod
+    def gradient_tiles(*_: object) -> Callable[[], None]:
+        """There is no background to leave out."""
+        return lambda: None
 
     def forward(self, x: Array, training: bool = True, plan: None = None) -> Array:
         """(H, W, 3) image of the features x (scale H, scale W, C)."""

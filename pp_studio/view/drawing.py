@@ -15,7 +15,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import ERROR_GAIN
 from pp_cl.files.image import to_8bit
 from pp_cl.files.srgb import linear_to_srgb, srgb_to_linear
-from pp_cl.run import Run
+from pp_cl.run import Run, rendered_picture
 
 SHOWN = ("colour", "alpha", "depth", "normals", "fragments", "error", "photograph")
 OWN_CAMERA = SHOWN[5:]  # are shown from the nearest training view's own camera
@@ -72,7 +72,7 @@ def _rendered(run, renderer, camera, show, early_stop, truth):
         hits = np.diff(drawn.pairs.pixel_offset.get().astype(np.int64))
         hits = drawn.cropped(hits.reshape(drawn.size))
         return colour_scale(hits, 0, hits.max(), hits > 0), f"0 to {hits.max()} fragments"
-    picture = renderer.picture(camera, run.gamma, **options)
+    picture = rendered_picture(renderer, camera, run.gamma, **options)
     colour, is_known = run.checked(picture.colour), picture.alpha >= LEAST_ALPHA
     if show == "alpha":
         return to_8bit(np.repeat(picture.alpha[..., None], 3, axis=2)), ""

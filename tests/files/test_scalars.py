@@ -30,7 +30,7 @@ def test_without_the_package_one_line_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(UserError, match=r"pip install tensorboardX"):
         curves(tmp_path / "tensorboard", 0).__enter__()
-    monkeypatch.setattr("pp_cl.drivers.discover.open_device", lambda _: pytest.fail("work"))
+    monkeypatch.setattr("pp_cl.drivers.open_device", lambda _: pytest.fail("work"))
     assert main(["train", "demo", "--out", str(tmp_path / "run"), "--tensorboard"]) == 2
     assert not list(tmp_path.iterdir())
 

@@ -21,7 +21,7 @@ from pp_cl.scene.load import load_scene
 @pytest.fixture
 def scene(tmp_path, monkeypatch):
     """Eight photographs with distortion that are halved while they are read."""
-    monkeypatch.setattr("pp_cl.engine.views.KEPT_BYTES", 8 * 4 * 50 * 50)
+    monkeypatch.setattr("pp_cl.scene.image_file.KEPT_BYTES", 8 * 4 * 50 * 50)
     folder = write_ball_scene(tmp_path / "ball", size=98)
     file = tmp_path / "ball/transforms_train.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"k1": 0.1}))

@@ -61,7 +61,7 @@ def scene(tmp_path):
 
 def large(monkeypatch, most=8 * 4 * 50 * 50):
     """Scenes are large from `most` bytes on: eight images of 98 pixels are halved."""
-    monkeypatch.setattr("pp_cl.engine.views.KEPT_BYTES", most)
+    monkeypatch.setattr("pp_cl.scene.image_file.KEPT_BYTES", most)
 
 
 def opened(dev, scene, downscale):

@@ -123,8 +123,8 @@ def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monke
     photographs, found = run.scene("train").splits["train"], views()
     assert len(found) == 2 * len(photographs)
     with monkeypatch.context() as patch:  # for a window that is smaller than the images
-        for module in ("scene.views", "export.gaussians"):
-            patch.setattr(f"pp_cl.{module}.MIN_SIDE", 8)
+        for module in ("pp_cl.engine.views", "pp_studio.export.gaussians"):
+            patch.setattr(f"{module}.MIN_SIDE", 8)
         assert {view.camera.width for view in views(15)} == {15}
     for one, other in zip(photographs, found, strict=False):
         assert one.name == other.name and (one.image == other.image).all()
