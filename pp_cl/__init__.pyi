@@ -6,6 +6,7 @@ from .evaluate import evaluate_run as evaluate_run
 from .files.picture import Picture as Picture
 from .files.run_folder import RunFolder as RunFolder
 from .run import Run as Run
+from .run import find_run as find_run
 from .run import load as load
 from .run import stored_config as stored_config
 from .scene.load import Scene as Scene

@@ -1,5 +1,4 @@
 from .agreement import disagreements as disagreements
-from .bounds import corners_of as corners_of
 from .distortion import Distortion as Distortion
 from .distortion import undistort as undistort
 from .edits import EDITS as EDITS
@@ -25,7 +24,6 @@ from .masks import MaskRule as MaskRule
 from .masks import cut_out as cut_out
 from .masks import named_mask as named_mask
 from .masks import of_size as of_size
-from .overview import draw_overview as draw_overview
 from .readers.camera_file import read_cameras as read_cameras
 from .readers.common import read_json as read_json
 from .readers.found import MASK_FOLDERS as MASK_FOLDERS

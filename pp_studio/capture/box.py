@@ -112,3 +112,10 @@ def _table(points):
 def _spread(points):
     """(2,) width of points in x and y, but for some at the ends."""
     return np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0)
+
+
+def corners_of(box: np.ndarray) -> np.ndarray:
+    """(8, 3) corners of a (2, 3) box: bit i of a row's number says whether it lies on the upper
+    side of axis i.
+    """
+    return np.array([[box[n >> axis & 1][axis] for axis in range(3)] for n in range(8)])

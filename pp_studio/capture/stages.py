@@ -35,7 +35,6 @@ from pp_cl.files import (
 )
 from pp_cl.scene import (
     Distortion,
-    draw_overview,
     frame_keys,
     named_mask,
     read_edits,
@@ -43,6 +42,7 @@ from pp_cl.scene import (
     shrink,
 )
 from pp_studio.capture import STAGES, box, features, frames, masks, pinhole, poses, still
+from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
 SCENE_FILE = "transforms.json"
@@ -452,7 +452,7 @@ def _seen_from_outside(model, box):
     """The picture of a model's points and cameras, and a box (2, 3), from two sides."""
     cameras = [one.camera for one in poses.photographs(model)]
     colours = np.array([point.color for point in model.points3D.values()])
-    return draw_overview(cameras, box, poses.points(model)[0], colours, SHOWN_WIDTH)
+    return overview(cameras, box, poses.points(model)[0], colours, SHOWN_WIDTH)
 
 
 def _left_out(lines: Sequence[str], what: str) -> str:

@@ -7,7 +7,8 @@ import numpy as np
 
 from pp_cl import Camera
 from pp_cl.errors import UserError
-from pp_cl.scene import Photograph, corners_of
+from pp_cl.scene import Photograph
+from pp_studio.capture.box import corners_of
 from pp_studio.capture.packages import needed
 
 cv2 = needed("cv2")
