@@ -14,9 +14,8 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import mend, remove_leftovers, write_text
+from pp_cl.files.atomic import check_ours, mend, own, remove_ours, write_text
 from pp_cl.files.checkpoint import Rows, save_checkpoint
-from pp_cl.files.manifest import begin_manifest, check_ours, remove_ours
 from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
 MASKS_PICTURE = "masks.png"
@@ -134,8 +133,7 @@ class RunFolder:
         """Make the folders, remove what a killed process left unfinished, and pictures that belong
         to no checkpoint; write config.json, which makes the folder one of a run, before the rest.
         """
-        begin_manifest(self.path)
-        remove_leftovers(self.path)
+        own(self.path)
         if not self.checkpoint.exists():
             remove_ours([self.path / MASKS_PICTURE, *self.previews.glob("step_*.png")])
         self.configure(config_json)
