@@ -95,8 +95,8 @@ def _header(path):
 
 
 def _window(path, header, name):
-    """(x and y of the first pixel, width and height) of a window in the header. Raises UserError for
-    one that no image has.
+    """(x and y of the first pixel, (width, height)) of a window in the header. Raises UserError
+    for one that no image has.
     """
     first, last = (np.array(corner, int) for corner in header[name])
     width, height = map(int, last - first + 1)
