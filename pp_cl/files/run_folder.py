@@ -5,17 +5,15 @@ import math
 import os
 import socket
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import check_ours, mend, own, remove_ours, write_text
-from pp_cl.files.checkpoint import Rows, save_checkpoint
 from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
 MASKS_PICTURE = "masks.png"
@@ -146,10 +144,6 @@ class RunFolder:
     def rows(self) -> list[dict[str, Any]]:
         """The rows of the log, up to the first that is broken."""
         return _rows(self.log)
-
-    def save(self, header: dict[str, Any], arrays: Mapping[str, np.ndarray | Rows]) -> None:
-        """Replace the checkpoint."""
-        save_checkpoint(self.checkpoint, header, arrays)
 
     def open_log(self, step: int) -> "Log":
         """The log, cut off after `step`: later rows will be made again."""

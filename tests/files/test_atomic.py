@@ -12,6 +12,7 @@ from pp_cl.files.atomic import (
     atomic_file,
     atomic_folder,
     remove_leftovers,
+    write_json,
     write_text,
 )
 
@@ -112,3 +113,9 @@ def test_windows_waits_for_a_reader_and_replaces_no_folder(tmp_path, monkeypatch
     monkeypatch.setattr("pp_cl.files.atomic.READER_SECONDS", 0.2)
     with pytest.raises(UserError, match="cannot be written"):
         write_text(tmp_path / "a", "other")
+
+
+def test_json_never_holds_nan(tmp_path):
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json(tmp_path / "a.json", {"x": float("nan")})
+    assert not (tmp_path / "a.json").exists()
