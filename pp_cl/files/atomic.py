@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 
 from platformdirs import user_cache_dir
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, shown
 
 READER_SECONDS = 5  # which a viewer takes to read a large checkpoint
 DISK = (errno.EIO, errno.ENOSPC, errno.EDQUOT)  # errors of a disk, not of what a system cannot do
@@ -50,11 +50,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Raises UserError naming the file when the library cannot write it.
     """
-    with _renamed(path, path.suffix) as temporary:
-        try:
-            yield temporary
-        except RuntimeError as error:  # of libraries in C++
-            raise _refusal(path, error) from error
+    kinds = OSError, RuntimeError  # the latter of libraries in C++
+    with _renamed(path, path.suffix) as temporary, told(path, kinds):
+        yield temporary
 
 
 @contextmanager
@@ -83,13 +81,12 @@ def _renamed(path, suffix="", *, noted=True):
     """
     temporary = _temporary(path, suffix)
     try:
-        yield temporary
-        if noted:
-            _note(temporary, path)
-        _replace(temporary, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise _refusal(path, error) from error
+        with told(path):
+            yield temporary
+            if noted:
+                _note(temporary, path)
+            _replace(temporary, path)
+            _sync_folder(path.parent)
     finally:
         _remove(temporary)
 
@@ -135,25 +132,30 @@ def _remove(temporary):
             temporary.unlink(missing_ok=True)
 
 
-def mend(error: OSError) -> str:
+def mend(error: Exception) -> str:
     """What to do about a file that cannot be opened or written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free some space"
-    if error.errno in (errno.EMFILE, errno.ENFILE):
+    if number in (errno.EMFILE, errno.ENFILE):
         return "allow more open files (ulimit -n)"
-    if error.errno == errno.ENAMETOOLONG:
+    if number == errno.ENAMETOOLONG:
         return "choose a shorter name"
     return "check the folder, its permissions and the disk"
 
 
-def _refusal(path, error):
-    """The UserError of a path that cannot be written. error: an OSError, or one of a library."""
-    if isinstance(error, OSError) and error.errno:
-        return UserError(f"{path}: cannot be written ({error.strerror}); {mend(error)}")
-    reason = " ".join(str(error).split())[:120]
-    return UserError(
-        f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
-    )
+@contextmanager
+def told(
+    path: Path | str, kinds: tuple[type[Exception], ...] = (OSError,), then: str = ""
+) -> Iterator[None]:
+    """An exception of these kinds in the block becomes a UserError that names the file and the
+    remedy. then: what follows in it.
+    """
+    try:
+        yield
+    except kinds as error:
+        reason = getattr(error, "strerror", None) or shown(str(error), 120)
+        raise UserError(f"{path}: cannot be written ({reason}); {mend(error)}{then}") from error
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -192,11 +194,10 @@ def check_target(path: Path) -> None:
     """
     tried = Path(os.path.abspath(path))
     try:
-        while not tried.parent.exists():
-            tried = tried.parent
-        _temporary(tried).touch()
-    except OSError as error:
-        raise _refusal(path, error) from None
+        with told(path):
+            while not tried.parent.exists():
+                tried = tried.parent
+            _temporary(tried).touch()
     finally:
         _remove(_temporary(tried))
 

@@ -13,7 +13,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import check_ours, mend, own, remove_ours, write_text
+from pp_cl.files.atomic import check_ours, own, remove_ours, told, write_text
 from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
 MASKS_PICTURE = "masks.png"
@@ -22,6 +22,7 @@ MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
 MOST_LOG = 2**25  # bytes of a log: 80,000 rows
 MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
 MOST_NUMBER = 1e300  # in a row
+GOES_ON = "; the same command goes on"
 MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
@@ -57,21 +58,18 @@ class RunFolder:
         if not file.exists():
             return None
         try:
-            result = json.loads(read_json_text(file, MOST_METRICS))
-            found = {
+            result = strict_json(read_json_text(file, MOST_METRICS))
+            if not all(math.isfinite(value) for value in result["mean"].values()):
+                raise ValueError("infinite values")
+            return {
                 "mean": {name: float(value) for name, value in result["mean"].items()},
-                "step": result["step"],
-                "finished": result["finished"],
-                "points": result["points"]["final"],
-                "device": result["device"],
+                "step": int(result["step"]),
+                "finished": bool(result["finished"]),
+                "points": int(result["points"]["final"]),
+                "device": str(result["device"]),
             }
-            kinds = {"step": int, "finished": bool, "points": int, "device": str}
-            is_right = all(type(found[key]) is kind for key, kind in kinds.items())
-            if not (is_right and all(map(math.isfinite, found["mean"].values()))):
-                raise ValueError("values of another kind")
         except Exception as error:  # whatever stands there
             raise refusal(file, error, "metrics", f"run `pp-cl eval {self}` again") from None
-        return found
 
     def check_usable(self) -> None:
         """Raise UserError if the folder is a file, or holds files that belong to no run."""
@@ -109,7 +107,7 @@ class RunFolder:
                 f"{lock.lock_file}: cannot be locked ({error.strerror}); check the file system"
             ) from error
         try:
-            with _told(owner):
+            with told(owner):
                 owner.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
             yield
         finally:
@@ -164,7 +162,7 @@ class Log:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with _told(self._file.name):
+        with told(self._file.name, then=GOES_ON):
             self._file.close()
 
     def write(self, row: dict[str, Any]) -> None:
@@ -172,20 +170,9 @@ class Log:
         NaN.
         """
         data = (json.dumps(row, allow_nan=False) + "\n").encode()
-        with _told(self._file.name):
+        with told(self._file.name, then=GOES_ON):
             while data:
                 data = data[self._file.write(data) :]
-
-
-@contextmanager
-def _told(path):
-    """A write that fails becomes a UserError naming the file."""
-    try:
-        yield
-    except OSError as error:
-        raise UserError(
-            f"{path}: cannot be written ({error.strerror}); {mend(error)}; the same command goes on"
-        ) from error
 
 
 def read_row(line: bytes | str) -> dict[str, Any] | None:
@@ -199,11 +186,11 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
             return None
     except (ValueError, RecursionError):
         return None
-    whole, device = type(row.get("step")) is int, row.get("device", "")
-    numbers = [row.get(name, 0) for name in ("step", "seconds", "loss", "psnr")]
-    is_row = whole and "seconds" in row and isinstance(device, str)
-    is_row = is_row and all(type(number) in (int, float) for number in numbers)
-    return row if is_row and min(numbers[:2]) >= 0 else None
+    kinds = {name: type(value) for name, value in row.items()}
+    is_row = kinds.get("step") is int and kinds.get("seconds") in (int, float)
+    is_row = is_row and kinds.get("device", str) is str
+    is_row = is_row and all(kinds.get(name, float) in (int, float) for name in ("loss", "psnr"))
+    return row if is_row and min(row["step"], row["seconds"]) >= 0 else None
 
 
 def _is_kept(value, levels=MOST_LEVELS):
@@ -219,13 +206,18 @@ def _is_kept(value, levels=MOST_LEVELS):
 def _rows(path, step=math.inf):
     """The rows of a log up to `step`, or to one that says finished where a step is given. The first
     that is broken, and all after it, are left out with a warning; of a log that may be growing its
-    last line without one.
+    last line without one. Raises UserError for a log that is too long.
     """
+    size = path.stat().st_size if path.is_file() else 0
+    if size > MOST_LOG:
+        raise UserError(
+            f"{path}: is larger than {MOST_LOG} bytes; move it away, and raise train.log_every"
+        )
     rows, last = [], {"step": 0, "seconds": 0}
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(path.read_bytes().splitlines(True) if size else (), 1):
         row = read_row(line)
         if row is None or any(row[name] < last[name] for name in last):
-            if line.endswith(b"\n") or len(line) > MOST_LINE or step < math.inf:
+            if line.endswith(b"\n") or step < math.inf:
                 warnings.warn(
                     f"{path}: line {number} is no row of a log; it is left out, as is all after it",
                     stacklevel=2,
@@ -236,16 +228,3 @@ def _rows(path, step=math.inf):
         rows.append(row)
         last = {name: row[name] for name in last}
     return rows
-
-
-def _lines(path):
-    """The lines of a log, in pieces where they are too long. Raises UserError for a log that is too
-    long itself.
-    """
-    if path.is_file():
-        if path.stat().st_size > MOST_LOG:
-            raise UserError(
-                f"{path}: is larger than {MOST_LOG} bytes; move it away, and raise train.log_every"
-            )
-        with path.open("rb") as file:
-            yield from iter(lambda: file.readline(MOST_LINE + 1), b"")

@@ -94,7 +94,7 @@ def render_frames(
                 if style.suffix == "exr":
                     write_exr(path, picture.channels())
                 else:
-                    write_png(path, picture.image(style.background))
+                    write_png(path, picture.over(style.background))
             on_frame(None if there else time.perf_counter() - start)
     return paths
 
