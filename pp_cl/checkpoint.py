@@ -3,7 +3,6 @@ atomically; before memory is taken for what is read, it is compared with the siz
 file and with the run's settings.
 """
 
-import errno
 import json
 import math
 import zipfile
@@ -24,7 +23,7 @@ from pp_cl.engine.training.state import PointState
 from pp_cl.errors import Diverged, UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.files.untrusted import opened_zip, strict_json
+from pp_cl.files.untrusted import opened_zip, refusal, strict_json
 from pp_cl.scene.identity import kept_views
 from pp_cl.settings import Config
 
@@ -191,13 +190,7 @@ def _refused(path):
     except UserError:
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno != errno.EINVAL:  # a place before the file
-            raise UserError(
-                f"{path}: cannot be read ({error.strerror or error}); check its permissions and the"
-                " disk"
-            ) from None
-        reason = shown(str(error)) or type(error).__name__
-        raise UserError(f"{path}: corrupt checkpoint ({reason}); {MEND}") from None
+        raise refusal(path, error, "a checkpoint", MEND) from None
 
 
 def _problem_of_header(header, steps):

@@ -101,7 +101,7 @@ def test_forms_and_single_arrays_are_read_without_the_others(folder, config):
             name: (array.shape, array.dtype) for name, array in arrays.items()
         }
         np.testing.assert_array_equal(stored.array("points.ids"), arrays["points.ids"])
-        with pytest.raises(UserError, match=r"npz: corrupt checkpoint \(Bad CRC"):
+        with pytest.raises(UserError, match=r"npz: cannot be read as a checkpoint \(Bad CRC"):
             stored.array("points.sh2")
     folder.checkpoint.unlink()
     with pytest.raises(UserError, match="no such checkpoint"), opened_run(folder, config):

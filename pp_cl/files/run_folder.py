@@ -181,16 +181,13 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
     something else.
     """
     try:
-        row = strict_json(line) if len(line) <= MOST_LINE else None
-        if not isinstance(row, dict) or not _is_kept(row):
-            return None
-    except (ValueError, RecursionError):
+        row = strict_json(line) if len(line) <= MOST_LINE else {}
+        numbers = [row["step"], row["seconds"], row.get("loss", 0), row.get("psnr", 0)]
+        is_row = type(numbers[0]) is int and all(type(n) in (int, float) for n in numbers)
+        is_row = is_row and min(numbers[:2]) >= 0 and type(row.get("device", "")) is str
+        return row if is_row and _is_kept(row) else None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
-    kinds = {name: type(value) for name, value in row.items()}
-    is_row = kinds.get("step") is int and kinds.get("seconds") in (int, float)
-    is_row = is_row and kinds.get("device", str) is str
-    is_row = is_row and all(kinds.get(name, float) in (int, float) for name in ("loss", "psnr"))
-    return row if is_row and min(row["step"], row["seconds"]) >= 0 else None
 
 
 def _is_kept(value, levels=MOST_LEVELS):

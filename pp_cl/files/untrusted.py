@@ -29,7 +29,7 @@ def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
     descriptor = os.open(path, os.O_RDONLY | flags)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+        raise OSError(errno.ENOTSUP, "Not a regular file", str(path))
     with open(descriptor, "rb") as file:
         yield file
 
@@ -86,7 +86,8 @@ def refusal(
     """
     if isinstance(error, FileNotFoundError):
         return UserError(f"{path}: no such file; copy it there")
-    if isinstance(error, OSError) and error.errno is not None:
+    # EINVAL: the content names a place before the file's beginning
+    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
         return UserError(
             f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
         )
