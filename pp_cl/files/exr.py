@@ -13,7 +13,8 @@ from pp_cl.files.srgb import linear_to_srgb
 from pp_cl.files.untrusted import MOST_PIXELS, refusal
 
 COLOURS = (("R", "G", "B"), ("Y",))  # what makes an image
-MOST_VALUES = 4 * MOST_PIXELS  # of all channels: some compressions unpack them together
+# bytes of a tile, or of the most rows that a compression packs together, with all channels
+MOST_CHUNK, CHUNK_ROWS = 2**29, 256
 FLOAT = Imath.PixelType(Imath.PixelType.FLOAT)
 
 
@@ -44,7 +45,7 @@ def read_exr_rgba(path: Path | str) -> np.ndarray:
     header = _header(path)
     first_shown, (width, height) = _window(path, header, "displayWindow")
     first, (columns, rows) = _window(path, header, "dataWindow")
-    names = _wanted(path, header, columns * rows)
+    names = _wanted(path, header, columns * min(rows, CHUNK_ROWS))
     try:
         with closing(OpenEXR.InputFile(str(path))) as file:
             read = [np.frombuffer(one, np.float32) for one in file.channels(names, FLOAT)]
@@ -108,8 +109,10 @@ def _window(path, header, name):
     return first, (width, height)
 
 
-def _wanted(path, header, pixels):
-    """The names of R, G and B, or of Y, and of A where it is there. Raises UserError."""
+def _wanted(path, header, chunk):
+    """The names of R, G and B, or of Y, and of A where it is there. chunk: pixels that are packed
+    together, but for tiles. Raises UserError.
+    """
     channels = {channel.name: channel for channel in header["channels"]}
     layers = {name[: name.rfind(".") + 1] for name in channels}  # with the point behind their name
     found = [
@@ -129,10 +132,10 @@ def _wanted(path, header, pixels):
     if any((channels[name].xSampling, channels[name].ySampling) != (1, 1) for name in names):
         raise UserError(f"{path}: its channels differ in size; save it without subsampling")
     tiles = header.get("tiles")
-    values = len(channels) * max(pixels, tiles.xSize * tiles.ySize if tiles else 0)
-    if values > MOST_VALUES:
-        told = (
-            f"{path}: {len(channels)} channels of {pixels} pixels, more than {MOST_VALUES} values"
+    packed = 4 * len(channels) * (tiles.xSize * tiles.ySize if tiles else chunk)
+    if packed > MOST_CHUNK:
+        raise UserError(
+            f"{path}: {len(channels)} channels are packed together, {packed} bytes and more than"
+            f" {MOST_CHUNK}; save R, G, B and A alone"
         )
-        raise UserError(f"{told}; save R, G, B and A alone")
     return names
