@@ -12,39 +12,22 @@ from support.runs import arguments, spoken
 from support.sweeps import jobs_of, pretend, words_of
 
 from pp_cl.cli import main
-from pp_studio.export import FORMATS
 
 FILM = ["render", "run", "--seconds", "0.2", "--fps", "10"]
-OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
-RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--blend", "alpha"]
-# of a small window, for which splats are fitted faster
-EXPORT = {
-    name: ["export", "run", "--format", name, *(("--window", "100") if "splat" in name else ())]
-    for name in FORMATS
-}
-# {name: (words, BALL stands for a scene; files that the words name, which may be replaced)}
+# One command for each way in which files are written, replaced and removed: {name: (words, files
+# that they name, which may be replaced)}
 COMMANDS = {
     "train": (None, ()),
     "eval": (["eval", "run", "--save-images"], ()),
-    "eval of a split": (["eval", "run", "--save-images", "--split", "train"], ()),
     "eval elsewhere": (["eval", "run", "--save-images", "--out", "there"], ()),
     "eval in JSON": (["eval", "run", "--json", "a.json"], ("a.json",)),
     "film": (FILM, ()),
-    "film elsewhere": ([*FILM, "--out", "a.gif"], ("a.gif",)),
-    "mp4 elsewhere": ([*FILM, "--out", "a.mp4"], ("a.mp4",)),
-    "frames": ([*FILM, "--format", "png"], ()),
+    "film elsewhere": ([*FILM, "--out", "a.mp4"], ("a.mp4",)),
     "frames elsewhere": ([*FILM, "--format", "exr", "--out", "there"], ()),
-    **{f"export {name}": (words, ()) for name, words in EXPORT.items()},
-    **{
-        f"export {name} elsewhere": ([*EXPORT[name], "--out", f"a{end}"], named)
-        for name, (_, ends, _) in FORMATS.items()
-        for end in (ends or ("",))[:1]
-        for named in ((f"a{end}",) if end else (),)
-    },
-    "info": (["info", "run", "--picture", "a.png", "--json", "a.json"], ("a.png", "a.json")),
-    "compare": ([*OF_BALL, "a.json"], ("a.json",)),
-    "bench": ([*RASTER, "--json", "a.json"], ("a.json",)),
-    "bench in a plot": ([*RASTER, "--plot", "a.svg"], ("a.svg",)),
+    "export": (["export", "run", "--format", "html"], ()),
+    "export elsewhere": (["export", "run", "--format", "ply", "--out", "a.ply"], ("a.ply",)),
+    "export of a folder": (["export", "run", "--format", "gallery"], ()),
+    "export of a folder elsewhere": (["export", "run", "--format", "scene", "--out", "a"], ()),
     "sweep": (None, ()),
 }
 STATE = ("config.json", "checkpoint.npz", "log.jsonl")  # of a run, which is what its name says
@@ -66,7 +49,7 @@ def words_for(name, scene):
         for job in jobs_of([scene], "there"):
             pretend(job, 20.0)
         return words_of([scene], "there")
-    return [word.replace("BALL", scene) for word in COMMANDS[name][0]]
+    return COMMANDS[name][0]
 
 
 def files(folder):
