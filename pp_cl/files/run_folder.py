@@ -59,15 +59,14 @@ class RunFolder:
             return None
         try:
             result = strict_json(read_json_text(file, MOST_METRICS))
-            if not all(math.isfinite(value) for value in result["mean"].values()):
+            found = {name: result[name] for name in ("mean", "step", "finished", "device")}
+            found["points"] = result["points"]["final"]
+            kinds = {"step": int, "finished": bool, "points": int, "device": str}
+            if any(type(found[name]) is not kind for name, kind in kinds.items()):
+                raise ValueError("values of another kind")
+            if not all(math.isfinite(value) for value in found["mean"].values()):
                 raise ValueError("infinite values")
-            return {
-                "mean": {name: float(value) for name, value in result["mean"].items()},
-                "step": int(result["step"]),
-                "finished": bool(result["finished"]),
-                "points": int(result["points"]["final"]),
-                "device": str(result["device"]),
-            }
+            return found
         except Exception as error:  # whatever stands there
             raise refusal(file, error, "metrics", f"run `pp-cl eval {self}` again") from None
 
