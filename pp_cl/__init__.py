@@ -4,7 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.engine.camera import Camera
     from pp_cl.errors import UserError
     from pp_cl.evaluate import evaluate_run
@@ -39,7 +39,7 @@ _MODULES = {
     "evaluate_run": "evaluate",
     "load": "run",
     "load_scene": "scene.load",
-    "open_device": "drivers.discover",
+    "open_device": "drivers",
     "train_scene": "session.training",
 }
 

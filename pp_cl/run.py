@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from pp_cl.checkpoint import load_run_state
 from pp_cl.config import configure, load_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.model import Model

@@ -24,7 +24,7 @@ def test_devices_are_listed_and_without_one_it_is_said_what_to_install(
     assert "works" in capsys.readouterr().out
     assert main(["devices", "--json"]) == 0
     assert any(d["problem"] is None and d["name"] for d in json.loads(capsys.readouterr().out))
-    monkeypatch.setattr("pp_cl.drivers.discover.list_devices", lambda **_: [])
+    monkeypatch.setattr("pp_cl.drivers.list_devices", lambda **_: [])
     for words in (["train", scene, "--out", tmp_path / "run"], ["devices"]):
         assert "install" in failure(*words)
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from support.guarded import slow
 from support.refused import failure
 from support.runs import arguments, checkpoint, train_and_interrupt
 from support.scenes import ball_image, ring_cameras
@@ -40,7 +41,9 @@ def scene(tmp_path_factory):
     return str(folder)
 
 
-@pytest.fixture(scope="module", params=[24, 0, 64], ids=["crops", "whole", "larger crops"])
+@pytest.fixture(
+    scope="module", params=[24, slow(0), slow(64)], ids=["crops", "whole", "larger crops"]
+)
 def trained(request, scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("mixed") / "run"
     assert main(arguments(scene, out, 1, train__crop=request.param)) == 0

@@ -8,26 +8,49 @@ import shutil
 from pathlib import Path
 
 import pytest
+from support.guarded import slow
 from support.runs import arguments, spoken
 from support.sweeps import jobs_of, pretend, words_of
 
 from pp_cl.cli import main
+from pp_studio.export import FORMATS
 
 FILM = ["render", "run", "--seconds", "0.2", "--fps", "10"]
-# One command for each way in which files are written, replaced and removed: {name: (words, files
-# that they name, which may be replaced)}
+OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
+RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--blend", "alpha"]
+# of a small window, for which splats are fitted faster
+EXPORT = {
+    name: ["export", "run", "--format", name, *(("--window", "100") if "splat" in name else ())]
+    for name in FORMATS
+}
+# what writes by a mechanism of its own: a run, an evaluation, a file, a folder, a page, a table
+ONE_EACH = (
+    *("train", "eval", "eval elsewhere", "film elsewhere", "frames", "export html"),
+    *("export ply elsewhere", "export scene elsewhere", "info", "sweep"),
+)
+# {name: (words, BALL stands for a scene; files that the words name, which may be replaced)}
 COMMANDS = {
     "train": (None, ()),
     "eval": (["eval", "run", "--save-images"], ()),
+    "eval of a split": (["eval", "run", "--save-images", "--split", "train"], ()),
     "eval elsewhere": (["eval", "run", "--save-images", "--out", "there"], ()),
     "eval in JSON": (["eval", "run", "--json", "a.json"], ("a.json",)),
     "film": (FILM, ()),
-    "film elsewhere": ([*FILM, "--out", "a.mp4"], ("a.mp4",)),
+    "film elsewhere": ([*FILM, "--out", "a.gif"], ("a.gif",)),
+    "mp4 elsewhere": ([*FILM, "--out", "a.mp4"], ("a.mp4",)),
+    "frames": ([*FILM, "--format", "png"], ()),
     "frames elsewhere": ([*FILM, "--format", "exr", "--out", "there"], ()),
-    "export": (["export", "run", "--format", "html"], ()),
-    "export elsewhere": (["export", "run", "--format", "ply", "--out", "a.ply"], ("a.ply",)),
-    "export of a folder": (["export", "run", "--format", "gallery"], ()),
-    "export of a folder elsewhere": (["export", "run", "--format", "scene", "--out", "a"], ()),
+    **{f"export {name}": (words, ()) for name, words in EXPORT.items()},
+    **{
+        f"export {name} elsewhere": ([*EXPORT[name], "--out", f"a{end}"], named)
+        for name, (_, ends, _) in FORMATS.items()
+        for end in (ends or ("",))[:1]
+        for named in ((f"a{end}",) if end else (),)
+    },
+    "info": (["info", "run", "--picture", "a.png", "--json", "a.json"], ("a.png", "a.json")),
+    "compare": ([*OF_BALL, "a.json"], ("a.json",)),
+    "bench": ([*RASTER, "--json", "a.json"], ("a.json",)),
+    "bench in a plot": ([*RASTER, "--plot", "a.svg"], ("a.svg",)),
     "sweep": (None, ()),
 }
 STATE = ("config.json", "checkpoint.npz", "log.jsonl")  # of a run, which is what its name says
@@ -49,7 +72,7 @@ def words_for(name, scene):
         for job in jobs_of([scene], "there"):
             pretend(job, 20.0)
         return words_of([scene], "there")
-    return COMMANDS[name][0]
+    return [word.replace("BALL", scene) for word in COMMANDS[name][0]]
 
 
 def files(folder):
@@ -67,7 +90,7 @@ def made(paths, folder):
     return {path: there for path, there in files(folder).items() if path in paths}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", [n if n in ONE_EACH else slow(n) for n in COMMANDS])
 def test_what_is_the_users_stays(work, scene, name, capsys):
     """Files beside those of the command, and those of the command that the user has changed."""
     before, words = files(work), words_for(name, scene)
@@ -95,7 +118,10 @@ def full(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("name", [n for n in COMMANDS if "elsewhere" in n or COMMANDS[n][1]])
+@pytest.mark.parametrize(
+    "name",
+    [n if n in ONE_EACH else slow(n) for n in COMMANDS if "elsewhere" in n or COMMANDS[n][1]],
+)
 def test_a_full_disk_is_one_line_and_nothing_is_left(work, scene, name, monkeypatch):
     words = words_for(name, scene)
     with monkeypatch.context() as patch:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pp_cl.bench.timing import interleave
 from pp_cl.config import run_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.network.layers import multiplications
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.weights import listed_hits

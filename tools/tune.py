@@ -18,7 +18,7 @@ import numpy as np
 from pp_cl.bench.conv import Layer, UploadedLayer
 from pp_cl.bench.timing import interleave
 from pp_cl.config import preset
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import blocking_of, device_class
 from pp_cl.engine.layers.conv_direct import Blocking, Direction

@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
     """
     from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
     from pp_cl.bench.timing import HEAD, line
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
 
     foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
     shared.refuse(options, foreign, f"bench {options.what} has no such option")

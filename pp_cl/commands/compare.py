@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _images(options):
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.metrics.compare import compare
 
     metrics = options.metrics or METRICS
@@ -70,7 +70,7 @@ def _images(options):
 def _shape(options):
     from pp_cl.commands.compare_mesh import mesh_shape, run_shape
     from pp_cl.config import nearby_run
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.metrics.shape import read_mesh
 

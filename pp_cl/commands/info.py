@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> None:
     """Print the facts, write the picture. Raises UserError for options that do not fit."""
     from pp_cl.commands.info_facts import describe_scene, run_facts, run_picture, scene_picture
     from pp_cl.config import nearby_run
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.files.image import write_png
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.scene.load import DEMO

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.config import run_config
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state

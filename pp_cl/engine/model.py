@@ -14,6 +14,8 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 
+REFINING_BYTES = 320  # of the host, which refining takes for each point before it
+
 
 class Model:
     """Points and network on a device.

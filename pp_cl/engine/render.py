@@ -14,18 +14,25 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.device.buffers import Buffers, Reading, grown
+from pp_cl.engine.device.buffers import Buffers, Reading, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.tiles import tiles_hit
 from pp_cl.engine.model import Model
-from pp_cl.engine.raster.blend import BlendGradients, blend_backward, blend_forward, shade_forward
-from pp_cl.engine.raster.pairs import Pairs, find_pairs, room_needed
-from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid
+from pp_cl.engine.raster.blend import (
+    BlendGradients,
+    blend_backward,
+    blend_backward_table,
+    blend_forward,
+    shade_forward,
+)
+from pp_cl.engine.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
+from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid, projection_table
 from pp_cl.engine.raster.weights import (
     BlendWeights,
     blend_weights,
     list_weights,
     record_weights,
+    weights_table,
 )
 from pp_cl.errors import UserError
 from pp_cl.settings import RasterConfig
@@ -41,6 +48,31 @@ def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, 
         return settings.radius * edge
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
+
+
+def view_table(
+    settings: RasterConfig,
+    n: int,
+    pixels: int,
+    pairs: int,
+    visible: int,
+    *,
+    until: Literal["weights", "image"] = "image",
+    training: bool = False,
+) -> Table:
+    """The buffers of Renderer for a view of n points with so many pixels, hits and visible points.
+    until, training: of forward(); with record_weights() if it ends at the weights, with backward()
+    in a training.
+    """
+    table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs)
+    table |= weights_table(n, pixels, pairs if training else 1)
+    table["features"] = (pixels, 16), np.float32
+    if until == "weights":
+        return table | {"pair_gradient": ((pairs, 2), np.float32)}
+    table["shaded_features"] = (visible, 16), np.float32
+    if training:
+        table |= blend_backward_table(visible, pixels, pairs, settings.blend, settings.footprint)
+    return table
 
 
 @dataclass

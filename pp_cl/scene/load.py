@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import (
     MASK_THRESHOLD,

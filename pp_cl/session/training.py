@@ -13,7 +13,7 @@ import numpy as np
 
 from pp_cl.checkpoint import check_finite, load_run_state, opened_run, save_checkpoint
 from pp_cl.config import load_config, refuse_setting, run_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.model import Model

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.views import evenly, fitting_downscale
 from pp_cl.errors import UserError, listing
 from pp_cl.files.atomic import (

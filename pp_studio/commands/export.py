@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the run, say what was written."""
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import load_run
     from pp_studio.export.formats import check_target, export

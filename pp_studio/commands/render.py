@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a film of them where one is asked for."""
     from tqdm import tqdm
 
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.files.atomic import own
     from pp_cl.run import load_run
     from pp_studio.export.film import render_film, render_frames

@@ -132,7 +132,7 @@ def _run(options, jobs, total):
     SIGTERM.
     """
     from pp_cl.commands.progress import first_signal
-    from pp_cl.drivers.discover import separate_devices
+    from pp_cl.drivers import separate_devices
     from pp_studio.sweep.cluster import client_of, local_client, run_jobs
     from pp_studio.sweep.table import run_text, values_text
 

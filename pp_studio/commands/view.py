@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.errors import UserError, name_of, require
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import stored_config

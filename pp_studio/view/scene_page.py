@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.config import assign, configure, preset, preset_downscale
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.camera_path import looked_at, up_of

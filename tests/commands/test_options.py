@@ -43,7 +43,7 @@ def test_texts_become_what_is_meant(tmp_path):
 
 def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypatch):
     """One rule for every command."""
-    monkeypatch.setattr("pp_cl.drivers.discover.list_devices", lambda **_: [])
+    monkeypatch.setattr("pp_cl.drivers.list_devices", lambda **_: [])
     file = tmp_path / "a.json"
     for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):
         assert main(["devices", *words]) == 2  # none works

@@ -27,7 +27,7 @@ def test_a_row_gives_a_curve_for_every_number():
 
 def test_without_the_package_one_line_names_the_extra(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    monkeypatch.setattr("pp_cl.drivers.discover.open_device", lambda _: pytest.fail("work"))
+    monkeypatch.setattr("pp_cl.drivers.open_device", lambda _: pytest.fail("work"))
     assert main(["train", "demo", "--out", str(tmp_path / "run"), "--tensorboard"]) == 2
     assert "pip install tensorboardX" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -1,5 +1,6 @@
 """A sign or a comparison flipped in any kernel file is seen, and the case that it concerns is
-named.
+named. Each builds kernels of its own, so these are for the night and for changes of cl/: `make
+test-slow`. A fault in a kernel is seen by the cases themselves (test_cases.py), too.
 """
 
 import pytest
@@ -7,6 +8,8 @@ import pytest
 from pp_cl.engine.device import device as device_module
 from pp_cl.engine.device.device import Program
 from pp_cl.selftest.run import CASES, run_cases
+
+pytestmark = pytest.mark.slow
 
 KERNELS = device_module.kernel_folder()
 # (kernel file, text that stands there once, what it becomes, the case that must fail)

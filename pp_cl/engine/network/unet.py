@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import PackedArrays, packed_arrays, table_bytes
+from pp_cl.engine.device.buffers import PackedArrays, Table, packed_arrays, table_bytes
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import AUTO, blocking_of, choose
 from pp_cl.engine.layers.conv_direct import (
@@ -217,6 +217,10 @@ def _work_table(convs):
     return {key: (c.work_shape, np.float32) for key, c in convs.items() if c.work_shape}
 
 
+def _row_of(array):
+    return array.shape, array.dtype
+
+
 def _first_float(array):
     """Where an array of packed_arrays() begins in the whole."""
     return array.base_data.offset // array.dtype.itemsize
@@ -420,14 +424,18 @@ class UNet:
                 found[layer.name, direction, source] = conv
         return found
 
-    def work_bytes(self, size: Size, training: bool) -> int:
-        """Of the arrays that the convolutions of images of a size take beside a layer's own: the
-        weights as kernels read them, and the parts of the gradients.
+    def table(self, crop: Size, image: Size) -> Table:
+        """The arrays of a network that is trained on crops of one size and renders images of
+        another: its parameters, the feature maps and work of both passes, and the scratch memory
+        that their convolutions share, which grows with the device's compute units.
         """
-        return table_bytes(_work_table(self.work(size, training)))
-
-    def scratch_bytes(self, size: Size, training: bool) -> int:
-        """Of the memory that the convolutions of images of a size share, which grows with the
-        device's compute units.
-        """
-        return 4 * max(conv.scratch_floats() for conv in self.work(size, training).values())
+        table: Table = dict.fromkeys(("parameters", "gradients"), _row_of(self.all_parameters))
+        scratch = 0
+        for training, size in ((True, crop), (False, image)):
+            convs = self.work(size, training)
+            shapes = array_shapes(self.layers, size)
+            shared = share_buffers(lifetimes(self.layers, training), shapes)
+            table |= {f"{training} {i}": ((b.floats,), np.float32) for i, b in enumerate(shared)}
+            table[f"{training} work"] = (table_bytes(_work_table(convs)),), np.uint8
+            scratch = max(scratch, *(conv.scratch_floats() for conv in convs.values()))
+        return table | {"scratch": ((scratch,), np.float32)}

@@ -4,6 +4,7 @@ many pixels it hits.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
 # numbered as in cl/raster/footprint.h, which explains them
 FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
 MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in edges of the grid
+LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,11 @@ class ProjectedPoints:
     point_white: Array
     cloud_offset: Array | None = None
     radius: float = 0.0
+
+
+def footprint_pixels(radius: float) -> float:
+    """How many pixels a point hits, about. radius: of its footprint, pixels."""
+    return math.pi * max(LEAST_RADIUS, radius) ** 2
 
 
 def projection_table(n: int, footprint: str = "soft") -> Table:
