@@ -28,7 +28,7 @@ from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.identity import difference, kept_views, learned
 from pp_cl.scene.image_file import Photograph
-from pp_cl.scene.load import DEMO, Scene, open_scene, scene_frames
+from pp_cl.scene.load import DEMO, Scene, open_scene, scene_format, scene_frames
 from pp_cl.settings import Config
 
 COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
@@ -223,11 +223,25 @@ def stored_config(folder: RunFolder, scene: str | None = None) -> Config:
     return configure(config, scene or config.scene.path)
 
 
+def find_run(path: Path | str) -> RunFolder:
+    """The run in a folder: the folder itself, or the one that `pp-cl make` has put into it, unless
+    the folder is a scene.
+    """
+    folder, made = RunFolder(path), RunFolder(Path(path) / "run")
+    if folder.config.exists() or not made.config.exists():
+        return folder
+    try:
+        scene_format(str(path))
+    except UserError:
+        return made
+    return folder
+
+
 def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Run:
     """The run in a folder, finished or not. scene: the folder of its scene, if that has moved.
     Raises UserError naming the file that is missing or broken.
     """
-    place = RunFolder(folder)
+    place = find_run(folder)
     config = stored_config(place, scene)
     header, arrays = load_run_state(place, config)
     net = UNet.of_settings(dev, config.network)

@@ -16,7 +16,6 @@ docs/results/NAME.json (NAME may be KIND/TABLE), which holds
 """
 
 import argparse
-import dataclasses
 import importlib
 import inspect
 import json
@@ -33,7 +32,7 @@ import pp_studio
 from pp_cl.commands import COMMANDS
 from pp_cl.config import text_of
 from pp_cl.presets import PRESETS
-from pp_cl.settings import Config, sections
+from pp_cl.settings import Config, every_setting
 from tools.provenance import ROOT, digest, sentence
 
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
@@ -91,12 +90,10 @@ def readme(results: dict, now: str) -> dict[str, str]:
 def settings() -> str:
     """Every setting: its value in the preset tiny and in those that differ, and its help."""
     rows = []
-    for section, values in sections(Config()):
-        for item in dataclasses.fields(values):
-            key = f"{section}.{item.name}"
-            others = [f"{n}: {text_of(c[key])}" for n, c in PRESETS.items() if key in c]
-            value = "; ".join([text_of(item.default), *others])
-            rows.append([f"`{key}`", value, item.metadata["help"].replace("|", "\\|")])
+    for key, _, item in every_setting(Config()):
+        others = [f"{n}: {text_of(c[key])}" for n, c in PRESETS.items() if key in c]
+        value = "; ".join([text_of(item.default), *others])
+        rows.append([f"`{key}`", value, item.metadata["help"].replace("|", "\\|")])
     return "\n".join(markdown(["setting", "value", "meaning"], rows))
 
 

@@ -69,7 +69,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     if folder.checkpoint.exists():
         made = json.loads(folder.config.read_text("utf-8"))["train"]["iterations"]
         given = [("train.iterations", made + steps, "stages")]
-    config = run_config(folder, scene, preset, given, extends=True)
+    config = run_config(folder, scene, preset, given)
     dev = open_device()
     trainer = open_training(dev, folder, config, stored_state(folder, config)).trainer
     net, cloud, seen = trainer.model.net, trainer.model.cloud, []

@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
     if options.scene is None and is_new:
         raise UserError("SCENE: name the folder of a scene, or the word demo")
     scene = options.scene or load_config(folder.config).scene.path
-    config = run_config(folder, scene, preset, given, extends=True)
+    config = run_config(folder, scene, preset, given)
     stored = stored_state(folder, config)
     if stored and is_finished(stored, config):
         print(

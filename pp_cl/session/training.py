@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pp_cl.checkpoint import check_finite, load_run_state, opened_run, save_checkpoint
-from pp_cl.config import load_config, refuse_setting, run_config
+from pp_cl.config import configure, load_config, refuse_setting, run_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
@@ -29,7 +29,6 @@ from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
-from pp_cl.scene.hull import agreeing
 from pp_cl.scene.identity import difference, identity, learned
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.load import (
@@ -37,7 +36,6 @@ from pp_cl.scene.load import (
     list_split,
     measured_split,
     open_scene,
-    scene_box,
     scene_frames,
 )
 from pp_cl.session.budget import Budget
@@ -253,16 +251,14 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     """
     check_target(folder.config)
     folder.check_pictures(0)
-    net = UNet.of_settings(dev, config.network, seed=config.train.seed)
-    begin_network(net, config)
+    net = begin_network(dev, config)
     listing = list_split(config.scene.path)
     room = Room(config, net, listing.photographs)
     room.check_unseen()
     views, info, kept = _read_views(dev, folder, config, listing)
 
     start = time.perf_counter()
-    agreement = agreeing(dev, views, scene_box(config))
-    hull, depth_range = fitting_hull(dev, config, agreement, room)
+    agreement, hull, depth_range = fitting_hull(dev, config, views, room)
     seconds = time.perf_counter() - start
     picture = picture_of_masks(dev, views, hull, agreement.left_out)
 
@@ -359,7 +355,7 @@ def train_scene(
     settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
     folder = RunFolder(out)
     given = [(*s, "settings") for s in settings.items()]
-    config = run_config(folder, str(scene), preset, given, extends=True)
+    config = run_config(folder, str(scene), preset, given)
     stored, dev = stored_state(folder, config), open_device(device)
     if not is_finished(stored, config):
         open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
@@ -374,17 +370,18 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     note of where its scene is now. Raises UserError for a folder or checkpoint that does not fit.
     """
     folder.check_usable()
-    stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
-    if folder.config.exists() and (stored is None or is_finished(stored, config)):
-        path, now = load_config(folder.config).scene.path, config.scene.path
-        if path != now:
+    there = load_config(folder.config) if folder.config.exists() else config
+    stored = load_run_state(folder, there) if folder.checkpoint.exists() else None
+    if stored is None or is_finished(stored, config):
+        now = config.scene.path
+        if there.scene.path != now:
             listed = [] if stored is None else scene_frames(now, edited=False)
             if stored is None or difference(stored[0], learned(stored[0], listed), []):
-                refuse_setting(folder, "scene.path", path, now)
-            folder.configure(config.to_json())
+                refuse_setting(folder, "scene.path", there.scene.path, now)
+            folder.configure(configure(there, now).to_json())
     return stored
 
 
 def is_finished(stored: Stored | None, config: Config) -> bool:
-    """Whether there is a checkpoint and it is of the last step."""
-    return stored is not None and stored[0]["step"] == config.train.iterations
+    """Whether there is a checkpoint, and no step is left to train after it."""
+    return stored is not None and stored[0]["step"] >= config.train.iterations

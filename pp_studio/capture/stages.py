@@ -34,11 +34,11 @@ from pp_cl.scene.edits import read_edits
 from pp_cl.scene.image_file import shrink
 from pp_cl.scene.masks import named_mask
 from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
-from pp_cl.scene.overview import overview
 from pp_cl.scene.readers.common import read_json
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.readers.transforms import SINGLE
 from pp_studio.capture import STAGES, box, features, frames, masks, pinhole, poses, still
+from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many

@@ -17,7 +17,7 @@ from pp_studio.export.page import card, filled, page_text, still
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS = "thumbnail.png", "views.png"
 FILMS = ("film.mp4", "film.webp")
-LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM"}
+LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
 WHAT = {
     MODEL: "the model alone, one page that needs no network",
     SPLAT: "3D Gaussians, for SuperSplat, Blender and other viewers",

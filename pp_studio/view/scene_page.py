@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.config import assign, configure, preset, preset_downscale
+from pp_cl.config import configure, preset, scene_config
 from pp_cl.drivers import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
@@ -208,8 +208,7 @@ class ScenePage:
 
 def hull_points(device: str | None, folder: str) -> np.ndarray:
     """(N, 3) world positions of a coarse visual hull. Raises UserError where masks leave none."""
-    dev, config = open_device(device), configure(preset("tiny"), folder)
-    assign(config, "scene.downscale", preset_downscale(folder, "tiny"), "preset")
+    dev, config = open_device(device), scene_config(folder, "tiny")
     views, box = open_scene(dev, config, ("train",)).splits["train"], scene_box(config)
     views, _, forgiven = agreeing(dev, views, box)
     hull = build_grid(dev, views, SHOWN_POINTS, box, forgiven)

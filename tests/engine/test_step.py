@@ -116,9 +116,9 @@ def test_a_training_begins_with_the_network_of_the_demo(scene, tmp_path):
 def test_where_the_demos_network_is_taken(dev, scene, widths, is_taken):
     config = preset("tiny")
     config.scene.path, config.network.widths = scene, widths
-    net = UNet.of_settings(dev, config.network)
-    random = {name: dev.download(array).copy() for name, array in net.parameters.items()}
-    begin_network(net, config)
+    net = begin_network(dev, config)
+    plain = UNet.of_settings(dev, config.network).parameters
+    random = {name: dev.download(array) for name, array in plain.items()}
     with np.load(DEMO_NETWORK) as kept:
         for name, array in net.parameters.items():
             expected = kept[f"net.{name}"] if is_taken else random[name]
