@@ -129,7 +129,7 @@ def test_published_rows_are_printed_beside_what_compares(run, tmp_path, capsys, 
     command = ["eval", str(run), "--scene", str(tmp_path / "34_1479_4753"), "--out"]
     for compares in (False, True):
         if compares:
-            monkeypatch.setattr("pp_cl.run.differences", lambda *_: "")
+            monkeypatch.setattr("pp_cl.evaluate.differences", lambda *_: "")
         out = tmp_path / f"eval{compares}"
         assert main([*command, str(out)]) == 0
         result = json.loads((out / "metrics.json").read_text())

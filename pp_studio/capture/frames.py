@@ -16,9 +16,8 @@ from PIL import Image, ImageOps
 from tqdm import tqdm
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import atomic_file, atomic_folder
+from pp_cl.files.atomic import atomic_file, atomic_folder, is_owned
 from pp_cl.files.image import ORIENTATION, in_srgb, is_deep_png
-from pp_cl.files.manifest import has_manifest
 from pp_cl.files.untrusted import opened_regular
 from pp_cl.scene.readers.found import MASK_FOLDERS
 from pp_studio.capture.packages import needed
@@ -132,7 +131,7 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
     found = []
     for place, folders, files in os.walk(folder):
         here = Path(place)
-        if here != folder and has_manifest(here):
+        if here != folder and is_owned(here):
             folders.clear()
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]

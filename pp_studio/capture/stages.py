@@ -18,17 +18,17 @@ from filelock import FileLock, Timeout
 from pp_cl.drivers import open_device
 from pp_cl.engine.views import evenly, fitting_downscale
 from pp_cl.errors import UserError, listing
-from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
+from pp_cl.files.atomic import (
+    atomic_folder,
+    atomic_path,
+    check_ours,
+    ours,
+    own,
+    remove_ours,
+    write_json,
+)
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_rgba, write_png
-from pp_cl.files.manifest import (
-    begin_manifest,
-    check_ours,
-    has_manifest,
-    note_in_place,
-    ours,
-    remove_ours,
-)
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.image_file import shrink
@@ -112,8 +112,6 @@ class Capture:
             files = {stage: self._files(stage) for stage in left}
             for stage in left:
                 check_ours(files[stage])
-            note_in_place(self.scene, [self.scene / name for name in CHANGING])
-            remove_leftovers(self.scene)
             for path in mended if replace_masks else ():
                 path.unlink()
             for stage in reversed(left):
@@ -121,6 +119,8 @@ class Capture:
                     if stage == "matches" and self.database.exists():
                         features.forget_matches(self.database)
                     remove_ours(files[stage])
+                    for name in {*CHANGING} & {*LEFT[stage]}:
+                        (self.scene / name).unlink(missing_ok=True)
             if changed or not self.kept.exists():
                 write_json(self.kept, self.options)
             for stage in done:
@@ -150,10 +150,8 @@ class Capture:
     @contextmanager
     def _locked(self):
         """While it is entered, no other process captures into the folder, which is made."""
-        if self.scene.exists() and not has_manifest(self.scene) and any(self.scene.iterdir()):
-            raise UserError(f"{self.scene}: exists already; choose a new or empty folder")
+        own(self.scene, alone=True)
         try:
-            begin_manifest(self.scene)
             self.work.mkdir(exist_ok=True)
             with FileLock(self.work / ".pp-cl.lock", timeout=0):
                 yield
@@ -221,11 +219,11 @@ class Capture:
                     named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
-        """What a stage has left, and what else lies in its folders, but for masks of others. Its
-        JSON comes first: without it the stage is not done.
+        """What a stage has left, and what else lies in its folders, but for masks of others and
+        what changes in place. Its JSON comes first: without it the stage is not done.
         """
         found = [self._file(stage), self._file(stage).with_suffix(".png")]
-        for path in (self.scene / name for name in LEFT[stage]):
+        for path in (self.scene / name for name in LEFT[stage] if name not in CHANGING):
             inside = path.rglob("*") if path.is_dir() else [path]
             inside = [one for one in inside if one.is_symlink() or not one.is_dir()]
             found += ours(inside) if stage == "masks" else inside

@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from pp_cl.drivers import open_device
-    from pp_cl.files.manifest import begin_manifest, check_ours
+    from pp_cl.files.atomic import own
     from pp_cl.run import load_run
     from pp_studio.export.film import render_film, render_frames
     from pp_studio.video import check_video
@@ -116,8 +116,7 @@ def run(options: argparse.Namespace) -> None:
         )
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
     if kind in FILMS and not options.out:
-        check_ours([out], "move it away, or choose another --out")
-        begin_manifest(out.parent)
+        own(out.parent, [out], "move it away, or choose another --out")
     seconds = []
     with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
 

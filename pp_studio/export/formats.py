@@ -13,8 +13,7 @@ import numpy as np
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError, require
 from pp_cl.evaluate import image_files
-from pp_cl.files.atomic import check_file, check_new_folder, write_text
-from pp_cl.files.manifest import begin_manifest, check_ours
+from pp_cl.files.atomic import check_file, check_new_folder, check_ours, own, write_text
 from pp_cl.run import Run
 from pp_cl.scene.readers.transforms import write_scene
 from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
@@ -136,7 +135,7 @@ def export(
 def _begin_default(name, path):
     """Make the folder of a file that has no --out, as its name says."""
     if path.parts[-2:] == ("export", FORMATS[name][0]):
-        begin_manifest(path.parent)
+        own(path.parent)
 
 
 def renderings(run: Run) -> dict[str, list[View]]:
