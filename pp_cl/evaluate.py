@@ -10,17 +10,14 @@ from tqdm import tqdm
 
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View
-from pp_cl.errors import UserError
-from pp_cl.files.atomic import check_target, remove_leftovers, write_json
+from pp_cl.files.atomic import own, remove_ours, write_json
 from pp_cl.files.image import image_files, write_png
-from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest, remove_ours
 from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
 from pp_cl.metrics.published import differences, published_rows
 from pp_cl.run import Run, load
 
 SHOWN_VIEWS = 4  # rows of the comparison image
-MOVE = "move it away, or choose another --out"
 
 
 class Rendered(NamedTuple):
@@ -75,15 +72,12 @@ def evaluate(
     written as it is now.
     """
     target = run.folder.evaluation(split) if out is None else Path(out)
-    _check_target(target, is_new=out is not None)
     scene = run.scene(split)
     views = scene.splits[split]
     images = [target / "images" / file for file in image_files([view.name for view in views])]
-    if save_images:
-        check_ours(images, MOVE)
     measure = Metrics(run.dev, metrics)
-    begin_manifest(target)
-    remove_leftovers(target)
+    written = [target / "metrics.json", target / "comparison.png", *(images if save_images else [])]
+    own(target, written, "move it away, or choose another --out", alone=out is not None)
     if save_images:
         remove_ours((target / "images").rglob("*"))
     rows: list[dict[str, Any]] = []
@@ -110,18 +104,6 @@ def evaluate(
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
-
-
-def _check_target(target, *, is_new):
-    """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
-    files and no evaluation.
-    """
-    if target.exists() and not target.is_dir():
-        raise UserError(f"{target}: is not a folder; choose another --out")
-    check_target(target / "metrics.json")
-    if is_new and target.exists() and not has_manifest(target) and any(target.iterdir()):
-        raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
-    check_ours([target / "metrics.json", target / "comparison.png"], MOVE)
 
 
 def _published(scene, split, views):

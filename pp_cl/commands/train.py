@@ -49,14 +49,13 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.config import run_config
     from pp_cl.drivers import open_device
     from pp_cl.files.run_folder import RunFolder
-    from pp_cl.files.scalars import writer_class
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
 
     if options.view:
         require("the viewer", "viser")
     if options.tensorboard:
-        writer_class()  # refuses before the work where it is missing
+        require("--tensorboard", "tensorboardX")
     folder = RunFolder(options.out)
     given, is_new = shared.read_short(options, SHORT) + options.set, not folder.config.exists()
     preset = options.preset

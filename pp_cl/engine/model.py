@@ -90,7 +90,7 @@ class Model:
         *,
         degree: int,
     ) -> Model:
-        """Model of a checkpoint's header and arrays, as training/checkpoint.py has checked them;
+        """Model of a checkpoint's header and arrays, as pp_cl/checkpoint.py has checked them;
         the arrays are taken out of `arrays`, net takes the parameters stored there.
         """
         grid = Grid.of_header(header["grid"])

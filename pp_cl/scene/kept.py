@@ -18,9 +18,8 @@ from PIL.PngImagePlugin import PngInfo
 
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_file
+from pp_cl.files.atomic import atomic_file, remove_ours
 from pp_cl.files.image import read_rgba
-from pp_cl.files.manifest import remove_ours
 from pp_cl.scene.image_file import Photograph
 
 DIGITS = 32  # of a file's name, hexadecimal

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.checkpoint import load_run_state, opened_run
+from pp_cl.checkpoint import check_finite, load_run_state, opened_run, save_checkpoint
 from pp_cl.config import configure, load_config, refuse_setting, run_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
@@ -23,7 +23,6 @@ from pp_cl.engine.step import Trainer
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_target
-from pp_cl.files.checkpoint import check_finite
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.files.sheets import write_comparison
@@ -209,7 +208,8 @@ class Training:
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         header |= {"exposed": True} if trainer.is_exposed else {}
-        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        arrays = trainer.model.arrays() if finished else trainer.arrays()
+        save_checkpoint(self.folder.checkpoint, header, arrays)
         self._expect_save()
         self._saved = trainer.step
 
@@ -300,9 +300,6 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
             " use another --out"
         )
 
-    for name, array in arrays.items():
-        if name.startswith("points.") and array.dtype == np.float16:  # of a compressed run
-            arrays[name] = array.astype(np.float32)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
     left_out = header.get("left_out", [])
     trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])

@@ -19,9 +19,9 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files import (
     atomic_file,
     atomic_folder,
-    has_manifest,
     in_srgb,
     is_deep_png,
+    is_owned,
     opened_regular,
 )
 from pp_cl.scene import MASK_FOLDERS
@@ -136,7 +136,7 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
     found = []
     for place, folders, files in os.walk(folder):
         here = Path(place)
-        if here != folder and has_manifest(here):
+        if here != folder and is_owned(here):
             folders.clear()
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]

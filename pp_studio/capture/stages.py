@@ -21,14 +21,11 @@ from pp_cl.errors import UserError, listing
 from pp_cl.files import (
     atomic_folder,
     atomic_path,
-    begin_manifest,
     check_ours,
     contact_sheet,
-    has_manifest,
-    note_in_place,
     ours,
+    own,
     read_rgba,
-    remove_leftovers,
     remove_ours,
     write_json,
     write_png,
@@ -117,8 +114,6 @@ class Capture:
             files = {stage: self._files(stage) for stage in left}
             for stage in left:
                 check_ours(files[stage])
-            note_in_place(self.scene, [self.scene / name for name in CHANGING])
-            remove_leftovers(self.scene)
             for path in mended if replace_masks else ():
                 path.unlink()
             for stage in reversed(left):
@@ -126,6 +121,8 @@ class Capture:
                     if stage == "matches" and self.database.exists():
                         features.forget_matches(self.database)
                     remove_ours(files[stage])
+                    for name in {*CHANGING} & {*LEFT[stage]}:
+                        (self.scene / name).unlink(missing_ok=True)
             if changed or not self.kept.exists():
                 write_json(self.kept, self.options)
             for stage in done:
@@ -155,10 +152,8 @@ class Capture:
     @contextmanager
     def _locked(self):
         """While it is entered, no other process captures into the folder, which is made."""
-        if self.scene.exists() and not has_manifest(self.scene) and any(self.scene.iterdir()):
-            raise UserError(f"{self.scene}: exists already; choose a new or empty folder")
+        own(self.scene, alone=True)
         try:
-            begin_manifest(self.scene)
             self.work.mkdir(exist_ok=True)
             with FileLock(self.work / ".pp-cl.lock", timeout=0):
                 yield
@@ -226,11 +221,11 @@ class Capture:
                     named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
-        """What a stage has left, and what else lies in its folders, but for masks of others. Its
-        JSON comes first: without it the stage is not done.
+        """What a stage has left, and what else lies in its folders, but for masks of others and
+        what changes in place. Its JSON comes first: without it the stage is not done.
         """
         found = [self._file(stage), self._file(stage).with_suffix(".png")]
-        for path in (self.scene / name for name in LEFT[stage]):
+        for path in (self.scene / name for name in LEFT[stage] if name not in CHANGING):
             inside = path.rglob("*") if path.is_dir() else [path]
             inside = [one for one in inside if one.is_symlink() or not one.is_dir()]
             found += ours(inside) if stage == "masks" else inside

@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from pp_cl import load
-    from pp_cl.files import begin_manifest, check_ours
+    from pp_cl.files import own
     from pp_studio.export.film import render_film, render_frames
     from pp_studio.video import check_video
 
@@ -115,8 +115,7 @@ def run(options: argparse.Namespace) -> None:
         )
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
     if kind in FILMS and not options.out:
-        check_ours([out], "move it away, or choose another --out")
-        begin_manifest(out.parent)
+        own(out.parent, [out], "move it away, or choose another --out")
     seconds = []
     with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
 

@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
     from pp_cl import RunFolder
-    from pp_cl.files import begin_manifest, check_ours, note_in_place
+    from pp_cl.files import own
     from pp_studio.sweep.result import failed_row, finished_row
     from pp_studio.sweep.table import TABLES, markdown, run_text, values_text, write_tables
 
@@ -89,9 +89,7 @@ def run(options: argparse.Namespace) -> None:
         return
     print(told, flush=True)
     missing = [job for job in jobs if job.folder not in rows]
-    check_ours([out / name for name in TABLES])
-    begin_manifest(out)
-    note_in_place(out.resolve(), [job.log for job in missing])
+    own(out, [out / name for name in TABLES])
     if missing:
         rows |= _run(options, missing, len(jobs))
     # folders as seen from `out`, which may be moved

@@ -17,13 +17,12 @@ from pp_cl import Camera, Run
 from pp_cl.errors import UserError
 from pp_cl.files import (
     MANIFEST,
-    begin_manifest,
     check_file,
     check_ours,
     check_target,
+    own,
     read_regular,
     read_rgba,
-    remove_leftovers,
     remove_ours,
     write_exr,
     write_json,
@@ -85,8 +84,7 @@ def render_frames(
                 )
             check_ours([*paths, folder / IDENTITY])
             remove_ours(folder.iterdir())
-        begin_manifest(folder)
-        remove_leftovers(folder)
+        own(folder)
         write_json(folder / IDENTITY, identity)
         for camera, path in zip(cameras, paths, strict=True):
             start, there = time.perf_counter(), path.exists()
@@ -95,7 +93,7 @@ def render_frames(
                 if style.suffix == "exr":
                     write_exr(path, picture.channels())
                 else:
-                    write_png(path, picture.image(style.background))
+                    write_png(path, picture.over(style.background))
             on_frame(None if there else time.perf_counter() - start)
     return paths
 

@@ -13,14 +13,7 @@ import numpy as np
 from pp_cl import Run
 from pp_cl.engine import View
 from pp_cl.errors import UserError, require
-from pp_cl.files import (
-    begin_manifest,
-    check_file,
-    check_new_folder,
-    check_ours,
-    image_files,
-    write_text,
-)
+from pp_cl.files import check_file, check_new_folder, check_ours, image_files, own, write_text
 from pp_cl.scene import write_scene
 from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
 from pp_studio.export.gltf import gltf_colours, write_glb
@@ -141,7 +134,7 @@ def export_run(
 def _begin_default(name, path):
     """Make the folder of a file that has no --out, as its name says."""
     if path.parts[-2:] == ("export", FORMATS[name][0]):
-        begin_manifest(path.parent)
+        own(path.parent)
 
 
 def renderings(run: Run) -> dict[str, list[View]]:

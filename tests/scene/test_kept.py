@@ -13,7 +13,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.errors import UserError
-from pp_cl.files.manifest import begin_manifest
+from pp_cl.files.atomic import own
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.load import load_scene
 
@@ -47,7 +47,7 @@ def test_what_was_read_comes_back_and_what_changed_is_read_again(
     dev, scene, tmp_path, looked_at, recwarn
 ):
     folder = tmp_path / "views"
-    begin_manifest(tmp_path)
+    own(tmp_path)
 
     def views(**how):
         kept = KeptViews(folder)

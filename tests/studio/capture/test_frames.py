@@ -11,9 +11,8 @@ from PIL import ExifTags, Image, TiffImagePlugin
 from support.profile import display_p3, in_srgb
 
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import write_json
+from pp_cl.files.atomic import own, write_json
 from pp_cl.files.image import read_rgba
-from pp_cl.files.manifest import begin_manifest
 from pp_studio.capture import frames
 from pp_studio.capture.features import find_features
 from pp_studio.capture.frames import take_images
@@ -293,7 +292,7 @@ def test_photographs_of_several_rounds(shots, tmp_path):
         (tmp_path / place).parent.mkdir(parents=True)
         Image.fromarray(shots[0]).save(tmp_path / place)
     (tmp_path / "low/7.DNG").write_bytes(b"raw")
-    begin_manifest(tmp_path / "scene")
+    own(tmp_path / "scene")
     taken = take_images(tmp_path, tmp_path / "scene/capture")
     ordered = [*places[:4], *places[8:], *places[4:8]]
     assert [one["source"] for one in taken["images"]] == ordered
