@@ -16,6 +16,10 @@ from pp_cl.files.untrusted import read_regular
 from pp_cl.presets import IMAGE_SIZES, PRESETS
 from pp_cl.settings import FORMAT, Config, every_setting
 
+# what other packages may use; docs/api.md lists it
+__all__ = ["PRESETS", "configure", "field_of", "load_config", "preset"]
+__all__ += ["refuse_setting", "run_config", "scene_config"]
+
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder

@@ -1,9 +1,8 @@
 """Measures a run on the views of a split."""
 
-import os
 import time
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +11,8 @@ from tqdm import tqdm
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View
 from pp_cl.files.atomic import own, remove_ours, write_json
-from pp_cl.files.contact_sheet import write_comparison
-from pp_cl.files.image import write_png
+from pp_cl.files.image import image_files, write_png
+from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
 from pp_cl.metrics.published import differences, published_rows
 from pp_cl.run import Run, load
@@ -37,7 +36,7 @@ class Rendered(NamedTuple):
 
 
 def evaluate_run(
-    folder: Path | str,
+    run: Run | Path | str,
     split: str = "test",
     metrics: tuple[str, ...] = ("psnr", "ssim"),
     *,
@@ -46,11 +45,11 @@ def evaluate_run(
     scene: str | None = None,
     out: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Measure the run in a folder as `pp-cl eval` does, into `out`, else into its own folder;
-    returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write every
-    view, too. device, scene: as load() takes them.
+    """Measure a run, or the one in a folder, as `pp-cl eval` does, into `out`, else into its own
+    folder; returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write
+    every view, too. device, scene: of a folder, as load() takes them.
     """
-    run = load(folder, device, scene=scene)
+    run = run if isinstance(run, Run) else load(run, device, scene=scene)
     return evaluate(run, split, metrics, save_images=save_images, out=out)
 
 
@@ -131,19 +130,6 @@ def _about(run, costs):
         "seconds_per_frame": float(np.median(seconds)),
         "computed_fraction": float(np.mean(computed)),
     }
-
-
-def image_files(names: list[str]) -> list[PurePosixPath]:
-    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
-    those that all of them share go.
-    """
-    paths = [PurePosixPath(name) for name in names]
-    shared = os.path.commonpath([path.parent for path in paths])
-    paths = [path.relative_to(shared) for path in paths]
-    files = [path.with_suffix(".png") for path in paths]
-    if len(set(files)) < len(files):  # a.jpg beside a.png
-        files = [path.with_name(f"{path.name}.png") for path in paths]
-    return files
 
 
 def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:

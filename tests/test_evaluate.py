@@ -13,7 +13,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl import load
 from pp_cl.cli import main
-from pp_cl.evaluate import image_files, render_views
+from pp_cl.evaluate import render_views
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.metrics.psnr_ssim import psnr
 
@@ -71,21 +71,6 @@ def test_what_an_earlier_evaluation_left_goes_with_the_next(run):
     left = [p.name for p in sorted((run / "eval" / "images").rglob("*"))]
     assert left == ["own.png", "r_0.png", "r_1.png"]
     own.unlink()
-
-
-@pytest.mark.parametrize(
-    "names, files",
-    [
-        (["test/r_0.png", "test/r_1.png"], ["r_0.png", "r_1.png"]),
-        (["cam0/0001.png", "cam1/0001.jpg"], ["cam0/0001.png", "cam1/0001.png"]),
-        (["images/a/1.png", "images/b/1.png"], ["a/1.png", "b/1.png"]),
-        (["test/1.png", "2.png"], ["test/1.png", "2.png"]),
-        (["test/1.png", "test/1.jpg"], ["1.png.png", "1.jpg.png"]),
-        (["r_0.png"], ["r_0.png"]),
-    ],
-)
-def test_every_image_has_a_file_of_its_own(names, files):
-    assert [str(path) for path in image_files(names)] == files
 
 
 def changed_scene(run, tmp_path, split, name):

@@ -14,8 +14,8 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.files.contact_sheet import GAP, HEADER
 from pp_cl.files.image import read_rgba
+from pp_cl.files.sheets import GAP, HEADER
 from pp_cl.scene.outline import OUTLINE
 
 BALL = 0.8  # its radius, support.scenes

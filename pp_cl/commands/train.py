@@ -169,7 +169,8 @@ def _sizes(cameras):
 
 def _run(training, options):
     """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
-    from pp_cl.commands.progress import Progress, first_signal
+    from pp_cl.commands.progress import Progress
+    from pp_cl.commands.signals import first_signal
     from pp_cl.errors import Stopped
     from pp_cl.files.scalars import curves
 

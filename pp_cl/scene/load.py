@@ -33,8 +33,7 @@ from pp_cl.files.image import is_transparent, read_mask, read_rgba
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.distortion import BAND_BYTES, undistort
-from pp_cl.scene.edits import FILE as EDITS
-from pp_cl.scene.edits import read_edits
+from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.image_file import Photograph, shrink, shrink_factor
 from pp_cl.scene.kept import KeptViews

@@ -23,9 +23,9 @@ from pp_cl.engine.step import Trainer
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_target
-from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run

@@ -15,32 +15,34 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pp_cl.drivers import open_device
-from pp_cl.engine.views import evenly, fitting_downscale
+from pp_cl import open_device
+from pp_cl.engine import evenly, fitting_downscale
 from pp_cl.errors import UserError, listing
-from pp_cl.files.atomic import (
+from pp_cl.files import (
     atomic_folder,
     atomic_path,
     check_ours,
+    contact_sheet,
     ours,
     own,
+    read_rgba,
     remove_ours,
     write_json,
+    write_png,
 )
-from pp_cl.files.contact_sheet import contact_sheet
-from pp_cl.files.image import read_rgba, write_png
-from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.edits import read_edits
-from pp_cl.scene.image_file import shrink
-from pp_cl.scene.masks import named_mask
-from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
-from pp_cl.scene.readers.common import read_json
-from pp_cl.scene.readers.frame import frame_keys
-from pp_cl.scene.readers.transforms import SINGLE
+from pp_cl.scene import (
+    Distortion,
+    frame_keys,
+    named_mask,
+    read_edits,
+    read_json,
+    shrink,
+)
 from pp_studio.capture import STAGES, box, features, frames, masks, pinhole, poses, still
 from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
+SCENE_FILE = "transforms.json"
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
 SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
 # decimals of what the scene states: the last digits depend on how COLMAP's threads share a sum
@@ -56,7 +58,7 @@ LEFT = {
     "images": ("images",),
     "box": (),
     "masks": ("masks",),
-    "scene": (SINGLE, "sparse", "points.ply"),
+    "scene": (SCENE_FILE, "sparse", "points.ply"),
 }
 CHANGING = (*LEFT["features"][1:], *LEFT["matches"])  # in place
 # {option: (the stage that depends on it, what it is where it is not given)}
@@ -254,9 +256,9 @@ class Capture:
 
     def _frames(self):
         found = frames.take_images(self.source, self.frames)
-        names = [one["name"] for one in evenly(found["images"], SHOWN_VIEWS)]
+        names = [one["name"] for one in evenly(found["images"], masks.SHOWN_VIEWS)]
         shown = [read_rgba(self.frames / name) for name in names]
-        shown = [shrink(one, fitting_downscale(one.shape[:2], SHOWN_SIZE)) for one in shown]
+        shown = [shrink(one, fitting_downscale(one.shape[:2], masks.SHOWN_SIZE)) for one in shown]
         self._show("frames", contact_sheet(shown, names))
         left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
         line = f"{len(found['images'])} images" + _left_out(left_out, "left out")
@@ -399,7 +401,7 @@ class Capture:
         with atomic_path(self.scene / "points.ply") as unfinished:
             model.export_PLY(unfinished)
         write_json(
-            self.scene / SINGLE,
+            self.scene / SCENE_FILE,
             {
                 "camera_model": "OPENCV",
                 "ply_file_path": "points.ply",
@@ -407,7 +409,7 @@ class Capture:
                 "frames": places,
             },
         )
-        return {"line": f"wrote {self.scene / SINGLE} with {len(found)} photographs"}
+        return {"line": f"wrote {self.scene / SCENE_FILE} with {len(found)} photographs"}
 
     def _world(self):
         """(pycolmap's model in the scene's world, (2, 3) box of the object there: the user's, if

@@ -13,22 +13,21 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from pp_cl.engine.camera import Camera
+from pp_cl import Camera, Run
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import (
+from pp_cl.files import (
     MANIFEST,
     check_file,
     check_ours,
     check_target,
     own,
+    read_regular,
+    read_rgba,
     remove_ours,
+    write_exr,
     write_json,
+    write_png,
 )
-from pp_cl.files.exr import write_exr
-from pp_cl.files.image import read_rgba, write_png
-from pp_cl.files.picture import WHITE
-from pp_cl.files.untrusted import read_regular
-from pp_cl.run import Run
 from pp_studio.video import write_video
 
 MOST_IDENTITY = 1000  # bytes of it
@@ -48,7 +47,7 @@ class Style:
     """
 
     suffix: str = "png"
-    background: tuple[float, float, float] | None = WHITE
+    background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     samples: int = 1
     features: bool = False
 

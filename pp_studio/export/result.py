@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pp_cl import Run
 from pp_cl.errors import name_of
-from pp_cl.files.atomic import atomic_file, own, write_text
-from pp_cl.files.image import write_png
-from pp_cl.run import Run
+from pp_cl.files import atomic_file, own, write_png, write_text
 from pp_studio.export.page import card, filled, page_text, still
 
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"

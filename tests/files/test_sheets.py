@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pp_cl.files.contact_sheet import GAP, HEADER, contact_sheet, write_comparison
 from pp_cl.files.image import read_rgba
+from pp_cl.files.sheets import GAP, HEADER, contact_sheet, write_comparison
 
 
 def tile(picture, row, column, height, width):
