@@ -203,7 +203,7 @@ def _probe(drivers):
 def _start(name, library):
     """A process that runs report()."""
     code = (
-        f"import sys; sys.path[:] = {sys.path!r}; from pp_cl.engine.device import drivers;"
+        f"import sys; sys.path[:] = {sys.path!r}; from pp_cl.drivers import drivers;"
         f" drivers.report({name!r}, {library!r})"
     )
     silent = {"stdin": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
