@@ -21,7 +21,7 @@ from pp_cl.settings import Config
 
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
 # {key of the header: its type as JSON has it}; those that it may lack
-NEEDED: dict[str, Any] = {"scene": str, "views": list, "step": int, "finished": bool}
+NEEDED: dict[str, Any] = {"views": list, "step": int, "finished": bool}
 NEEDED |= {"initial_points": int, "grid": dict, "depth_range": list, "pixels": dict | None}
 OPTIONAL = {"format": int, "extended_from": int, "exposed": bool, "left_out": list, "notes": list}
 OTHER_RUN = "its config.json may belong to another run"

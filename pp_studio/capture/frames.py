@@ -20,7 +20,7 @@ from pp_cl.files.atomic import atomic_file, atomic_folder
 from pp_cl.files.image import ORIENTATION, in_srgb, is_deep_png
 from pp_cl.files.manifest import has_manifest
 from pp_cl.files.untrusted import opened_regular
-from pp_cl.scene.readers.found import MASK_FOLDERS
+from pp_cl.scene.found import MASK_FOLDERS
 from pp_studio.capture.packages import needed
 
 ENDINGS = (

@@ -21,7 +21,7 @@ from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_mask, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.image_file import Photograph, shrink
-from pp_cl.scene.masks import MaskRule, cut_out, named_mask, of_size
+from pp_cl.scene.masks import MaskRule, cut_out, named_mask, read_mask_of_size
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_studio.capture.cut import (
     FORGIVEN,
@@ -124,7 +124,7 @@ def _found(scene, photograph, given, sources, fitted, words):
     file, size = scene / photograph.name, (photograph.camera.width, photograph.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)
-        return "given", fitted(photograph.name, of_size(read_mask(mask), size, mask))
+        return "given", fitted(photograph.name, read_mask_of_size(mask, size))
     if words is not None:
         return "by the program", _of_program(words, file, size[::-1])
     if not photograph.name.lower().endswith(OPAQUE):
@@ -175,7 +175,7 @@ def _kept(scene, photograph):
     UserError for one of another shape.
     """
     file = mask_file(scene, photograph.name)
-    return of_size(read_mask(file), (photograph.camera.width, photograph.camera.height), file)
+    return read_mask_of_size(file, (photograph.camera.width, photograph.camera.height))
 
 
 def _window(scene, photograph, box):

@@ -8,6 +8,7 @@ over, since they are nearly all of a file.
 import os
 import struct
 import unicodedata
+import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -21,6 +22,7 @@ from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.found import LeftOut, find_image, folder_named, holds_images, usable
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     MOST,
@@ -30,7 +32,6 @@ from pp_cl.scene.readers.common import (
     progress,
     two_splits,
 )
-from pp_cl.scene.readers.found import Notes, find_image, folder_named, holds_images
 
 FILES = "a sparse model of COLMAP beside images"
 # and in numbered folders in them; the folder itself has the model of RealityScan
@@ -100,7 +101,7 @@ def recognises(folder: Path) -> bool:
     return bool(_models(folder))
 
 
-def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     """The photographs of a split: test is every eighth in the order of their names.
 
     Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
@@ -108,12 +109,13 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """
     model = model_folder(folder) or folder
     if (count := len(_models(folder))) > 1:
-        notes.done[f"of {count} models the largest beside images is read"] = [str(model)]
+        text = f"of {count} models the largest beside images is read ({model})"
+        warnings.warn(f"{folder}: {text}", stacklevel=1)
     lenses, images = read_model(model)
     chosen = hold_out(sorted(images, key=lambda image: image.name), split)
     near = _images_of(folder, model) or folder / IMAGES
     read = partial(_photograph, folder, near.relative_to(folder).as_posix(), model, lenses)
-    return list(notes.usable(progress(chosen), read, lambda image: image.name))
+    return list(usable(progress(chosen), read, lambda image: image.name, left_out))
 
 
 def model_folder(folder: Path) -> Path | None:
@@ -165,7 +167,7 @@ def _photograph(folder, near, model, lenses, image):
     fail = fail_at(model, image.name)
     name, lens = find_image(folder, f"{near}/{image.name}", fail), lenses[image.camera]
     if isinstance(lens, Unusable):
-        return lens
+        raise lens
     if lens.model not in ONE_FOCAL + TWO_FOCALS:
         raise UserError(
             f"{model}: camera model {lens.model} is not read; convert with `colmap"
@@ -179,7 +181,7 @@ def _photograph(folder, near, model, lenses, image):
     distortion = Distortion(**dict(zip(order, coefficients, strict=False)), fisheye=is_fisheye)
     w, x, y, z, *place = image.pose
     if not _are_numbers(image.pose) or abs(np.linalg.norm((w, x, y, z)) - 1) > 1e-3:
-        return Unusable(fail("its pose is no unit quaternion and place; fix it"), "no pose")
+        raise Unusable(fail("its pose is no unit quaternion and place; fix it"), "no pose")
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ place])
     camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)

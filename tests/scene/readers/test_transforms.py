@@ -13,7 +13,6 @@ from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
-from pp_cl.scene.readers.found import Notes
 
 # -------------------------------------------------------------------------------------------------
 
@@ -178,7 +177,7 @@ def test_a_bad_depth_range(tmp_path, near, far, key):
         ({"frames": []}, "frames:"),
         ({"frames": {}}, "frames:"),
         ({"frames": "all"}, "frames:"),
-        ({"frames": [[1, 2]]}, "frames[0]:"),
+        ({"frames": [[1, 2]]}, "frames[0].file_path:"),
     ),
 )
 def test_bad_keys_of_the_whole_file(tmp_path, change, place):
@@ -220,7 +219,7 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
     """The latter writes the tangential coefficients as zeros beside."""
     keys |= {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0, "p2": 0}
     write_scene(tmp_path, edit=lambda data: data.update(keys))
-    [one, *_] = transforms.read_split(tmp_path, "train", Notes())
+    [one, *_] = transforms.read_split(tmp_path, "train", [])
     assert one.distortion == Distortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
     write_scene(tmp_path, edit=lambda data: data.update(keys, p2=0.1))
     refused(tmp_path, tmp_path / "transforms_train.json", "p2:")
