@@ -173,7 +173,8 @@ def find_mask(folder: Path, image: str, *, by_number: bool = False) -> str | Non
     found = masks.get(name) or masks.get(stem)
     if not found and by_number and stem.isdecimal():
         found = masks.get(int(stem))
-    return posixpath.join(above, found) if found else None
+    is_there = found and os.path.isfile(folder / above / found)
+    return posixpath.join(above, found) if is_there else None
 
 
 @lru_cache(maxsize=256)

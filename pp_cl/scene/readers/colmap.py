@@ -112,6 +112,13 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
         text = f"of {count} models the largest beside images is read ({model})"
         warnings.warn(f"{folder}: {text}", stacklevel=1)
     lenses, images = read_model(model)
+    for lens in lenses.values():
+        if isinstance(lens, Lens) and lens.model not in ONE_FOCAL + TWO_FOCALS:
+            raise UserError(
+                f"{model}: camera model {lens.model} is not read; convert with `colmap"
+                f" image_undistorter --image_path {folder / IMAGES} --input_path {model}"
+                " --output_path NEW` and give NEW"
+            )
     chosen = hold_out(sorted(images, key=lambda image: image.name), split)
     near = _images_of(folder, model) or folder / IMAGES
     read = partial(_photograph, folder, near.relative_to(folder).as_posix(), model, lenses)
@@ -168,12 +175,6 @@ def _photograph(folder, near, model, lenses, image):
     name, lens = find_image(folder, f"{near}/{image.name}", fail), lenses[image.camera]
     if isinstance(lens, Unusable):
         raise lens
-    if lens.model not in ONE_FOCAL + TWO_FOCALS:
-        raise UserError(
-            f"{model}: camera model {lens.model} is not read; convert with `colmap"
-            f" image_undistorter --image_path {folder / IMAGES} --input_path {model} --output_path"
-            " NEW` and give NEW"
-        )
     numbers = lens.parameters
     fx, fy, cx, cy, *coefficients = numbers if lens.model in TWO_FOCALS else (numbers[0], *numbers)
     is_fisheye = lens.model.endswith("FISHEYE")

@@ -39,10 +39,12 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in matrices)
     cameras = [f"world_mat_{index}" for index in range(count)]
 
-    def read(index, name):
-        key, scale = cameras[index], f"scale_mat_{index}"
+    for key in cameras:
         if key not in matrices:
             raise fail_at(file, key)("is missing; number the cameras from 0 on")
+
+    def read(index, name):
+        key, scale = cameras[index], f"scale_mat_{index}"
         camera = _camera(matrices[key], image_size(folder / name), fail_at(file, key))
         if scale not in scales:
             return Photograph(name, camera)
