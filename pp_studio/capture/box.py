@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pp_cl.engine.camera import Camera
-from pp_cl.scene.camera_path import level, looked_at, up_of
+from pp_cl.scene.around import looked_at, up_of
+from pp_studio.camera_path import level
 
 SEEN = 0.75  # of the cameras that see what most of them see: what the object's points have
 NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from which on it is alone

@@ -205,8 +205,8 @@ def _frame_count(options, kind):
 
 def _cameras(run, path, count, *, size, fov):
     """The cameras of a path, `count` of an orbit or spiral, with size and angle of view."""
-    from pp_cl.scene.camera_path import Surroundings
     from pp_cl.scene.readers.camera_file import read_cameras
+    from pp_studio.camera_path import Surroundings
 
     def shaped(camera):
         camera = camera.resized(*size) if size else camera

@@ -26,8 +26,8 @@ from pp_cl.engine.training.crops import Crop, Crops
 from pp_cl.engine.views import MIN_SIDE, View
 from pp_cl.errors import UserError
 from pp_cl.run import Run
-from pp_cl.scene.camera_path import between
 from pp_cl.settings import Config, TrainConfig
+from pp_studio.camera_path import between
 from pp_studio.export.harmonics import fit_harmonics
 
 STEPS = 7000

@@ -18,7 +18,8 @@ from pp_cl.errors import UserError, name_of
 from pp_cl.files.atomic import atomic_folder, write_text
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.run import NEAREST, Run
-from pp_cl.scene.camera_path import level, up_of
+from pp_cl.scene.around import up_of
+from pp_studio.camera_path import level
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 # Bytes of a point: place (3, uint16), opacity (uint16), coefficients (27, uint8), logarithm of the

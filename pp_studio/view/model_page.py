@@ -19,8 +19,9 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.views import MIN_SIDE, View
 from pp_cl.errors import UserError, name_of
 from pp_cl.run import Run
-from pp_cl.scene.camera_path import through, up_of
+from pp_cl.scene.around import up_of
 from pp_cl.scene.readers.frame import frame_keys
+from pp_studio.camera_path import through
 from pp_studio.view.drawing import DARK, OWN_CAMERA, SHOWN, draw
 from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 

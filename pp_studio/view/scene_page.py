@@ -12,7 +12,7 @@ from pp_cl.config import assign, configure, preset, preset_downscale
 from pp_cl.drivers.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.camera_path import looked_at, up_of
+from pp_cl.scene.around import looked_at, up_of
 from pp_cl.scene.edits import FILE, read_edits, write_edits
 from pp_cl.scene.hull import agreeing, build_grid
 from pp_cl.scene.load import open_scene, scene_box, scene_frames, scene_splits

@@ -52,10 +52,10 @@ def escape(file):
     file.symlink_to(outside)
 
 
-def left_out(folder, *words):
-    """Some views of the training split are left out; the error of the first has all the words."""
+def left_out(folder, *words, split="train"):
+    """Some views of a split are left out; the error of the first has all the words."""
     gone: list = []
-    assert find_reader(folder).read_split(folder, "train", gone)
+    assert find_reader(folder).read_split(folder, split, gone)
     with refusing(*words):
         raise gone[0][1]
 

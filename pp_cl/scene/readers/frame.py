@@ -85,11 +85,11 @@ class Frame:
     def image(self, key: str, folder: Path) -> str | None:
         """find_image() of the path that a key holds; None where it is absent. Raises UserError."""
         given = self.get(key)
+        kind = "mask" if key == "mask_path" else "image"
         if given is None:
             return None
         if not isinstance(given, str) or not given:
-            raise self.error(key, "must be the path of an image")
-        kind = "mask" if key == "mask_path" else "image"
+            raise Unusable(self.error(key, "must be the path of an image"), f"no {kind}")
         return find_image(folder, given, partial(self.error, key), kind)
 
 

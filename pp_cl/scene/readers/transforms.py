@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from pp_cl.engine.views import View
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.found import LeftOut, usable
@@ -120,7 +120,7 @@ def _image(folder, frame):
     """The name of a frame's image, None where it is not there."""
     try:
         return frame.image("file_path", folder)
-    except UserError:
+    except Unusable:
         return None
 
 

@@ -111,7 +111,7 @@ def scale(matrix):
 
 
 BAD = {
-    "missing": (lambda a: a.pop("world_mat_2"), "10 cameras"),
+    "missing": (lambda a: a.pop("world_mat_2"), "world_mat_2: is missing"),
     "one more": (lambda a: a.update(world_mat_11=np.eye(4)), "12 cameras"),
     "numbered from 1": (lambda a: a.update(world_mat_11=a.pop("world_mat_2")), "world_mat_2"),
     "mirrored": (world(lambda m: m @ np.diag([-1, 1, 1, 1])), "world_mat_2"),
