@@ -12,6 +12,7 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import MASK_THRESHOLD, View
+from pp_cl.errors import Unusable
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import Distortion, undistort
 from pp_cl.scene.masks import OPAQUE, MaskRule, cut_out, read_mask_of_size
@@ -109,6 +110,9 @@ def read_view(
         image = cut_out(image, photograph.name, rule.tolerance)
     if ignored is not None:
         image = np.where(ignored[..., None], np.uint8(0), image)
+    if image[..., 3].max() <= MASK_THRESHOLD:
+        text = f"{folder / photograph.name}: its mask is empty; correct it, or remove the image"
+        raise Unusable(text, "an empty mask")
     return View(
         photograph.name,
         camera.downscaled(factor) if factor > 1 else camera,

@@ -445,7 +445,7 @@ def load_scene(
         split: _read_views(folder, some, masks, dev, factor, left_out[split])
         for split, some in chosen.items()
     }
-    has_masks = any(view.is_masked for some in views.values() for view in some)
+    has_masks = any(v.is_masked or v.has_mask for some in views.values() for v in some)
     for split, some in views.items():
         is_whole, done = split == "train" and most is None, []
         if has_masks:

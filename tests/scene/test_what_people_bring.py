@@ -140,6 +140,25 @@ def cut_out(folder):
             mask.unlink()
 
 
+def one_opaque(folder):
+    """Cut-outs alone, of which one is the whole photograph."""
+    for file in sorted((folder / "images").iterdir()):
+        image = Image.open(file).convert("RGB")
+        if file.stem != "000003":
+            image.putalpha(Image.open(folder / f"masks/{file.name}.png").convert("L"))
+        image.save(file)
+    shutil.rmtree(folder / "masks")
+
+
+def empty_mask(folder):
+    file = folder / "masks/000003.png.png"
+    Image.open(file).point(lambda _: 0).save(file)
+
+
+def far_off(i, matrix):
+    return [[*row[:3], row[3] + 1e6] if i == 3 and row is matrix[0] else row for row in matrix]
+
+
 def light(folder):
     """OpenEXR, of which one image has a NaN."""
     for i, file in enumerate(sorted((folder / "images").iterdir())):
@@ -298,6 +317,13 @@ TRAINS = {
         frame_by_frame("file_path", lambda _, name: WINDOWS + name.replace("/", "\\")),
         "",
     ),
+    "one opaque image among cut-outs": ("colmap", one_opaque, "but for a rim (images/000003.png)"),
+    "an empty mask": ("colmap", empty_mask, "1 of 12 views left out: an empty mask"),
+    "a pose that is far off": (
+        "nerfstudio",
+        frame_by_frame("transform_matrix", far_off),
+        "left out of the training: images/000003.png (100% of it)",
+    ),
     "a uniform scale": (
         "nerfstudio",
         frame_by_frame(
@@ -385,7 +411,7 @@ def test_it_trains_and_says_what_was_done(tmp_path, report):
     assert len(said) == bool(told) and told in "".join(said), said
     header, _ = load_checkpoint(tmp_path / "run/checkpoint.npz")
     assert len(header.get("notes", [])) == ("train: " in "".join(said))
-    assert len(header["views"]) == VIEWS - 2 - sum("left out" in line for line in said) * (
+    assert len(header["views"]) == VIEWS - 2 - sum("views left out" in line for line in said) * (
         2 if "2 of" in "".join(said) else 1
     )
 

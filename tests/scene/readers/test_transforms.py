@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 import pytest
-from support.transforms_scenes import SIZE, opengl_pose, refused, train_views, write_scene
+from support.transforms_scenes import SIZE, left_out, opengl_pose, refused, train_views, write_scene
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
@@ -234,3 +234,19 @@ def test_a_pipe_is_no_file_of_cameras(tmp_path):
     (tmp_path / "transforms_train.json").unlink()
     os.mkfifo(tmp_path / "transforms_train.json")
     refused(tmp_path, tmp_path, "no scene in it")
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        (lambda frames: frames[2].update(file_path=None), "frames[2].file_path: is missing"),
+        (lambda frames: frames[2].update(file_path=5), "frames[2].file_path: must be the path"),
+        (lambda frames: frames.__setitem__(2, "none"), "frames[2].file_path: is missing"),
+        (lambda frames: frames[2].update(near=1.0), "frames[2].far: near and far must both"),
+    ],
+)
+def test_a_frame_that_is_wrong_costs_its_view(tmp_path, change, told):
+    write_scene(tmp_path, count=10, edit=lambda data: change(data["frames"]))
+    left_out(tmp_path, told)
+    with pytest.warns(UserWarning, match="1 of 10 views left out"):
+        assert len(load_scene(tmp_path).splits["train"]) == 9
