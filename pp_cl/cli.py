@@ -12,16 +12,12 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
-from itertools import pairwise
 
 from pp_cl import __version__
 from pp_cl.commands import COMMANDS
-from pp_cl.commands.options import METRICS
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
 from pp_cl.files.atomic import mend
 
-# options whose value may be left out, and what it is then
-ALONE = {"--json": "-", "--metrics": ",".join(METRICS)}
 SIGPIPE = 13  # Windows has no name for it
 
 
@@ -35,10 +31,14 @@ class _Parser(argparse.ArgumentParser):
     """
 
     def error(self, message):
+        taker = next((word for word in ("--json", "--metrics") if word in self._words), "")
+        if "required" in message and taker:  # which may have taken what is missing as its value
+            message += f" (write it before {taker})"
         end = " " if message.endswith("?") else "; "
         raise _UsageError(f"{self.prog}: {message}{end}see {self.prog} --help")
 
     def parse_known_args(self, args=None, namespace=None):
+        self._words = args or ()
         options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             word = next((word for word in unknown if word.startswith("-")), "")
@@ -91,7 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # letters that its encoding lacks
             stream.reconfigure(errors="backslashreplace")
     try:
-        options = _parse(sys.argv[1:] if argv is None else list(argv))
+        words = sys.argv[1:] if argv is None else list(argv)
+        options = _parser(words[:1]).parse_args(words)
         json_alone = getattr(options, "json", None) is sys.stdout
         with redirect_stdout(sys.stderr) if json_alone else nullcontext():
             options.run(options)
@@ -140,26 +141,8 @@ def _fail(message, status=2):
     return status
 
 
-def _parse(argv):
-    """The options. Where the words make no sense otherwise, the word after --json or --metrics is
-    what the command works on, as in `pp-cl info --json RUN`.
-    """
-    parser, errors = _parser(), []
-    for alone in ((), ("--json",), ("--metrics",), tuple(ALONE)):
-        words = list(argv)
-        for i, (word, value) in enumerate(pairwise(argv)):
-            if word in alone and not {*value.split(",")} <= {*METRICS}:
-                words[i] = f"{word}={ALONE[word]}"
-        try:
-            return parser.parse_args(words)
-        except _UsageError as error:
-            errors.append(error)
-    # with these words in their places, only an option is wrong
-    unknown = [error for error in errors if "unrecognized arguments: -" in str(error)]
-    raise (unknown or errors)[0]
-
-
-def _parser():
+def _parser(first):
+    """The parser of the command that the first word names, else of all. first: [] or [word]."""
     parser = _Parser(
         prog="pp-cl",
         description="Reconstruct an object from photographs with OpenCL.",
@@ -167,8 +150,8 @@ def _parser():
     )
     parser.add_argument("--version", action="version", version=f"pp-cl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
-    for name, path in COMMANDS.items():
-        module = importlib.import_module(path)
+    for name in first if {*first} <= COMMANDS.keys() and first else COMMANDS:
+        module = importlib.import_module(COMMANDS[name])
         command = commands.add_parser(
             name,
             help=module.HELP,

@@ -10,14 +10,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pp_cl.checkpoint import opened_run
-from pp_cl.engine.views import MIN_SIDE, fitting_downscale
 from pp_cl.errors import UserError, quoted, shown, suggestion
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.files.untrusted import read_regular
 from pp_cl.presets import IMAGE_SIZES, PRESETS
-from pp_cl.scene.load import scene_frames
-from pp_cl.settings import FORMAT, Config, sections
+from pp_cl.settings import FORMAT, Config, every_setting
+
+# what other packages may use; docs/api.md lists it
+__all__ = ["PRESETS", "configure", "field_of", "load_config", "preset"]
+__all__ += ["refuse_setting", "run_config", "scene_config"]
 
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
@@ -41,11 +42,12 @@ def preset(name: str) -> Config:
 def assign(config: Config, key: str, value: Any, origin: str) -> None:
     """Set section.key from a value or its text. Raises UserError naming the origin and the key."""
     section, _, name = key.partition(".")
-    owner = dict(sections(config)).get(section)
-    if owner is None or name not in vars(owner):
-        near = suggestion(key, (f"{s}.{name}" for s, v in sections(config) for name in vars(v)))
-        known = f"{section} has {', '.join(vars(owner))}" if owner else "`train --help` lists them"
-        raise UserError(f"{origin}: unknown key {quoted(key)}; {near}{known}")
+    known = [each for each, _, _ in every_setting(config)]
+    if key not in known:
+        alike = [each.partition(".")[2] for each in known if each.startswith(f"{section}.")]
+        listed = f"{section} has {', '.join(alike)}" if alike else "`train --help` lists them"
+        raise UserError(f"{origin}: unknown key {quoted(key)}; {suggestion(key, known)}{listed}")
+    owner = getattr(config, section)
     setattr(owner, name, _convert(value, getattr(owner, name), f"{origin}: {key}"))
 
 
@@ -111,10 +113,8 @@ def validate(config: Config, origin: str, origins: Mapping[str, str] | None = No
     def where(key):
         return f"{(origins or {}).get(key, origin)}: {key}"
 
-    for section, values in sections(config):
-        for item in dataclasses.fields(values):
-            key = f"{section}.{item.name}"
-            _check(getattr(values, item.name), where(key), **item.metadata)
+    for key, section, item in every_setting(config):
+        _check(getattr(section, item.name), where(key), **item.metadata)
     if config.train.crop % 4:
         raise UserError(
             f"{where('train.crop')} = {config.train.crop}; it must be a multiple of 4"
@@ -184,10 +184,9 @@ def begin_with(
     left_out = set(LENGTH) if asked & set(LENGTH) else set(LENGTH) - {length}
     left_out |= {*config.decided}
     settings = [
-        (f"{section}.{name}", value, f"--config {path}")
-        for section, values in sections(config)
-        for name, value in vars(values).items()
-        if section != "scene" and f"{section}.{name}" not in left_out | asked
+        (key, getattr(section, item.name), f"--config {path}")
+        for key, section, item in every_setting(config)
+        if section is not config.scene and key not in left_out | asked
     ]
     return config.preset, settings + given
 
@@ -202,8 +201,12 @@ def load_config(path: Path | str) -> Config:
         raise UserError(f"{path}: {error.strerror}; {mend}") from None
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON ({shown(str(error))}); {MEND_SETTINGS}") from None
+
+    def broken(what):
+        return UserError(f"{path}: {what}; {MEND_SETTINGS}")
+
     if not isinstance(stored, dict):
-        raise UserError(f"{path}: not settings but {quoted(stored, 40)}; {MEND_SETTINGS}")
+        raise broken(f"not settings but {quoted(stored, 40)}")
     number, name = stored.pop("format", None), stored.pop("preset", None)
     decided = stored.pop("decided", [])
     if type(number) is not int or number != FORMAT:
@@ -211,38 +214,28 @@ def load_config(path: Path | str) -> Config:
             f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
         )
     if type(name) is not str or name not in PRESETS:
-        raise UserError(
-            f"{path}: key preset is missing or none of {', '.join(PRESETS)}; {MEND_SETTINGS}"
-        )
+        raise broken(f"key preset is missing or none of {', '.join(PRESETS)}")
     if not isinstance(decided, list) or not all(key in OPEN for key in decided):
-        raise UserError(
-            f"{path}: decided is {quoted(decided, 40)}, no list of {', '.join(OPEN)};"
-            f" {MEND_SETTINGS}"
-        )
+        raise broken(f"decided is {quoted(decided, 40)}, no list of {', '.join(OPEN)}")
+    found: dict[str, Any] = {}
+    for section, values in stored.items():
+        if not isinstance(values, dict):
+            raise broken(f"{shown(section, 40)} is no section of settings")
+        found |= {f"{section}.{key}": value for key, value in values.items()}
     config = preset(name)
     config.decided = decided
-    ours = dict(sections(config))
-    for section, values in stored.items():
-        where = f"{path}: {shown(section, 40)}"
-        if section not in ours or not isinstance(values, dict):
-            raise UserError(f"{where} is no section of settings; {MEND_SETTINGS}")
-        if unknown := sorted(values.keys() - vars(ours[section]).keys()):
-            key = f"{section}.{shown(unknown[0], 60)}"
-            raise UserError(f"{path}: unknown key {key}; {MEND_SETTINGS}")
-    for section, own in ours.items():
-        for key, example in vars(own).items():
-            where = f"{path}: {section}.{key}"
-            if key not in stored.get(section, {}):
-                raise UserError(f"{where} is missing; {MEND_SETTINGS}")
-            value = stored[section][key]
-            if not _is_alike(value, example):
-                raise UserError(
-                    f"{where} is {quoted(value, 40)}, not like {text_of(example)}; {MEND_SETTINGS}"
-                )
-            setattr(own, key, _convert(value, example, where))
+    for key, section, item in every_setting(config):
+        if key not in found:
+            raise broken(f"{key} is missing")
+        value = found.pop(key)
+        if not _is_alike(value, item.default):
+            raise broken(f"{key} is {quoted(value, 40)}, not like {text_of(item.default)}")
+        setattr(section, item.name, _convert(value, item.default, f"{path}: {key}"))
+    for key in found:
+        raise broken(f"unknown key {shown(key, 100)}")
     validate(config, str(path))
     if not config.scene.path:
-        raise UserError(f"{path}: scene.path is empty; {MEND_SETTINGS}")
+        raise broken("scene.path is empty")
     return config
 
 
@@ -268,8 +261,7 @@ def text_of(value: Any) -> str:
 
 def field_of(key: str) -> dataclasses.Field:
     """The dataclass field of a setting section.key."""
-    section, _, name = key.partition(".")
-    return next(f for f in dataclasses.fields(getattr(Config(), section)) if f.name == name)
+    return {each: item for each, _, item in every_setting(Config())}[key]
 
 
 def help_lines() -> list[str]:
@@ -277,14 +269,13 @@ def help_lines() -> list[str]:
     that differ: the text of `--help`.
     """
     return [
-        f"  {section}.{item.name} = {text_of(item.default)}  ({item.metadata['help']})"
+        f"  {key} = {text_of(item.default)}  ({item.metadata['help']})"
         + "".join(
             f"  {name}: {text_of(changes[key])}"
             for name, changes in PRESETS.items()
-            if (key := f"{section}.{item.name}") in changes
+            if key in changes
         )
-        for section, values in sections(Config())
-        for item in dataclasses.fields(values)
+        for key, _, item in every_setting(Config())
     ]
 
 
@@ -303,71 +294,76 @@ def run_config(
     scene: str,
     preset_name: str | None = None,
     given: Iterable[tuple[str, Any, str]] = (),
-    *,
-    extends: bool = False,
 ) -> Config:
-    """Config of a training in `folder`: that of the run which has a checkpoint there, else the
-    preset's, with the given settings.
+    """Config of a training in `folder`: that of the run there, else the preset's, with the given
+    settings.
 
-    scene: a folder, or the word demo. given: (key, value or its text, origin); a run that has a
-    checkpoint must have the same values. extends: whether train.iterations of a finished run may
-    change: with more of them it goes on, with fewer it stays finished. Raises UserError naming the
-    first setting that differs or makes no sense, or what is wrong with the scene's files.
+    scene: a folder, or the word demo. given: (key, value or its text, origin). A run that has a
+    checkpoint must have the same values, but a finished one may be asked for other
+    train.iterations: with more of them it goes on. Raises UserError naming the first setting that
+    differs or makes no sense, or what is wrong with the scene's files.
     """
+    given, stored = list(given), load_config(folder.config) if folder.config.exists() else None
+    other_preset = stored is not None and preset_name not in (None, stored.preset)
+    if stored and folder.checkpoint.exists():
+        if other_preset:
+            raise UserError(
+                f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
+                " another --out"
+            )
+        return _resumed(folder, stored, scene, given)
+    if not stored or other_preset:
+        return scene_config(scene, preset_name or "tiny", given)
+    # a training that was stopped before its first checkpoint: what its images decided is open again
+    for key in stored.decided:
+        assign(stored, key, field_of(key).default, "preset")
+    if "train.iterations" in [key for key, _, _ in given]:
+        stored.train.minutes = 0
+    return configure(stored, scene, given)
+
+
+def scene_config(
+    scene: str, preset_name: str, given: Iterable[tuple[str, Any, str]] = ()
+) -> Config:
+    """Config of a preset for a scene, with the given settings: unless scene.downscale is among
+    them, images are reduced to about the preset's size, by the largest training image, as long as
+    the smallest keeps enough pixels. Raises UserError as configure() and scene_frames() do.
+    """
+    # here, so that --help needs neither numpy nor OpenCL
+    from pp_cl.engine.views import MIN_SIDE, fitting_downscale
+    from pp_cl.scene.load import scene_frames
+
     given = list(given)
-    if folder.config.exists() and folder.checkpoint.exists():
-        return _config_to_resume(folder, scene, preset_name, given, extends)
-    return _config_to_begin(folder, scene, preset_name, given)
-
-
-def _config_to_begin(folder, scene, preset_name, given):
-    """That of a run that was stopped before its first checkpoint, if it is of this preset; else the
-    preset's, which reduces the images to about its size unless scene.downscale is given.
-    """
-    if folder.config.exists():
-        stored = load_config(folder.config)
-        if preset_name in (None, stored.preset):
-            for key in stored.decided:  # of other images, maybe
-                assign(stored, key, field_of(key).default, "preset")
-            if "train.iterations" in [key for key, _, _ in given]:
-                stored.train.minutes = 0
-            return configure(stored, scene, given)
-    config = configure(preset(preset_name or "tiny"), scene, given)
+    config = configure(preset(preset_name), scene, given)
     if "scene.downscale" not in [key for key, _, _ in given]:
-        downscale = preset_downscale(config.scene.path, config.preset)
-        assign(config, "scene.downscale", downscale, "preset")
+        cameras = [one.camera for one in scene_frames(config.scene.path)]
+        sizes = [(camera.width, camera.height) for camera in cameras]
+        fitting = fitting_downscale(max(sizes, key=max), IMAGE_SIZES[preset_name])
+        most = max(1, min(map(min, sizes)) // MIN_SIDE)
+        assign(config, "scene.downscale", min(fitting, most), "preset")
     return config
 
 
-def _config_to_resume(folder, scene, preset_name, given, extends):
-    """That of the run, which may change in nothing but the iterations of a finished one."""
-    stored, config = load_config(folder.config), load_config(folder.config)
-    if preset_name not in (None, stored.preset):
-        raise UserError(
-            f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
-            " another --out"
-        )
-    configure(config, scene, given)
+def _resumed(folder, stored, scene, given):
+    """The settings of a run with a checkpoint, which may change in FREE alone, and where it is
+    finished in its length.
+    """
+    from pp_cl.checkpoint import opened_run
+
+    config, free = configure(load_config(folder.config), scene, given), {*FREE}
     if stored.train.minutes:  # planned meanwhile, as train.iterations are
         config.train.refine_at = stored.train.refine_at
-    if extends and config.train.iterations != stored.train.iterations:
+    if config.train.iterations != stored.train.iterations:
         with opened_run(folder, stored) as run:
-            if run.header["step"] == stored.train.iterations:
-                most = max(config.train.iterations, stored.train.iterations)
-                for one in (config, stored):
-                    assign(one, "train.iterations", most, "settings")
-                    assign(one, "train.minutes", 0, "settings")
-    _check_same(config, stored, folder)
+            if run.header["finished"]:
+                free |= {*LENGTH}
+                config.train.minutes = 0
+    for key, section, item in every_setting(config):
+        there = getattr(getattr(stored, key.partition(".")[0]), item.name)
+        asked = getattr(section, item.name)
+        if asked != there and key not in free:
+            refuse_setting(folder, key, there, asked)
     return config
-
-
-def _check_same(asked, stored, folder):
-    """Raise UserError naming the first setting that differs, but for those of FREE."""
-    for (section, ours), (_, theirs) in zip(sections(asked), sections(stored), strict=True):
-        for name, value in vars(ours).items():
-            there = getattr(theirs, name)
-            if value != there and f"{section}.{name}" not in FREE:
-                refuse_setting(folder, f"{section}.{name}", there, value)
 
 
 def refuse_setting(folder: RunFolder, key: str, there: Any, asked: Any) -> NoReturn:
@@ -376,13 +372,3 @@ def refuse_setting(folder: RunFolder, key: str, there: Any, asked: Any) -> NoRet
         f"{folder.config}: {key} is {there} there, {asked} asked for; use another --out, or the"
         " settings of the run"
     )
-
-
-def preset_downscale(path: str, preset: str) -> int:
-    """How many times a preset reduces the images of a scene, by the size of the largest training
-    image that leaves the smallest enough pixels. Raises UserError as scene_frames does.
-    """
-    cameras = [one.camera for one in scene_frames(path)]
-    sizes = [(camera.width, camera.height) for camera in cameras]
-    fitting = fitting_downscale(max(sizes, key=max), IMAGE_SIZES[preset])
-    return max(1, min(fitting, min(map(min, sizes)) // MIN_SIDE))

@@ -272,8 +272,11 @@ class Config:
         return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)
 
 
-def sections(config: Config) -> Iterator[tuple[str, Any]]:
-    """(name, dataclass) of each section, in their order."""
-    for name, value in vars(config).items():
-        if dataclasses.is_dataclass(value):
-            yield name, value
+def every_setting(config: Config) -> Iterator[tuple[str, Any, dataclasses.Field]]:
+    """(section.key, the section that holds its value, its field) of each setting, in their order:
+    the value is getattr(section, field.name).
+    """
+    for name, section in vars(config).items():
+        if dataclasses.is_dataclass(section):
+            for item in dataclasses.fields(section):
+                yield f"{name}.{item.name}", section, item

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from pp_cl.engine.camera import Camera, look_at
-from pp_cl.scene.around import looked_at, up_of
+from pp_cl import Camera
+from pp_cl.scene import looked_at, up_of
 
 MARGIN = 0.95  # of the image that the object may fill
 HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles a picture would spin
@@ -59,7 +60,8 @@ class Surroundings:
             + math.sin(e) * self.up
             for a, e in zip(angles, elevations, strict=True)
         ]
-        poses = [look_at(offset, (0, 0, 0), self.up) for offset in offsets]
+        size = {"fx": camera.fx, "width": camera.width, "height": camera.height}
+        poses = [Camera.look_at(offset, (0, 0, 0), self.up, **size).pose for offset in offsets]
         distance = max(self.distance, *(self._least_distance(camera, pose) for pose in poses))
         centred = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
         return [
@@ -81,8 +83,6 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """
     if len(cameras) == 1:
         return list(cameras)
-    from scipy.interpolate import CubicSpline  # takes long to import
-
     first, times = cameras[0], np.linspace(0, len(cameras) - 1, frames)
     at = np.arange(len(cameras))
     eyes = CubicSpline(at, [camera.eye for camera in cameras])(times)

@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, settings
 from support.guarded import DATA, GuardedDevice, TracedDevice
 from support.runs import Runs
 
-from pp_cl.drivers import discover
-from pp_cl.drivers.discover import open_device
+from pp_cl import drivers
+from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
@@ -95,7 +95,7 @@ def session_device(tmp_path_factory):
         return device if (opened, _variables()) == (device.device, wanted) else Device(opened)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(discover, "Device", shared)
+        patch.setattr(drivers, "Device", shared)
         yield device
 
 

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 from support.checkpoints import load_checkpoint
+from support.guarded import slow
 from support.runs import arguments
 from support.scenes import move_scene, write_ball_scene
 
@@ -47,7 +48,7 @@ def at_origin(tmp_path_factory):
     return trained(tmp_path_factory.mktemp("origin"), 0, unit=UNIT)
 
 
-@pytest.mark.parametrize("by", [NEAR, FAR, -8 * FAR], ids=["near", "far", "farther"])
+@pytest.mark.parametrize("by", [slow(NEAR), FAR, slow(-8 * FAR)], ids=["near", "far", "farther"])
 def test_exact_moves_give_the_same_bits(at_origin, by, tmp_path):
     header, arrays, psnr, _ = trained(tmp_path, by, unit=UNIT)
     expected, expected_arrays, expected_psnr, _ = at_origin

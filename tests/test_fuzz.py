@@ -4,7 +4,6 @@ A few examples of each surface here; `make fuzz` tries as many as it is told, ot
 """
 
 import argparse
-import dataclasses
 import importlib
 import json
 import math
@@ -54,12 +53,12 @@ from pp_cl.scene.masks import cut_out, read_mask_of_size
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
-from pp_cl.settings import Config, sections
+from pp_cl.settings import Config, every_setting
 from pp_studio.sweep.plan import Job, plan, read_varied
 from pp_studio.sweep.result import finished_row
 
 MOST_MEMORY = 2**26  # bytes of pixels that a small file may unfold to without a word
-KEYS = [f"{section}.{name}" for section, values in sections(Config()) for name in vars(values)]
+KEYS = [key for key, _, _ in every_setting(Config())]
 keys = st.sampled_from(KEYS) | damage.words
 # what makes a command end soon, whatever else it is told; others are refused in any case
 ENDING = {
@@ -296,16 +295,15 @@ def tell(run):
 
 def check_config(config):
     """Settings are of their types and within their limits."""
-    for section, values in sections(config):
-        for item in dataclasses.fields(values):
-            value, key = getattr(values, item.name), f"{section}.{item.name}"
-            several, limits = isinstance(item.default, tuple), item.metadata
-            assert type(value) is type(item.default), key
-            assert not several or len(value) == len(item.default), key
-            for part in value if several else (value,):
-                check_finite(**{key: part})
-                assert limits["least"] is None or limits["least"] <= part <= limits["most"], key
-            assert not limits["choices"] or value in limits["choices"], key
+    for key, section, item in every_setting(config):
+        value, limits = getattr(section, item.name), item.metadata
+        several = isinstance(item.default, tuple)
+        assert type(value) is type(item.default), key
+        assert not several or len(value) == len(item.default), key
+        for part in value if several else (value,):
+            check_finite(**{key: part})
+            assert limits["least"] is None or limits["least"] <= part <= limits["most"], key
+        assert not limits["choices"] or value in limits["choices"], key
 
 
 @fuzzed(3)

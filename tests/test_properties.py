@@ -1,6 +1,5 @@
 """Properties of what reads and writes texts, for whatever texts and numbers there are."""
 
-import dataclasses
 import json
 import math
 
@@ -10,13 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from support.checkpoints import load_checkpoint
 
+from pp_cl.checkpoint import FORMAT, save_checkpoint
 from pp_cl.config import assign, load_config, preset, text_of
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
-from pp_cl.files.checkpoint import FORMAT, save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid
-from pp_cl.settings import Config, sections
+from pp_cl.settings import Config, every_setting
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -40,12 +39,7 @@ def test_foreign_values_are_short(value, most):
         assert len(line) <= most and (line.isprintable() or not line)
 
 
-SETTINGS = [
-    (f"{section}.{item.name}", item)
-    for section, owner in sections(Config())
-    for item in dataclasses.fields(owner)
-    if section != "scene"
-]
+SETTINGS = [(key, item) for key, _, item in every_setting(Config()) if not key.startswith("scene.")]
 
 
 @st.composite

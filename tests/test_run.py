@@ -16,7 +16,7 @@ from support.runs import SETTINGS, arguments
 import pp_cl
 from pp_cl.cli import main
 from pp_cl.config import assign, run_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.training.schedule import GAMMA
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit

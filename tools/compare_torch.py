@@ -14,7 +14,7 @@ import numpy as np
 from pp_cl.bench import unet as bench
 from pp_cl.bench.timing import errors, interleave
 from pp_cl.commands.options import integer, widths
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.layers.choice import AUTO, VARIANTS
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json

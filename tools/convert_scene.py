@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 
 from pp_cl.config import configure, preset
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder

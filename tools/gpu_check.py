@@ -30,7 +30,7 @@ from typing import NamedTuple
 from unittest.mock import patch
 
 from pp_cl.cli import main as pp_cl
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import (
     INTEL_PLATFORM,
     STANDARD,

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from pp_cl.config import run_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder

@@ -12,7 +12,7 @@ import sys
 import tempfile
 from datetime import date
 
-from pp_cl.drivers.discover import list_devices
+from pp_cl.drivers import list_devices
 from pp_cl.files.atomic import write_json
 from tools.provenance import ROOT, digest
 from tools.results import RESULTS, WIDTHS, git, processor

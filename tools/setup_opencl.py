@@ -13,7 +13,7 @@ import subprocess
 import sys
 
 LIST = """
-from pp_cl.drivers.discover import list_devices
+from pp_cl.drivers import list_devices
 for index, device, problem in list_devices(again=True):
     print(index, device.platform.name, device.name, problem or "works")
 """

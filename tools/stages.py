@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pp_cl.bench.timing import interleave
 from pp_cl.config import run_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.network.layers import multiplications
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.weights import listed_hits
@@ -69,7 +69,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     if folder.checkpoint.exists():
         made = json.loads(folder.config.read_text("utf-8"))["train"]["iterations"]
         given = [("train.iterations", made + steps, "stages")]
-    config = run_config(folder, scene, preset, given, extends=True)
+    config = run_config(folder, scene, preset, given)
     dev = open_device()
     trainer = open_training(dev, folder, config, stored_state(folder, config)).trainer
     net, cloud, seen = trainer.model.net, trainer.model.cloud, []

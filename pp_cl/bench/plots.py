@@ -24,31 +24,22 @@ def figure_of(file: str | None) -> Any | None:
     return Figure(figsize=(9, 6), layout="constrained")
 
 
-def plot_time_and_error(figure: Any, rows: list[dict]) -> None:
-    """Time against error, both logarithmic, of the rows that have one: a colour for each variant of
-    a bench, a marker for each direction or blend.
+def plot_time_and_error(figure: Any, rows: list[dict], path: str) -> None:
+    """Draw time against error, both logarithmic, of the rows that have one, with a colour for each
+    variant of a bench, direction and blend, and write the figure.
     """
     axes = figure.add_subplot(xscale="log", yscale="log")
     axes.set(xlabel="milliseconds", ylabel="error against float64")
-    series: dict[tuple[str, str], list[dict]] = {}
+    series: dict[str, list[dict]] = {}
     for row in rows:
         if "max_err" in row:
-            kind = row.get("direction") or row["blend"]
-            series.setdefault((f"{row['bench']} {row.get('variant', '')}", kind), []).append(row)
-    variants, kinds = (list(dict.fromkeys(key[i] for key in series)) for i in (0, 1))
-    for (variant, kind), some in series.items():
-        axes.plot(
-            [row["ms"] for row in some],
-            [max(row.get("rel_l2", row["max_err"]), LEAST_ERROR) for row in some],
-            "os^Dv"[kinds.index(kind) % 5],
-            color=f"C{variants.index(variant) % 10}",
-            label=f"{variant.strip()}, {kind}",
-        )
+            words = (row.get(key) for key in ("bench", "variant", "direction", "blend"))
+            series.setdefault(" ".join(filter(None, words)), []).append(row)
+    for number, (label, some) in enumerate(series.items()):
+        errors = [max(row.get("rel_l2", row["max_err"]), LEAST_ERROR) for row in some]
+        marker = "os^D"[number // 10 % 4]  # there are ten colours
+        axes.plot([row["ms"] for row in some], errors, marker, label=label)
     axes.grid(True, which="both", alpha=0.3)
     axes.legend(fontsize="small")
-
-
-def save_figure(figure: Any, path: str) -> None:
-    """Write a figure."""
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())

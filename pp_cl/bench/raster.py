@@ -1,69 +1,249 @@
 """`pp-cl bench raster`: time, bytes and error of the rasteriser's stages, by number of points,
-image side and blend, on the scenes of raster_scenes.py.
+image side and blend, on two made scenes.
 
-Times are wall clock until the stage's work is done, with both blends in turn.
+Times are wall clock until the stage's work is done, with both blends in turn. Errors are against
+float64, of CHECKED_POINTS points in CHECKED_SIDE x CHECKED_SIDE pixels, some hundred in a pixel.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from pp_cl.bench.raster_scenes import SCENES
+from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
 from pp_cl.bench.timing import interleave
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.buffers import Buffers, gather_rows
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.model import Model
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.raster.blend import blend_backward, blend_forward
+from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.raster.weights import blend_weights
+from pp_cl.engine.render import Renderer, RenderResult
+from pp_cl.reference import dense
+from pp_cl.settings import RasterConfig
 
 BLENDS = ("alpha", "softmax")
+GAMMA = 0.01  # depth sharpness: the last one of a training, the sharpest
+RADIUS = 0.0015  # the paper's and Pulsar's, world units
+CHECKED_POINTS, CHECKED_SIDE = 4000, 16
+ROUNDING = 4 * np.finfo(np.float32).eps  # of the distance from a ray, in shares of the range
+CHANNELS = 16
+# every coefficient of degrees 1 and 2; random ones would take minutes for 4 million points
+HIGHER_SH = 0.1
+
+
+class BenchScene:
+    """Points in view of a camera, and the float64 features of its pixels.
+
+    positions: (N, 3), world. opacity: (N,) float32. size: side of the image in pixels. grad: (H, W,
+    16) device array, dL/dfeatures. forward(blend) rasterises in the stages FORWARD (Device.stage),
+    backward(blend, its result) in others; exact_features() are (N, 16).
+    """
+
+    FORWARD: tuple[str, ...]
+    footprint: str
+    depth_range: tuple[float, float]
+    camera: Camera
+    positions: np.ndarray
+    opacity: np.ndarray
+    forward: Callable[[str], RenderResult]
+    exact_features: Callable[[], np.ndarray]
+
+    def __init__(self, dev: Device, size: int, rng: np.random.Generator):
+        self.dev, self.size = dev, size
+        self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
+
+    def error(self, blend: str, features: np.ndarray) -> float:
+        """Largest difference of an image's (H, W, 16) features from float64, over the range of the
+        points' features and the background, 1. Pixels where float32's rounding may decide over a
+        hit are left out. Every point meets every pixel: for small scenes.
+        """
+        geometry = dense.geometry(
+            self.camera, self.positions, RADIUS, self.footprint, depth_range=self.depth_range
+        )
+        clear = (geometry["margin"] >= ROUNDING * self.camera.fx).all(axis=0)
+        point_features = self.exact_features()
+        exact = dense.blend_by_rule(blend, geometry, self.opacity, GAMMA)
+        expected = dense.features(exact, point_features)
+        span = np.maximum(point_features.max(0), 1) - np.minimum(point_features.min(0), 1)
+        difference = np.abs(features.reshape(expected.shape) - expected) / span
+        return float(difference[clear].max(initial=0))
+
+
+class GridScene(BenchScene):
+    """About n discs of the paper's radius on a grid inside the unit ball, seen from a distance of 4
+    under 40 degrees, by the renderer.
+
+    Opacities are uniform in [0.7, 1]: in a trained model few are lower. The camera looks along no
+    axis of the grid.
+    """
+
+    FORWARD = ("project", "pairs", "weights", "shade", "blend")
+    footprint, depth_range = "disc", (2.0, 6.0)
+
+    def __init__(self, dev: Device, n: int, size: int):
+        rng = np.random.default_rng(0)
+        super().__init__(dev, size, rng)
+        edge = (4 / 3 * np.pi / n) ** (1 / 3)
+        side = int(2 / edge) + 2
+        grid = Grid((-edge * (side - 1) / 2,) * 3, edge, (side,) * 3)
+        squares = (grid.origin[0] + edge * np.arange(side)) ** 2
+        inside = squares[:, None, None] + squares[:, None] + squares < 1
+        ids = np.flatnonzero(inside).astype(np.uint32)
+        self.positions, n = grid.positions(ids), len(ids)
+        focal = size / (2 * np.tan(np.radians(20)))
+        eye = 2.4, -1.6, np.sqrt(16 - 2.4**2 - 1.6**2)
+        self.camera = Camera.look_at(eye, (0, 0, 0), fx=focal, width=size, height=size)
+
+        net = UNet(dev, widths=(CHANNELS,) * 3)
+        self.cloud = PointCloud.create(dev, ids)
+        model = Model(dev, grid, self.depth_range, self.cloud, net=net)
+        self.opacity = rng.uniform(0.7, 1, n).astype(np.float32)
+        self.sh_0 = rng.standard_normal((n, 1, CHANNELS), np.float32)
+        self.cloud.opacity.set(self.opacity)
+        self.cloud.sh[0].set(self.sh_0)
+        for coefficients in self.cloud.sh[1:]:
+            dev.fill(coefficients, HIGHER_SH)
+        disc = RasterConfig(footprint="disc", radius=RADIUS, early_stop=0.0)
+        self.renderers = {b: Renderer(dev, model, replace(disc, blend=b)) for b in BLENDS}
+
+    def forward(self, blend: str) -> RenderResult:
+        """Project, find pairs, weigh, shade and blend."""
+        return self.renderers[blend].forward(self.camera, GAMMA, until="features", training=True)
+
+    def backward(self, blend: str, result: RenderResult) -> None:
+        """Stage `backward`: gradients of features and opacities."""
+        self.renderers[blend].backward_features(result, self.grad)
+
+    def exact_features(self) -> np.ndarray:
+        """(N, 16) float64 features of the points, shaded."""
+        coefficients = np.full((len(self.positions), 9, CHANNELS), HIGHER_SH)
+        coefficients[:, :1] = self.sh_0
+        return dense.shade(self.positions, self.camera.eye, coefficients)
+
+
+class PulsarScene(BenchScene):
+    """Spheres of radius 0.0015, uniform in a cube of side 1 at a depth of 1 to 2: Pulsar's own
+    benchmark.
+
+    Focal length and sensor are equal, near is 0.6, far 2.5, opacities are 1. Stage `spheres`:
+    gradients of positions and radii.
+    """
+
+    FORWARD = ("project", "pairs", "weights", "blend")
+    footprint, depth_range = "sphere", (0.6, 2.5)
+
+    def __init__(self, dev: Device, n: int, size: int):
+        rng = np.random.default_rng(0)
+        super().__init__(dev, size, rng)
+        self.camera = Camera(np.eye(3, 4), size, size, size / 2, size / 2, size, size)
+        self.opacity = np.ones(n, np.float32)
+        self.positions = rng.random((n, 3), np.float32) + np.array([-0.5, -0.5, 1], np.float32)
+        self.point_features = rng.random((n, CHANNELS), np.float32)
+        self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
+        self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
+        self.point_radius = dev.upload(np.full(n, RADIUS), np.float32)
+        self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
+        self.device_features = dev.upload(self.point_features)
+        self.features = dev.empty((size, size, CHANNELS))
+
+    def forward(self, blend: str) -> RenderResult:
+        """Project, find pairs, weigh and blend."""
+        dev, b, camera, size = self.dev, self.buffers[blend], self.camera_buffer, (self.size,) * 2
+        with dev.stage("project"):
+            points = project_spheres(
+                dev,
+                b,
+                self.footprint,
+                camera,
+                self.point_positions,
+                point_radius=self.point_radius,
+            )
+        with dev.stage("pairs"):
+            pairs = find_all_pairs(dev, b, points, size, self.room)
+            self.room = pairs.capacity
+        with dev.stage("weights"):
+            weights = blend_weights(
+                dev, b, pairs, camera, self.point_opacity, blend=blend, gamma=GAMMA
+            )
+        with dev.stage("blend"):
+            features = gather_rows(dev, self.device_features, weights.shaded)
+            blend_forward(dev, pairs, weights, features, self.features)
+        result = RenderResult(dev, self.camera, (0, 0), size, points, pairs, weights, None)
+        result.shaded_features, result.features = features, self.features
+        return result
+
+    def backward(self, blend: str, result: RenderResult) -> None:
+        """Stages `backward` and `spheres`."""
+        dev, opacity = self.dev, self.point_opacity
+        view = result.points, result.pairs, result.weights
+        with dev.stage("backward"):
+            gradients = blend_backward(
+                dev,
+                self.buffers[blend],
+                *view,
+                opacity=opacity,
+                shaded_features=result.shaded_features,
+                features=result.features,
+                grad_features=self.grad,
+            )
+        with dev.stage("spheres"):
+            spheres_backward(dev, *view, gradients.pair_gradient, opacity=opacity, gamma=GAMMA)
+
+    def exact_features(self) -> np.ndarray:
+        """(N, 16) float64 features of the points."""
+        return self.point_features.astype(np.float64)
+
+
+SCENES = {"grid": GridScene, "pulsar": PulsarScene}
 
 
 def bench_raster(
-    dev: Device,
-    scene: str,
-    points: list[int],
-    sizes: list[int],
-    *,
-    blends: Sequence[str] = BLENDS,
-    gamma: float,
+    dev: Device, name: str, points: list[int], sizes: list[int], *, blends: Sequence[str] = BLENDS
 ) -> Iterator[dict]:
-    """Yield a row for every number of points, side and blend. scene: a key of SCENES."""
+    """Yield a row for every number of points, side and blend. name: a key of SCENES."""
+    small = SCENES[name](dev, CHECKED_POINTS, CHECKED_SIDE)
+    errors = {blend: small.error(blend, small.forward(blend).features.get()) for blend in blends}
     for n in points:
         for size in sizes:
             before = dev.reset_peak()
-            yield from _rows(dev, SCENES[scene](dev, n, size, gamma), blends, before=before)
+            scene = SCENES[name](dev, n, size)
+            stages_ms, whole_ms = _time(dev, scene, blends)
+            for blend in blends:
+                result, stages, times = scene.forward(blend), stages_ms[blend], whole_ms[blend]
+                forward = sum(ms for stage, ms in stages.items() if stage in scene.FORWARD)
+                yield {
+                    "scene": name,
+                    "points": len(scene.positions),
+                    "size": size,
+                    "gamma": GAMMA,
+                    "blend": blend,
+                    "pairs": result.pairs.total,
+                    "shaded": int(result.weights.shaded.size),
+                    "forward_ms": forward,
+                    "backward_ms": sum(stages.values()) - forward,
+                    "ms": float(np.median(times)),
+                    "ms_range": [min(times), max(times)],
+                    "stages_ms": stages,
+                    "peak_device_bytes": dev.peak_bytes - before,
+                    "max_err": errors[blend],
+                }
 
 
-def _rows(dev, bench, blends, *, before):
-    """Rows of one scene. before: bytes that were in use without it."""
-    stages_ms, whole_ms = _time(dev, bench, blends)
-    for blend in blends:
-        result, stages, times = bench.forward(blend), stages_ms[blend], whole_ms[blend]
-        forward = sum(ms for name, ms in stages.items() if name in bench.forward_stages)
-        yield {
-            "scene": bench.name,
-            "points": bench.count,
-            "size": bench.size,
-            "gamma": bench.gamma,
-            "blend": blend,
-            "pairs": result.pairs.total,
-            "shaded": int(result.weights.shaded.size),
-            "forward_ms": forward,
-            "backward_ms": sum(stages.values()) - forward,
-            "ms": float(np.median(times)),
-            "ms_range": [min(times), max(times)],
-            "stages_ms": stages,
-            "peak_device_bytes": dev.peak_bytes - before,
-            "max_err": bench.error(blend, result),
-        }
-
-
-def _time(dev, bench, blends):
+def _time(dev, scene, blends):
     """({blend: {stage: median milliseconds}}, {blend: all its milliseconds}), in turn."""
     seconds = {blend: defaultdict(list) for blend in blends}
 
     def runner(blend):
         def run():
             with dev.timed_stages() as stages:
-                bench.backward(blend, bench.forward(blend))
+                scene.backward(blend, scene.forward(blend))
             for name, values in stages.items():
                 seconds[blend][name] += values
 

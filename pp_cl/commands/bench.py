@@ -5,7 +5,6 @@ from itertools import chain
 from typing import Any
 
 from pp_cl.commands import options as shared
-from pp_cl.config import assign, preset
 from pp_cl.errors import UserError
 from pp_cl.settings import BLOCKS
 
@@ -14,8 +13,8 @@ HELP = "time against error of the convolutions, the network, the rasteriser, a t
 OPTIONS = {
     "conv": ("size", "widths", "blocks", "plot"),
     "unet": ("size", "widths", "blocks", "plot"),
-    "raster": ("size", "scene", "points", "blend", "gamma", "plot"),
-    "train": ("scene", "points", "set"),
+    "raster": ("size", "scene", "points", "blend", "plot"),
+    "train": ("scene", "points", "widths"),
     "all": ("plot",),
 }
 # what `all` measures: about two minutes on two cores
@@ -23,8 +22,9 @@ SMALL: dict[str, dict[str, Any]] = {
     "conv": {"size": [128], "widths": (32, 64, 128)},
     "unet": {"size": [128], "widths": (32, 64, 128)},
     "raster": {"size": [200, 400], "points": [10_000, 250_000]},
-    "train": {"points": [250_000], "set": [("network.widths", "32,64,128", "bench")]},
+    "train": {"points": [250_000], "widths": (32, 64, 128)},
 }
+WIDTHS = (128, 256, 512)  # the paper's
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--widths",
         type=shared.widths,
         metavar="A,B,C",
-        help="conv, unet: channels of the levels (128,256,512: the paper's)",
+        help="conv, unet, train: channels of the levels (128,256,512: the paper's)",
     )
     add("--blocks", choices=BLOCKS, help="conv, unet: of a level (double)")
     add(
@@ -69,13 +69,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="B,...",
         help="raster: of alpha,softmax (both)",
     )
-    add(
-        "--gamma",
-        type=shared.number(1e-5, 1),
-        metavar="G",
-        help="raster: depth sharpness of the blend (0.01)",
-    )
-    shared.add_set(parser, "train: a setting in place of the paper preset's")
     shared.add_json(parser, OPTIONS)
     add(
         "--plot",
@@ -90,9 +83,9 @@ def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write the files asked for. Raises UserError, before anything is
     measured, for options that make no sense and files that cannot be written.
     """
-    from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
+    from pp_cl.bench.plots import figure_of, plot_time_and_error
     from pp_cl.bench.timing import HEAD, line
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
 
     foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
     shared.refuse(options, foreign, f"bench {options.what} has no such option")
@@ -100,12 +93,10 @@ def run(options: argparse.Namespace) -> None:
     given = {options.what: vars(options)}
     if options.what == "all":
         given = {name: vars(options) | changes for name, changes in SMALL.items()}
-    benches = [
-        (name, BENCHES[name](name, argparse.Namespace(**own))) for name, own in given.items()
-    ]
+    benches = {name: _prepared(name, argparse.Namespace(**own)) for name, own in given.items()}
     dev, rows = open_device(options.device), []
     print(f"{dev.name} [{dev.info['platform']}]\n{HEAD}")
-    for name, measure in benches:
+    for name, measure in benches.items():
         for row in measure(dev):
             rows.append({"bench": name} | row)
             print(line(rows[-1]), flush=True)
@@ -113,48 +104,36 @@ def run(options: argparse.Namespace) -> None:
     shared.write_json_option(options.json, result)
     if figure:
         figure.suptitle(dev.name)
-        plot_time_and_error(figure, rows)
-        save_figure(figure, options.plot)
+        plot_time_and_error(figure, rows, options.plot)
 
 
-# ---- each bench: its options are checked; the function of a device that it returns yields the rows
-# as they are measured
-
-
-def _network(name, options):
+def _prepared(name, options):
+    """A bench as a function of the device that yields its rows as they are measured. Raises
+    UserError for options that make no sense.
+    """
     from pp_cl.bench.conv import bench_conv
-    from pp_cl.bench.unet import bench_unet
-
-    size = _one(options, "size") if options.size else 256
-    widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
-    bench = bench_conv if name == "conv" else bench_unet
-    return lambda dev: bench(dev, size, widths, blocks=blocks)
-
-
-def _raster(_, options):
-    from pp_cl.bench.raster import BLENDS, bench_raster
-    from pp_cl.bench.raster_scenes import SCENES
-
-    scene = options.scene or "grid"
-    if scene not in SCENES:
-        raise UserError(f"--scene {scene}: choose from {', '.join(SCENES)}")
-    points = options.points or [10_000, 63_000, 250_000, 1_000_000, 4_000_000]
-    sizes, blends = options.size or [200, 400, 800], options.blend or BLENDS
-    gamma = options.gamma or 0.01  # the last one of a training, the sharpest
-    return lambda dev: bench_raster(dev, scene, points, sizes, blends=blends, gamma=gamma)
-
-
-def _train(_, options):
+    from pp_cl.bench.raster import BLENDS, SCENES, bench_raster
     from pp_cl.bench.training import bench_step
-    from pp_cl.config import configure
+    from pp_cl.bench.unet import bench_unet
+    from pp_cl.config import configure, preset
 
-    config = configure(preset("paper"), options.scene or "demo", options.set)
-    if options.points:
-        assign(config, "points.count", _one(options, "points"), "--points")
-    return lambda dev: bench_step(dev, config)
-
-
-BENCHES = {"conv": _network, "unet": _network, "raster": _raster, "train": _train}
+    widths = options.widths or WIDTHS
+    if name == "raster":
+        scene, blends = options.scene or "grid", options.blend or BLENDS
+        if scene not in SCENES:
+            raise UserError(f"--scene {scene}: choose from {', '.join(SCENES)}")
+        points = options.points or [10_000, 63_000, 250_000, 1_000_000, 4_000_000]
+        sizes = options.size or [200, 400, 800]
+        return lambda dev: bench_raster(dev, scene, points, sizes, blends=blends)
+    if name == "train":
+        given = [("network.widths", widths, "--widths")]
+        if options.points:
+            given.append(("points.count", _one(options, "points"), "--points"))
+        config = configure(preset("paper"), options.scene or "demo", given)
+        return lambda dev: bench_step(dev, config)
+    size = _one(options, "size") if options.size else 256
+    bench = bench_conv if name == "conv" else bench_unet
+    return lambda dev: bench(dev, size, widths, blocks=options.blocks or "double")
 
 
 def _one(options, name):

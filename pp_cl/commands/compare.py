@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _images(options):
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.metrics.compare import compare
 
     metrics = options.metrics or METRICS
@@ -70,9 +70,9 @@ def _images(options):
 def _shape(options):
     from pp_cl.commands.compare_mesh import mesh_shape, run_shape
     from pp_cl.config import nearby_run
-    from pp_cl.drivers.discover import open_device
-    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.drivers import open_device
     from pp_cl.metrics.shape import read_mesh
+    from pp_cl.run import find_run
 
     path, samples = Path(options.subject), options.samples or SAMPLES
     if not path.exists():
@@ -81,7 +81,7 @@ def _shape(options):
     if path.is_dir():
         shared.refuse(options, ("edge",), "only of a mesh")
         mesh, dev = read_mesh(options.mesh) if options.mesh else None, open_device(options.device)
-        return run_shape(dev, RunFolder(path), mesh, samples, scene=options.scene)
+        return run_shape(dev, find_run(path), mesh, samples, scene=options.scene)
     shared.refuse(options, ("mesh", "scene"), "only of a run")
     mesh, dev = read_mesh(path), open_device(options.device)
     return mesh_shape(dev, mesh, options.edge, samples)

@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the devices. Raises UserError if none works."""
-    from pp_cl.drivers.discover import list_devices, list_left_out, mend
+    from pp_cl.drivers import list_devices, list_left_out, mend
     from pp_cl.engine.device.device import describe
 
     found = [(i, describe(d), problem) for i, d, problem in list_devices(again=True)]

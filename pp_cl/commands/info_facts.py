@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.checkpoint import opened_run
-from pp_cl.config import assign, configure, preset, preset_downscale
+from pp_cl.config import scene_config
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
@@ -18,25 +18,16 @@ from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement, disagreements
-from pp_cl.scene.around import looked_at, up_of
 from pp_cl.scene.edits import read_edits
+from pp_cl.scene.gaze import looked_at, up_of
 from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
 from pp_cl.scene.identity import kept_views
 from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
-from pp_cl.scene.overview import overview
-from pp_cl.scene.sparse import sparse_points
 from pp_cl.session.start import first_hull
-
-SHOWN_POINTS = 20_000  # of a hull
-HULL_COLOUR = (230, 140, 200)
-LEAST_WIDTH = 640  # pixels of a picture
 
 Facts = dict[str, Any]
 Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
@@ -46,7 +37,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     or broken.
     """
     config, rows, measured = stored_config(folder, scene), folder.rows(), folder.measured()
-    last = rows[-1] if rows else {}
+    last, network = rows[-1] if rows else {}, config.network
     facts = {
         "run": str(folder),
         "preset": config.preset,
@@ -55,11 +46,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "views": None,
         "downscale": config.scene.downscale,
         "iterations": config.train.iterations,
-        "network": {
-            "widths": list(config.network.widths),
-            "blocks": config.network.blocks,
-            "parameters": None,
-        },
+        "network": {"widths": list(network.widths), "blocks": network.blocks, "parameters": None},
         "step": 0,
         "finished": False,
         "notes": [],
@@ -72,42 +59,40 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "metrics_step": measured and measured["step"],
         "files": _files(folder.path),
     }
-    if folder.checkpoint.exists():
-        with opened_run(folder, config) as stored:
-            header, forms = stored.header, stored.forms
-        sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
-        facts["network"]["parameters"] = sum(sizes)
-        facts |= {"step": header["step"], "finished": header["finished"]}
-        facts["notes"] = header.get("notes", [])
-        photographs = kept_views(header["views"])
-        facts["views"] = {"count": len(photographs), "images": _image_sizes(photographs)}
-        left, grid = forms["points.ids"].shape[0], header["grid"]
-        facts["points"] = {"initial": header["initial_points"], "left": left}
-        cameras = [one.camera.downscaled(config.scene.downscale) for one in photographs]
-        facts["grid"] = grid | {"edge_pixels": spacing_pixels(Grid.of_header(grid), cameras)}
-    return facts
+    if not folder.checkpoint.exists():
+        return facts
+    with opened_run(folder, config) as stored:
+        header, forms = stored.header, stored.forms
+    sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
+    facts["network"]["parameters"] = sum(sizes)
+    photographs, grid = kept_views(header["views"]), header["grid"]
+    cameras = [one.camera.downscaled(config.scene.downscale) for one in photographs]
+    return facts | {
+        "step": header["step"],
+        "finished": header["finished"],
+        "notes": header.get("notes", []),
+        "views": {"count": len(photographs), "images": _image_sizes(photographs)},
+        "points": {"initial": header["initial_points"], "left": forms["points.ids"].shape[0]},
+        "grid": grid | {"edge_pixels": spacing_pixels(Grid.of_header(grid), cameras)},
+    }
 
 
 def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
     """picture() of the points that a run has left, over renderings where its scene is missing.
     Raises UserError as run_facts does, and for a scene that is broken.
     """
-    config = stored_config(folder, scene)
-    with opened_run(folder, config) as stored:
-        grid = Grid.of_header(stored.header["grid"])
-        points = Hull(grid, stored.array("points.ids"), capped=False)
-    if scene_is_there(config.scene.path):
-        return picture(
-            dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points
+    run = load_run(dev, folder.path, scene=scene)
+    path = run.config.scene.path
+    points = Hull(run.model.grid, run.model.cloud.ids.get(), capped=False)
+    if scene_is_there(path):
+        views = open_scene(dev, run.config, ("train",), SHOWN_VIEWS).splits["train"]
+    else:
+        warnings.warn(
+            f"{path}: is not there; the picture shows the run's renderings in place of photographs",
+            stacklevel=2,
         )
-    warnings.warn(
-        f"{config.scene.path}: is not there; the picture shows the run's renderings in place of"
-        " photographs",
-        stacklevel=2,
-    )
-    run = load_run(dev, folder.path)
-    shown = evenly(run.photographs("train"), SHOWN_VIEWS)
-    return picture(dev, run.rendered(shown, opaque=True), points)
+        views = run.rendered(evenly(run.photographs("train"), SHOWN_VIEWS), opaque=True)
+    return picture(dev, views, points)
 
 
 def _files(folder):
@@ -124,9 +109,6 @@ def _image_sizes(photographs):
     return dict(Counter(f"{p.camera.width}x{p.camera.height}" for p in photographs))
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def describe_scene(
     dev: Device, scene: str, preset_name: str, given: Iterable[Given] = ()
 ) -> tuple[Facts, list[View], Hull | None, list[Disagreement]]:
@@ -137,11 +119,8 @@ def describe_scene(
     as configure takes them. Raises UserError for a scene that is missing or broken; what prevents a
     hull is a fact.
     """
-    given = list(given)
-    config = configure(preset(preset_name), scene, given)
+    config = scene_config(scene, preset_name, given)
     path = config.scene.path
-    if "scene.downscale" not in [key for key, _, _ in given]:
-        assign(config, "scene.downscale", preset_downscale(path, preset_name), "preset")
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
     opened = open_scene(dev, config, ("train",))
@@ -188,35 +167,6 @@ def describe_scene(
             "box": hull.grid.box.tolist(),
         }
     return facts, views, hull, found
-
-
-def scene_picture(
-    dev: Device,
-    scene: str,
-    facts: Facts,
-    views: list[View],
-    hull: Hull | None,
-    found: list[Disagreement],
-) -> np.ndarray:
-    """uint8 picture of what describe_scene() gave: the sparse points, or else the hull's, with
-    cameras and box from two sides, above picture() of the masks.
-    """
-    points, colours = np.empty((0, 3)), np.empty((0, 3), np.uint8)
-    if scene != DEMO:
-        points, colours = sparse_points(Path(scene))
-    if not len(points) and hull:
-        points = hull.grid.positions(hull.ids[:: 1 + len(hull.ids) // SHOWN_POINTS])
-        colours = np.full(points.shape, HULL_COLOUR, np.uint8)
-    box = facts["box"] or (facts["hull"] and facts["hull"]["box"])
-    sheet = picture(dev, views, hull, found)
-    cameras = [view.stored_camera for view in views]
-    width = max(LEAST_WIDTH, sheet.shape[1])
-    drawn = overview(cameras, box and np.array(box), points, colours, width)
-    rows = [
-        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
-        for part in (drawn, sheet)
-    ]
-    return np.concatenate(rows)
 
 
 def _range(values):

@@ -71,32 +71,33 @@ def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
     return read
 
 
+def _parts(text, separator, one, count, what):
+    """So many values of another type, written as `what`."""
+    parts = text.split(separator)
+    if len(parts) != count:
+        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+    return [one(part) for part in parts]
+
+
 def widths(text: str) -> tuple[int, ...]:
     """The type of the channels of the network's three levels."""
-    found = tuple(map(integer(1, 4096), text.split(",")))
-    if len(found) != 3:
-        raise argparse.ArgumentTypeError(
-            f"{quoted(text)}: write three numbers of channels, as 128,256,512"
-        )
-    return found
+    what = "three numbers of channels, as 128,256,512"
+    return tuple(_parts(text, ",", integer(1, 4096), 3, what))
 
 
 def box(text: str) -> list[float]:
     """The type of a box: six numbers, two corners that differ in x, y and z."""
-    corners = [number(-1e6, 1e6)(word) for word in text.split(",")]
-    if len(corners) != 6 or any(a == b for a, b in zip(corners, corners[3:], strict=False)):
-        raise argparse.ArgumentTypeError(f"{text}: write two corners, as -1,-1,-1,1,1,1")
+    what = "two corners, as -1,-1,-1,1,1,1"
+    corners = _parts(text, ",", number(-1e6, 1e6), 6, what)
+    if any(a == b for a, b in zip(corners[:3], corners[3:], strict=True)):
+        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
     return corners
 
 
 def size(text: str) -> tuple[int, int]:
     """The type of (width, height) of an image."""
-    try:
-        width, height = map(integer(16, MOST_SIDE), text.lower().split("x"))
-    except (ValueError, argparse.ArgumentTypeError):
-        raise argparse.ArgumentTypeError(
-            f"{quoted(text)}: write WIDTHxHEIGHT, each from 16 to {MOST_SIDE}"
-        ) from None
+    what = f"WIDTHxHEIGHT, each from 16 to {MOST_SIDE}"
+    width, height = _parts(text.lower(), "x", integer(16, MOST_SIDE), 2, what)
     return width, height
 
 
@@ -142,14 +143,16 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
     """
 
     def target(text):
-        if text in known:
-            raise argparse.ArgumentTypeError(f"{text}: is a word of the command; write ./{text}")
         if text == "-":
             return sys.stdout
-        file = output_file()(text)  # which refuses pipes, that reading would wait for
-        if _holds_else_than_json(file):
-            raise argparse.ArgumentTypeError(f"{text}: is there, and no JSON; name another file")
-        return file
+        is_of_command = text in known or os.path.isdir(text)
+        # output_file() refuses pipes, that reading would wait for
+        if is_of_command or _holds_else_than_json(output_file()(text)):
+            raise argparse.ArgumentTypeError(
+                f"{quoted(text)}: no JSON may be written there; name another FILE, or write what"
+                " the command works on before --json"
+            )
+        return text
 
     parser.add_argument(
         "--json",
@@ -201,12 +204,18 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 def add_metrics(parser: argparse.ArgumentParser) -> None:
     """Add --metrics."""
+
+    def names(text):
+        if os.path.exists(text):
+            raise argparse.ArgumentTypeError(f"{quoted(text)}: write it before --metrics")
+        return words(METRICS)(text)
+
     parser.add_argument(
         "--metrics",
         nargs="?",
         const=",".join(METRICS),
         default="psnr,ssim",
-        type=words(METRICS),
+        type=names,
         metavar="A,B",
         help="out of psnr, ssim, lpips; without names all three (default psnr,ssim)",
     )

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the cases, print the table. Raises Stopped, which names them, where cases fail."""
-    from pp_cl.drivers.discover import open_device
+    from pp_cl.drivers import open_device
     from pp_cl.selftest.run import CASES, HEAD, as_json, line, run_cases, setup
 
     dev = open_device(options.device)

@@ -7,25 +7,33 @@ project -> pairs -> blend weights -> shade the visible points -> blend their fea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.device.buffers import Buffers, Reading, grown
+from pp_cl.engine.device.buffers import Buffers, Reading, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.tiles import tiles_hit
 from pp_cl.engine.model import Model
-from pp_cl.engine.raster.blend import BlendGradients, blend_backward, blend_forward, shade_forward
-from pp_cl.engine.raster.pairs import Pairs, find_pairs, room_needed
-from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid
+from pp_cl.engine.raster.blend import (
+    BlendGradients,
+    blend_backward,
+    blend_backward_table,
+    blend_forward,
+    shade_forward,
+)
+from pp_cl.engine.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
+from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid, projection_table
 from pp_cl.engine.raster.weights import (
+    ALL,
     BlendWeights,
     blend_weights,
     list_weights,
     record_weights,
+    weights_table,
 )
 from pp_cl.errors import UserError
 from pp_cl.settings import RasterConfig
@@ -41,6 +49,31 @@ def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, 
         return settings.radius * edge
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
+
+
+def view_table(
+    settings: RasterConfig,
+    n: int,
+    pixels: int,
+    pairs: int,
+    visible: int,
+    *,
+    until: Literal["weights", "image"] = "image",
+    training: bool = False,
+) -> Table:
+    """The buffers of Renderer for a view of n points with so many pixels, hits and visible points.
+    until, training: of forward(); with record_weights() if it ends at the weights, with backward()
+    in a training.
+    """
+    table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs)
+    table |= weights_table(n, pixels, pairs if training else 1)
+    table["features"] = (pixels, 16), np.float32
+    if until == "weights":
+        return table | {"pair_gradient": ((pairs, 2), np.float32)}
+    table["shaded_features"] = (visible, 16), np.float32
+    if training:
+        table |= blend_backward_table(visible, pixels, pairs, settings.blend, settings.footprint)
+    return table
 
 
 @dataclass
@@ -70,6 +103,11 @@ class RenderResult:
     image: Array = field(init=False)
     computed_fraction: float = 1.0
 
+    def fragments(self) -> np.ndarray:
+        """(height, width) int64: the points that cover each pixel, without the padding."""
+        counts = np.diff(self.pairs.pixel_offset.get().astype(np.int64))
+        return self.cropped(counts.reshape(self.size))
+
     def clamped(self) -> np.ndarray:
         """(height, width, 3) float32 image without the padding, clamped to [0, 1]."""
         return np.clip(self.cropped(self.dev.download(self.image)), 0, 1)
@@ -93,6 +131,11 @@ class Renderer:
         self._by_pair = False
         self._room, self._shaded_room = [1, 1], [1, 1]
         self.release()
+
+    @property
+    def point_radius(self) -> float:
+        """The radius in world units of points whose offset is 0."""
+        return point_radius(self.settings, self.model.grid.edge, self.model.depth_range)
 
     def release(self) -> None:
         """Free the buffers; the next view makes them anew."""
@@ -142,7 +185,7 @@ class Renderer:
                 self.model.grid_buffer,
                 point_id=cloud.ids,
                 cloud_offset=cloud.offset,
-                radius=point_radius(self.settings, self.model.grid.edge, self.model.depth_range),
+                radius=self.point_radius,
             )
         pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop, training)
         result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)
@@ -239,6 +282,28 @@ class Renderer:
                 spread_weight=spread_weight,
                 edge=self.model.grid.edge if moves else 0.0,
             )
+
+    def blend(self, result: RenderResult, features: np.ndarray) -> np.ndarray:
+        """(H, W, 16) float32: features (S, 16) of the visible points result.weights.shaded, blended
+        by the weights of a view, without its padding. They take the place of result.features.
+
+        result: of the last forward(training=True).
+        """
+        self.dev.write(result.shaded_features[: len(features)], features)
+        blend_forward(
+            self.dev, result.pairs, result.weights, result.shaded_features, result.features
+        )
+        return result.cropped(self.dev.download(result.features))
+
+    def gather(self, result: RenderResult, pixels: np.ndarray) -> np.ndarray:
+        """(S, 16) float32, the transpose of blend(): of each visible point the sum over the pixels
+        (H, W, 16), without the padding, times its weights there.
+        """
+        padded = np.zeros((*result.size, 16), np.float32)
+        result.cropped(padded)[:] = pixels
+        result.weights = replace(result.weights, tracked=ALL)
+        gradients = self.backward_features(result, self.dev.upload(padded))
+        return self.dev.download(gradients.shaded_features[: result.weights.shaded.size])
 
     def record_weights(
         self,

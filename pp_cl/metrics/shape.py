@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.host import at_most_more
 from pp_cl.engine.grid import Grid
 from pp_cl.errors import UserError
 from pp_cl.files.untrusted import refusal
@@ -19,9 +18,7 @@ SAMPLES = 1024**3  # of the supplemental
 RUN = 256  # samples of a work-item
 LAUNCH = 2**24  # samples of a launch
 WHOLE_AREA = 1 << 60
-# bytes of a file with a mesh; how much memory trimesh may take for each, by its worst format thrice
-# what was measured, and beside that
-MOST_FILE, MULTIPLE, BESIDES = 2**28, 32, 2**28
+MOST_FILE = 2**28  # bytes of a file with a mesh, for each of which trimesh takes up to 11 of memory
 MOST_VERTICES = 2**33  # of the grid around mesh and points: a bitset of 1 GiB
 
 
@@ -40,19 +37,13 @@ def read_mesh(path: Path | str) -> Mesh:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a triangle mesh")
-    size = path.stat().st_size
-    if size > MOST_FILE:
+    if path.stat().st_size > MOST_FILE:
         raise UserError(f"{path}: is larger than {MOST_FILE} bytes; save it as PLY, or decimate it")
     try:
         # the warnings are of numbers that are refused below
-        with np.errstate(all="ignore"), at_most_more(MULTIPLE * size + BESIDES):
+        with np.errstate(all="ignore"):
             mesh: Any = trimesh.load(path, force="mesh", process=False)
             made = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
-    except MemoryError:
-        raise UserError(
-            f"{path}: takes more memory than {MULTIPLE} times its size and {BESIDES} bytes; save it"
-            " as PLY"
-        ) from None
     except Exception as error:  # loaders meet broken files with whatever comes up
         raise refusal(path, error, "a mesh") from error
     if made.faces.size == 0 or not made.vertices.shape[1:] == made.faces.shape[1:] == (3,):

@@ -47,13 +47,6 @@ def reach_of(views: Sequence[View]) -> float:
     return reach
 
 
-def corners_of(box: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of a (2, 3) box: bit i of a row's number says whether it lies on the upper
-    side of axis i.
-    """
-    return np.array([[box[n >> axis & 1][axis] for axis in range(3)] for n in range(8)])
-
-
 def _all_of(views):
     return f"{views[0].name} and the {len(views) - 1} other training views"
 

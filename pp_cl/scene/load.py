@@ -24,8 +24,7 @@ from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.distortion import BAND_BYTES
-from pp_cl.scene.edits import FILE as EDITS
-from pp_cl.scene.edits import read_edits
+from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.found import (
     IGNORE_FOLDERS,
     MASK_FOLDERS,

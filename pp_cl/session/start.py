@@ -16,7 +16,7 @@ from pp_cl.engine.views import View
 from pp_cl.errors import UserError, listing
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.scene.agreement import disagreements
-from pp_cl.scene.hull import Agreement, Hull, build_grid, depth_range, spacing_pixels
+from pp_cl.scene.hull import Agreement, Hull, agreeing, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import DEMO, scene_box
 from pp_cl.scene.outline import picture
 from pp_cl.session.memory import Room
@@ -35,16 +35,18 @@ LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to r
 DEMO_NETWORK = Path(__file__).with_name("demo.npz")
 
 
-def begin_network(net: UNet, config: Config) -> None:
-    """Give net the parameters that network.start names; those of the demo only where the scene is
-    another and they fit. Raises UserError for a run whose network has another shape.
+def begin_network(dev: Device, config: Config) -> UNet:
+    """The network that a training starts with: its parameters are those that network.start names,
+    those of the demo only where the scene is another and they fit; else random ones. Raises
+    UserError for a run whose network has another shape.
     """
+    net = UNet.of_settings(dev, config.network, seed=config.train.seed)
     settings, folder = config.network, RunFolder(config.network.start)
     if settings.start == DEMO:
         if config.scene.path != DEMO and not _unlike(settings, NetworkConfig()):
             with np.load(DEMO_NETWORK) as stored:
                 for name, parameter in net.parameters.items():
-                    net.dev.write(parameter, stored[f"net.{name}"].astype(np.float32))
+                    dev.write(parameter, stored[f"net.{name}"].astype(np.float32))
     elif settings.start != RANDOM:
         other = load_config(folder.config)
         for key, ours, theirs in _unlike(settings, other.network):
@@ -54,7 +56,8 @@ def begin_network(net: UNet, config: Config) -> None:
             )
         with opened_run(folder, other) as run:
             for name, parameter in net.parameters.items():
-                net.dev.write(parameter, run.array(f"net.{name}"))
+                dev.write(parameter, run.array(f"net.{name}"))
+    return net
 
 
 def _unlike(ours, theirs):
@@ -89,12 +92,12 @@ def first_hull(
 
 
 def fitting_hull(
-    dev: Device, config: Config, agreement: Agreement, room: Room
-) -> tuple[Hull, tuple[float, float]]:
-    """first_hull() and its (near, far); config.train.refine_at becomes what it says, and an open
-    raster.radius one pixel of the images. Where memory is too small for points COARSEST pixels
-    apart in the end, they are as close as it allows. Raises UserError as Room.check_points() does,
-    and for an open radius of footprints that are not soft.
+    dev: Device, config: Config, views: list[View], room: Room
+) -> tuple[Agreement, Hull, tuple[float, float]]:
+    """(which views' masks agree, first_hull() of them, its (near, far)); config.train.refine_at
+    becomes what it says, and an open raster.radius one pixel of the images. Where memory is too
+    small for points COARSEST pixels apart in the end, they are as close as it allows. Raises
+    UserError as Room.check_points() does, and for an open radius of footprints that are not soft.
     """
     is_open, train, coarsest = config.train.refine_at == UNDECIDED, config.train, COARSEST
     raster, is_radius_open = config.raster, config.raster.radius == 0
@@ -104,6 +107,7 @@ def fitting_hull(
             f"raster.radius: is open, which raster.footprint={raster.footprint} cannot be; give it"
             " in world units at a depth range of 4 (0.0015 in the paper)"
         )
+    agreement = agreeing(dev, views, scene_box(config))
     while True:
         hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
         if is_radius_open:
@@ -114,7 +118,7 @@ def fitting_hull(
         near_far = depth_range(agreement.views, hull)
         try:
             room.check_points(hull.grid, len(hull.ids), near_far)
-            return hull, near_far
+            return agreement, hull, near_far
         except UserError:
             if not is_open or train.refine_at == NEVER:
                 raise

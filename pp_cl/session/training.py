@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.checkpoint import load_run_state, opened_run
-from pp_cl.config import load_config, refuse_setting, run_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.checkpoint import check_finite, load_run_state, opened_run, save_checkpoint
+from pp_cl.config import configure, load_config, refuse_setting, run_config
+from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.model import Model
@@ -23,21 +23,18 @@ from pp_cl.engine.step import Trainer
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_target
-from pp_cl.files.checkpoint import check_finite
-from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
-from pp_cl.scene.hull import agreeing
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import (
     Listing,
     list_split,
     measured_split,
     open_scene,
-    scene_box,
 )
 from pp_cl.session.budget import Budget
 from pp_cl.session.memory import Room
@@ -206,7 +203,8 @@ class Training:
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         header |= {"exposed": True} if trainer.is_exposed else {}
-        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        arrays = trainer.model.arrays() if finished else trainer.arrays()
+        save_checkpoint(self.folder.checkpoint, header, arrays)
         self._expect_save()
         self._saved = trainer.step
 
@@ -248,16 +246,14 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     """
     check_target(folder.config)
     folder.check_pictures(0)
-    net = UNet.of_settings(dev, config.network, seed=config.train.seed)
-    begin_network(net, config)
+    net = begin_network(dev, config)
     listing = list_split(config.scene.path)
     room = Room(config, net, listing.photographs)
     room.check_unseen()
     views, info = _read_views(dev, config, listing)
 
     start = time.perf_counter()
-    agreement = agreeing(dev, views, scene_box(config))
-    hull, depth_range = fitting_hull(dev, config, agreement, room)
+    agreement, hull, depth_range = fitting_hull(dev, config, views, room)
     seconds = time.perf_counter() - start
     picture = picture_of_masks(dev, views, hull, agreement.left_out)
 
@@ -299,9 +295,6 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
             " use another --out"
         )
 
-    for name, array in arrays.items():
-        if name.startswith("points.") and array.dtype == np.float16:  # of a compressed run
-            arrays[name] = array.astype(np.float32)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
     left_out = header.get("left_out", [])
     trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])
@@ -353,7 +346,7 @@ def train_scene(
     settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
     folder = RunFolder(out)
     given = [(*s, "settings") for s in settings.items()]
-    config = run_config(folder, str(scene), preset, given, extends=True)
+    config = run_config(folder, str(scene), preset, given)
     stored, dev = stored_state(folder, config), open_device(device)
     if not is_finished(stored, config):
         open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
@@ -368,16 +361,17 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     note of where its scene is now. Raises UserError for a folder or checkpoint that does not fit.
     """
     folder.check_usable()
-    stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
-    if folder.config.exists() and (stored is None or is_finished(stored, config)):
-        path, now = load_config(folder.config).scene.path, config.scene.path
-        if path != now:
+    there = load_config(folder.config) if folder.config.exists() else config
+    stored = load_run_state(folder, there) if folder.checkpoint.exists() else None
+    if stored is None or is_finished(stored, config):
+        now = config.scene.path
+        if there.scene.path != now:
             if stored is None or difference(stored[0], list_split(now, edited=False).photographs):
-                refuse_setting(folder, "scene.path", path, now)
-            folder.configure(config.to_json())
+                refuse_setting(folder, "scene.path", there.scene.path, now)
+            folder.configure(configure(there, now).to_json())
     return stored
 
 
 def is_finished(stored: Stored | None, config: Config) -> bool:
-    """Whether there is a checkpoint and it is of the last step."""
-    return stored is not None and stored[0]["step"] == config.train.iterations
+    """Whether there is a checkpoint, and no step is left to train after it."""
+    return stored is not None and stored[0]["step"] >= config.train.iterations

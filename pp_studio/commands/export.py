@@ -69,13 +69,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the run, say what was written."""
-    from pp_cl.drivers.discover import open_device
-    from pp_cl.files.run_folder import RunFolder
-    from pp_cl.run import load_run
-    from pp_studio.export.formats import check_target, export
+    from pp_cl import find_run, load, open_device
+    from pp_studio.export.formats import check_target, export_run
     from pp_studio.export.length import set_length
 
-    name, folder = options.format, Path(options.run_folders[0])
+    name, folders = options.format, [find_run(one) for one in options.run_folders]
     if name not in OF_POINTS:
         shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
     if name not in OF_SPLATS:
@@ -85,13 +83,13 @@ def run(options: argparse.Namespace) -> None:
     if name != "gallery" and len(options.run_folders) > 1:
         raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
     ends = (*options.length[:2], _metres(options.length[2])) if options.length else None
-    path = check_target(name, folder, Path(options.out) if options.out else None)
-    for one in options.run_folders:
-        load_config(RunFolder(one).config)  # that all are there is seen before any work
+    path = check_target(name, folders[0].path, Path(options.out) if options.out else None)
+    for one in folders:
+        load_config(one.config)  # that all are there is seen before any work
     device = open_device(options.device)
 
     def loaded(folder):
-        run = load_run(device, folder, scene=options.scene)
+        run = load(folder.path, device, scene=options.scene)
         if not run.header["finished"]:
             print(
                 f"{folder}: unfinished, step {run.header['step']} of"
@@ -99,12 +97,12 @@ def run(options: argparse.Namespace) -> None:
             )
         return run
 
-    first, *others = options.run_folders
+    first, *others = folders
     run = loaded(first)
     if ends:
         unit = set_length(run, *ends)
         print(f"a unit of the scene is {unit:.6g} m")
-    written = export(
+    written = export_run(
         run,
         name,
         path,

@@ -8,14 +8,13 @@ import threading
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pp_cl.commands import options as shared
 from pp_studio.view.server import LOOPBACK, PORT
 
 if TYPE_CHECKING:
-    from pp_cl.session.training import OnStep, Training
+    from pp_cl import OnStep, Training
 
 HELP = "look at a run, also while it is trained, or at a scene in the browser"
 EPILOG = """A scene: its cameras, and sparse points or visual hull. Its box can be moved and views
@@ -49,24 +48,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
-    from pp_cl.drivers.discover import open_device
+    from pp_cl import find_run, open_device, stored_config
     from pp_cl.errors import UserError, name_of, require
-    from pp_cl.files.run_folder import RunFolder
-    from pp_cl.run import stored_config
-    from pp_cl.scene.load import scene_splits
+    from pp_cl.scene import scene_splits
     from pp_studio.view.run_view import RunView
     from pp_studio.view.scene_page import ScenePage
     from pp_studio.view.server import started
 
     require("the viewer", "viser")
-    folder, scene = Path(options.run_folder), options.scene
-    is_scene = folder.is_dir() and not RunFolder(folder).config.exists()
+    run, scene = find_run(options.run_folder), options.scene
+    folder = run.path
+    is_scene = folder.is_dir() and not run.config.exists()
     if is_scene and scene is not None:
         raise UserError("--scene: only of a run; leave it out")
     if is_scene:
         scene_splits(folder)
     else:
-        stored_config(RunFolder(folder), scene)
+        stored_config(run, scene)
     if options.host not in LOOPBACKS:
         print(
             f"pp-cl: --host {options.host}: whoever can reach this address sees the viewer and"
@@ -84,7 +82,7 @@ def run(options: argparse.Namespace) -> None:
         if is_scene:
             view = ScenePage(server, folder, options.device)
         else:
-            view = RunView(server, open_device(options.device), RunFolder(folder), scene)
+            view = RunView(server, open_device(options.device), run, scene)
         print(f"{options.run_folder}: {address}  (Ctrl-C ends)", flush=True)
         if options.open:
             open_browser(address)

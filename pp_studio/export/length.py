@@ -8,11 +8,10 @@ import re
 import numpy as np
 from scipy.optimize import root
 
+from pp_cl import Run
 from pp_cl.errors import UserError, quoted, shown, suggestion
-from pp_cl.files.atomic import write_json
-from pp_cl.files.untrusted import read_json_text
-from pp_cl.run import Run
-from pp_cl.scene.load import scene_frames
+from pp_cl.files import read_json_text, write_json
+from pp_cl.scene import scene_frames
 
 FILE = "length.json"  # in the folder of a run
 MOST_BYTES = 2**16
@@ -90,9 +89,14 @@ def surface_point(run: Run, text: str) -> np.ndarray:
     matches = [one for one in photographs if one.name == name or one.name.endswith(f"/{name}")]
     if len(matches) != 1:
         names = [one.name for one in photographs]
-        why = "is in several folders" if matches else suggestion(name, names)
+        near = suggestion(name, names).strip() or f"name one such as {names[0]}"
         raise UserError(
-            f"--length {shown(text)}: no training photograph of that name; {why or names[0]}"
+            f"--length {shown(text)}: "
+            + (
+                f"{name} is in several folders; write more of its path"
+                if matches
+                else f"no training photograph of that name; {near}"
+            )
         )
     stored = matches[0].camera
     if not (x < stored.width and y < stored.height):

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from pp_cl.config import load_config, run_config
+from pp_cl import RunFolder
+from pp_cl.config import load_config, refuse_setting, run_config
 from pp_cl.errors import UserError
-from pp_cl.files.run_folder import RunFolder
 from pp_studio.sweep.plan import Job
 
 
@@ -27,8 +27,10 @@ def finished_row(job: Job) -> dict[str, Any] | None:
     folder = RunFolder(job.folder)
     if not (folder.config.exists() and folder.checkpoint.exists()):
         return None
-    config = run_config(folder, job.scene, job.preset, job.given)
-    if load_config(folder.config).scene.path != config.scene.path:
+    config, there = run_config(folder, job.scene, job.preset, job.given), load_config(folder.config)
+    if config.train.iterations != there.train.iterations:
+        refuse_setting(folder, "train.iterations", there.train.iterations, config.train.iterations)
+    if there.scene.path != config.scene.path:
         return None  # for the training to refuse or, if it is the same scene, to go on with
     try:
         result = folder.measured()

@@ -26,7 +26,7 @@ def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
         "conv": {"size": [8], "widths": (16, 16, 16)},
         "unet": {"size": [8], "widths": (16, 16, 16)},
         "raster": {"size": [12, 20], "points": [60, 500]},
-        "train": {"points": [1000], "set": [("network.widths", "16,16,16", "--set")]},
+        "train": {"points": [1000], "widths": (16, 16, 16)},
     }
     assert small.keys() == command.SMALL.keys()
     monkeypatch.setattr(command, "SMALL", small)
@@ -47,8 +47,7 @@ def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
 
 def test_a_step_on_a_small_scene(tmp_path, capsys):
     scene = write_ball_scene(tmp_path / "ball", size=40)
-    words = ["--points", "1500", "--set", "raster.early_stop=0.001"]
-    words += ["--set", "network.widths=16,16,16"]
+    words = ["--points", "1500", "--widths", "16,16,16"]
     (row,) = bench(tmp_path, "train", "--scene", scene, *words)
     assert 1500 <= row["points"] < 1600 and row["size"] == 40
     stages = ["target", "project", "pairs", "weights", "shade", "blend", "network", "loss"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.refused import failure
 
-from pp_cl.cli import _parse, main
+from pp_cl.cli import main
 from pp_cl.commands import options
 from pp_cl.files.image import write_png
 
@@ -43,7 +43,7 @@ def test_texts_become_what_is_meant(tmp_path):
 
 def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypatch):
     """One rule for every command."""
-    monkeypatch.setattr("pp_cl.drivers.discover.list_devices", lambda **_: [])
+    monkeypatch.setattr("pp_cl.drivers.list_devices", lambda **_: [])
     file = tmp_path / "a.json"
     for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):
         assert main(["devices", *words]) == 2  # none works
@@ -51,14 +51,12 @@ def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypat
     assert json.loads(file.read_text()) == []
 
 
-def test_no_other_file_becomes_json(tmp_path, capsys):
-    """The word after --json is what the command works on if it is such a file."""
+def test_no_other_file_becomes_json(tmp_path):
     for name in "ab":
         write_png(tmp_path / f"{name}.png", np.zeros((16, 16, 3)))
     pictures, before = [str(tmp_path / f"{n}.png") for n in "ab"], (tmp_path / "a.png").read_bytes()
-    assert main(["compare", "--json", *pictures, "--metrics", "psnr"]) == 0
-    assert "psnr" in json.loads(capsys.readouterr().out)["mean"]
-    assert "no JSON" in failure("compare", *pictures, "--json", pictures[0])
+    for words in (["--json", *pictures], [*pictures, "--json", pictures[0]]):
+        assert "before --json" in failure("compare", *words)
     assert (tmp_path / "a.png").read_bytes() == before
 
 
@@ -94,22 +92,29 @@ def test_an_empty_value_is_refused(words, capsys):
 @pytest.mark.parametrize(
     "words, found",
     [
-        ("bench --json conv", {"what": "conv", "json": "-"}),
-        ("bench --json a.json conv", {"what": "conv", "json": "a.json"}),
-        ("bench conv --json", {"what": "conv", "json": "-"}),
-        ("bench conv --json out", {"what": "conv", "json": "out"}),
-        ("sweep --out S --json out demo", {"scenes": ["demo"], "json": "out"}),
-        ("compare --metrics A B", {"subject": "A", "truth": "B", "metrics": options.METRICS}),
-        ("eval --json --metrics RUN", {"metrics": options.METRICS, "json": "-"}),
-        ("eval --metrics RUN", {"run_folder": "RUN", "metrics": options.METRICS}),
-        ("eval RUN --metrics psnr", {"run_folder": "RUN", "metrics": ("psnr",)}),
-        ("info --json RUN", {"subject": "RUN", "json": "-"}),
+        ("RUN --json", {"subject": "RUN", "truth": None, "json": None}),
+        ("RUN --json -", {"json": None}),
+        ("A B --json out", {"subject": "A", "truth": "B", "json": "out"}),
+        ("--json out RUN", {"subject": "RUN", "json": "out"}),
+        ("A B --metrics", {"truth": "B", "metrics": options.METRICS}),
+        ("A B --metrics --json", {"metrics": options.METRICS, "json": None}),
+        ("A B --metrics psnr", {"truth": "B", "metrics": ("psnr",)}),
     ],
 )
-def test_a_word_after_an_option_that_may_stand_alone(tmp_path, monkeypatch, words, found):
-    """It is its value, unless the command then lacks what it works on."""
+def test_options_whose_value_may_be_left_out(tmp_path, monkeypatch, words, found):
+    """They take the word behind them; without one, --json prints and --metrics are all."""
     monkeypatch.chdir(tmp_path)
-    given = vars(_parse(words.split()))
-    given["json"] = "-" if given["json"] is sys.stdout else given["json"]
-    for name, value in found.items():
-        assert given[name] == value, name
+    given = {}
+    monkeypatch.setattr("pp_cl.commands.compare.run", lambda options: given.update(vars(options)))
+    assert main(["compare", *words.split()]) == 0
+    given["json"] = None if given["json"] is sys.stdout else given["json"]
+    assert {name: given[name] for name in found} == found
+
+
+@pytest.mark.parametrize(
+    "words", ["info --json RUN", "info --json none", "eval --metrics RUN", "bench --json conv"]
+)
+def test_it_is_said_how_to_write_what_they_have_taken(tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "RUN").mkdir()
+    assert f"before {words.split()[1]}" in failure(*words.split())

@@ -4,7 +4,6 @@ computed or written.
 
 import shutil
 import sys
-from pathlib import Path
 
 import pytest
 import trimesh
@@ -15,13 +14,43 @@ from pp_cl.run import Run
 TRAIN = "train BALL --out new"
 OF_RUNS = ("eval", "render", "view", "export --format ply", "info --picture a.png")
 SHAPE = "compare --mesh ball.ply"
-REFUSED = [
+WRITTEN = [  # what the command line alone tells, of whatever runs there are
     ("", "command"),
     ("trian", "did you mean train?"),
     (f"{TRAIN} --iters 6", "did you mean --iterations?"),
     (f"{TRAIN} --preset smal", "did you mean small?"),
-    (f"{TRAIN} --set trian.seed=1", "did you mean train.seed?"),
     ("compare a b --metrics psrn", "did you mean psnr?"),
+    ("compare a.png a.png --json /no/such/a.json", "--json"),
+    ("eval run --json /no/such/a.json", "--json"),
+    ("info run --picture /no/such/a.png", "--picture"),
+    ("bench conv --plot /no/such/a.png", "--plot"),
+    ("bench unet --plot b.xyz", "--plot"),
+    ("sweep demo --out new --json none/a.json", "none/a.json"),
+    ("selftest --json none/a.json", "none/a.json"),
+    (f"{TRAIN} --speed 9", "--speed"),
+    ("export run --format ply --box 0,0,0,1,1,0", "two corners"),
+    ("make BALL --out new --minutes 2000", "--minutes"),
+    (f"{TRAIN} --set nonsense", "--set"),
+    (f"{TRAIN} --preset huge", "--preset"),
+    ("sweep demo --out new --seeds a", "--seeds"),
+    ("sweep demo --out new --workers 0", "--workers"),
+    ("eval run --metrics beauty", "--metrics"),
+    ("view run --port 70000", "--port"),
+    ("bench unet --blocks triple", "--blocks"),
+    ("bench raster --blend alpha,beta", "--blend"),
+    ("compare run --samples 0", "--samples"),
+    ("compare ball.ply --edge nan", "--edge"),
+    ("export run", "--format"),
+    ("export run --format obj", "obj"),
+    ("export run --format ply --min-weight x", "--min-weight"),
+    ("export run --format splat --window 8", "--window"),
+    ("render run --size large", "--size"),
+    ("render run --fov nan", "--fov"),
+    ("render run --samples 3", "--samples"),
+    ("render run --background red", "--background"),
+]
+REFUSED = [
+    (f"{TRAIN} --set trian.seed=1", "did you mean train.seed?"),
     # what is missing, broken or not what it is to be
     *((f"{command} none", "none") for command in (*OF_RUNS, SHAPE)),
     *((f"{command} empty", "empty") for command in (*OF_RUNS, SHAPE)),
@@ -41,13 +70,6 @@ REFUSED = [
     ("compare run", "--mesh"),
     ("bench train --scene none", "none"),
     # where nothing can be written
-    ("compare a.png a.png --json /no/such/a.json", "--json"),
-    ("eval run --json /no/such/a.json", "--json"),
-    ("info run --picture /no/such/a.png", "--picture"),
-    ("bench conv --plot /no/such/a.png", "--plot"),
-    ("bench unet --plot b.xyz", "--plot"),
-    ("sweep demo --out new --json none/a.json", "none/a.json"),
-    ("selftest --json none/a.json", "none/a.json"),
     *((f"{command} --out /proc/a", "/proc/a") for command in ("train BALL", "eval run")),
     ("train BALL --out full", "full"),
     ("train BALL --out file", "file"),
@@ -74,7 +96,6 @@ REFUSED = [
     *((f"{command} run --device abacus", "abacus") for command in ("eval", "render")),
     *((f"{command} --device abacus", "abacus") for command in (TRAIN, "bench unet", "selftest")),
     # options that are unknown, of other commands or subjects, or do not fit each other
-    (f"{TRAIN} --speed 9", "--speed"),
     ("info run --scene run --masks run", "--masks"),
     ("info run --set train.seed=1", "--set"),
     ("info run --preset tiny", "--preset"),
@@ -89,18 +110,13 @@ REFUSED = [
     ("bench all --size 64", "--size"),
     ("bench conv --points 9", "--points"),
     ("bench unet --scene demo", "--scene"),
-    ("bench raster --set train.seed=1", "--set"),
     ("bench raster --widths 16,16,16", "--widths"),
     ("bench train --plot b.png", "--plot"),
     ("export run other --format html", "other"),
     ("export run other --format gallery", "other"),
-    # an option that is wrong, behind a word that may stand alone
-    ("eval --metrics run --splt test", "--splt"),
-    ("info --json run --pictur a.png", "--pictur"),
     ("export run --format html --min-weight 1", "--min-weight"),
     ("export run --format html --box 0,0,0,1,1,1", "--box"),
     ("export run --format scene --axes viewer", "--axes"),
-    ("export run --format ply --box 0,0,0,1,1,0", "two corners"),
     ("export run --format ply --box 50,0,0,51,1,1", "nothing lies in it"),
     ("export run --format html --window 800", "--window"),
     ("render run --background transparent --out a.mp4", "--background"),
@@ -114,7 +130,6 @@ REFUSED = [
     # values that make no sense
     (f"{TRAIN} --set train.offset_rate=0.01,0", "train.offset_rate"),
     (f"{TRAIN} --iterations 9 --set train.iterations=12", "--set: train.iterations"),
-    ("make BALL --out new --minutes 2000", "--minutes"),
     (f"{TRAIN} --iterations 0", "--iterations: train.iterations"),
     (f"{TRAIN} --iterations x", "--iterations"),
     (f"{TRAIN} --downscale 20", "--downscale"),
@@ -122,12 +137,8 @@ REFUSED = [
     (f"{TRAIN} --downscale 2 --points 300 --set train.refine_at=0.3,0.6", "train.refine_at"),
     (f"{TRAIN} --set train.crop=6", "--set: train.crop"),
     (f"{TRAIN} --set train.sped=1", "train.sped"),
-    (f"{TRAIN} --set nonsense", "--set"),
     (f"{TRAIN} --set scene.path=b", "scene.path"),
-    (f"{TRAIN} --preset huge", "--preset"),
-    ("sweep demo --out new --seeds a", "--seeds"),
     ("sweep demo --out new --vary points.count", "--vary points.count"),
-    ("sweep demo --out new --workers 0", "--workers"),
     ("sweep demo --out new --set train.seed=1", "--seeds"),
     ("train demo --out new --masks run", "--masks"),
     ("sweep demo --out new --set points.sh_degree=3", "points.sh_degree"),
@@ -138,54 +149,54 @@ REFUSED = [
         (f"{TRAIN} --set scene.box={box}", "scene.box")
         for box in ("1,2,3", "0,0,0,1,1,0", "a,0,0,1,1,1")
     ),
-    ("eval run --metrics beauty", "--metrics"),
-    ("view run --port 70000", "--port"),
-    ("bench unet --blocks triple", "--blocks"),
-    ("bench raster --gamma 0.1,0.2", "--gamma"),
-    ("bench raster --blend alpha,beta", "--blend"),
     ("bench raster --scene moon", "--scene"),
     ("bench train --points 10,20", "--points"),
-    ("compare run --samples 0", "--samples"),
-    ("compare ball.ply --edge nan", "--edge"),
-    ("export run", "--format"),
-    ("export run --format obj", "obj"),
-    ("export run --format ply --min-weight x", "--min-weight"),
-    ("export run --format splat --window 8", "--window"),
     ("export run --format ply --length a:1,2 b:1,2 x", "--length"),
     ("export run --format ply --length a b 1", "PHOTO:X,Y"),
-    ("render run --size large", "--size"),
-    ("render run --fov nan", "--fov"),
     ("render run --seconds 0.001", "--seconds"),
-    ("render run --samples 3", "--samples"),
-    ("render run --background red", "--background"),
 ]
 
 
-@pytest.fixture
-def folder(scene, finished, tmp_path, monkeypatch):
-    """The folder that one is in: a run, runs that lack something, a mesh, files in the way."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def folder(scene, finished, tmp_path_factory):
+    """What all cases see, as none writes anything: a run, runs that lack something, a mesh, files
+    in the way.
+    """
+    folder = tmp_path_factory.mktemp("refused")
     for name in ("run", "young", "unknown"):
-        shutil.copytree(finished, name)
-    Path("young/checkpoint.npz").unlink()
-    Path("unknown/config.json").write_text("{}")
-    shutil.copytree(scene, "broken")
-    Path("broken/transforms_train.json").write_text('{"frames": [')
+        shutil.copytree(finished, folder / name)
+    (folder / "young/checkpoint.npz").unlink()
+    (folder / "unknown/config.json").write_text("{}")
+    shutil.copytree(scene, folder / "broken")
+    (folder / "broken/transforms_train.json").write_text('{"frames": [')
     for name in ("empty", "full", "folder.mp4", "folder.ply"):
-        Path(name).mkdir()
-    Path("full/holiday.jpg").write_bytes(b"")
-    Path("file").write_bytes(b"")
-    trimesh.creation.icosphere(subdivisions=1).export("ball.ply")
-    return tmp_path
+        (folder / name).mkdir()
+    (folder / "full/holiday.jpg").write_bytes(b"")
+    (folder / "file").write_bytes(b"")
+    trimesh.creation.icosphere(subdivisions=1).export(folder / "ball.ply")
+    return folder
 
 
-@pytest.mark.parametrize("line, named", REFUSED, ids=[line[:60] for line, _ in REFUSED])
-def test_bad_input_is_one_line_and_nothing_is_done(folder, scene, capsys, monkeypatch, line, named):
-    monkeypatch.setattr(Run, "render", None)  # that nothing is computed
-    monkeypatch.setitem(sys.modules, "pp_studio.sweep.cluster", None)
+def check_refused(words, named, folder, capsys):
+    """One line names what is wrong; the folder, in which the command is given, stays as it is."""
     before = sorted(folder.rglob("*"))
-    assert main([scene if word == "BALL" else word for word in line.split()]) == 2
+    assert main(words) == 2
     said = capsys.readouterr().err.splitlines()
     assert [text for text in said if text.startswith("pp-cl")] == said[-1:]
     assert named in said[-1]
     assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize("line, named", WRITTEN, ids=[line[:60] for line, _ in WRITTEN])
+def test_what_makes_no_sense_is_one_line(tmp_path, capsys, monkeypatch, line, named):
+    monkeypatch.chdir(tmp_path)
+    check_refused(line.split(), named, tmp_path, capsys)
+
+
+@pytest.mark.parametrize("line, named", REFUSED, ids=[line[:60] for line, _ in REFUSED])
+def test_bad_input_is_one_line_and_nothing_is_done(folder, scene, capsys, monkeypatch, line, named):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(Run, "render", None)  # that nothing is computed
+    monkeypatch.setitem(sys.modules, "pp_studio.sweep.cluster", None)
+    words = [scene if word == "BALL" else word for word in line.split()]
+    check_refused(words, named, folder, capsys)

@@ -1,5 +1,5 @@
 // An OpenCL driver for tests: with -DCRASHES or -DHANGS it does that when it is asked for its platforms, else it lists one
-// device on which no program builds.
+// device on which no program builds; with -DCRASHES_IN_BUILD it crashes there.
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -66,7 +66,12 @@ static struct object *create_program(struct object *of, uint32_t n, void *s, voi
 
 static int32_t keep(void *object) { return 0; }
 
-static int32_t build(void) { return -11; }  // CL_BUILD_PROGRAM_FAILURE
+static int32_t build(void) {
+#ifdef CRASHES_IN_BUILD
+  abort();
+#endif
+  return -11;  // CL_BUILD_PROGRAM_FAILURE
+}
 
 static int32_t get_build_info(struct object *of, void *d, uint32_t what, size_t room, void *out, size_t *needed) {
   int32_t status = -2;

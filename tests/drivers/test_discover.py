@@ -10,9 +10,15 @@ import pyopencl as cl
 import pytest
 from support.refused import refusing
 
-from pp_cl.drivers import discover
-from pp_cl.drivers.discover import list_devices, mend, open_device, separate_devices
-from pp_cl.drivers.drivers import LEAST_CONSTANT, find_problem
+from pp_cl import drivers
+from pp_cl.drivers import (
+    LEAST_CONSTANT,
+    find_problem,
+    list_devices,
+    mend,
+    open_device,
+    separate_devices,
+)
 from pp_cl.engine.device.device import kernel_folder
 from pp_cl.engine.training.loss import TAPS
 
@@ -32,9 +38,9 @@ def listed(monkeypatch):
     """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a
     Device.
     """
-    monkeypatch.setattr(discover, "Device", lambda d: d)
+    monkeypatch.setattr(drivers, "Device", lambda d: d)
     monkeypatch.delenv("PP_DEVICE", raising=False)
-    return lambda *entries: monkeypatch.setattr(discover, "list_devices", lambda **_: list(entries))
+    return lambda *entries: monkeypatch.setattr(drivers, "list_devices", lambda **_: list(entries))
 
 
 def test_listed_devices_are_probed(session_device):
@@ -119,8 +125,8 @@ def test_one_command_for_each_system(monkeypatch, system, machine, tool, word):
     monkeypatch.setattr("sys.platform", system)
     monkeypatch.setattr("platform.machine", lambda: machine)
     monkeypatch.setattr("shutil.which", lambda name: name == tool)
-    monkeypatch.setattr(discover, "in_conda", lambda: False)
-    monkeypatch.setattr(discover, "runtime_library", lambda: None)
+    monkeypatch.setattr(drivers, "in_conda", lambda: False)
+    monkeypatch.setattr(drivers, "runtime_library", lambda: None)
     assert f"`{word}" in mend() or f"`sudo {word}" in mend()
     assert mend().count("`") == 2
 
@@ -130,7 +136,7 @@ def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_p
     blocked.write_text("")
     index = next(i for i, d, _ in list_devices() if d == session_device.device)
     script = (
-        "import os; from pp_cl.drivers.discover import open_device; "
+        "import os; from pp_cl.drivers import open_device; "
         f"open_device({index!r}).program('training/adam'); print(os.environ['XDG_CACHE_HOME'])"
     )
     ran = subprocess.run(

@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from support.checkpoints import load_checkpoint
+from support.guarded import slow
 from support.refused import failure
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
@@ -54,7 +55,7 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
 
 
-@pytest.mark.parametrize("blocks", ["double", "gated"])
+@pytest.mark.parametrize("blocks", [slow("double"), "gated"])
 def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     scene, tmp_path, monkeypatch, blocks
 ):
@@ -115,9 +116,9 @@ def test_a_training_begins_with_the_network_of_the_demo(scene, tmp_path):
 def test_where_the_demos_network_is_taken(dev, scene, widths, is_taken):
     config = preset("tiny")
     config.scene.path, config.network.widths = scene, widths
-    net = UNet.of_settings(dev, config.network)
-    random = {name: dev.download(array).copy() for name, array in net.parameters.items()}
-    begin_network(net, config)
+    net = begin_network(dev, config)
+    plain = UNet.of_settings(dev, config.network).parameters
+    random = {name: dev.download(array) for name, array in plain.items()}
     with np.load(DEMO_NETWORK) as kept:
         for name, array in net.parameters.items():
             expected = kept[f"net.{name}"] if is_taken else random[name]
@@ -133,7 +134,7 @@ def test_what_has_a_rate_of_0_is_left_alone(scene, tmp_path, monkeypatch):
     assert main(arguments(scene, tmp_path / "run", **changes)) == 0
 
 
-@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("degree", [0, slow(1)])
 def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path, degree):
     lower, zero = tmp_path / "lower", tmp_path / "zero"
     rates = ",".join(["0.5", "0.25", "0.125"][: degree + 1] + ["0"] * (2 - degree))

@@ -14,7 +14,7 @@ from support.transforms_scenes import SIZE, write_scene
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.views import MASK_THRESHOLD
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png

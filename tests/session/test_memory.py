@@ -11,6 +11,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.config import assign, preset, run_config
 from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.buffers import table_bytes
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.host import resident_bytes
 from pp_cl.engine.grid import Grid
@@ -84,7 +85,7 @@ def test_each_compute_unit_has_memory_of_its_own(dev, plain, monkeypatch):
         image = net.forward(made.zeros((128, 128, 16)))
         net.backward(made.zeros(image.shape))
         taken.append(made.peak_bytes)
-        shared.append(net.scratch_bytes((128, 128), True))
+        shared.append(table_bytes(net.table((128, 128), (128, 128))))
         planned.append(needed(plain, size=(128, 128), network__widths="32,64,128").device)
     assert np.ptp(taken) > 2**28
     assert np.ptp(shared) == pytest.approx(np.ptp(taken), rel=0.01)
@@ -211,11 +212,10 @@ def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, m
     scene = write_ball_scene(tmp_path / "ball", size=64)
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
-    monkeypatch.setattr("pp_cl.session.memory.KEPT_BY_PRUNING", 0.05)
-    monkeypatch.setattr(
-        "pp_cl.session.memory.prunings", lambda train, start, end: int(end > start + 1)
-    )
-    monkeypatch.setattr("pp_cl.drivers.discover.open_device", lambda choice: plain)
+    schedule = "pp_cl.engine.training.schedule"
+    monkeypatch.setattr(f"{schedule}.KEPT_BY_PRUNING", 0.05)
+    monkeypatch.setattr(f"{schedule}.prunings", lambda train, start, end: int(end > start + 1))
+    monkeypatch.setattr("pp_cl.drivers.open_device", lambda choice: plain)
     plain.info["memory_bytes"] = 30 * MIB
     words = arguments(scene, tmp_path / "run", downscale=1, points__count=5000, **settings)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pp_cl.settings import Config, sections
+from pp_cl.settings import Config, every_setting
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
@@ -78,7 +78,7 @@ def anchors(page: Path) -> set[str]:
     "path", [p for p in DOCUMENTS if p.stem != "CHANGELOG"], ids=lambda p: p.stem
 )
 def test_named_settings_exist(path):
-    known = {name: vars(values) for name, values in sections(Config())}
+    known = {key.partition(".")[0]: vars(section) for key, section, _ in every_setting(Config())}
     words = re.findall(rf"\b({'|'.join(known)})\.(\w+)\b(?!\.)", path.read_text("utf-8"))
     files = {"py", "cl", "md", "json", "h"}
     assert not [w for w in words if w[1] not in known[w[0]] and w[1] not in files]

@@ -24,6 +24,11 @@ def large(*values):
     return pytest.param(*values, marks=pytest.mark.large)
 
 
+def slow(*values):
+    """Arguments of a test that others show in part: `make test-slow` runs them."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 class GuardedDevice(Device):
     """A Device whose fresh buffers hold NaN (0xff bytes) and are followed by canary bytes that
     check() compares.
@@ -98,13 +103,13 @@ class TracedDevice(GuardedDevice):
                 self.queue, (array.nbytes,), None, array.data, value.data, np.uint32(value.nbytes)
             )
 
-    def copy_rows(self, target, start, source, count):
-        """As Device.copy_rows."""
+    def copy(self, target, source, start=0):
+        """As Device.copy."""
         row_bytes = source[:1].nbytes
-        if count:
+        if source.size:
             self._copy_kernel(
                 self.queue,
-                (count * row_bytes,),
+                (source.nbytes,),
                 None,
                 target.data,
                 np.uint32(start * row_bytes),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.device.buffers import gather_rows
 from pp_cl.engine.device.device import Device, kernel_folder
 from pp_cl.engine.device.kernel import parse_signatures

@@ -77,7 +77,9 @@ def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]
     """(octets, arrays of these shapes and dtypes that lie in them), all zeros: one launch or
     transfer handles them all. The arrays are valid as long as the octets are held.
     """
-    starts = _packed_starts(dev, rows)
+    align = dev.device.mem_base_addr_align // 8
+    sizes = [-(-max(1, _row_bytes(*row)) // align) * align for row in rows]
+    starts = [0, *map(int, np.cumsum(sizes))]
     whole = dev.zeros((starts.pop(),), np.uint8)
     data: Any = whole.base_data
     arrays: list[Array] = []
@@ -85,13 +87,6 @@ def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]
         region = data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
         arrays.append(QueuedArray(dev.queue, shape, dtype, data=region))
     return whole, arrays
-
-
-def _packed_starts(dev, rows):
-    """Where each of the rows begins, aligned as the device needs, and the end."""
-    align = dev.device.mem_base_addr_align // 8
-    sizes = [-(-max(1, _row_bytes(*row)) // align) * align for row in rows]
-    return [0, *map(int, np.cumsum(sizes))]
 
 
 class PackedArrays:
@@ -188,7 +183,7 @@ def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
         count = min(piece, m - start)
         _gather(dev, array, keep, scratch, first=start, count=count)
         if piece < m:
-            dev.copy_rows(array, start, scratch, count)
+            dev.copy(array, scratch[:count], start)
     return scratch if piece == m else array[:m]
 
 

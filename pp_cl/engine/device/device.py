@@ -44,6 +44,15 @@ SPILLING_ON_INTEL = frozenset(
     )
 )
 
+# bytes of the host that a driver's compiler takes until all kernels of a training are built, by
+# platform; one that is not listed is taken for the one that takes the most
+COMPILER_BYTES = {"Portable Computing Language": 80 * 2**20, "Intel(R) OpenCL": 620 * 2**20}
+
+
+def compiler_bytes(info: dict[str, Any]) -> int:
+    """Of the host, which the driver's compiler takes in a training. info: of describe()."""
+    return COMPILER_BYTES.get(info["platform"], max(COMPILER_BYTES.values()))
+
 
 def vendor_options(info: dict[str, Any], name: str) -> tuple[str, ...]:
     """Options of cl/<name>.cl on devices of one vendor. info: of describe()."""
@@ -309,20 +318,13 @@ class Device:
                 array.nbytes,
             )
 
-    def copy(self, target: Array, source: Array) -> None:
-        """Copy one array of this device into another of the same size."""
-        if target.nbytes != source.nbytes:
-            raise ValueError(
-                f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}"
-            )
-        self.copy_rows(target, 0, source, len(source))
-
-    def copy_rows(self, target: Array, start: int, source: Array, count: int) -> None:
-        """Copy the first `count` rows of one array of this device over those of another from row
-        `start` on.
+    def copy(self, target: Array, source: Array, start: int = 0) -> None:
+        """Copy one array of this device over the rows of another from row `start` on. Raises
+        ValueError where it has other rows or too many.
         """
-        row_bytes = source[:1].nbytes
-        if target[:1].nbytes != row_bytes or target.dtype != source.dtype:
+        row_bytes, count = source[:1].nbytes, len(source)
+        is_alike = (target[:1].nbytes, target.dtype) == (row_bytes, source.dtype)
+        if not is_alike or start + count > len(target):
             raise ValueError(
                 f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}"
             )

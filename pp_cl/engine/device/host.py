@@ -1,14 +1,10 @@
 """Memory of the machine that the program runs on."""
 
 import ctypes
-import importlib
 import mmap
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 GROUP = Path("/sys/fs/cgroup")  # of this process, as a container shows it
 PROC = Path("/proc")
@@ -28,7 +24,11 @@ def available_bytes() -> int | None:
 
 def resident_bytes() -> int:
     """Memory that this process holds; 0 where the system does not tell."""
-    return _own_bytes(1)
+    try:
+        pages = int((PROC / "self/statm").read_text().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def ask_for_huge_pages(address: int, nbytes: int) -> None:
@@ -41,42 +41,6 @@ def ask_for_huge_pages(address: int, nbytes: int) -> None:
         size = (address + nbytes - first) // mmap.PAGESIZE * mmap.PAGESIZE
         madvise = ctypes.CDLL(None).madvise
         madvise(ctypes.c_void_p(first), ctypes.c_size_t(size), mmap.MADV_HUGEPAGE)
-
-
-def _own_bytes(field):
-    """Bytes of this process that a field of statm counts; 0 where the system does not tell."""
-    try:
-        pages = int((PROC / "self/statm").read_text().split()[field])
-    except (OSError, IndexError, ValueError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-@contextmanager
-def at_most_more(most: int) -> Iterator[None]:
-    """While the block runs, memory that the process takes beyond so many bytes more than it has is
-    a MemoryError, where the system tells what it has.
-    """
-    mapped = _own_bytes(0)
-    resource = _resource()
-    if not mapped or resource is None:
-        yield
-        return
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    if soft == resource.RLIM_INFINITY or mapped + most < soft:
-        resource.setrlimit(resource.RLIMIT_AS, (mapped + most, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def _resource() -> Any:
-    """The module of that name, which Windows has not."""
-    try:
-        return importlib.import_module("resource")
-    except ImportError:
-        return None
 
 
 def _free_in_group():

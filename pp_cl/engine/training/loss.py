@@ -7,7 +7,7 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, Reading, read_later
+from pp_cl.engine.device.buffers import Buffers, Reading, Table, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import group_items, lanes, launch_groups
 from pp_cl.errors import Diverged
@@ -15,6 +15,24 @@ from pp_cl.errors import Diverged
 TAPS = 11  # pixels, the side of an SSIM window
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
 FURTHER = ("mask", "spread")  # terms that not every training has
+
+
+def loss_table(
+    dev: Device, size: tuple[int, int], padded: tuple[int, int], ssim_weight: float
+) -> Table:
+    """The buffers of Loss for a target of size (height, width) in a prediction of a larger one."""
+    height, width = size
+    values, has_ssim = lanes_of_loss(dev), ssim_weight != 0 and min(size) >= TAPS
+    window_rows = height - TAPS + 1 if has_ssim else 0
+    blocks = (-(-3 * width // 16) * 16 + MARGIN) // values  # vectors in a scratch row
+    return {
+        "moments": ((window_rows, 4, blocks, values), np.float32),
+        "slopes": ((window_rows, 3, blocks, values), np.float32),
+        "row_slopes": ((window_rows, 3, blocks, values), np.float32),
+        "partial_terms": ((window_rows + height, blocks, 4), np.float32),
+        "row_terms": ((window_rows + height, 4), np.float32),
+        "grad_prediction": ((*padded, 3), np.float32),
+    }
 
 
 class Loss:
@@ -48,19 +66,9 @@ class Loss:
         """
         corner = corner_of(prediction.shape, target.shape, left, top)
         (height, width, _), pw, b = target.shape, prediction.shape[1], self._buffers
-        values = lanes_of_loss(self.dev)
-        has_ssim = self.ssim_weight != 0 and min(height, width) >= TAPS
-        window_rows = height - TAPS + 1 if has_ssim else 0
-        blocks = (-(-3 * width // 16) * 16 + MARGIN) // values  # vectors in a scratch row
-        shapes = {
-            "moments": (window_rows, 4, blocks, values),
-            "slopes": (window_rows, 3, blocks, values),
-            "row_slopes": (window_rows, 3, blocks, values),
-            "partial_terms": (window_rows + height, blocks, 4),
-            "row_terms": (window_rows + height, 4),
-            "grad_prediction": prediction.shape,
-        }
-        b.require({name: (shape, np.float32) for name, shape in shapes.items()})
+        padded = prediction.shape[0], prediction.shape[1]
+        b.require(loss_table(self.dev, (height, width), padded, self.ssim_weight))
+        window_rows, _, blocks, _ = b.moments.shape
         program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
         program.launch(
             "loss_moments",

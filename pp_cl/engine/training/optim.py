@@ -12,7 +12,7 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import DeviceRows
+from pp_cl.engine.device.buffers import DeviceRows, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.model import Model
@@ -28,6 +28,14 @@ POINT_EPS = 1e-15  # gradients of points span many decades; clamping bounds the 
 NETWORK_EPS = 1e-8  # PyTorch's default
 
 
+def network_state_table(n: int, is_averaged: bool) -> Table:
+    """What the optimiser keeps of a network with n parameters: Adam's moments, and the averages
+    once there are any.
+    """
+    names = ("m", "v", "average") if is_averaged else ("m", "v")
+    return dict.fromkeys(names, ((n,), np.float32))
+
+
 class Optimiser:
     """Updates points and network; owns the network's moments and averages, the points' are in
     `state`.
@@ -40,7 +48,8 @@ class Optimiser:
         self.dev = dev
         self.model = model
         self.state = state
-        self.moments = {kind: dev.zeros(model.net.all_parameters.shape) for kind in "mv"}
+        table = network_state_table(model.net.all_parameters.size, is_averaged=False)
+        self.moments = {kind: dev.zeros(*row) for kind, row in table.items()}
         self.averages: dict[str, Array] = {}
 
     def update(

@@ -5,8 +5,14 @@ from the optimiser, whose moments stay as they are.
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.engine.device.buffers import Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
+
+
+def smoothing_table(n: int) -> Table:
+    """The arrays of a Smoother of n points."""
+    return {"neighbours": ((n, 6), np.uint32), "colour": ((n,), np.uint8)}
 
 
 class Smoother:
@@ -18,7 +24,7 @@ class Smoother:
 
     def __init__(self, dev: Device, grid: Array, ids: Array):
         n = len(ids)
-        self.neighbours, self._colour = dev.empty((n, 6), np.uint32), dev.empty((n,), np.uint8)
+        self.neighbours, self._colour = (dev.empty(*row) for row in smoothing_table(n).values())
         self._program = dev.program("training/smooth", LANES=lanes(dev))
         self._parts = row_parts(dev)
         self._program.launch(

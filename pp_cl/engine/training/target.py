@@ -7,11 +7,16 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View
 
 AROUND = 2  # pixels on either side of a place that interpolation reads
+
+
+def target_table(size: tuple[int, int]) -> Table:
+    """The buffers of Target for a crop of size (height, width), beside the photograph's rows."""
+    return {"target": ((*size, 3), np.float32), "alpha": (size, np.float32)}
 
 
 class Target:
@@ -37,8 +42,7 @@ class Target:
         camera.
         """
         x0, y0, width, height = box
-        shapes = {"target": (height, width, 3), "alpha": (height, width)}
-        self._buffers.require({name: (shape, np.float32) for name, shape in shapes.items()})
+        self._buffers.require(target_table((height, width)))
         whole = [round(stored) for stored in jitter]
         left, top = (view.downscale * c + d for c, d in zip((x0, y0), whole, strict=True))
         stored_height, stored_width, _ = view.image.shape

@@ -11,7 +11,7 @@ import pyopencl as cl
 import pytest
 from support.guarded import GuardedDevice
 
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.device import device as device_module
 from pp_cl.engine.device.device import Device, acts_as_cpu, kernel_folder
 from pp_cl.errors import BuildError, UserError
@@ -64,7 +64,7 @@ def test_upload_fill_zeros_copy(dev, rng):
     dev.fill(a, 2.5)
     assert np.array_equal(a.get(), np.full((31, 16), 2.5))
     assert np.array_equal(b.get(), values.astype(np.float32))
-    for other in (dev.zeros((30, 16)), dev.zeros((31, 16), np.uint32)):
+    for other in (dev.zeros((32, 16)), dev.zeros((31, 15)), dev.zeros((31, 16), np.uint32)):
         with pytest.raises(ValueError, match="copy"):
             dev.copy(b, other)
 

@@ -12,7 +12,7 @@ from support.checkpoints import load_checkpoint
 from support.runs import arguments, train_and_interrupt
 
 from pp_cl.cli import main
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.training.exposure import Exposure, decided_at
 from pp_cl.metrics.psnr_ssim import exposed_alike
 from pp_cl.scene.demo import demo_views

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+from support.guarded import slow
 from support.runs import spoken
 
 from pp_cl.cli import main
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import read_rgba, to_8bit, write_png
 from pp_cl.scene.demo import render
@@ -150,6 +151,7 @@ def test_images_of_which_few_fit_as_of_a_turned_object_they_are_placed_as_usual(
     assert not (tmp_path / "model" / "usual").exists()
 
 
+@pytest.mark.slow
 def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
     """That of larger photographs, which EXIF may keep: with it, few images have a place."""
     work = captured / "capture"
@@ -268,7 +270,7 @@ def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
     assert changed(mug) == before
 
 
-@pytest.mark.parametrize("words", [[], *(["--from", stage] for stage in STAGES)])
+@pytest.mark.parametrize("words", [[], *(slow(["--from", stage]) for stage in STAGES)])
 def test_what_is_the_users_stays(captured, shot, tmp_path, words):
     """Files beside those of the capture, and what the user has changed of these, but for masks."""
     scene = shutil.copytree(captured, tmp_path / "scene")
@@ -450,7 +452,7 @@ def turned(dev, folder, steps, wall=None):
     return folder / "photographs", folder / "masks"
 
 
-@pytest.mark.parametrize("wall", [None, 0.8])
+@pytest.mark.parametrize("wall", [None, slow(0.8)])
 def test_an_object_that_turns(dev, tmp_path, wall):
     """Its cameras are found though its pattern is that of other steps, too. It is noticed, but for
     a uniform wall.
@@ -467,6 +469,7 @@ def test_an_object_that_turns(dev, tmp_path, wall):
     assert off(scene, cameras(SIZE, "turntable")).position < 0.01
 
 
+@pytest.mark.slow
 def test_a_wall_places_no_cameras(dev, tmp_path):
     """Of an object that turns by too much between its photographs."""
     scene = tmp_path / "scene"

@@ -125,6 +125,7 @@ def test_the_object_is_cut_out_of_any_background(capture):
     assert len(np.unique(read_mask(capture.file(0)))) > 4, "no soft border"
 
 
+@pytest.mark.slow
 def test_a_box_that_cuts_the_object_grows(capture):
     """Where it has no points, and but for what it stands on."""
     whole, cut_off = capture.box.copy(), capture.box.copy()

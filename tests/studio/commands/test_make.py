@@ -8,11 +8,12 @@ import pytest
 from support.runs import spoken
 
 from pp_cl.cli import main
-from pp_cl.files.atomic import write_json
+from pp_cl.files.atomic import own, write_json
 from pp_cl.files.image import read_rgba
-from pp_cl.files.manifest import begin_manifest
+from pp_cl.run import load
 from pp_studio.capture import STAGES
 from pp_studio.commands import make
+from pp_studio.export.result import write_result
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,33 @@ def test_a_folder_that_has_moved_goes_on(made, tmp_path):
     assert stored["scene"]["path"] == str(tmp_path / "scene")
 
 
+def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, monkeypatch):
+    _, folder = made
+    assert main(["info", str(folder)]) == 0
+    assert f"{folder / 'run'}, preset" in capsys.readouterr().out
+    file = tmp_path / "points.ply"
+    assert main(["export", str(folder), "--format", "ply", "--out", str(file)]) == 0
+    assert file.exists()
+    shown = []
+    monkeypatch.setattr(
+        "pp_studio.view.run_view.RunView", lambda _, __, run, ___: shown.append(run)
+    )
+    with pytest.raises(AttributeError):  # of what is not there to serve
+        main(["view", str(folder), "--port", "0"])
+    assert shown[0].path == folder / "run"
+
+
+def test_the_page_has_every_metric_that_was_measured(made):
+    _, folder = made
+    file = folder / "run" / "eval" / "metrics.json"
+    kept = file.read_text()
+    found = json.loads(kept)
+    file.write_text(json.dumps(found | {"mean": found["mean"] | {"lpips": 0.1234}}))
+    write_result(load(folder / "run"), "test", folder, "film.mp4")
+    file.write_text(kept)
+    assert "<td>LPIPS</td><td>0.1234</td>" in (folder / "index.html").read_text("utf-8")
+
+
 def test_what_is_not_its_own_stays(made, tmp_path):
     scene, folder = made
     (tmp_path / "mine.txt").write_text("mine")
@@ -105,7 +133,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
     photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
     found.mkdir(parents=True)
-    begin_manifest(tmp_path / "out")
+    own(tmp_path / "out")
     hints = ["--turntable", "--masks", "M", "--box=-1,-1,-1,1,1,2"]
     with pytest.raises(Enough):
         spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])

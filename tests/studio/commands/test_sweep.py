@@ -17,7 +17,7 @@ from support.sweeps import jobs_of, pretend, words_of
 
 from pp_cl.cli import main
 from pp_cl.config import run_config
-from pp_cl.drivers.discover import open_device
+from pp_cl.drivers import open_device
 from pp_cl.evaluate import evaluate
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run

@@ -10,6 +10,7 @@ import urllib.error
 import urllib.request
 
 import pytest
+from support.guarded import slow
 from support.refused import failure
 from support.runs import arguments
 from support.scenes import write_ball_scene
@@ -77,7 +78,7 @@ def test_a_scene_is_shown_from_the_background_of_a_shell(tmp_path):
 
 
 @pytest.mark.unix
-@pytest.mark.parametrize("host", ["localhost", "0.0.0.0", "::"])  # noqa: S104
+@pytest.mark.parametrize("host", [slow("localhost"), "0.0.0.0", slow("::")])  # noqa: S104
 def test_the_address_of_a_host_works(begun, host):
     """Whichever of its numbers the name of this machine stands for; only others' reach warns."""
     process = started(begun, "--host", host, "--port", "0")

@@ -83,8 +83,10 @@ def test_what_tells_no_length_is_refused(mine):
     good = text_of(one, mine.model.positions().mean(0))
     with refusing("PHOTO:X,Y"):
         surface_point(mine, "a.jpg")
-    with refusing("no training photograph", one.name):
+    with refusing(f"no training photograph of that name; did you mean {one.name}?"):
         surface_point(mine, f"{one.name}x:1,2")
+    with refusing("no training photograph of that name; name one such as train/"):
+        surface_point(mine, "qqq:1,2")
     with refusing("60x60"):
         surface_point(mine, f"{one.name}:60,2")
     with refusing("no object"):

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.gltf import glb
 
-from pp_cl.scene.around import up_of
+from pp_cl.scene.gaze import up_of
 from pp_studio.export import texture
 from pp_studio.export.formats import export
 from pp_studio.export.texture import texels, write_textured

@@ -1,4 +1,4 @@
-"""What cameras around an object tell: which way is up, and what they look at."""
+"""Where the cameras of photographs look, and what is up in them."""
 
 from collections.abc import Sequence
 

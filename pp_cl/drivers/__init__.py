@@ -1,1 +1,0 @@
-"""OpenCL drivers of this machine: which work, and which device is taken."""
