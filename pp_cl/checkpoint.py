@@ -31,7 +31,7 @@ FORMAT = 3  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
 # {key of the header: its types as JSON has them}, and those that it may lack
-KEYS: dict[str, tuple[type, ...]] = {"scene": (str,), "views": (list,), "step": (int,)}
+KEYS: dict[str, tuple[type, ...]] = {"views": (list,), "step": (int,)}
 KEYS |= {"finished": (bool,), "initial_points": (int,), "grid": (dict,), "depth_range": (list,)}
 KEYS |= {"pixels": (dict, type(None)), "format": (int,), "extended_from": (int,)}
 KEYS |= {"exposed": (bool,), "left_out": (list,), "notes": (list,)}

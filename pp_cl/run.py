@@ -26,9 +26,9 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.scene.identity import difference, kept_views, learned
+from pp_cl.scene.identity import difference, kept_views
 from pp_cl.scene.image_file import Photograph
-from pp_cl.scene.load import DEMO, Scene, open_scene, scene_format, scene_frames
+from pp_cl.scene.load import DEMO, Scene, list_split, open_scene, scene_format, scene_frames
 from pp_cl.settings import Config
 
 COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
@@ -79,10 +79,8 @@ class Run:
         path, header = self.config.scene.path, self.header
         try:
             views = read()
-            told = difference(header, scene_frames(path), views)
-            if told:  # else views were dropped or taken back since, which changes no result
-                listed = learned(header, scene_frames(path, edited=False))
-                told = difference(header, listed, views)
+            # views that were dropped or taken back since change no result
+            told = difference(header, list_split(path, edited=False).photographs, views)
         except UserError as error:
             warnings.warn(
                 f"{path}: cannot be compared with the scene of {self.folder} ({error})",

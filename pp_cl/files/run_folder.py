@@ -27,7 +27,7 @@ MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews, views: paths in it, which need not
+    """path: the folder; config, checkpoint, log, previews: paths in it, which need not
     exist.
     """
 
@@ -37,7 +37,6 @@ class RunFolder:
         self.checkpoint = self.path / "checkpoint.npz"
         self.log = self.path / "log.jsonl"
         self.previews = self.path / "previews"
-        self.views = self.path / "views"
 
     def __str__(self) -> str:
         return str(self.path)

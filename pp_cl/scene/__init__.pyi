@@ -5,6 +5,7 @@ from .edits import EDITS as EDITS
 from .edits import Edits as Edits
 from .edits import read_edits as read_edits
 from .edits import write_edits as write_edits
+from .found import MASK_FOLDERS as MASK_FOLDERS
 from .gaze import looked_at as looked_at
 from .gaze import up_of as up_of
 from .hull import Hull as Hull
@@ -23,10 +24,9 @@ from .load import scene_splits as scene_splits
 from .masks import MaskRule as MaskRule
 from .masks import cut_out as cut_out
 from .masks import named_mask as named_mask
-from .masks import of_size as of_size
+from .masks import read_mask_of_size as read_mask_of_size
 from .readers.camera_file import read_cameras as read_cameras
 from .readers.common import read_json as read_json
-from .readers.found import MASK_FOLDERS as MASK_FOLDERS
 from .readers.frame import frame_keys as frame_keys
 from .readers.transforms import write_scene as write_scene
 from .sparse import sparse_points as sparse_points

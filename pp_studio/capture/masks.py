@@ -18,7 +18,7 @@ from tqdm import tqdm
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, listing, shown
 from pp_cl.files import contact_sheet, read_mask, read_rgba, write_png
-from pp_cl.scene import MaskRule, Photograph, cut_out, disagreements, named_mask, of_size, shrink
+from pp_cl.scene import MaskRule, Photograph, cut_out, disagreements, named_mask, read_mask_of_size, shrink
 from pp_studio.capture.cut import (
     FORGIVEN,
     GROWTHS,
@@ -122,7 +122,7 @@ def _found(scene, photograph, given, sources, fitted, words):
     file, size = scene / photograph.name, (photograph.camera.width, photograph.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)
-        return "given", fitted(photograph.name, of_size(read_mask(mask), size, mask))
+        return "given", fitted(photograph.name, read_mask_of_size(mask, size))
     if words is not None:
         return "by the program", _of_program(words, file, size[::-1])
     if not photograph.name.lower().endswith(OPAQUE):
@@ -173,7 +173,7 @@ def _kept(scene, photograph):
     UserError for one of another shape.
     """
     file = mask_file(scene, photograph.name)
-    return of_size(read_mask(file), (photograph.camera.width, photograph.camera.height), file)
+    return read_mask_of_size(file, (photograph.camera.width, photograph.camera.height))
 
 
 def _window(scene, photograph, box):

@@ -19,7 +19,6 @@ from pp_cl.selftest.points import some_ids
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
     "pixels": None,
-    "scene": "5ce0e",
     "views": [[one.name, kept_camera(one.camera)] for one in demo_frames("train")[:3]],
     "step": STEP,
     "finished": False,
