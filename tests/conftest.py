@@ -15,6 +15,7 @@ from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
+from pp_cl.scene import hull
 from pp_studio.export import gaussians, texture
 
 # of Hypothesis: the same few examples each time, or as many as `make fuzz` is told
@@ -66,11 +67,12 @@ def cache_of_its_own(tmp_path_factory):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def small_exports():
-    """Texels: what a ball needs; steps of fitting Gaussians: few, as one file sees to how good
-    these are (export/test_splat.py).
+def small_work():
+    """Points of the hull by which masks are compared, and texels: what a ball needs; steps of
+    fitting Gaussians: few, as one file sees to how good these are (export/test_splat.py).
     """
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hull, "COMPARED_POINTS", 8000)
         patch.setattr(gaussians, "STEPS", 40)
         patch.setattr(texture, "SIDE", 256)
         yield

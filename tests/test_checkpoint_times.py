@@ -6,19 +6,19 @@ from types import SimpleNamespace
 import pytest
 from support.runs import arguments, checkpoint
 
+from pp_cl.checkpoint import save_checkpoint
 from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
-from pp_cl.files.run_folder import RunFolder
 
 
 @pytest.fixture
 def saved(monkeypatch):
     """The steps at which checkpoints are written while every step takes a minute."""
-    steps, now, save, train_step = [], [0.0], RunFolder.save, Trainer.train_step
+    steps, now, train_step = [], [0.0], Trainer.train_step
 
-    def saving(self, header, arrays):
+    def saving(path, header, arrays):
         steps.append(header["step"])
-        save(self, header, arrays)
+        save_checkpoint(path, header, arrays)
 
     def stepping(self):
         now[0] += 60
@@ -26,7 +26,7 @@ def saved(monkeypatch):
 
     clock = SimpleNamespace(monotonic=lambda: now[0], perf_counter=time.perf_counter)
     monkeypatch.setattr("pp_cl.session.training.time", clock)
-    monkeypatch.setattr(RunFolder, "save", saving)
+    monkeypatch.setattr("pp_cl.session.training.save_checkpoint", saving)
     monkeypatch.setattr(Trainer, "train_step", stepping)
     return steps
 

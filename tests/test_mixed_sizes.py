@@ -12,7 +12,6 @@ from pp_cl.cli import main
 from pp_cl.config import assign, preset
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.views import View
-from pp_cl.files.contact_sheet import GAP, tiles
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.hull import build_grid
@@ -103,11 +102,3 @@ def test_memory_is_planned_for_the_largest(dev, scene):
         Room(config, net, order).need_of(hull.grid, len(hull.ids), (2, 6)) for order in orders
     )
     assert mixed == turned and 0.9 * largest.device < mixed.device <= largest.device
-
-
-def test_pictures_of_different_sizes_lie_in_equal_cells():
-    images = [np.full((h, w, 3), i, np.uint8) for i, (w, h) in enumerate(SIZES)]
-    picture = tiles(images, 2)
-    assert picture.shape == (2 * 48 + GAP, 2 * 48 + GAP, 3)
-    assert (picture[:29, 50:87] == 1).all() and (picture[29:48, 50:98] == 255).all()
-    assert (picture[50:90, :24] == 2).all()

@@ -21,12 +21,11 @@ from pp_cl.config import preset
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import blocking_of, device_class
-from pp_cl.engine.layers.conv_direct import Blocking, Direction
+from pp_cl.engine.layers.conv import Blocking
 from pp_cl.engine.network.layers import convolutions, unet_layers
 
 SIDE = 96
-IMAGES = Direction.FORWARD, Direction.BACKWARD_INPUT
-WEIGHTS = (Direction.BACKWARD_WEIGHTS,)
+IMAGES, WEIGHTS = ("forward", "input"), ("weights",)
 ONE, TILE = (1, 1, 1), (16, 4, 1)  # work-groups
 # {class of device: [(variant, directions, the fields that are tried)]}
 CANDIDATES: dict[str, Any] = {
@@ -100,7 +99,7 @@ def tuned(dev: Device, convs: Sequence[UploadedLayer]) -> Blocking:
                 runs = {i: conv.runner(variant, direction, b) for i, b in enumerate(tried)}
                 ms += [np.median(times) for times in interleave(runs).values()]
         for fields, total in zip(candidates, ms, strict=True):
-            print(f"{variant} {'/'.join(d.value for d in directions)} {fields}: {total:.2f} ms")
+            print(f"{variant} {'/'.join(directions)} {fields}: {total:.2f} ms")
         blocking = tried[int(ms.argmin())]
     return blocking
 

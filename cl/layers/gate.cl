@@ -28,7 +28,7 @@ kernel void gate_forward(
     const int w,
     const int c,
     global const float *x,           // (h, w, 2*c) features, gates
-    global const float *tile_count,  // (?, ?) of out, 0 = not computed
+    global const float *tile_count,  // ((h+3)/4, (w+3)/4) of out, 0 = not computed
     global float *out)               // (h, w, c)
 {
     const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
@@ -50,7 +50,7 @@ kernel void gate_backward(
     const int w,
     const int c,
     global const float *x,           // (h, w, 2*c) features, gates
-    global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
+    global const float *tile_count,  // ((h+3)/4, (w+3)/4) of grad_x, 0 = not computed
     global const float *grad_out,    // (h, w, c)
     global float *grad_x)            // (h, w, 2*c)
 {

@@ -8,8 +8,8 @@ kernel void output_forward(
     const uint channels,  // of the features
     const int residual,
     const float share,
-    global const float *features,  // (...) N rows of CHANNELS; not read without residual
-    global float *image)           // (...) N rows of 3: the output, overwritten by the colours
+    global const float *features,  // (H, W, channels) not read without residual
+    global float *image)           // (H, W, 3) the output, overwritten by the colours
 {
     const size_t i = get_global_id(0);
     if (i >= n) return;
@@ -23,8 +23,8 @@ kernel void output_forward(
 // One work-item per colour: reads its gradient, writes that of the last layer's output.
 kernel void output_backward(
     const uint n,
-    global const float *grad_image,  // (...)
-    global float *grad_out)          // (...)
+    global const float *grad_image,  // (H, W, 3)
+    global float *grad_out)          // (H, W, 3)
 {
     const size_t i = get_global_id(0);
     if (i >= n) return;
@@ -37,8 +37,8 @@ kernel void residual_backward(
     const uint n,         // pixels
     const uint channels,  // of the features
     const float share,
-    global const float *grad_image,  // (...) N rows of 3
-    global float *grad_features)     // (...) N rows of CHANNELS
+    global const float *grad_image,  // (H, W, 3)
+    global float *grad_features)     // (H, W, channels)
 {
     const size_t i = get_global_id(0);
     if (i >= n) return;
@@ -54,7 +54,7 @@ kernel void mean_forward(
     const uint width,  // of the image
     const uint scale,
     const uint channels,
-    global const float *features,  // (...) height * scale rows of width * scale CHANNELS
+    global const float *features,  // (height*scale, width*scale, channels)
     global float *image)           // (height, width, 3)
 {
     const uint x = get_global_id(0), y = get_global_id(1);
@@ -77,7 +77,7 @@ kernel void mean_backward(
     const uint scale,
     const uint channels,
     global const float *grad_image,  // (height, width, 3)
-    global float *grad_features)     // (...) height * scale rows of width * scale CHANNELS
+    global float *grad_features)     // (height*scale, width*scale, channels)
 {
     const uint x = get_global_id(0), y = get_global_id(1);
     if (x >= width * scale || y >= height * scale) return;

@@ -12,16 +12,23 @@ import numpy as np
 
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_class
-from pp_cl.engine.layers.conv_direct import (
+from pp_cl.engine.layers.choice import (
+    OFFERED,
+    VARIANTS,
+    blocking_of,
+    can_run,
+    device_class,
+    lay_out,
+    work_shape,
+)
+from pp_cl.engine.layers.conv import (
+    DIRECTIONS,
     Blocking,
+    Conv,
     ConvShape,
-    DirectConv,
-    Direction,
     pack_bias,
     pack_weights,
     sum_parts,
-    table_of_sums,
 )
 from pp_cl.engine.layers.tiles import Tiles, all_tiles
 from pp_cl.engine.network.layers import convolutions, unet_layers
@@ -29,11 +36,7 @@ from pp_cl.reference import network as reference
 
 CHECK_SIDE = 33  # several tiles of any variant, and parts of some; float64 takes a second
 # what of Layer.expected a direction computes
-RESULTS = {
-    Direction.FORWARD: slice(0, 1),
-    Direction.BACKWARD_WEIGHTS: slice(1, 2),
-    Direction.BACKWARD_INPUT: slice(3, None),
-}
+RESULTS = {"forward": slice(0, 1), "weights": slice(1, 2), "input": slice(3, None)}
 
 
 class Layer:
@@ -96,13 +99,13 @@ class Layer:
     def computed(
         self,
         dev: Device,
-        variant: type[DirectConv],
+        variant: str,
         blocking: Blocking,
         tiles: Tiles | None = None,
     ) -> list[np.ndarray]:
         """What `expected` lists, by a variant. tiles: of output and gradients."""
         uploaded = UploadedLayer(dev, self)
-        for direction in Direction:
+        for direction in DIRECTIONS:
             uploaded.compute(variant, blocking, direction, tiles)
         results = uploaded.out, uploaded.grad_weight, uploaded.grad_bias, *uploaded.grad_parts
         return [array.get() for array in results]
@@ -125,62 +128,55 @@ class UploadedLayer:
         sources = [part.shape[2] for part in layer.parts]
         self.variants = [v for v in OFFERED[device_class(dev)] if can_run(v, k, *sources, co)]
 
-    def runner(self, variant: str, direction: Direction, blocking: Blocking) -> Callable:
+    def runner(self, variant: str, direction: str, blocking: Blocking) -> Callable:
         """A function that computes a direction by a variant and waits for it."""
         tiles = all_tiles(self.dev, *self.grad_out.shape[:2])
 
         def run():
-            self.compute(VARIANTS[variant], blocking, direction, tiles)
+            self.compute(variant, blocking, direction, tiles)
             self.dev.finish()
 
         return run
 
     def compute(
         self,
-        variant: type[DirectConv],
+        variant: str,
         blocking: Blocking,
-        direction: Direction,
+        direction: str,
         tiles: Tiles | None,
     ) -> None:
-        """Compute a direction by a variant, as the network does."""
-        dev, parts, grad_out = self.dev, self.parts, self.grad_out
+        """Compute a direction by a variant, as the network does in each step of a training."""
+        dev, parts, grad_out, kernels = self.dev, self.parts, self.grad_out, VARIANTS[variant]
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
         shape = ConvShape(direction, self.weight.shape[1], channels, co, (height, width))
         tiles = tiles or all_tiles(dev, height, width)
-        if direction == Direction.FORWARD:
-            conv = variant(dev, blocking, shape)
-            weights = self._laid_out(conv)
-            conv.forward(parts, weights, self.bias, self.out, relu=self.relu, tiles=tiles)
-        elif direction == Direction.BACKWARD_WEIGHTS:
-            conv = variant(dev, blocking, shape)
-            partial = self._work(conv.work_shape)
-            count = conv.backward_weights(parts, grad_out, partial, tiles=tiles)
-            rows, n = table_of_sums([(partial.shape, count, 0, 0, 0)])
-            table = dev.constant(rows)
-            sum_parts(dev, table, n, partial, self.grad_weight, self.grad_bias)
+        if direction == "forward":
+            conv = self._conv(blocking, variant, shape)
+            kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
+        elif direction == "weights":
+            conv = self._conv(blocking, variant, shape)
+            count = kernels.backward_weights(conv, parts, grad_out, tiles=tiles)
+            sum_parts(dev, [(conv, count)], conv.work, self.grad_weight, self.grad_bias)
         else:
             for i, (part, grad) in enumerate(zip(parts, self.grad_parts, strict=True)):
-                conv = variant(dev, blocking, replace(shape, source=i))
+                conv = self._conv(blocking, variant, replace(shape, source=i))
                 mask = part if self.relu else None
-                conv.backward_input(self._laid_out(conv), grad_out, grad, mask=mask, tiles=tiles)
+                kernels.backward_input(conv, grad_out, grad, mask=mask, tiles=tiles)
 
-    def _laid_out(self, conv):
-        """The weights as a convolution reads them, laid out anew as in each step of a training."""
-        if conv.work_shape is None:
-            return self.weight
-        work = self._work(conv.work_shape)
-        conv.lay_out(self.dev, self.weight.reshape(-1), [(conv.shape, 0, 0)], work)
-        return work
+    def _conv(self, blocking, variant, shape):
+        """A direction of the convolution, its weights laid out anew."""
+        conv = Conv(self.dev, blocking, variant, shape, self.weight, self.bias)
+        needed = work_shape(variant, shape)
+        if needed:
+            n = math.prod(needed)
+            shared = self.dev.scratch("bench: weights and parts of their gradients", n)
+            conv.work = shared[:n].reshape(needed)
+            lay_out(self.dev, [conv], self.weight.reshape(-1), conv.work)
+        return conv
 
-    def _work(self, shape):
-        n = math.prod(shape)
-        return self.dev.scratch("bench: weights and parts of their gradients", n)[:n].reshape(shape)
 
-
-def layer_errors(
-    layer: Layer, computed: list[np.ndarray], direction: Direction
-) -> tuple[float, float]:
+def layer_errors(layer: Layer, computed: list[np.ndarray], direction: str) -> tuple[float, float]:
     """errors() of what Layer.computed() returned, of one direction."""
     own = RESULTS[direction]
     actual, expected = (
@@ -213,11 +209,11 @@ def bench_conv(
             for n in (side, min(side, CHECK_SIDE))
         )
         uploaded = UploadedLayer(dev, timed)
-        found = {v: checked.computed(dev, VARIANTS[v], blocking) for v in uploaded.variants}
+        found = {v: checked.computed(dev, v, blocking) for v in uploaded.variants}
         shape = [side, side, sum(layer.sources), layer.channels, k]
-        for direction in Direction:
+        for direction in DIRECTIONS:
             yield from variant_rows(
-                {"layer": layer.name, "shape": shape, "direction": direction.value},
+                {"layer": layer.name, "shape": shape, "direction": direction},
                 {v: uploaded.runner(v, direction, blocking) for v in uploaded.variants},
                 {v: layer_errors(checked, results, direction) for v, results in found.items()},
                 flops=2 * layer.multiplications(size, size),

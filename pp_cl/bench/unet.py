@@ -12,7 +12,7 @@ from pyopencl.array import Array
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import AUTO, OFFERED, device_class
-from pp_cl.engine.layers.conv_direct import unpack_weights
+from pp_cl.engine.layers.conv import unpack_weights
 from pp_cl.engine.network.layers import multiplications
 from pp_cl.engine.network.unet import UNet
 from pp_cl.reference import network as reference

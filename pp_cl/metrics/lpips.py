@@ -12,8 +12,8 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device, Program
 from pp_cl.engine.device.launch import group_ranges, lanes, row_parts
-from pp_cl.engine.layers.choice import blocking_of, choose
-from pp_cl.engine.layers.conv_direct import ConvShape, Direction, pack_weights
+from pp_cl.engine.layers.choice import VARIANTS, prepared
+from pp_cl.engine.layers.conv import Conv, ConvShape, pack_weights
 from pp_cl.engine.layers.simple import maxpool2_forward
 from pp_cl.engine.layers.tiles import all_tiles
 from pp_cl.errors import UserError
@@ -48,8 +48,8 @@ class Lpips:
             co, ci = kernel.shape[:2]
             self._layers[block].append((ci, co, dev.upload(pack_weights(kernel)), bias))
         self._size: tuple[int, int] | None = None
-        # of each block, [(convolution, weights as it reads them, biases)]; and its tiles
-        self._blocks: list[tuple[list[tuple], Any]] = []
+        # of each block, its convolutions and its tiles
+        self._blocks: list[tuple[list[Conv], Any]] = []
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> float:
         """LPIPS of two (H, W, 3) images in [0, 1].
@@ -89,10 +89,10 @@ class Lpips:
                 pooled = self._place(next(turns), (height // 2, width // 2, channels))
                 maxpool2_forward(self.dev, x, pooled)
                 x = pooled
-            for i, (convolution, weights, bias) in enumerate(convolutions, 1):
+            for i, conv in enumerate(convolutions, 1):
                 place = name if i == len(convolutions) else next(turns)
-                out = self._place(place, (*x.shape[:2], bias.size))
-                convolution.forward((x,), weights, bias, out, relu=True, tiles=tiles)
+                out = self._place(place, (*x.shape[:2], conv.shape.co))
+                VARIANTS[conv.variant].forward(conv, (x,), out, relu=True, tiles=tiles)
                 x = out
             yield x
 
@@ -130,8 +130,7 @@ class Lpips:
         for block, layers in enumerate(self._layers):
             size, convolutions = (height >> block, width >> block), []
             for ci, co, weights, bias in layers:
-                shape = ConvShape(Direction.FORWARD, 3, (ci,), co, size)
-                convolution = choose(self.dev, shape)(self.dev, blocking_of(self.dev), shape)
-                convolutions.append((convolution, convolution.laid_out(weights), bias))
+                shape = ConvShape("forward", 3, (ci,), co, size)
+                convolutions.append(prepared(self.dev, shape, weights, bias))
             self._blocks.append((convolutions, all_tiles(self.dev, *size)))
         self._size = height, width

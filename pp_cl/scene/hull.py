@@ -15,7 +15,7 @@ from pp_cl.engine.grid import Grid, smallest_edge
 from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import explain_empty_hull
-from pp_cl.scene.bounds import bounding_box, reach_of
+from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
 CELL_CAP = 2**27
@@ -152,17 +152,11 @@ def build_grid(
     The search starts from the box that the masks allow and rescales the edge from the measured
     count, until the count is `points` to 1.02 points. At CELL_CAP vertices of the grid, or after
     8 rounds, the best carving is taken: the smallest with enough points, else the largest. Raises
-    UserError for an impossible `points`, a view without a mask where others have one, masks or
-    poses that leave no vertex, cameras that make no scene.
+    UserError for an impossible `points`, masks or poses that leave no vertex, cameras that make no
+    scene.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
-    masked = [view.has_mask or view.is_masked for view in views]
-    if any(masked) and not all(masked):
-        raise UserError(
-            f"{views[masked.index(False)].name}: has no transparent pixel, but other photographs"
-            " have: give it a mask that is 0 around the object"
-        )
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     limit = None if box is None else box - corner
@@ -211,7 +205,7 @@ def _search(dev, views, points, box, forgiven, limit):
         return _tight(grid, carver.carve(grid, forgiven))
 
     best = last = carve(smallest_edge(box, min(COARSE_CELLS, CELL_CAP)))
-    capped, rounds, count = False, 0, len(last.ids)
+    capped, rounds, count = False, 0, last.count
     if not count:
         raise UserError(explain_empty_hull(views, box))
     while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
@@ -225,21 +219,33 @@ def _search(dev, views, points, box, forgiven, limit):
         if capped and edge > 0.99 * last.grid.edge:
             break  # the box shrinks no more
         last = carve(edge)
-        count, rounds = len(last.ids), rounds + 1
-        best = min(best, last, key=lambda h: (len(h.ids) < points, abs(len(h.ids) - points)))
-    return replace(best, capped=capped and len(best.ids) < points)
+        count, rounds = last.count, rounds + 1
+        best = min(best, last, key=lambda c: (c.count < points, abs(c.count - points)))
+    return Hull(best.grid, best.grid.ids_of(best.inside), capped and best.count < points)
+
+
+class _Carving(NamedTuple):
+    """The smallest grid that holds all `count` vertices inside, which are True in (nz, ny, nx)."""
+
+    grid: Grid
+    inside: np.ndarray
+    count: int
 
 
 def _tight(grid, inside):
-    """The Hull of the vertices inside, (nz, ny, nx) bool, on the grid itself if there are none."""
-    if not inside.any():
-        return Hull(grid, np.empty(0, np.uint32))
+    """The _Carving of the vertices inside, (nz, ny, nx) bool; of all of the grid if there are none.
+
+    Ids are left to the carving that is chosen in the end: to number those of the first takes longer
+    than to carve it.
+    """
     used = [np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 1), (0, 2), (1, 2))]
+    if not len(used[0]):
+        return _Carving(grid, inside, 0)
     low = np.array([places[0] for places in used])
     part = inside[tuple(slice(places[0], places[-1] + 1) for places in reversed(used))]
     origin = np.asarray(grid.origin) + grid.edge * low
     tight = Grid(tuple(float(x) for x in origin), grid.edge, part.shape[::-1])
-    return Hull(tight, tight.ids_of(part))
+    return _Carving(tight, part, int(np.count_nonzero(part)))
 
 
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
@@ -295,19 +301,25 @@ class Agreement(NamedTuple):
 def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) -> Agreement:
     """How far masks agree, by what share of each lies where their hull does not.
 
-    The hull of masks that agree covers all of them. Where a mask lies beside it by MOST_BESIDE and
-    several times the usual share, it belongs to another place or another camera, and is left out.
-    Where all do a little, masks are wrong here and there: then as many are forgiven as it takes.
+    Views that look elsewhere are left out. The hull of masks that agree covers all of them. Where a
+    mask lies beside it by MOST_BESIDE and several times the usual share, it belongs to another
+    place or another camera, and is left out. Where all do a little, masks are wrong here and there:
+    then as many are forgiven as it takes.
     box: as build_grid() takes it. Raises UserError as build_grid() does.
     """
-    kept = list(views)
-    left_out: dict[str, float] = {}
-    is_masked = any(one.has_mask for one in kept)
-    if not is_masked or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
-        return Agreement(kept, left_out, 0)
-    most = int(MOST_LEFT_OUT * len(kept))
+    if not any(one.has_mask for one in views):
+        return Agreement(list(views), {}, 0)
+    most = int(MOST_LEFT_OUT * len(views))
+    elsewhere = looking_elsewhere(views)
+    left_out = {view.name: 1.0 for view in elsewhere if len(elsewhere) <= most}
+    kept, forgiven = [view for view in views if view.name not in left_out], most // 2
+    try:
+        if _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
+            return Agreement(kept, left_out, 0)
+    except UserError:  # no place is in all masks
+        forgiven = most
     while len(left_out) < most:
-        shares = _shares_beside(dev, kept, box, most // 2)
+        shares = _shares_beside(dev, kept, box, forgiven)
         worst = int(shares.argmax())
         if shares[worst] <= max(MOST_BESIDE, TIMES_USUAL * np.median(shares)):
             break

@@ -141,7 +141,7 @@ def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterato
     bound = BOUNDS[variant]
     layers = _layers() if can_run(variant, 1) else _layers()[: len(SHAPES)]
     for layer in layers:
-        results = layer.computed(dev, VARIANTS[variant], blocking_of(dev))
+        results = layer.computed(dev, variant, blocking_of(dev))
         for actual, expected in zip(results, layer.expected, strict=True):
             of_weights = expected.ndim != 3
             yield relative(actual, expected, max(bound, WEIGHTS_BOUND) if of_weights else bound)
@@ -150,7 +150,7 @@ def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterato
 def _hard_convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Large means, weights over six decades, values of 6e4 and 1e-7, 512 channels, zeros."""
     for layer in _hard_layers().values():
-        results = layer.computed(dev, VARIANTS[variant], blocking_of(dev))
+        results = layer.computed(dev, variant, blocking_of(dev))
         yield from map(within, results, layer.expected)
 
 

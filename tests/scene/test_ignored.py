@@ -125,7 +125,7 @@ def test_the_network_learns_the_same_where_tiles_are_left_out(dev, monkeypatch, 
     assert np.linalg.norm(whole - planned) < 1e-5 * np.linalg.norm(whole)
 
 
-def test_the_lens_moves_them_as_it_moves_the_image(tmp_path):
+def test_the_lens_moves_them_as_it_moves_the_image(tmp_path, dev):
     """What is beside them is as without the hand, but for the ringing of the spline."""
     scene = with_hand(tmp_path / "scene", (255, 0, 90, 255))
     hand_masks(scene / "ignore")
@@ -135,7 +135,8 @@ def test_the_lens_moves_them_as_it_moves_the_image(tmp_path):
         data = json.loads(file.read_text()) | {"k1": 0.15, "p1": 0.02}
         file.write_text(json.dumps(data))
     views, right = (
-        load_scene(folder, downscale=2).splits["train"] for folder in (scene, tmp_path / "ball")
+        load_scene(folder, downscale=2, dev=dev).splits["train"]
+        for folder in (scene, tmp_path / "ball")
     )
     assert [view.ignored is not None for view in views] == [True, False] * 4
     for view, other in zip(views, right, strict=True):

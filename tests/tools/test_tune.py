@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from pp_cl.bench.conv import Layer, layer_errors
-from pp_cl.engine.layers.choice import OFFERED, VARIANTS, blocking_of, device_class
+from pp_cl.engine.layers.choice import OFFERED, blocking_of, device_class
 from tools import tune as TOOL
 
 
@@ -18,6 +18,6 @@ def test_every_candidate_is_right(dev, rng):
             for variant, directions, candidates in variants:
                 for fields in candidates if variant in OFFERED[device_class(dev)] else ():
                     blocking = replace(blocking_of(dev), **fields)
-                    computed = layer.computed(dev, VARIANTS[variant], blocking)
+                    computed = layer.computed(dev, variant, blocking)
                     for direction in directions:
                         assert layer_errors(layer, computed, direction)[0] < 1e-5

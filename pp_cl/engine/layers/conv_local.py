@@ -1,12 +1,15 @@
 """Direct convolutions for GPUs: a work-group shares inputs and weights in local memory, and
-computes tiles of a list. Any channels, 1x1 and 3x3; weights and parts are DirectConv's.
+computes tiles of a list. Any channels, 1x1 and 3x3; the launches of conv_local.cl and of
+conv_local_backward_weights.cl.
 """
 
 import math
+from collections.abc import Sequence
 
 from pyopencl.array import Array
 
-from pp_cl.engine.layers.conv_direct import DirectConv, Sources, most_parts
+from pp_cl.engine.device.device import Program
+from pp_cl.engine.layers.conv import Conv, ConvShape, most_parts
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles, grid_shape
 
 QUAD = 4  # channels of a work-item
@@ -27,100 +30,142 @@ PART_TILES = 8
 MOST_GROUPS = 512
 
 
-class LocalConv(DirectConv):
-    """Its kernels are conv_local.cl and conv_local_backward_weights.cl."""
+def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
+    """See conv_direct."""
+    shape, kernel = conv.shape, "conv_local_forward"
+    program, size, items = _program(conv, kernel, shape.co, shape.sources, tiles)
+    program.launch(
+        kernel,
+        size,
+        (items, 1),
+        multiply_adds=tiles.number * SIDE**2 * shape.products,
+        c1=shape.sources[0],
+        c2=sum(shape.sources[1:]),
+        co=shape.co,
+        relu=relu,
+        x=sources[0],
+        x2=sources[-1],
+        weight=conv.work,
+        bias=conv.bias,
+        tile_list=tiles.list,
+        out=out,
+    )
 
-    def _launch(self, kernel, tiles, channels, inputs, **arguments):
-        """See DirectConv; in the largest groups that the device runs."""
-        kernel, aligned = f"conv_local_{kernel}", _is_aligned(channels, *inputs)
-        in_group = _quads(channels, aligned)
-        for items in (n for n in GROUPS if n >= TILE_PARTS * in_group):
-            program = self.dev.program(
-                "layers/conv_local",
-                ITEMS=items,
-                KERNEL_SIZE=self.shape.k,
-                ALIGNED=int(aligned),
-                QUADS=in_group,
-            )
-            if program.kernels[kernel].largest_group >= items:
-                break
-        groups = -(-tiles.number * TILE_PARTS * in_group // items)
-        program.launch(
-            kernel,
-            (groups * items, -(-channels // (QUAD * in_group))),
-            local=(items, 1),
-            multiply_adds=self._multiply_adds(tiles),
-            tile_list=tiles.list,
-            **arguments,
-        )
 
-    def backward_weights(
-        self, sources: Sources, grad_out: Array, partial: Array, *, tiles: Tiles
-    ) -> int:
-        """See DirectConv."""
-        self._check(partial, tiles)
-        k, ci, co, (_, width) = self.shape.k, self.shape.ci, self.shape.co, self.shape.size
-        run = max(SUMMED, -(-tiles.number // self._parts()))
-        parts, first = -(-tiles.number // run), 0
-        for source, c in zip(sources, self.shape.sources, strict=True):
-            program, in_group, items = self._weights_program(c)
-            program.launch(
-                "conv_local_backward_weights",
-                (-(-c // (QUAD * CI_QUADS[k])) * items, -(-co // (QUAD * in_group)), parts),
-                local=(items, 1, 1),
-                multiply_adds=tiles.number * SIDE**2 * k**2 * c * co,
-                along=2,
-                c=c,
-                first=first,
-                ci=ci,
-                summed=max(1, min(SUMMED, width // (2 * SIDE * SIDE))),
-                x=source,
-                co=co,
-                run=run,
-                grad_out=grad_out,
-                tile_list=tiles.list,
-                tile_count=tiles.count,
-                partial=partial,
-            )
-            first += c
+def backward_input(
+    conv: Conv, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
+) -> None:
+    """See conv_direct."""
+    shape, kernel = conv.shape, "conv_local_backward_input"
+    program, size, items = _program(conv, kernel, shape.ci, (shape.co,), tiles)
+    program.launch(
+        kernel,
+        size,
+        (items, 1),
+        multiply_adds=tiles.number * SIDE**2 * shape.products,
+        c=shape.ci,
+        co=shape.co,
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
+        flipped=conv.work,
+        grad_out=grad_out,
+        tile_list=tiles.list,
+        grad_x=grad_x,
+    )
+
+
+def backward_weights(conv: Conv, sources: Sequence[Array], grad_out: Array, *, tiles: Tiles) -> int:
+    """See conv_direct."""
+    shape, first = conv.shape, 0
+    k, ci, co, (_, width) = shape.k, shape.ci, shape.co, shape.size
+    run = max(SUMMED, -(-tiles.number // parts_of(shape)))
+    parts = -(-tiles.number // run)
+    for source, c in zip(sources, shape.sources, strict=True):
+        program, in_group, items = _weights_program(conv, c)
         program.launch(
-            "conv_local_backward_bias",
-            (-(-co // VECTOR) * VECTOR, parts),
-            per_block=k * k * ci,
-            parts=parts,
+            "conv_local_backward_weights",
+            (-(-c // (QUAD * CI_QUADS[k])) * items, -(-co // (QUAD * in_group)), parts),
+            (items, 1, 1),
+            multiply_adds=tiles.number * SIDE**2 * k**2 * c * co,
+            along=2,
+            c=c,
             co=co,
+            first=first,
+            ci=ci,
             run=run,
+            summed=max(1, min(SUMMED, width // (2 * SIDE * SIDE))),
+            x=source,
             grad_out=grad_out,
             tile_list=tiles.list,
             tile_count=tiles.count,
-            partial=partial,
+            partial=conv.work,
         )
-        return parts
+        first += c
+    program.launch(
+        "conv_local_backward_bias",
+        (-(-co // VECTOR) * VECTOR, parts),
+        co=co,
+        per_block=k * k * ci,
+        run=run,
+        parts=parts,
+        grad_out=grad_out,
+        tile_list=tiles.list,
+        tile_count=tiles.count,
+        partial=conv.work,
+    )
+    return parts
 
-    def _parts(self):
-        k, ci, co = self.shape.k, self.shape.ci, self.shape.co
-        quads = _quads(co, _is_aligned(*self.shape.sources, co))
-        groups = -(-ci // (QUAD * CI_QUADS[k])) * -(-co // (QUAD * quads))
-        tiles = math.prod(grid_shape(*self.shape.size))
-        wanted = min(-(-tiles // PART_TILES), -(-MOST_GROUPS // groups))
-        return min(wanted, most_parts(self.shape))
 
-    def _weights_program(self, c):
-        """(program, groups of four output channels and work-items of a work-group)."""
-        k, aligned = self.shape.k, _is_aligned(c, self.shape.co)
-        most = _quads(self.shape.co, aligned)
-        for in_group in (n for n in (16, 8, 4) if n <= most):
-            items = CI_QUADS[k] * in_group * k
-            program = self.dev.program(
-                "layers/conv_local_backward_weights",
-                KERNEL_SIZE=k,
-                CI_QUADS=CI_QUADS[k],
-                QUADS=in_group,
-                ALIGNED=int(aligned),
-            )
-            if program.kernels["conv_local_backward_weights"].largest_group >= items:
-                break
-        return program, in_group, items
+def parts_of(shape: ConvShape) -> int:
+    """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
+    quads = _quads(shape.co, _is_aligned(*shape.sources, shape.co))
+    groups = -(-shape.ci // (QUAD * CI_QUADS[shape.k])) * -(-shape.co // (QUAD * quads))
+    tiles = math.prod(grid_shape(*shape.size))
+    wanted = min(-(-tiles // PART_TILES), -(-MOST_GROUPS // groups))
+    return min(wanted, most_parts(shape))
+
+
+def _program(
+    conv: Conv, kernel: str, channels: int, inputs: tuple[int, ...], tiles: Tiles
+) -> tuple[Program, tuple[int, int], int]:
+    """(program, work-items, items of a work-group) for the tiles of a result of so many channels,
+    of inputs of so many each; in the largest groups that the device runs.
+    """
+    tiles.check(conv.shape.size)
+    aligned = _is_aligned(channels, *inputs)
+    in_group = _quads(channels, aligned)
+    for items in (n for n in GROUPS if n >= TILE_PARTS * in_group):
+        program = conv.dev.program(
+            "layers/conv_local",
+            ITEMS=items,
+            KERNEL_SIZE=conv.shape.k,
+            ALIGNED=int(aligned),
+            QUADS=in_group,
+        )
+        if program.kernels[kernel].largest_group >= items:
+            break
+    groups = -(-tiles.number * TILE_PARTS * in_group // items)
+    return program, (groups * items, -(-channels // (QUAD * in_group))), items
+
+
+def _weights_program(conv: Conv, c: int) -> tuple[Program, int, int]:
+    """(program, groups of four output channels and work-items of a work-group) for the weights of
+    c input channels.
+    """
+    k, aligned = conv.shape.k, _is_aligned(c, conv.shape.co)
+    most = _quads(conv.shape.co, aligned)
+    for in_group in (n for n in (16, 8, 4) if n <= most):
+        items = CI_QUADS[k] * in_group * k
+        program = conv.dev.program(
+            "layers/conv_local_backward_weights",
+            KERNEL_SIZE=k,
+            CI_QUADS=CI_QUADS[k],
+            QUADS=in_group,
+            ALIGNED=int(aligned),
+        )
+        if program.kernels["conv_local_backward_weights"].largest_group >= items:
+            break
+    return program, in_group, items
 
 
 def _is_aligned(*channels):

@@ -1,21 +1,15 @@
 """3x3 convolutions by Winograd's minimal filtering F(4 x 4, 3 x 3): 4 times fewer multiplications
-than the direct ones, at two or three times the error. Channels come in multiples of 16.
+than the direct ones, at two or three times the error. Channels come in multiples of 16. The
+launches of winograd.cl, winograd_transform.cl and winograd_backward_weights.cl; results do not
+depend on the number of compute units.
 """
 
 from collections.abc import Sequence
 
 from pyopencl.array import Array
 
-from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.conv_direct import (
-    Blocking,
-    ConvShape,
-    DirectConv,
-    Direction,
-    Layout,
-    Sources,
-    parts_shape,
-)
+from pp_cl.engine.device.device import Device, Program
+from pp_cl.engine.layers.conv import Conv, ConvShape, first_float
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles
 
 POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile
@@ -30,8 +24,7 @@ CI_PART, CO_PART = 128, 128
 # The tiles are cut in their place, into 2, 4, 8 or 16 parts of LEAST_TILES or more.
 NARROW_SUMS = 64 * 128
 LEAST_TILES, MOST_PARTS = 80, 16
-SLICES = "Winograd: slices of the compute units"  # of Device.scratch()
-COUNTERS = VECTOR  # floats at the front of SLICES, 0 between kernels (cl/layers/winograd.h)
+COUNTERS = VECTOR  # floats at the front of the scratch, 0 between kernels (cl/layers/winograd.h)
 
 
 def fits(*channels: int) -> bool:
@@ -39,115 +32,149 @@ def fits(*channels: int) -> bool:
     return all(c and c % VECTOR == 0 for c in channels)
 
 
-class WinogradConv(DirectConv):
-    """Its kernels are winograd.cl, winograd_transform.cl and winograd_backward_weights.cl. Results
-    do not depend on the number of compute units. Raises ValueError for channels that do not fit.
+def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
+    """See conv_direct."""
+    shape = conv.shape
+    _program(conv, shape.co, tiles).launch(
+        "winograd_forward",
+        min(conv.dev.info["compute_units"], tiles.number),
+        1,
+        c1=shape.sources[0],
+        c2=sum(shape.sources[1:]),
+        co=shape.co,
+        relu=relu,
+        x=sources[0],
+        x2=sources[-1],
+        weight=conv.work,
+        bias=conv.bias,
+        tile_list=tiles.list,
+        out=out,
+        scratch=_scratch(conv),
+    )
+
+
+def backward_input(
+    conv: Conv, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
+) -> None:
+    """See conv_direct."""
+    shape = conv.shape
+    _program(conv, shape.ci, tiles).launch(
+        "winograd_backward_input",
+        min(conv.dev.info["compute_units"], tiles.number),
+        1,
+        c=shape.ci,
+        co=shape.co,
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
+        flipped=conv.work,
+        grad_out=grad_out,
+        tile_list=tiles.list,
+        grad_x=grad_x,
+        scratch=_scratch(conv),
+    )
+
+
+def backward_weights(conv: Conv, sources: Sequence[Array], grad_out: Array, *, tiles: Tiles) -> int:
+    """See conv_direct."""
+    ci, co, units = conv.shape.ci, conv.shape.co, conv.dev.info["compute_units"]
+    tile_parts = _tile_parts(tiles.number, ci, co)
+    ci_part = ci if tile_parts > 1 else _ci_part(units, ci, co)
+    parts = tile_parts * -(-ci // ci_part) * -(-co // CO_PART)
+    conv.dev.program(
+        "layers/winograd_backward_weights",
+        TILES=conv.blocking.winograd_weights,
+        CO_PART=min(CO_PART, co),
+        BLOCKS=_groups(conv, co),
+    ).launch(
+        "winograd_backward_weights",
+        min(units, parts),
+        1,
+        c1=conv.shape.sources[0],
+        c2=sum(conv.shape.sources[1:]),
+        co=co,
+        ci_part=ci_part,
+        tile_parts=tile_parts,
+        x=sources[0],
+        x2=sources[-1],
+        grad_out=grad_out,
+        tile_list=tiles.list,
+        tile_count=tiles.count,
+        partial=conv.work,
+        scratch=_scratch(conv),
+    )
+    return tile_parts
+
+
+def parts_of(shape: ConvShape) -> int:
+    """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
+    return MOST_PARTS if _is_narrow(shape.ci, shape.co) else 1
+
+
+def transformed_shape(shape: ConvShape) -> tuple[int]:
+    """Of the transformed weights, as cl/layers/winograd.h lays them out."""
+    return (POSITIONS * (shape.ci * shape.co + VECTOR),)
+
+
+def transform_weights(dev: Device, convs: Sequence[Conv], weights: Array, work: Array) -> None:
+    """Transform the weights of convolutions in one launch.
+
+    weights, work: (?,) float32, in which Conv.weight and Conv.work lie.
     """
+    rows, n = [], 0
+    for conv in convs:
+        shape, flipped = conv.shape, conv.shape.direction == "input"
+        channels, co = (shape.co, shape.ci) if flipped else (shape.ci, shape.co)
+        start, target = first_float(conv.weight), first_float(conv.work) // VECTOR
+        ci = sum(shape.sources)
+        rows.append((n, channels, co // VECTOR, start, target, shape.first, ci, int(flipped)))
+        n += channels * co // VECTOR
+    dev.program("layers/winograd_transform").launch(
+        "winograd_transform",
+        n,
+        VECTOR,
+        n=n,
+        rows=len(rows),
+        table=dev.constant(rows),
+        weights=weights,
+        transformed=work,
+    )
 
-    def __init__(self, dev: Device, blocking: Blocking, shape: ConvShape):
-        if not fits(*shape.sources, shape.co):
-            channels = *shape.sources, shape.co
-            raise ValueError(
-                f"Winograd convolution of {channels} channels: they come in multiples of 16"
-            )
-        super().__init__(dev, blocking, shape)
-        narrow = shape.ci * shape.co <= NARROW
-        # tiles transformed at a time, and multiplied together
-        self._at_once, self._together = blocking.winograd_narrow if narrow else blocking.winograd
 
-    def _work_shape(self):
-        ci, co = self.shape.ci, self.shape.co
-        if self.shape.direction is Direction.BACKWARD_WEIGHTS:
-            return parts_shape(MOST_PARTS if _is_narrow(ci, co) else 1, 3, ci, co)
-        # as cl/layers/winograd.h lays them out
-        return (POSITIONS * (ci * co + VECTOR),)
+def scratch_floats(conv: Conv) -> int:
+    """Floats of the scratch that all convolutions share: each compute unit's slice of it."""
+    ci, co = conv.shape.ci, conv.shape.co
+    vectors = POSITIONS * ((ci + co) // VECTOR * _at_once(conv)[0] + 3)
+    if conv.shape.direction == "weights":
+        ci_part, co_part = min(CI_PART, ci), min(CO_PART, co)
+        values = (ci_part + co_part) // VECTOR * conv.blocking.winograd_weights
+        vectors = POSITIONS * (values + 3 + ci_part * co_part // VECTOR) + co_part // VECTOR
+    return COUNTERS + conv.dev.info["compute_units"] * vectors * VECTOR
 
-    def scratch_floats(self) -> int:
-        """Floats of Device.scratch() that the kernels take as SLICES."""
-        ci, co = self.shape.ci, self.shape.co
-        vectors = POSITIONS * ((ci + co) // VECTOR * self._at_once + 3)
-        if self.shape.direction is Direction.BACKWARD_WEIGHTS:
-            ci_part, co_part = min(CI_PART, ci), min(CO_PART, co)
-            values = (ci_part + co_part) // VECTOR * self.blocking.winograd_weights
-            vectors = POSITIONS * (values + 3 + ci_part * co_part // VECTOR) + co_part // VECTOR
-        return COUNTERS + self.dev.info["compute_units"] * vectors * VECTOR
 
-    @staticmethod
-    def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
-        """Transform weights in one launch, see DirectConv."""
-        rows, n = [], 0
-        for shape, start, target in jobs:
-            flipped = shape.direction is Direction.BACKWARD_INPUT
-            channels, co = (shape.co, shape.ci) if flipped else (shape.ci, shape.co)
-            ci, place = sum(shape.sources), target // VECTOR
-            rows.append((n, channels, co // VECTOR, start, place, shape.first, ci, int(flipped)))
-            n += channels * co // VECTOR
-        dev.program("layers/winograd_transform").launch(
-            "winograd_transform",
-            n,
-            local=VECTOR,
-            n=n,
-            rows=len(rows),
-            table=dev.constant(rows),
-            weights=weights,
-            transformed=laid_out,
-        )
+def _scratch(conv: Conv) -> Array:
+    return conv.dev.scratch(
+        "Winograd: slices of the compute units", scratch_floats(conv), zeros=COUNTERS
+    )
 
-    def _launch(self, kernel, tiles, channels, inputs, **arguments):
-        """See DirectConv."""
-        program = self.dev.program(
-            "layers/winograd",
-            TILES=self._at_once,
-            TOGETHER=self._together,
-            BLOCKS=self._groups(channels),
-        )
-        program.launch(
-            f"winograd_{kernel}",
-            min(self.dev.info["compute_units"], tiles.number),
-            local=1,
-            tile_list=tiles.list,
-            scratch=self.dev.scratch(SLICES, self.scratch_floats(), zeros=COUNTERS),
-            **arguments,
-        )
 
-    def _groups(self, channels):
-        """Groups of 16 output channels that are multiplied together."""
-        groups = self.blocking.winograd_groups
-        return 1 if channels // VECTOR % groups else groups
+def _program(conv: Conv, channels: int, tiles: Tiles) -> Program:
+    """The program for a result of so many channels."""
+    tiles.check(conv.shape.size)
+    at_once, together = _at_once(conv)
+    blocks = _groups(conv, channels)
+    return conv.dev.program("layers/winograd", TILES=at_once, TOGETHER=together, BLOCKS=blocks)
 
-    def backward_weights(
-        self, sources: Sources, grad_out: Array, partial: Array, *, tiles: Tiles
-    ) -> int:
-        """See DirectConv."""
-        self._check(partial, tiles)
-        ci, co, (c1, *others) = self.shape.ci, self.shape.co, self.shape.sources
-        units = self.dev.info["compute_units"]
-        tile_parts = _tile_parts(tiles.number, ci, co)
-        ci_part = ci if tile_parts > 1 else _ci_part(units, ci, co)
-        parts = tile_parts * -(-ci // ci_part) * -(-co // CO_PART)
-        self.dev.program(
-            "layers/winograd_backward_weights",
-            TILES=self.blocking.winograd_weights,
-            CO_PART=min(CO_PART, co),
-            BLOCKS=self._groups(co),
-        ).launch(
-            "winograd_backward_weights",
-            min(units, parts),
-            local=1,
-            c1=c1,
-            c2=sum(others),
-            co=co,
-            ci_part=ci_part,
-            tile_parts=tile_parts,
-            x=sources[0],
-            x2=sources[-1],
-            grad_out=grad_out,
-            tile_list=tiles.list,
-            tile_count=tiles.count,
-            partial=partial,
-            scratch=self.dev.scratch(SLICES, self.scratch_floats(), zeros=COUNTERS),
-        )
-        return tile_parts
+
+def _at_once(conv):
+    """(tiles transformed at a time, tiles multiplied together)."""
+    narrow = conv.shape.ci * conv.shape.co <= NARROW
+    return conv.blocking.winograd_narrow if narrow else conv.blocking.winograd
+
+
+def _groups(conv, channels):
+    """Groups of 16 output channels that are multiplied together."""
+    groups = conv.blocking.winograd_groups
+    return 1 if channels // VECTOR % groups else groups
 
 
 def _is_narrow(ci, co):

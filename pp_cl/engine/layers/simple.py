@@ -8,9 +8,9 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import channel_ranges, lanes
-from pp_cl.engine.layers.tiles import Tiles, checked_tiles
+from pp_cl.engine.layers.tiles import Tiles, all_tiles
 
-RESAMPLE = "layers/resample"
+GATE, RESAMPLE = "layers/gate", "layers/resample"
 SHARE = 0.25  # of a feature in its colour; features differ by about four times as much
 
 
@@ -18,22 +18,20 @@ def gate_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = Non
     """out (H, W, C) = ELU(features) * sigmoid(gates). x: (H, W, 2 C), the features of each pixel
     and then its gates.
     """
-    shape = _check_gate(x, out)
-    _launch(dev, "layers/gate", "gate_forward", shape, out, tiles=tiles, x=x, out=out)
+    _launch(dev, GATE, "gate_forward", out.shape, out, tiles, x=x, out=out)
 
 
 def gate_backward(
     dev: Device, x: Array, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
 ) -> None:
     """grad_x (H, W, 2 C) = gradient of gate_forward, given grad_out (H, W, C)."""
-    shape, arrays = _check_gate(x, grad_out), {"x": x, "grad_out": grad_out, "grad_x": grad_x}
-    _launch(dev, "layers/gate", "gate_backward", shape, grad_x, tiles=tiles, **arrays)
+    arrays = {"x": x, "grad_out": grad_out, "grad_x": grad_x}
+    _launch(dev, GATE, "gate_backward", grad_out.shape, grad_x, tiles, **arrays)
 
 
 def avgpool2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
     """out (H, W, C) = mean of 2x2 pixels of x (2H, 2W, C)."""
-    shape = _check_double(out, x)
-    _launch(dev, RESAMPLE, "avgpool2_forward", shape, out, tiles=tiles, x=x, out=out)
+    _launch(dev, RESAMPLE, "avgpool2_forward", out.shape, out, tiles, x=x, out=out)
 
 
 def avgpool2_backward(
@@ -50,18 +48,19 @@ def avgpool2_backward(
     mask: what was pooled, where it is a ReLU's output, else None; grad_x: gradient of its other
     use; grad_out: (H, W, C).
     """
-    shape = _check_double(grad_out, grad_x)
-    _launch(
-        dev,
-        RESAMPLE,
+    h, w, c = grad_out.shape
+    size, work_group = channel_ranges(dev, *grad_x.shape)
+    dev.program(RESAMPLE, LANES=lanes(dev)).launch(
         "avgpool2_backward",
-        shape,
-        grad_x,
-        grad_x.shape,
-        tiles=tiles,
+        size,
+        work_group,
+        h=h,
+        w=w,
+        c=c,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
         grad_out=grad_out,
+        tile_count=(tiles or all_tiles(dev, *grad_x.shape[:2])).count,
         grad_x=grad_x,
     )
 
@@ -73,28 +72,41 @@ def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
         raise ValueError(f"max pooling of {x.shape} to {out.shape}")
     size, work_group = channel_ranges(dev, h, w, c)
     sizes = {"h": h, "w": w, "c": c, "x_width": x.shape[1]}
-    _program(dev, RESAMPLE).launch("maxpool2_forward", size, work_group, x=x, out=out, **sizes)
+    dev.program(RESAMPLE, LANES=lanes(dev)).launch(
+        "maxpool2_forward", size, work_group, x=x, out=out, **sizes
+    )
 
 
 def upsample2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
     """out (2H, 2W, C) = x (H, W, C), bilinear, align_corners False, border repeated."""
-    shape = _check_double(x, out)
-    _launch(dev, RESAMPLE, "upsample2_forward", shape, out, tiles=tiles, x=x, out=out)
+    _launch(dev, RESAMPLE, "upsample2_forward", x.shape, out, tiles, x=x, out=out)
 
 
 def upsample2_backward(
     dev: Device, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
 ) -> None:
     """grad_x (H, W, C) = gradient of upsample2_forward, given grad_out (2H, 2W, C)."""
-    shape, arrays = _check_double(grad_x, grad_out), {"grad_out": grad_out, "grad_x": grad_x}
-    _launch(dev, RESAMPLE, "upsample2_backward", shape, grad_x, tiles=tiles, **arrays)
+    arrays = {"grad_out": grad_out, "grad_x": grad_x}
+    _launch(dev, RESAMPLE, "upsample2_backward", grad_x.shape, grad_x, tiles, **arrays)
+
+
+def _launch(dev, file, kernel, shape, result, tiles, **arguments):
+    """Launch a kernel that computes `tiles` of the array `result`. shape: its h, w, c, those of the
+    smaller map.
+    """
+    h, w, c = shape
+    size, work_group = channel_ranges(dev, h, w, c)
+    count = (tiles or all_tiles(dev, *result.shape[:2])).count
+    dev.program(file, LANES=lanes(dev)).launch(
+        kernel, size, work_group, h=h, w=w, c=c, tile_count=count, **arguments
+    )
 
 
 def output_forward(dev: Device, image: Array, features: Array | None) -> None:
     """image (H, W, 3) = 0.5 + 0.5 * image, and SHARE * (the first three of the features (H, W, C)
     - the background's 1), if they are given: a residual connection past the network.
     """
-    height, width, channels = _check_image(image if features is None else features, image)
+    height, width, channels = (image if features is None else features).shape
     dev.program("layers/output").launch(
         "output_forward",
         height * width,
@@ -109,7 +121,6 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
 
 def output_backward(dev: Device, grad_image: Array, grad_out: Array) -> None:
     """Write grad_out (H, W, 3), dL/d(last layer's output), from grad_image (H, W, 3)."""
-    _check_image(grad_out, grad_image)
     n = grad_image.size
     dev.program("layers/output").launch(
         "output_backward", n, n=n, grad_image=grad_image, grad_out=grad_out
@@ -120,7 +131,7 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
     """Add the gradient through the residual connection, of grad_image (H, W, 3), to grad_features
     (H, W, C).
     """
-    height, width, channels = _check_image(grad_features, grad_image)
+    height, width, channels = grad_features.shape
     dev.program("layers/output").launch(
         "residual_backward",
         height * width,
@@ -136,10 +147,16 @@ def mean_forward(dev: Device, features: Array, image: Array, scale: int) -> None
     """image (H, W, 3) = means of the first three features of scale x scale pixels, of features
     (scale H, scale W, C).
     """
-    sizes = _mean_sizes(image, features, scale)
-    size = image.shape[1], image.shape[0]
+    height, width, _ = image.shape
     dev.program("layers/output").launch(
-        "mean_forward", size, features=features, image=image, **sizes
+        "mean_forward",
+        (width, height),
+        height=height,
+        width=width,
+        scale=scale,
+        channels=features.shape[2],
+        features=features,
+        image=image,
     )
 
 
@@ -147,54 +164,14 @@ def mean_backward(dev: Device, grad_image: Array, grad_features: Array, scale: i
     """Write grad_features (scale H, scale W, C), 0 beyond the first three, from grad_image (H, W,
     3).
     """
-    sizes = _mean_sizes(grad_image, grad_features, scale)
-    size = grad_features.shape[1], grad_features.shape[0]
+    height, width, _ = grad_image.shape
     dev.program("layers/output").launch(
-        "mean_backward", size, grad_image=grad_image, grad_features=grad_features, **sizes
+        "mean_backward",
+        (width * scale, height * scale),
+        height=height,
+        width=width,
+        scale=scale,
+        channels=grad_features.shape[2],
+        grad_image=grad_image,
+        grad_features=grad_features,
     )
-
-
-def _mean_sizes(image, features, scale):
-    height, width, channels = image.shape
-    if channels != 3 or features.shape[:2] != (height * scale, width * scale):
-        raise ValueError(f"means of {scale}x{scale} pixels of {features.shape}: no {image.shape}")
-    return {"height": height, "width": width, "scale": scale, "channels": features.shape[2]}
-
-
-def _launch(dev, file, kernel, shape, result, size=None, *, tiles, **arguments):
-    """Launch a kernel that computes the tiles of the array `result`. shape: its h, w, c, those of
-    the smaller map; size: over which (height, width, channels) it runs, if not these.
-    """
-    h, w, c = shape
-    size, work_group = channel_ranges(dev, *(size or shape))
-    count = checked_tiles(dev, tiles, *result.shape[:2]).count
-    _program(dev, file).launch(
-        kernel, size, work_group, h=h, w=w, c=c, tile_count=count, **arguments
-    )
-
-
-def _program(dev, file):
-    return dev.program(file, LANES=lanes(dev))
-
-
-def _check_double(small, large):
-    h, w, c = small.shape
-    if large.shape != (2 * h, 2 * w, c):
-        raise ValueError(
-            f"a layer between {small.shape} and {large.shape}: expected {(2 * h, 2 * w, c)}"
-        )
-    return h, w, c
-
-
-def _check_gate(x, out):
-    h, w, c = out.shape
-    if x.shape != (h, w, 2 * c):
-        raise ValueError(f"a gate from {x.shape} to {out.shape}: expected {(h, w, 2 * c)}")
-    return h, w, c
-
-
-def _check_image(features, image):
-    height, width, channels = features.shape
-    if channels < 3 or image.shape != (height, width, 3):
-        raise ValueError(f"an image {image.shape} is none of features {features.shape}")
-    return features.shape

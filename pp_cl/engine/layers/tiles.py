@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Reading, Table, read_later
+from pp_cl.engine.device.buffers import Reading, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import channel_ranges, lanes
 
@@ -33,6 +33,13 @@ class Tiles:
     number: int
     list: Array
     count: Array
+
+    def check(self, size: tuple[int, int]) -> None:
+        """Raise ValueError for another size of the feature map; kernels that take the list alone
+        would write beside it.
+        """
+        if self.size != size:
+            raise ValueError(f"tiles of {self.size} for a feature map of {size}")
 
 
 def grid_shape(height: int, width: int) -> tuple[int, int]:
@@ -59,23 +66,6 @@ def tile_arrays(size: tuple[int, int], count: np.ndarray) -> tuple[np.ndarray, n
 def all_tiles(dev: Device, height: int, width: int) -> Tiles:
     """Every tile of a feature map."""
     return some_tiles(dev, (height, width), np.ones(grid_shape(height, width)))
-
-
-def all_tiles_buffers(height: int, width: int) -> Table:
-    """{name: (shape, dtype)} of the device buffers of all_tiles()."""
-    rows, columns = grid_shape(height, width)
-    return {"list": ((3 + rows * columns,), np.int32), "count": ((rows, columns), np.float32)}
-
-
-def checked_tiles(dev: Device, tiles: Tiles | None, height: int, width: int) -> Tiles:
-    """`tiles`, or all tiles of the feature map if None. Raises ValueError for tiles of a feature
-    map of another size.
-    """
-    if tiles is None:
-        return all_tiles(dev, height, width)
-    if tiles.size != (height, width):
-        raise ValueError(f"tiles of {tiles.size} for a feature map of {(height, width)}")
-    return tiles
 
 
 def tiles_find(dev: Device, x: Array, background: float) -> Reading[np.ndarray]:
@@ -115,18 +105,8 @@ def tiles_copy(dev: Device, x: Array, from_to: Array, n: int) -> None:
     copy_list() has them; none is both. A tile and its source have the same shape.
     """
     h, w, c = x.shape
-    size, local = channel_ranges(dev, n, SIDE * SIDE, c)
-    _program(dev).launch(
-        "tiles_copy",
-        size,
-        local,
-        h=h,
-        w=w,
-        c=c,
-        n=n,
-        from_to=from_to,
-        x=x,
-    )
+    size, work_group = channel_ranges(dev, n, SIDE * SIDE, c)
+    _program(dev).launch("tiles_copy", size, work_group, h=h, w=w, c=c, n=n, from_to=from_to, x=x)
 
 
 def _program(dev):

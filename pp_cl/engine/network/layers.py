@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pp_cl.engine.device.buffers import Table
-from pp_cl.engine.layers.conv_direct import packed_shape
+from pp_cl.engine.layers.conv import packed_shape
 from pp_cl.engine.layers.tiles import VECTOR
 
 
@@ -128,8 +128,9 @@ def gradient_of(name: str) -> str:
 
 
 def levels_of(layers: list[Layer]) -> dict[str, int]:
-    """{name: level} of the network's input "x" and of all layers' outputs."""
-    return {"x": 0} | {layer.name: layer.level for layer in layers}
+    """{name: level} of the network's input "x", of all layers' outputs, and of their gradients."""
+    levels = {"x": 0} | {layer.name: layer.level for layer in layers}
+    return levels | {gradient_of(name): level for name, level in levels.items()}
 
 
 def array_shapes(layers: list[Layer], size: tuple[int, int]) -> dict[str, tuple[int, int, int]]:
@@ -137,11 +138,11 @@ def array_shapes(layers: list[Layer], size: tuple[int, int]) -> dict[str, tuple[
     = (height, width).
     """
     channels = {"x": sum(layers[0].sources)} | {layer.name: layer.channels for layer in layers}
-    shapes = {
+    channels |= {gradient_of(name): n for name, n in channels.items()}
+    return {
         name: (size[0] >> level, size[1] >> level, channels[name])
         for name, level in levels_of(layers).items()
     }
-    return shapes | {gradient_of(name): shape for name, shape in shapes.items()}
 
 
 def multiplications(layers: list[Layer], height: int, width: int) -> int:

@@ -15,10 +15,8 @@ Feature maps have the names of UNet's arrays: those of the layers, and gradient_
 tiles are (rows, columns) bool.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -30,7 +28,6 @@ from pp_cl.engine.layers.tiles import (
     SIDE,
     Tiles,
     all_tiles,
-    all_tiles_buffers,
     copy_list,
     grid_shape,
     tile_arrays,
@@ -82,7 +79,7 @@ def double(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
     """The tiles of an image of `size` = (height, width) where the gradient of the loss may differ
     from that of background over a white target: those within the loss's reach of a tile of the
-    target that is not white. Borders are left to BackwardPlan.
+    target that is not white. Borders are left to plan_backward().
 
     found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
     in the image, less than a tile.
@@ -155,19 +152,14 @@ def _read_backward(layer, computed, shape):
 
 @dataclass(frozen=True)
 class TileMap:
-    """The tiles of one feature map of `size` = (height, width).
+    """The tiles of a feature map that have equal ones.
 
     source: (rows, columns) int, the number of the computed tile that has the same values: the
-    tile's own, or its class's representative.
+    tile's own, or its class's representative. computed: (rows, columns) bool.
     """
 
-    size: tuple[int, int]
     source: np.ndarray
-
-    @cached_property
-    def computed(self) -> np.ndarray:
-        """(rows, columns) bool."""
-        return self.source == np.arange(self.source.size).reshape(self.source.shape)
+    computed: np.ndarray
 
     def count(self) -> np.ndarray:
         """(rows, columns) int: how many tiles each one stands for, itself among them; 0 for
@@ -185,12 +177,13 @@ def map_tiles(size: tuple[int, int], level: int, active: np.ndarray, border: int
     """
     rows, columns = (_classes(length, level, border * SIDE) for length in size)
     classes = (rows[:, None] * (columns.max() + 1) + columns).ravel()
-    idle, source = np.flatnonzero(~active), np.arange(active.size)
+    numbers = np.arange(active.size)
+    idle, source = np.flatnonzero(~active), numbers.copy()
     representative = np.zeros(classes.max() + 1, int)
     # assigned backwards, so that the first tile of a class remains
     representative[classes[idle[::-1]]] = idle[::-1]
     source[idle] = representative[classes[idle]]
-    return TileMap((size[0] >> level, size[1] >> level), source.reshape(active.shape))
+    return TileMap(source.reshape(active.shape), (source == numbers).reshape(active.shape))
 
 
 def _classes(length, level, border):
@@ -201,148 +194,125 @@ def _classes(length, level, border):
     return np.where(near, np.arange(len(start)), len(start))
 
 
-class AllTiles:
-    """The plan that skips nothing: a pass that computes all tiles."""
-
-    def __init__(self, dev: Device, size: tuple[int, int], layers: list[Layer]):
-        levels = levels_of(layers)
-        tiles = {n: all_tiles(dev, size[0] >> n, size[1] >> n) for n in set(levels.values())}
-        self._tiles = {name: tiles[level] for name, level in levels.items()}
-        self._tiles |= {gradient_of(name): of_level for name, of_level in self._tiles.items()}
-
-    def tiles(self, name: str) -> Tiles:
-        """The tiles of a feature map to compute."""
-        return self._tiles[name]
-
-    def fill_copies(self, name: str, array: Array) -> None:
-        """Nothing: there are no copies."""
-
-    def backward(self, arrays: dict[str, Array], lists: PackedArrays) -> AllTiles:
-        """The backward pass after this forward pass."""
-        return self
-
-
+@dataclass
 class TilePlan:
-    """A pass that computes some tiles of each feature map.
+    """Which tiles of each feature map a pass computes, and which are then copied from them.
 
-    size: (height, width) of the image. active: the tiles of the image where the pass starts.
-    radius: {name: pixels} of the feature maps that the pass computes: tiles within that distance of
-    `active` are computed; within `border` tiles more than that from the image's border they are
-    classes of their own. maps: {name: TileMap}. needed: {name: tiles that a layer reads}.
+    tiles: {name: Tiles} to compute. copies: {name: (from_to, number) of tiles_copy()}; none where
+    all tiles are computed. computed_fraction: share of the network's multiplications that is left
+    in a forward pass. For the backward pass after it, maps: {name: TileMap} of the layers' outputs;
+    active: (rows, columns) bool, the tiles of the image where it starts.
     """
 
-    def __init__(
-        self,
-        dev: Device,
-        layers: list[Layer],
-        size: tuple[int, int],
-        active: np.ndarray,
-        *,
-        radius: dict[str, int],
-        border: int = 0,
-    ):
-        self.dev, self.layers, self.size = dev, layers, size
-        levels, away, made = levels_of(layers), distance(active), {}
-        levels |= {gradient_of(name): level for name, level in levels.items()}
-        self.maps: dict[str, TileMap] = {}
-        for name, pixels in radius.items():
-            level, n = key = levels[name], _tiles_of(pixels)
-            if key not in made:
-                made[key] = map_tiles(size, level, halve(away <= n, level), border + n)
-            self.maps[name] = made[key]
-        self.needed = {name: np.zeros_like(m.computed) for name, m in self.maps.items()}
-        self._tiles: dict[int, Tiles] = {}  # {id of a TileMap: its tiles}
-        self._copies: dict[str, tuple[Array, int]] = {}  # {name: arguments of tiles_copy()}
+    tiles: dict[str, Tiles]
+    copies: dict[str, tuple[Array, int]] = field(default_factory=dict)
+    computed_fraction: float = 1.0
+    maps: dict[str, TileMap] = field(default_factory=dict)
+    active: Any = None
 
-    def upload(self, lists: PackedArrays, copied: dict[str, TileMap]) -> None:
-        """Bring all lists to the device, where they are valid until `lists` holds others.
-
-        copied: {name: TileMap} of the feature maps in `needed`, tiles of which are copied.
-        """
-        maps = {id(tile_map): tile_map for tile_map in self.maps.values()}
-        rows = [row for m in maps.values() for row in all_tiles_buffers(*m.size).values()]
-        rows += [((copied[name].source.size, 2), np.int32) for name in self.needed]
-        values = [part for m in maps.values() for part in tile_arrays(m.size, m.count())]
-        copies = {
-            name: copy_list(copied[name].source, needed & ~copied[name].computed)
-            for name, needed in self.needed.items()
-        }
-        arrays = iter(lists.send(rows, [*values, *copies.values()]))
-        for key, m in maps.items():
-            self._tiles[key] = Tiles(m.size, int(m.computed.sum()), next(arrays), next(arrays))
-        for (name, from_to), array in zip(copies.items(), arrays, strict=True):
-            self._copies[name] = array, len(from_to)
-
-    def tiles(self, name: str) -> Tiles:
-        """The tiles of a feature map to compute; of a plan that is on the device."""
-        return self._tiles[id(self.maps[name])]
-
-    def fill_copies(self, name: str, array: Array) -> None:
-        """Copy representatives to the needed tiles that were not computed."""
-        tiles_copy(self.dev, array, *self._copies[name])
+    def copy_tiles(self, dev: Device, name: str, array: Array) -> None:
+        """Copy the tiles of a feature map that are needed and were not computed."""
+        if name in self.copies:
+            tiles_copy(dev, array, *self.copies[name])
 
 
-class ForwardPlan(TilePlan):
-    """The forward pass over an image of `size`, where x differs from the background in the tiles
-    `active`.
+def plan_all(dev: Device, layers: list[Layer], size: tuple[int, int]) -> TilePlan:
+    """The plan of both passes over images of `size` = (height, width) that compute all tiles."""
+    levels = levels_of(layers)
+    tiles = {n: all_tiles(dev, size[0] >> n, size[1] >> n) for n in set(levels.values())}
+    return TilePlan({name: tiles[level] for name, level in levels.items()})
 
-    gradient_tiles: as gradient_tiles() returns it; None: all tiles. affected: the tiles of the
-    image whose receptive field holds more than background. computed_fraction: share of the
-    network's multiplications that is left.
+
+def plan_forward(
+    layers: list[Layer],
+    size: tuple[int, int],
+    active: np.ndarray,
+    gradient_tiles: np.ndarray | None,
+    lists: PackedArrays,
+    *,
+    most: float,
+) -> TilePlan | None:
+    """The forward pass over an image of `size` = (height, width), where x differs from the
+    background in the tiles `active`; None if more than `most` of the multiplications remain.
+
+    gradient_tiles: as gradient_tiles() returns it; None: all tiles. lists: where the lists of tiles
+    lie on the device, until it holds others.
     """
-
-    def __init__(
-        self,
-        dev: Device,
-        layers: list[Layer],
-        size: tuple[int, int],
-        active: np.ndarray,
-        *,
-        gradient_tiles: np.ndarray | None = None,
-    ):
-        radius, last = receptive_radius(layers), layers[-1].name
-        computed = {name: pixels for name, pixels in radius.items() if name != "x"}  # x is given
-        super().__init__(dev, layers, size, active, radius=computed)
-        for layer in layers:
-            of_layer = self.maps[layer.name].computed
-            for name in layer.inputs:
-                if name != "x":
-                    needed = self.needed[name]
-                    needed |= _read_forward(layer, of_layer, needed.shape)
-        self.needed[last][:] = True
-        self.affected = grow(active, _tiles_of(radius[last]))
-        self.gradient_tiles = np.ones_like(active) if gradient_tiles is None else gradient_tiles
-        count = {c.name: c.multiplications(*size) for c in convolutions(layers)}
-        done = sum(n * self.maps[name].computed.mean() for name, n in count.items())
-        self.computed_fraction = done / sum(count.values())
-
-    def backward(self, arrays: dict[str, Array], lists: PackedArrays) -> BackwardPlan:
-        """The backward pass, on the device; the outputs in `arrays` are completed where it reads
-        them.
-        """
-        plan = BackwardPlan(self)
-        plan.upload(lists, self.maps | plan.maps)
-        for name in plan.needed.keys() - plan.maps.keys():
-            plan.fill_copies(name, arrays[name])
-        return plan
+    radius, last = receptive_radius(layers), layers[-1].name
+    affected = grow(active, _tiles_of(radius[last]))
+    del radius["x"]  # which is given
+    maps = _map_all(layers, size, active, radius)
+    count = {c.name: c.multiplications(*size) for c in convolutions(layers)}
+    done = sum(n * maps[name].computed.mean() for name, n in count.items()) / sum(count.values())
+    if done > most:
+        return None
+    needed = {name: np.zeros_like(of_layer.computed) for name, of_layer in maps.items()}
+    for layer in layers:
+        for name in needed.keys() & layer.inputs:
+            needed[name] |= _read_forward(layer, maps[layer.name].computed, needed[name].shape)
+    needed[last][:] = True
+    plan = _send(levels_of(layers), size, maps, needed, maps, lists)
+    plan.computed_fraction, plan.maps = done, maps
+    plan.active = affected | (True if gradient_tiles is None else gradient_tiles)
+    return plan
 
 
-class BackwardPlan(TilePlan):
-    """The backward pass after a forward pass. Among the needed tiles are those of forward outputs
-    that it reads, as inputs of layers and as masks of ReLUs.
+def plan_backward(
+    layers: list[Layer], size: tuple[int, int], forward: TilePlan, lists: PackedArrays
+) -> TilePlan:
+    """The backward pass after a forward pass. Among the copies are those of forward outputs that it
+    reads, as inputs of layers and as masks of ReLUs. lists: as of plan_forward().
     """
+    if not forward.maps:
+        return forward
+    border = _tiles_of(max(LOSS_BORDER, receptive_radius(layers)[layers[-1].name]))
+    maps = _map_all(layers, size, forward.active, gradient_radius(layers), border)
+    needed = {name: np.zeros_like(of_map.computed) for name, of_map in maps.items()}
+    for layer in layers:
+        grad = gradient_of(layer.name)
+        for name in layer.inputs:
+            at_input = maps[gradient_of(name)].computed
+            needed[grad] |= _read_backward(layer, at_input, needed[grad].shape)
+            if layer.reads_input_backward and name != "x":
+                reads = _read_forward(layer, maps[grad].computed, at_input.shape) | at_input
+                needed[name] = needed.get(name, False) | reads
+    needed[gradient_of("x")][:] = True
+    return _send(levels_of(layers), size, maps, needed, forward.maps | maps, lists)
 
-    def __init__(self, forward: ForwardPlan):
-        dev, layers, size = forward.dev, forward.layers, forward.size
-        border = _tiles_of(max(LOSS_BORDER, receptive_radius(layers)[layers[-1].name]))
-        active = forward.affected | forward.gradient_tiles
-        super().__init__(dev, layers, size, active, radius=gradient_radius(layers), border=border)
-        for layer in layers:
-            out = self.maps[gradient_of(layer.name)].computed
-            for name in layer.inputs:
-                at_input = self.maps[gradient_of(name)].computed
-                self.needed[gradient_of(layer.name)] |= _read_backward(layer, at_input, out.shape)
-                if layer.reads_input_backward and name != "x":
-                    reads = _read_forward(layer, out, at_input.shape) | at_input
-                    self.needed[name] = self.needed.get(name, False) | reads
-        self.needed[gradient_of("x")][:] = True
+
+def _map_all(layers, size, active, radius, border=0):
+    """{name: TileMap} of feature maps in an image of `size`, some of which are one.
+
+    radius: {name: pixels}: tiles within that distance of the `active` tiles of the image are
+    computed; within `border` tiles more than that from its border they are classes of their own.
+    """
+    levels, away, made = levels_of(layers), distance(active), {}
+    keys = {name: (levels[name], _tiles_of(pixels)) for name, pixels in radius.items()}
+    for level, n in set(keys.values()):
+        made[level, n] = map_tiles(size, level, halve(away <= n, level), border + n)
+    return {name: made[key] for name, key in keys.items()}
+
+
+def _send(levels, size, maps, needed, copied, lists):
+    """TilePlan whose lists are sent to the device.
+
+    maps: {name: TileMap} of what the pass computes. needed: {name: (rows, columns) bool} of what it
+    reads. copied: {name: TileMap} of what is needed.
+    """
+    distinct = {id(of_map): (levels[name], of_map) for name, of_map in maps.items()}
+    rows, values, tiles = [], [], {}
+    for level, of_map in distinct.values():
+        rows += [((3 + of_map.source.size,), np.int32), (of_map.source.shape, np.float32)]
+        values += tile_arrays((size[0] >> level, size[1] >> level), of_map.count())
+    for name, chosen in needed.items():
+        rows.append(((chosen.size, 2), np.int32))
+        values.append(copy_list(copied[name].source, chosen & ~copied[name].computed))
+    arrays = iter(lists.send(rows, values))
+    for key, (level, of_map) in distinct.items():
+        here, number = (size[0] >> level, size[1] >> level), int(of_map.computed.sum())
+        tiles[key] = Tiles(here, number, list=next(arrays), count=next(arrays))
+    numbers = map(len, values[2 * len(distinct) :])
+    return TilePlan(
+        {name: tiles[id(of_map)] for name, of_map in maps.items()},
+        {name: copy for name, *copy in zip(needed, arrays, numbers, strict=True)},
+    )

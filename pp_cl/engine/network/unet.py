@@ -1,10 +1,6 @@
-"""The U-Net on a device: its parameters, and its forward and its backward pass, which are lists of
-launches, made once for images of one size.
-"""
+"""The U-Net on a device: its parameters, and its forward and its backward pass."""
 
 import math
-import weakref
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,18 +9,16 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import PackedArrays, Table, packed_arrays, table_bytes
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.choice import AUTO, blocking_of, choose
-from pp_cl.engine.layers.conv_direct import (
+from pp_cl.engine.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out, work_shape
+from pp_cl.engine.layers.conv import (
+    Conv,
     ConvShape,
-    DirectConv,
-    Direction,
-    Layout,
-    Sums,
+    first_float,
     pack_bias,
     pack_weights,
     sum_parts,
-    table_of_sums,
 )
+from pp_cl.engine.layers.conv_winograd import scratch_floats
 from pp_cl.engine.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
@@ -46,184 +40,74 @@ from pp_cl.engine.network.layers import (
     share_buffers,
     unet_layers,
 )
-from pp_cl.engine.network.tile_plan import AllTiles, ForwardPlan, gradient_tiles
+from pp_cl.engine.network.tile_plan import (
+    TilePlan,
+    gradient_tiles,
+    plan_all,
+    plan_backward,
+    plan_forward,
+)
 from pp_cl.settings import NetworkConfig
 
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 WHITE = 1.0  # of a target where its photograph is transparent
+SIMPLE = {"gate": gate_forward, "pool": avgpool2_forward, "upsample": upsample2_forward}
 
 Size = tuple[int, int]  # (height, width)
-# What is computed for a convolution: its layer, a direction, the input whose gradient it is.
-Work = tuple[str, Direction, int | None]
-Launch = tuple[Any, ...]  # a method of Pass, and its arguments before the tiles
+Convs = dict[tuple[str, str, int | None], Conv]  # {(layer, direction, source): Conv}
 
 
-class Pass:
-    """The forward pass over images of one size, or that and the backward pass: where the arrays
-    lie, and the launches in order.
+class Workspace:
+    """What the forward pass over images of one size works in, or that and the backward pass.
 
-    training: with the backward pass. size: of the images. arrays: {name: feature map}, gradients by
-    gradient_of(name); some share a buffer, one after the other. "x", the caller's, is there while a
-    pass runs. forward, backward: the launches. all_tiles: every tile of every feature map.
+    size: of the images. arrays: {name: feature map}, gradients by gradient_of(name); some share a
+    buffer, one after the other. "x", the caller's, is there while a pass runs. convs: what computes
+    the convolutions, with their arrays, all of which lie in `work`. all_tiles: the plan that skips
+    nothing. is_laid_out: whether the weights in `work` are the network's.
     """
 
-    def __init__(self, net: "UNet", training: bool):
-        # weakly: in a circle the buffers would live until the garbage collector runs
-        self.net: UNet = weakref.proxy(net)
-        self.training = training
+    def __init__(self) -> None:
         self.size: Size = (0, 0)
         self.arrays: dict[str, Array] = {}
-        self.forward: list[Launch] = []
-        self.backward: list[Launch] = []
+        self.convs: Convs = {}
+        self.work: Any = None
         self.all_tiles: Any = None
-        self.is_laid_out = False  # the weights, for the kernels
+        self.is_laid_out = False
         self._buffers: list[Any] = []
-        self._work: Any = None  # all of _work_table(), in one array
-        self._jobs: dict[Callable, list[Layout]] = {}  # {lay_out() of a variant: what it lays out}
-        self._sums: list[Sums] = []
-        self._table = net.dev.empty((len(convolutions(net.layers)), 8), np.int32)
 
-    def plan(self, size: Size) -> None:
-        """Make room for images of this size, in the same buffers where they are large enough, and
-        list the launches. The arrays are undefined then.
+    def plan(self, net: "UNet", size: Size, training: bool) -> None:
+        """Make room for images of this size, in the same buffers where they are large enough. The
+        arrays are undefined then.
         """
-        net, self.size, self.is_laid_out = self.net, (0, 0), False
-        self.forward, self.backward, self.all_tiles = [], [], None  # frees the old arrays first
-        self._place_feature_maps(size)
-        convs, self.all_tiles = self._place_work(size), AllTiles(net.dev, size, net.layers)
-        for layer in net.layers:
-            conv = convs.get((layer.name, Direction.FORWARD, None))
-            self.forward += [(Pass._compute, layer, conv), (Pass._copy, layer.name)]
-        for layer in reversed(net.layers) if self.training else ():
-            self.backward.append((Pass._copy, gradient_of(layer.name)))
-            if layer.kind == "conv":
-                conv = convs[layer.name, Direction.BACKWARD_WEIGHTS, None]
-                self.backward.append((Pass._compute_gradient_of_weights, layer, conv))
-            for i in range(len(layer.inputs)):
-                conv = convs.get((layer.name, Direction.BACKWARD_INPUT, i))
-                self.backward.append((Pass._compute_gradient, layer, i, conv))
-        self.backward.append((Pass._copy, gradient_of("x")))
-        self.size = size
-
-    def run(self, launches: list[Launch], tiles: Any) -> None:
-        """Launch `forward` or `backward`. tiles: an AllTiles or TilePlan, which says what tiles of
-        each feature map to compute.
-        """
-        for launch, *given in launches:
-            launch(self, *given, tiles)
-
-    def _place_feature_maps(self, size):
-        shapes = array_shapes(self.net.layers, size)
-        shared = share_buffers(lifetimes(self.net.layers, self.training), shapes)
-        self.arrays = {}
+        self.size, self.is_laid_out = (0, 0), False
+        # frees the old arrays first
+        self.arrays, self.convs, self.work, self.all_tiles = {}, {}, None, None
+        maps = array_shapes(net.layers, size)
+        shared = share_buffers(lifetimes(net.layers, training), maps)
         self._buffers += [None] * (len(shared) - len(self._buffers))
         for i, buffer in enumerate(shared):
             if self._buffers[i] is None or self._buffers[i].size < buffer.floats:
                 self._buffers[i] = None  # frees the old one first
-                self._buffers[i] = self.net.dev.empty((buffer.floats,))
+                self._buffers[i] = net.dev.empty((buffer.floats,))
             for name in buffer.names:
-                floats = math.prod(shapes[name])
-                self.arrays[name] = self._buffers[i][:floats].reshape(shapes[name])
-
-    def _place_work(self, size):
-        """{Work: (what computes it, its array)}: the weights as the kernels read them, or room for
-        the parts of the gradients.
-        """
-        convs, self._work, self._jobs = self.net.work(size, self.training), None, defaultdict(list)
-        rows = _work_table(convs)
-        whole, arrays = packed_arrays(self.net.dev, [*rows.values()])
-        self._work, work = whole.view(np.float32), dict(zip(rows, arrays, strict=True))
-        found = {}
-        for key, conv in convs.items():
-            weight = self.net.parameters[f"{key[0]}.weight"]
-            found[key] = conv, work.get(key, weight)
-            if key in work and conv.shape.direction is not Direction.BACKWARD_WEIGHTS:
-                places = _first_float(weight), _first_float(work[key])
-                self._jobs[conv.lay_out].append((conv.shape, *places))
-        return found
-
-    def lay_out(self) -> None:
-        """Lay out the weights for the kernels, in a launch for each kind of layout."""
-        for lay_out, jobs in self._jobs.items():
-            lay_out(self.net.dev, self.net.all_parameters, jobs, self._work)
-        self.is_laid_out = True
-
-    def sum_parts(self) -> None:
-        """Overwrite the gradients of all parameters by the sums of the parts that `backward` has
-        left.
-        """
-        net = self.net
-        rows, n = table_of_sums(self._sums)
-        net.dev.send(self._table, np.array(rows, np.int32))
-        sum_parts(net.dev, self._table, n, self._work, net.all_gradients, net.all_gradients)
-        self._sums = []
-
-    # ---- launches
-
-    def _compute(self, layer, planned, tiles):
-        """Compute a layer's output. planned: of a convolution, what computes it and its weights."""
-        net, arrays, of_layer = self.net, self.arrays, tiles.tiles(layer.name)
-        sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
-        if layer.kind == "gate":
-            gate_forward(net.dev, sources[0], out, tiles=of_layer)
-        elif layer.kind == "pool":
-            avgpool2_forward(net.dev, sources[0], out, tiles=of_layer)
-        elif layer.kind == "upsample":
-            upsample2_forward(net.dev, sources[0], out, tiles=of_layer)
-        else:
-            conv, weights = planned
-            bias = net.parameters[f"{layer.name}.bias"]
-            conv.forward(sources, weights, bias, out, relu=layer.relu, tiles=of_layer)
-
-    def _compute_gradient(self, layer, source, planned, tiles):
-        """Compute the gradient of a layer's input of number `source`. planned: of a convolution,
-        what computes it and its weights.
-        """
-        net, name = self.net, layer.inputs[source]
-        x, grad_x = self.arrays[name], self.arrays[gradient_of(name)]
-        grad_out = self.arrays[gradient_of(layer.name)]
-        of_input = tiles.tiles(gradient_of(name))
-        mask = x if name in net.relu_outputs else None
-        if layer.kind == "gate":
-            gate_backward(net.dev, x, grad_out, grad_x, tiles=of_input)
-        elif layer.kind == "pool":  # adds to the gradient of the skip
-            avgpool2_backward(net.dev, mask, grad_out, grad_x, tiles=of_input)
-        elif layer.kind == "upsample":
-            upsample2_backward(net.dev, grad_out, grad_x, tiles=of_input)
-        else:
-            conv, weights = planned
-            conv.backward_input(weights, grad_out, grad_x, mask=mask, tiles=of_input)
-
-    def _compute_gradient_of_weights(self, layer, planned, tiles):
-        """Compute the parts of the gradients of a convolution's weights and bias. planned: what
-        computes them, and where they go.
-        """
-        net, grad = self.net, gradient_of(layer.name)
-        conv, parts = planned
-        sources = tuple(self.arrays[name] for name in layer.inputs)
-        count = conv.backward_weights(sources, self.arrays[grad], parts, tiles=tiles.tiles(grad))
-        gradients = (net.gradients[f"{layer.name}.{kind}"] for kind in ("weight", "bias"))
-        self._sums.append((parts.shape, count, *map(_first_float, (parts, *gradients))))
-
-    def _copy(self, name, tiles):
-        """Copy the tiles of a feature map that were not computed from equal ones."""
-        tiles.fill_copies(name, self.arrays[name])
+                floats = math.prod(maps[name])
+                self.arrays[name] = self._buffers[i][:floats].reshape(maps[name])
+        self.convs = net.convolutions(size, training)
+        needed = _work_rows(self.convs)
+        whole, arrays = packed_arrays(net.dev, [*needed.values()])
+        self.work = whole.view(np.float32)
+        for key, array in zip(needed, arrays, strict=True):
+            self.convs[key].work = array
+        self.all_tiles = plan_all(net.dev, net.layers, size)
+        self.size = size
 
 
-def _work_table(convs):
-    """{Work: (shape, dtype)} of the arrays that convolutions take beside a layer's own."""
-    return {key: (c.work_shape, np.float32) for key, c in convs.items() if c.work_shape}
-
-
-def _row_of(array):
-    return array.shape, array.dtype
-
-
-def _first_float(array):
-    """Where an array of packed_arrays() begins in the whole."""
-    return array.base_data.offset // array.dtype.itemsize
+def _work_rows(convs):
+    """{key: (shape, dtype)} of the arrays that convolutions take beside a layer's own."""
+    shapes = {key: work_shape(conv.variant, conv.shape) for key, conv in convs.items()}
+    return {key: (shape, np.float32) for key, shape in shapes.items() if shape}
 
 
 class UNet:
@@ -266,9 +150,9 @@ class UNet:
             dev.write(self.parameters[layer.name + ".weight"], pack_weights(weight))
             dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
         self.relu_outputs = {layer.name for layer in self.layers if layer.relu}
-        self._passes: dict[bool, Pass] = {}  # {training: Pass}
+        self._workspaces: dict[bool, Workspace] = {}  # {training: Workspace}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
-        self._trained: Any = None  # tiles of the last forward(training=True), until its backward()
+        self._trained: Any = None  # plan of the last forward(training=True), until its backward()
         self._is_frozen = False
 
     @classmethod
@@ -292,7 +176,7 @@ class UNet:
         """{name of a parameter: its part of an array that is laid out as all_parameters}."""
         parts = {}
         for name, parameter in self.parameters.items():
-            start = _first_float(parameter)
+            start = first_float(parameter)
             parts[name] = whole[start : start + parameter.size].reshape(parameter.shape)
         return parts
 
@@ -301,7 +185,7 @@ class UNet:
         once, not for each image, and training is refused.
         """
         self._is_frozen = True
-        self._passes.clear()
+        self._workspaces.clear()
 
     @staticmethod
     def is_planned(size: tuple[int, int]) -> bool:
@@ -310,7 +194,7 @@ class UNet:
 
     def plan_tiles(
         self, size: tuple[int, int], active: np.ndarray, gradient_tiles: np.ndarray | None = None
-    ) -> ForwardPlan | None:
+    ) -> TilePlan | None:
         """Which tiles to compute for features of `size` = (height, width) that are the same in all
         tiles but the `active` ones, (rows, columns) bool; None = all, as few would be saved.
 
@@ -321,11 +205,8 @@ class UNet:
         """
         if not self.is_planned(size):
             return None
-        plan = ForwardPlan(self.dev, self.layers, size, active, gradient_tiles=gradient_tiles)
-        if plan.computed_fraction > MOST_COMPUTED:
-            return None
-        plan.upload(self._tile_lists["forward"], plan.maps)
-        return plan
+        lists = self._tile_lists["forward"]
+        return plan_forward(self.layers, size, active, gradient_tiles, lists, most=MOST_COMPUTED)
 
     def gradient_tiles(
         self,
@@ -347,7 +228,7 @@ class UNet:
         beside = False if ignored is None else tiles_with(ignored)
         return lambda: gradient_tiles(found.get() | beside, size, (corner[0], corner[1]))
 
-    def forward(self, x: Array, training: bool = True, plan: ForwardPlan | None = None) -> Array:
+    def forward(self, x: Array, training: bool = True, plan: TilePlan | None = None) -> Array:
         """(H, W, 3) image of the features x (H, W, 16); H and W are multiples of 4.
 
         The result is in a buffer of the network: the next call overwrites it. training: keep what
@@ -360,23 +241,31 @@ class UNet:
         taken = sum(self.layers[0].sources)
         if height % self.multiple or width % self.multiple or channels != taken:
             raise ValueError(f"the network takes (4n, 4m, {taken}) features, not {x.shape}")
-        if training not in self._passes:
-            self._passes[training] = Pass(self, training)
+        space = self._workspaces.setdefault(training, Workspace())
         if training:
             self._trained = None  # its arrays are overwritten
-        planned = self._passes[training]
-        if planned.size != (height, width):
-            planned.plan((height, width))
-        if not (self._is_frozen and planned.is_laid_out):
-            planned.lay_out()
-        planned.arrays["x"], tiles = x, plan or planned.all_tiles
-        planned.run(planned.forward, tiles)
-        out = planned.arrays[self.layers[-1].name]
+        if space.size != (height, width):
+            space.plan(self, (height, width), training)
+        if not (self._is_frozen and space.is_laid_out):
+            lay_out(self.dev, space.convs.values(), self.all_parameters, space.work)
+            space.is_laid_out = True
+        arrays, plan = space.arrays, plan or space.all_tiles
+        arrays["x"] = x
+        for layer in self.layers:
+            sources, out = [arrays[name] for name in layer.inputs], arrays[layer.name]
+            tiles = plan.tiles[layer.name]
+            if layer.kind == "conv":
+                conv = space.convs[layer.name, "forward", None]
+                variant = VARIANTS[conv.variant]
+                variant.forward(conv, sources, out, relu=layer.relu, tiles=tiles)
+            else:
+                SIMPLE[layer.kind](self.dev, sources[0], out, tiles=tiles)
+            plan.copy_tiles(self.dev, layer.name, out)
         output_forward(self.dev, out, x if self._residual else None)
         if training:
-            self._trained = tiles
+            self._trained = plan
         else:
-            del planned.arrays["x"]  # so that the caller can free it
+            del arrays["x"]  # so that the caller can free it
         return out
 
     def backward(self, grad_y: Array) -> Array:
@@ -389,38 +278,69 @@ class UNet:
         """
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
-        planned, tiles, self._trained = self._passes[True], self._trained, None
-        output_backward(self.dev, grad_y, planned.arrays[gradient_of(self.layers[-1].name)])
-        tiles = tiles.backward(planned.arrays, self._tile_lists["backward"])
-        planned.run(planned.backward, tiles)
-        grad_x = planned.arrays[gradient_of("x")]
+        dev, space, plan = self.dev, self._workspaces[True], self._trained
+        arrays, convs, self._trained = space.arrays, space.convs, None
+        output_backward(dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
+        plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
+        for name in sorted(plan.copies.keys() - plan.tiles.keys()):  # outputs that it reads
+            plan.copy_tiles(dev, name, arrays[name])
+        parts = []
+        for layer in reversed(self.layers):
+            grad_out = arrays[gradient_of(layer.name)]
+            plan.copy_tiles(dev, gradient_of(layer.name), grad_out)
+            if layer.kind == "conv":
+                conv = convs[layer.name, "weights", None]
+                sources = [arrays[name] for name in layer.inputs]
+                tiles = plan.tiles[gradient_of(layer.name)]
+                count = VARIANTS[conv.variant].backward_weights(
+                    conv, sources, grad_out, tiles=tiles
+                )
+                parts.append((conv, count))
+            for i, name in enumerate(layer.inputs):
+                x, grad_x = arrays[name], arrays[gradient_of(name)]
+                tiles = plan.tiles[gradient_of(name)]
+                mask = x if name in self.relu_outputs else None
+                if layer.kind == "gate":
+                    gate_backward(dev, x, grad_out, grad_x, tiles=tiles)
+                elif layer.kind == "pool":  # adds to the gradient of the skip
+                    avgpool2_backward(dev, mask, grad_out, grad_x, tiles=tiles)
+                elif layer.kind == "upsample":
+                    upsample2_backward(dev, grad_out, grad_x, tiles=tiles)
+                else:
+                    conv = convs[layer.name, "input", i]
+                    variant = VARIANTS[conv.variant]
+                    variant.backward_input(conv, grad_out, grad_x, mask=mask, tiles=tiles)
+        grad_x = arrays[gradient_of("x")]
+        plan.copy_tiles(dev, gradient_of("x"), grad_x)
         if self._residual:
-            residual_backward(self.dev, grad_y, grad_x)
-        planned.sum_parts()
-        del planned.arrays["x"]
+            residual_backward(dev, grad_y, grad_x)
+        sum_parts(dev, parts, space.work, self.all_gradients, self.all_gradients)
+        del arrays["x"]
         return grad_x
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its
         backward pass.
         """
-        return self._passes[True].arrays[name]
+        return self._workspaces[True].arrays[name]
 
-    def work(self, size: Size, training: bool) -> dict[Work, DirectConv]:
-        """All that is computed for convolutions: their outputs, and for training the gradients of
-        the weights and of each input.
+    def convolutions(self, size: Size, training: bool) -> Convs:
+        """What computes the convolutions of images of a size: their outputs, and for training the
+        gradients of the weights and of each input. They have no arrays of their own yet.
         """
-        found = {}
+        found: Convs = {}
         for layer in convolutions(self.layers):
-            ways: list[tuple[Direction, int | None]] = [(Direction.FORWARD, None)]
+            here = size[0] >> layer.level, size[1] >> layer.level
+            ways: list[tuple[str, int | None]] = [("forward", None)]
             if training:
-                ways.append((Direction.BACKWARD_WEIGHTS, None))
-                ways += [(Direction.BACKWARD_INPUT, i) for i in range(len(layer.sources))]
+                ways += [("weights", None), *(("input", i) for i in range(len(layer.sources)))]
             for direction, source in ways:
-                here = size[0] >> layer.level, size[1] >> layer.level
                 of_layer = layer.kernel_size, layer.sources, layer.channels
                 shape = ConvShape(direction, *of_layer, here, source)
-                conv = choose(self.dev, shape, self.variant)(self.dev, self.blocking, shape)
+                variant = choose(self.dev, shape, self.variant)
+                given = self.gradients if direction == "weights" else self.parameters
+                arrays = given[f"{layer.name}.weight"], given[f"{layer.name}.bias"]
+                conv = Conv(self.dev, self.blocking, variant, shape, *arrays)
                 found[layer.name, direction, source] = conv
         return found
 
@@ -429,13 +349,14 @@ class UNet:
         another: its parameters, the feature maps and work of both passes, and the scratch memory
         that their convolutions share, which grows with the device's compute units.
         """
-        table: Table = dict.fromkeys(("parameters", "gradients"), _row_of(self.all_parameters))
-        scratch = 0
+        whole = self.all_parameters.shape, np.float32
+        table: Table = {"parameters": whole, "gradients": whole}
+        scratch = [0]
         for training, size in ((True, crop), (False, image)):
-            convs = self.work(size, training)
-            shapes = array_shapes(self.layers, size)
-            shared = share_buffers(lifetimes(self.layers, training), shapes)
+            convs, maps = self.convolutions(size, training), array_shapes(self.layers, size)
+            shared = share_buffers(lifetimes(self.layers, training), maps)
             table |= {f"{training} {i}": ((b.floats,), np.float32) for i, b in enumerate(shared)}
-            table[f"{training} work"] = (table_bytes(_work_table(convs)),), np.uint8
-            scratch = max(scratch, *(conv.scratch_floats() for conv in convs.values()))
-        return table | {"scratch": ((scratch,), np.float32)}
+            table[f"{training} work"] = (table_bytes(_work_rows(convs)),), np.uint8
+            transformed = [conv for conv in convs.values() if conv.variant == "winograd"]
+            scratch += map(scratch_floats, transformed)
+        return table | {"scratch": ((max(scratch),), np.float32)}

@@ -61,21 +61,21 @@ def test_a_nan_is_the_largest_of_its_pool(dev, rng):
 
 def test_gates_of_other_shapes_are_refused(dev):
     x = dev.zeros((2, 3, 32))
-    with pytest.raises(ValueError, match="expected \\(2, 3, 64\\)"):
+    with pytest.raises(ValueError, match="x has shape \\(2, 3, 32\\), expected"):
         gate_forward(dev, x, x)
-    with pytest.raises(ValueError, match="expected \\(2, 4, 32\\)"):
+    with pytest.raises(ValueError, match="x has shape \\(2, 3, 32\\), expected"):
         gate_backward(dev, x, dev.zeros((2, 4, 16)), x)
 
 
 def test_outputs_of_other_shapes_are_refused(dev):
-    for features, image in (((4, 5, 16), (5, 4, 3)), ((4, 5, 2), (4, 5, 3))):
-        features, image = dev.zeros(features), dev.zeros(image)
-        with pytest.raises(ValueError, match="is none of features"):
-            output_forward(dev, image, features)
-        with pytest.raises(ValueError, match="is none of features"):
-            output_backward(dev, image, features)
-        with pytest.raises(ValueError, match="is none of features"):
-            residual_backward(dev, image, features)
+    features, image = dev.zeros((4, 5, 16)), dev.zeros((5, 4, 3))
+    for call, *given in (
+        (output_forward, image, features),
+        (output_backward, image, features),
+        (residual_backward, image, features),
+    ):
+        with pytest.raises(ValueError, match="has shape .*, expected"):
+            call(dev, *given)
 
 
 def test_the_residual_connection_adds_to_the_network(dev, rng):
@@ -102,7 +102,7 @@ def test_resampling_to_other_shapes_is_refused(dev):
         (simple.upsample2_forward, (small, large)),
         (simple.upsample2_backward, (large, small)),
     ):
-        with pytest.raises(ValueError, match="expected \\(4, 6, 16\\)"):
+        with pytest.raises(ValueError, match="\\(4, 7, 16\\), expected"):
             call(dev, *given)
     pooled = dev.zeros((2, 4, 16))
     with pytest.raises(ValueError, match="max pooling"):

@@ -21,8 +21,6 @@ from pp_cl.engine.layers.tiles import (
     SIDE,
     VECTOR,
     all_tiles,
-    all_tiles_buffers,
-    checked_tiles,
     some_tiles,
 )
 from pp_cl.reference import network
@@ -32,14 +30,11 @@ def test_lists_and_wrong_sizes(dev):
     tiles = some_tiles(dev, (9, 6), np.array([[0, 2], [1, 0], [0, 5]]))
     np.testing.assert_array_equal(tiles.list.get(), [9, 6, 3, 1, 2, 5])
     np.testing.assert_array_equal(tiles.count.get(), [[0, 2], [1, 0], [0, 5]])
-    assert checked_tiles(dev, tiles, 9, 6) is tiles
-    whole = all_tiles(dev, 9, 6)
-    assert whole.number == 6
-    for name, (shape, dtype) in all_tiles_buffers(9, 6).items():
-        assert getattr(whole, name).shape == shape and getattr(whole, name).dtype == dtype
-    np.testing.assert_array_equal(checked_tiles(dev, None, 9, 6).list.get(), whole.list.get())
+    np.testing.assert_array_equal(all_tiles(dev, 9, 6).list.get(), [9, 6, 6, *range(6)])
+    np.testing.assert_array_equal(all_tiles(dev, 9, 6).count.get(), np.ones((3, 2)))
+    tiles.check((9, 6))
     with pytest.raises(ValueError, match="\\(9, 6\\).*\\(9, 7\\)"):
-        checked_tiles(dev, tiles, 9, 7)
+        tiles.check((9, 7))
     with pytest.raises(ValueError, match="no tile"):
         some_tiles(dev, (9, 6), np.zeros((3, 2)))
 
@@ -76,7 +71,7 @@ def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
         call(dev, *[dev.upload(given) for given in inputs], result, tiles=tiles)
         np.testing.assert_array_equal(result.get()[~chosen], start[~chosen])
         assert relative_error(result.get()[chosen], expected[chosen]) < 2e-6, call.__name__
-        with pytest.raises(ValueError, match="tiles of"):
+        with pytest.raises(ValueError, match="tile_count has shape"):
             call(dev, *[dev.upload(given) for given in inputs], result, tiles=others)
 
 

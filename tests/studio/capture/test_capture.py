@@ -46,29 +46,36 @@ def near():
     return found
 
 
-@pytest.fixture(scope="module")
-def shot(session_device, tmp_path_factory):
-    """A folder with photographs of the demo in a room, and the folder of their masks."""
-    folder = tmp_path_factory.mktemp("shot")
+def photograph(folder):
+    """Make photographs of the demo in a room, their masks, and the scene of both."""
     for name in ("photographs", "masks"):
-        (folder / name).mkdir()
+        (folder / name).mkdir(parents=True)
     for i, camera in enumerate(near()):
-        rgba = render(session_device, camera)
+        rgba = render(open_device(), camera)
         alpha = rgba[..., 3:] / 255
         write_png(
             folder / "photographs" / f"{i:03d}.png",
             rgba[..., :3] / 255 * alpha + room(camera) * (1 - alpha),
         )
         write_png(folder / "masks" / f"{i:03d}.png", rgba[..., 3])
-    return folder / "photographs", folder / "masks"
+    words = folder / "photographs", folder / "scene", "--masks", folder / "masks"
+    assert capture(*words) == (0, [])
 
 
 @pytest.fixture(scope="module")
-def captured(shot, tmp_path_factory):
-    """The scene made of them."""
-    scene = tmp_path_factory.mktemp("captured") / "scene"
-    assert capture(shot[0], scene, "--masks", shot[1]) == (0, [])
-    return scene
+def captured(runs, tmp_path_factory):
+    """A scene that was made of photographs."""
+    made, folder = runs.made("captured", photograph), tmp_path_factory.mktemp("captured") / "made"
+    shutil.copytree(made, folder)
+    options = folder / "scene" / "capture" / "options.json"
+    options.write_text(options.read_text().replace(str(made), str(folder)))
+    return folder / "scene"
+
+
+@pytest.fixture(scope="module")
+def shot(captured):
+    """The folder of the photographs, and that of their masks."""
+    return captured.parent / "photographs", captured.parent / "masks"
 
 
 def capture(source, scene, *more):

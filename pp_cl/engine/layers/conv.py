@@ -1,0 +1,180 @@
+"""What all convolutions share: the layout of weights, and the sums of the parts of their gradients.
+
+All are convolutions K x K (K = 1 or 3) of stride 1 with zero padding K // 2. conv_direct.py,
+conv_local.py and conv_winograd.py compute them, each with the functions forward(),
+backward_input() and backward_weights(); choice.py says which one is taken.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes, row_parts
+from pp_cl.engine.layers.tiles import VECTOR
+
+# What of a convolution is computed: its output, the gradient of one of its inputs, or the gradients
+# of its weights and bias.
+DIRECTIONS = ("forward", "input", "weights")
+# The parts of gradients take at most this many floats (64 MiB), or one part if that is larger.
+PARTIAL_FLOATS = 1 << 24
+
+
+@dataclass(frozen=True)
+class ConvShape:
+    """One direction of a convolution.
+
+    direction: one of DIRECTIONS. k: side of the kernel. sources: channels of each input, one or
+    two, which are read as one. co: output channels. size: (height, width) of the image. source:
+    index of the input whose gradient is computed, None in the other directions.
+    """
+
+    direction: str
+    k: int
+    sources: tuple[int, ...]
+    co: int
+    size: tuple[int, int]
+    source: int | None = None
+
+    @property
+    def ci(self) -> int:
+        """Input channels; of a gradient of the input, those of its one source."""
+        return sum(self.sources) if self.source is None else self.sources[self.source]
+
+    @property
+    def first(self) -> int:
+        """The input channel of the weights that is the first of `ci`."""
+        return sum(self.sources[: self.source or 0])
+
+    @property
+    def products(self) -> int:
+        """Multiplications of weights by values for one pixel, counted as direct convolutions."""
+        return self.k**2 * self.ci * self.co
+
+
+@dataclass(frozen=True)
+class Blocking:
+    """Sizes that kernels are built and launched with. They change speed, and the rounding of
+    winograd_backward_weights.cl, which sums `winograd_weights` tiles at a time.
+
+    direct: (pixels of a row, groups of 16 output channels, work-group) of a work-item of conv.cl,
+    where the groups come in multiples of that number; direct_odd: the same for other channels.
+    accumulators: float16 sums that a work-item of conv_backward_weights.cl keeps in registers;
+    work_group: its work-group, None = the launcher's default. winograd_groups: groups of 16 output
+    channels that winograd.cl multiplies together, where the groups come in multiples of that
+    number. winograd: (tiles transformed at a time, tiles multiplied together) there;
+    winograd_narrow: the same for few channels (conv_winograd.NARROW). winograd_weights: tiles
+    transformed at a time by winograd_backward_weights.cl.
+    """
+
+    direct: tuple[int, int, tuple[int, int, int]]
+    direct_odd: tuple[int, int, tuple[int, int, int]]
+    accumulators: int
+    work_group: tuple[int, int, int] | None
+    winograd_groups: int = 2
+    # More tiles at a time use the transformed weights better, fewer leave more room in the caches.
+    # The second number divides the first: with 2 groups of channels, 8 take 16 of AVX-512's 32
+    # vectors, 12 take 24.
+    winograd: tuple[int, int] = (64, 8)
+    winograd_narrow: tuple[int, int] = (12, 12)
+    winograd_weights: int = 32
+
+
+@dataclass
+class Conv:
+    """One direction of a layer's convolution on a device.
+
+    variant: what computes it, a key of choice.VARIANTS. weight, bias: the layer's, (ceil(CO/16), K,
+    K, CI, 16) and (ceil(CO/16) * 16,) float32; of the direction "weights" their gradients. work: of
+    choice.work_shape(): the weights as the kernels read them, by default as they are, or the parts
+    of the gradients.
+    """
+
+    dev: Device
+    blocking: Blocking
+    variant: str
+    shape: ConvShape
+    weight: Array
+    bias: Array
+    work: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.work = self.weight
+
+
+def pack_weights(weight: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+    """(CO, CI, K, K) -> (ceil(CO / 16), K, K, CI, 16), output channels beyond CO zero."""
+    co, ci, k, _ = weight.shape
+    packed = np.zeros((-(-co // VECTOR) * VECTOR, ci, k, k), dtype)
+    packed[:co] = weight
+    return np.ascontiguousarray(packed.reshape(-1, VECTOR, ci, k, k).transpose(0, 3, 4, 2, 1))
+
+
+def unpack_weights(packed: np.ndarray, co: int) -> np.ndarray:
+    """The inverse of pack_weights: (CO, CI, K, K)."""
+    blocks, k, _, ci, _ = packed.shape
+    return packed.transpose(0, 4, 3, 1, 2).reshape(blocks * VECTOR, ci, k, k)[:co]
+
+
+def pack_bias(bias: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+    """(CO,) -> (ceil(CO / 16) * 16,), padded with zeros."""
+    return np.pad(np.asarray(bias, dtype), (0, -len(bias) % VECTOR))
+
+
+def packed_shape(k: int, ci: int, co: int) -> tuple[int, int, int, int, int]:
+    """The shape of pack_weights()."""
+    return -(-co // VECTOR), k, k, ci, VECTOR
+
+
+def parts_shape(parts: int, shape: ConvShape) -> tuple[int, int, int, int]:
+    """The shape of an array for so many parts of the gradients of weights and biases."""
+    return parts, -(-shape.co // VECTOR), shape.k**2 * shape.ci + 1, VECTOR
+
+
+def most_parts(shape: ConvShape) -> int:
+    """The parts for which there is memory."""
+    return max(1, PARTIAL_FLOATS // math.prod(parts_shape(1, shape)))
+
+
+def first_float(array: Array) -> int:
+    """Where an array of packed_arrays() begins in the whole; 0 for one with a buffer of its own."""
+    data: Any = array.base_data
+    return data.offset // array.dtype.itemsize
+
+
+def sum_parts(
+    dev: Device,
+    parts: Sequence[tuple[Conv, int]],
+    work: Array,
+    grad_weights: Array,
+    grad_biases: Array,
+) -> None:
+    """Overwrite the gradients of weights and biases by the sums, in order, of their parts, those of
+    all convolutions in one launch.
+
+    parts: [(convolution, number of parts that backward_weights() has left)]. work, grad_weights,
+    grad_biases: (?,) float32, in which Conv.work, Conv.weight and Conv.bias lie.
+    """
+    rows, n = [], 0
+    for conv, count in parts:
+        _, blocks, sums, _ = conv.work.shape
+        places = [first_float(array) // VECTOR for array in (conv.work, conv.weight, conv.bias)]
+        rows.append((n, sums, blocks, count, *places, 0))
+        n += sums * blocks
+    table = dev.scratch("rows of conv_sum_parts", 8 * len(rows), np.int32)[: 8 * len(rows)]
+    table = table.reshape(len(rows), 8)
+    dev.send(table, np.array(rows, np.int32))
+    dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
+        "conv_sum_parts",
+        n * row_parts(dev),
+        n=n,
+        rows=len(rows),
+        table=table,
+        partial=work,
+        grad_weights=grad_weights,
+        grad_biases=grad_biases,
+    )
