@@ -5,40 +5,10 @@ import pytest
 from pp_cl.errors import MOST_LINE, Stopped, UserError, one_line, quoted, require, shown
 
 
-@pytest.mark.parametrize(
-    "foreign, line",
-    [
-        ("plain text", "plain text"),
-        ("two\nlines\r\n\tand  more ", "two lines and more"),
-        ("red \x1b[31m\x07", "red ?[31m?"),
-        ("gr\u00fc\u00df \u202e", "gr\u00fc\u00df ?"),
-        ("x" * 101, "x" * 97 + "..."),
-        ("x" * 100, "x" * 100),
-        ("", ""),
-    ],
-)
-def test_foreign_text_is_one_short_line(foreign, line):
-    assert shown(foreign) == line
-
-
 def test_packages_that_are_missing_are_named_with_what_installs_them():
     require("a test", "numpy")
     with pytest.raises(UserError, match="a test needs numpy and no-such; .*install numpy no-such`"):
         require("a test", "numpy", "no-such")
-
-
-@pytest.mark.parametrize(
-    "value, line",
-    [
-        ("a\n", r"'a\n'"),
-        (["\x1b"], r"['\x1b']"),
-        (0.5, "0.5"),
-        (None, "None"),
-        ("x" * 200, "'" + "x" * 96 + "..."),
-    ],
-)
-def test_a_value_is_quoted_on_one_short_line(value, line):
-    assert quoted(value) == line
 
 
 def test_what_has_no_end_is_named_by_its_kind():

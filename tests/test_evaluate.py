@@ -110,14 +110,3 @@ def test_published_rows_are_printed_beside_what_compares(run, tmp_path, capsys, 
         assert len(result["published"]) == 5
         assert ("reduced 2 times" in result["published_differs"]) == (not compares)
         assert ("PlenopticPoints" in capsys.readouterr().out) == compares
-
-
-def test_an_evaluation_is_written_elsewhere_on_request(run, tmp_path, capsys):
-    """The run's folder stays as it is."""
-    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    out = tmp_path / "there" / "eval"
-    assert main(["eval", str(run), "--save-images", "--out", str(out)]) == 0
-    assert f"wrote {out / 'metrics.json'}" in capsys.readouterr().out
-    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
-    written = {path.name for path in out.rglob("[!.]*.*")}
-    assert written == {"metrics.json", "comparison.png", "r_0.png", "r_1.png"}

@@ -1,7 +1,6 @@
 """Ctrl-C and SIGTERM: the step is finished and a checkpoint written."""
 
 import signal
-from pathlib import Path
 
 import pytest
 from support.checkpoints import load_checkpoint
@@ -10,8 +9,6 @@ from support.runs import arguments
 from pp_cl.cli import main
 from pp_cl.commands.signals import first_signal
 from pp_cl.engine.step import Trainer
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

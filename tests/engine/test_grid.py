@@ -47,13 +47,6 @@ def test_a_packed_grid_counts_from_the_centre(grid):
     assert packed[3:].tolist() == [np.float32(grid.edge), 45, 37, 30, 0]
 
 
-def test_the_diagonal():
-    assert Grid((9.0, 9.0, 9.0), 0.5, (7, 9, 1)).diagonal == pytest.approx(5)
-    assert Grid((9.0, 9.0, 9.0), 0.5, (1, 1, 1)).diagonal == 0.5
-    grid = Grid((0.0, 0.0, 0.0), 0.5, (20, 30, 40))
-    assert grid.refined().diagonal == pytest.approx(grid.diagonal, rel=0.02)
-
-
 @pytest.mark.parametrize("by", [0, FAR])
 def test_the_smallest_edge_depends_on_the_size_alone(by):
     box = np.array([[-1.0, -2.0, 0.5], [1.0, 2.0, 0.5]])  # flat

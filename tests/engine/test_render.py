@@ -10,7 +10,6 @@ from support.comparisons import relative_error
 from support.models import GRID, make_model
 from support.scenes import ring_cameras
 
-import pp_cl.engine.network.unet
 from pp_cl.bench.unet import plain_parameters
 from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.engine.render import Renderer
@@ -102,17 +101,6 @@ def test_padding_does_not_move_the_picture(dev, rng):
     left, top = result.offset
     inner = result.features.get()[top : top + 19, left : left + 21]
     np.testing.assert_allclose(inner, whole[7:26, 5:26], atol=2e-5)
-
-
-def test_a_view_in_which_few_tiles_could_be_skipped_is_computed_whole(dev, rng, monkeypatch):
-    renderer, camera = (
-        Renderer(dev, make_model(dev, rng), RasterConfig(radius=0.85)),
-        ring_cameras(1, 32)[0],
-    )
-    whole = renderer.render(camera, GAMMA)
-    monkeypatch.setattr(pp_cl.engine.network.unet, "LEAST_PIXELS", 0)
-    monkeypatch.setattr(pp_cl.engine.network.unet, "MOST_COMPUTED", 0)
-    np.testing.assert_array_equal(renderer.render(camera, GAMMA), whole)
 
 
 def test_an_empty_view_is_the_background(dev, rng):

@@ -92,15 +92,6 @@ def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_
     assert not (tmp_path / "no").exists()
 
 
-def test_a_training_begins_with_the_network_of_the_demo(scene, tmp_path):
-    """Which helps."""
-    default = {"network__widths": "32,64,128", "train__iterations": 20}
-    for start in ("demo", "random"):
-        assert main([*arguments(scene, tmp_path / start, **default), "--network", start]) == 0
-    losses = [[r["loss"] for r in rows(tmp_path / start)[:-1]] for start in ("demo", "random")]
-    assert np.mean(losses[0]) < 0.8 * np.mean(losses[1])
-
-
 @pytest.mark.parametrize(
     "scene, widths, is_taken",
     [

@@ -46,20 +46,6 @@ def test_an_exception_fails_its_case_alone(dev, error):
     assert rest.passed and rest.case == "b: good"
 
 
-def test_ctrl_c_ends_all_cases(dev):
-    def interrupted(dev, rng):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        next(run_cases(dev, [Case("a: b", interrupted)]))
-
-
-def test_every_case_draws_the_same_numbers(dev):
-    checks = [Case(name, lambda dev, rng: [Check(rng.random(), 1.0)]) for name in "ab"]
-    first, second = run_cases(dev, checks)
-    assert first.error == second.error
-
-
 def test_a_case_without_checks_has_checked_nothing():
     assert not run_case(None, case()).passed
 
@@ -75,13 +61,6 @@ def test_variants_that_are_not_offered_are_left_out(dev, monkeypatch):
 GOOD = Row("a: good", 1.25e-7, 1e-6, True, "", 0.5)
 NAN = Row("a: bad", np.inf, 1e-6, False, "NaN", 0.25)
 RAISED = Row("a: raised", None, None, False, "RuntimeError: no", 0.25)
-
-
-def test_setup_names_what_a_report_needs(dev, monkeypatch):
-    monkeypatch.setenv("PYOPENCL_BUILD_OPTIONS", "-cl-opt-disable")
-    named = setup(dev)
-    assert named["build options"].endswith(" -cl-opt-disable")
-    assert all(text and "\n" not in text for text in named.values())
 
 
 def test_lines_and_json_have_every_row(dev):

@@ -50,12 +50,6 @@ class Tab:
         """Set a switch; True presses a button."""
         self.send("GuiUpdateMessage", uuid=self.handles[label]["uuid"], updates={"value": value})
 
-    def click(self, name):
-        """Click at a node."""
-        ray = {"ray_origin": [0, 0, 0], "ray_direction": [0, 0, 1], "screen_pos": [0, 0]}
-        more = {"instance_index": None, "modifier": None}
-        self.send("SceneNodeClickMessage", name=name, **ray, **more)
-
     def receive(self, kind, accept=lambda _message: True):
         """The next message of a type that is accepted."""
         deadline = time.monotonic() + SECONDS

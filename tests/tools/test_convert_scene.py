@@ -1,13 +1,10 @@
 """One scene in every format: the same cameras, images and masks come back."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.same_scene import held_out, same, views
 from support.scenes import write_ball_scene
 
-from pp_cl.errors import UserError
 from pp_cl.scene.load import load_scene, scene_format
 from tools.convert_scene import FORMATS, convert, main
 
@@ -26,37 +23,6 @@ def test_what_is_written_comes_back(tmp_path, name):
     folder = tmp_path / "scene" / PLACE.get(name, ".")
     assert scene_format(str(folder)) == READER.get(name, name)
     same(folder, given)
-
-
-def longer_lens(given):
-    """One view with another focal length, its principal point in the middle."""
-    first = given["train"][0]
-    camera = replace(first.stored_camera, fx=50.0, fy=50.0)
-    return given | {"train": [replace(first, stored_camera=camera), *given["train"][1:]]}
-
-
-MANY = views(centred=True)
-REFUSED = {
-    f"{name}, splits": (name, {"train": MANY[:6], "test": MANY[6:]}, "--hold-out")
-    for name in ("colmap", "llff", "neus")
-} | {
-    "co3d, train alone": ("co3d", {"train": views()}, "--hold-out"),
-    "co3d, no test": ("co3d", {"train": views(), "val": views()}, "--hold-out"),
-    "co3d, split": ("co3d", dict.fromkeys(("train", "test", "eval"), views()), "--hold-out"),
-    "nsvf, lenses": ("nsvf", held_out(views()), "one camera for all"),
-    "nsvf, val alone": ("nsvf", {"val": views(alike=True)}, "no val without test"),
-    "nsvf, split": ("nsvf", {"eval": views(alike=True)}, "knows the splits train, val, test"),
-    "llff, lenses": ("llff", longer_lens(held_out(views(centred=True))), "one camera for all"),
-    "llff, off the middle": ("llff", held_out(views(alike=True)), "in the middle"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_a_format_cannot_hold_is_refused(tmp_path, case):
-    name, given, words = REFUSED[case]
-    with pytest.raises(UserError, match=words):
-        convert(given, tmp_path / "scene", name)
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_command(tmp_path, capsys):

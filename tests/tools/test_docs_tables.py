@@ -2,7 +2,6 @@
 
 import json
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -77,17 +76,6 @@ def test_no_release_states_figures_of_older_code(tmp_path, capsys):
     assert "old.json: of commit abc" in told and "new.json" not in told
     (results / "old.json").unlink()
     assert provenance.main(tmp_path) == 0 and not capsys.readouterr().err
-
-
-@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="an archive without its history")
-def test_the_digest_of_a_commit_is_that_of_its_checkout(tmp_path):
-    words = ["git", "worktree", "add", "--detach", str(tmp_path / "tree"), "HEAD"]
-    subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
-    try:
-        assert provenance.digest_at("HEAD") == provenance.digest(tmp_path / "tree")
-    finally:
-        words = ["git", "worktree", "remove", "--force", str(tmp_path / "tree")]
-        subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
 
 
 @pytest.mark.parametrize("path", TOOL.documents(ROOT), ids=lambda path: path.stem)

@@ -3,21 +3,11 @@
 import pytest
 from support.scenes import write_ball_scene
 
-from pp_cl.config import assign, preset, validate
 from pp_cl.engine.device.device import Device
 from tools import memory_peaks as TOOL
 from tools.results import MEMORY
 
 SETTINGS = {"points.count": 400, "network.widths": (16, 16, 16), "train.iterations": 4}
-
-
-@pytest.mark.parametrize("name", TOOL.TRAININGS)
-def test_the_settings_of_each_training_are_allowed(name):
-    preset_name, settings = TOOL.TRAININGS[name]
-    config = preset(preset_name)
-    for key, value in (TOOL.EARLY | settings).items():
-        assign(config, key, value, name)
-    validate(config, name)
 
 
 def test_a_row_is_what_a_training_took(session_device, tmp_path, monkeypatch):

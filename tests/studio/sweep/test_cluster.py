@@ -4,7 +4,6 @@ import os
 import re
 import signal
 import sys
-from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -58,10 +57,6 @@ def test_nobody_at_the_address(monkeypatch, address):
     monkeypatch.setattr(cluster, "ANSWER", 1)
     with refusing(address), cluster.client_of(address):
         pass
-
-
-def future(status, exception=None):
-    return SimpleNamespace(status=status, exception=lambda: exception)
 
 
 @pytest.fixture
