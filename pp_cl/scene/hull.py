@@ -205,7 +205,7 @@ def _search(dev, views, points, box, forgiven, limit):
         return _tight(grid, carver.carve(grid, forgiven))
 
     best = last = carve(smallest_edge(box, min(COARSE_CELLS, CELL_CAP)))
-    capped, rounds, count = False, 0, last.count
+    capped, rounds, count = False, 0, last.total
     if not count:
         raise UserError(explain_empty_hull(views, box))
     while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
@@ -219,17 +219,17 @@ def _search(dev, views, points, box, forgiven, limit):
         if capped and edge > 0.99 * last.grid.edge:
             break  # the box shrinks no more
         last = carve(edge)
-        count, rounds = last.count, rounds + 1
-        best = min(best, last, key=lambda c: (c.count < points, abs(c.count - points)))
-    return Hull(best.grid, best.grid.ids_of(best.inside), capped and best.count < points)
+        count, rounds = last.total, rounds + 1
+        best = min(best, last, key=lambda c: (c.total < points, abs(c.total - points)))
+    return Hull(best.grid, best.grid.ids_of(best.inside), capped and best.total < points)
 
 
 class _Carving(NamedTuple):
-    """The smallest grid that holds all `count` vertices inside, which are True in (nz, ny, nx)."""
+    """The smallest grid that holds all `total` vertices inside, which are True in (nz, ny, nx)."""
 
     grid: Grid
     inside: np.ndarray
-    count: int
+    total: int
 
 
 def _tight(grid, inside):
