@@ -30,6 +30,7 @@ def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
     }
     assert small.keys() == command.SMALL.keys()
     monkeypatch.setattr(command, "SMALL", small)
+    monkeypatch.setattr("pp_cl.scene.demo.TRAIN_VIEWS", 6)
     monkeypatch.setattr(timing, "SECONDS", 0.0)
     monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)
     plot = tmp_path / "b.png"
