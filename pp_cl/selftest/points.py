@@ -94,19 +94,16 @@ class PairedPoints:
         """(?,) the points with a pair, ascending."""
         return np.flatnonzero(np.diff(self.pairs.point_offset.get()))
 
-    def _counts(self):
-        return np.diff(self.pairs.point_offset.get().astype(np.int64))
-
     def pair_points(self) -> np.ndarray:
         """(P,) the point of each pair, from the offsets alone."""
-        return np.repeat(np.arange(self.n), self._counts())
+        counts = np.diff(self.pairs.point_offset.get().astype(np.int64))
+        return np.repeat(np.arange(self.n), counts)
 
     def dense(self, pair_values: np.ndarray, missing: float = 0.0) -> np.ndarray:
         """(N, HW) of values by pair: (P, ...) on the host."""
         total = self.pairs.total
-        matrix = np.full(
-            (self.n, self.camera.width * self.camera.height), missing, pair_values.dtype
-        )
+        pixels = self.camera.width * self.camera.height
+        matrix = np.full((self.n, pixels), missing, pair_values.dtype)
         matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
         return matrix
 
@@ -186,7 +183,7 @@ class PairedPoints:
         sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend(); on a grid of
         an edge also "offset", (N, 4).
         """
-        alphas = None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32)
+        grad_features = np.reshape(grad_features, (*self.shape, 16))
         found = self.backward = blend_backward(
             self.dev,
             self.buffers,
@@ -196,13 +193,19 @@ class PairedPoints:
             opacity=self.opacity,
             shaded_features=self.shaded_features,
             features=self.features,
-            grad_features=self._uploaded(grad_features),
-            grad_alpha=alphas,
+            grad_features=self.dev.upload(grad_features, np.float32),
+            grad_alpha=None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32),
             spread_weight=spread_weight,
             edge=edge,
         )
-        rows = {"features": found.shaded_features, "opacity": found.opacity, "offset": found.offset}
-        return {name: self._of_points(array) for name, array in rows.items() if array is not None}
+        rows = {"features": found.shaded_features, "opacity": found.opacity}
+        if found.offset is not None:
+            rows["offset"] = found.offset
+        shaded, gradients = self.weights.shaded.get(), {}
+        for name, array in rows.items():  # of the visible points; those of all others are 0
+            gradients[name] = np.zeros((self.n, *array.shape[1:]), np.float32)
+            gradients[name][shaded] = array.get()[: len(shaded)]
+        return gradients
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
@@ -217,18 +220,6 @@ class PairedPoints:
             gamma=self.gamma,
         )
         return gradients | {"positions": positions.get(), "radius": radius.get()}
-
-    def _of_points(self, rows):
-        """(N, ...): those of the visible points, 0 for all others."""
-        shaded, of_points = (
-            self.weights.shaded.get(),
-            np.zeros((self.n, *rows.shape[1:]), np.float32),
-        )
-        of_points[shaded] = rows.get()[: len(shaded)]
-        return of_points
-
-    def _uploaded(self, grad_features):
-        return self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
 
 
 class PairedGaussians(PairedPoints):
