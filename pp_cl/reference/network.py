@@ -32,14 +32,11 @@ def convolution_backward_weights(x: np.ndarray, grad_out: np.ndarray, k: int) ->
     return gradient
 
 
-def _padding(k):
-    return (k // 2, k // 2), (k // 2, k // 2), (0, 0)
-
-
 def _taps(x, k):
     """Yields (ky, kx, (H W, CI) float64: what each pixel sees through that tap)."""
     height, width, channels = x.shape
-    padded = np.pad(np.asarray(x, np.float64), _padding(k))
+    around = (k // 2, k // 2)
+    padded = np.pad(np.asarray(x, np.float64), (around, around, (0, 0)))
     for ky in range(k):
         for kx in range(k):
             yield ky, kx, padded[ky : ky + height, kx : kx + width].reshape(-1, channels)

@@ -102,9 +102,6 @@ def _hard_layers() -> dict[str, Layer]:
         "means of 1e3, weights that sum to zero": layer(
             1e3 + x, weight - weight.mean((2, 3), keepdims=True)
         ),
-        "weights over six decades, by output channel": layer(
-            x, weight * decades[:, None, None, None]
-        ),
         "weights over six decades, by input channel": layer(x, weight * decades[:, None, None]),
         "weights over six decades, one by one": layer(
             x, weight * 10 ** rng.uniform(-3, 3, weight.shape)
@@ -118,8 +115,6 @@ def _hard_layers() -> dict[str, Layer]:
         "one colour": layer(
             np.full((64, 257, 16), 1.1), weight[:16, :16], grad_out=np.full((64, 257, 16), 0.7)
         ),
-        "weights of 6e4": layer(x, 6e4 * np.sign(weight)),
-        "weights of 1e-7": layer(x, 1e-7 * np.sign(weight), none),
         "output channels of 6e4 and of 1e-7": layer(x, weight * limits[:, None, None, None]),
         "inputs and gradients of 6e4": layer(
             6e4 * np.sign(x), weight, grad_out=6e4 * np.sign(_normal(rng, *x.shape))
@@ -187,9 +182,6 @@ def _upsample(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         # sums of up to 16 weighted values
         expected = network.upsample_backward(grad_out.astype(np.float64))
         yield relative(grad_x.get(), expected, 8 * EPS)
-    constant, out = np.full((3, 5, 16), 1e3, np.float32), dev.empty((6, 10, 16))
-    upsample2_forward(dev, dev.upload(constant), out)
-    yield exact(out.get(), np.full((6, 10, 16), 1e3))
 
 
 def _output(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
