@@ -67,7 +67,7 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
     basis = optim.basis(directions, np.zeros(3))
     grad = 1e-4 * np.ones((len(basis), 16))
     others = {"offset": np.zeros((len(basis), 4)), "opacity": np.zeros(len(basis))}
-    twin = optim.RmsProp(basis, 0.5, sh=np.zeros((len(basis), 9, 16)), **others)
+    twin = optim.RmsProp({"sh": np.zeros((len(basis), 9, 16))} | others, basis, 0.5)
     adam = optim.Adam(np.zeros((len(basis), 9, 16)), beta1=0.0)
     rates = {"sh": np.ones(9), "offset": 0, "opacity": 0}
     twin.step(1, {"sh": grad} | others, rates, {"sh": 0.0, "offset": 1.0, "opacity": 1.0})
@@ -77,7 +77,7 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
         of_degree = adam.v[:, degree**2 : (degree + 1) ** 2, 0].mean(axis=1)
         np.testing.assert_allclose(of_degree, twin.v["sh"][:, 0], rtol=1e-9)  # in every direction
     shared = np.sqrt(adam.v / twin.v["sh"][:, None])
-    np.testing.assert_allclose(adam.parameter * shared, twin.sh, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(adam.parameter * shared, twin.values["sh"], rtol=1e-9, atol=1e-12)
 
 
 def test_points_without_a_gradient_keep_their_values(dev, rng):
@@ -109,7 +109,7 @@ def test_degrees_at_rate_0_stay(dev, rng, rates):
     for _ in range(3):
         cloud.step(gradients(rng, 31), np.arange(31), rates=replace(RATES, sh=rates))
     found = cloud.learned()["sh"]
-    assert relative_error(found, cloud.twin.sh) < 1e-6
+    assert relative_error(found, cloud.twin.values["sh"]) < 1e-6
     for degree, rate in enumerate(rates):
         part = np.s_[:, degree**2 : (degree + 1) ** 2]
         assert (found[part] == cloud.start["sh"][part]).all() == (rate == 0)
