@@ -15,6 +15,9 @@
 #define ALWAYS_INLINE __attribute__((always_inline)) static inline
 #endif
 
+// Before a loop over an array of a work-item, which is in registers only where indices are known.
+#define UNROLLED_FOR _Pragma("unroll") for
+
 // A value in [least, most]; clamp() would hide a NaN.
 #define BOUNDED(value, least, most)                                                                \
     ((value) < (least) ? (least) : (value) > (most) ? (most) : (value))

@@ -46,11 +46,10 @@ typedef LANED(float) floats;
 typedef LANED(int) ints;
 typedef LANED(uint) uints;
 
-// Loops over arrays of a work-item, which are in a GPU's registers only where the indices are known.
 #if LANES == 16
-#define UNROLLED
+#define GPU_UNROLLED_FOR for
 #else
-#define UNROLLED _Pragma("unroll")
+#define GPU_UNROLLED_FOR UNROLLED_FOR
 #endif
 
 #if LANES == 1

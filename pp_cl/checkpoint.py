@@ -1,47 +1,172 @@
-"""Reads the checkpoint of a run and compares it with the run's settings before anything uses it."""
+"""The checkpoint of a run: a .npz of uncompressed arrays and a JSON header. It is written
+atomically; before memory is taken for what is read, it is compared with the size of its part of the
+file and with the run's settings.
+"""
 
+import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.grid import MOST_IDS, Grid
 from pp_cl.engine.network.layers import parameter_table, unet_layers
 from pp_cl.engine.raster.points import SH_DEGREES
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.engine.training.schedule import ema_start
 from pp_cl.engine.training.state import PointState
-from pp_cl.errors import UserError, shown
-from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
+from pp_cl.errors import Diverged, UserError, quoted, shown
+from pp_cl.files.atomic import atomic_file
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.files.untrusted import opened_zip, refusal, strict_json
 from pp_cl.scene.identity import kept_views
 from pp_cl.settings import Config
 
+FORMAT = 3  # raised when the arrays change meaning
+MOST_HEADER = 2**24  # bytes; a view takes some 400
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
-# {key of the header: its type as JSON has it}; those that it may lack
-NEEDED: dict[str, Any] = {"scene": str, "views": list, "step": int, "finished": bool}
-NEEDED |= {"initial_points": int, "grid": dict, "depth_range": list, "pixels": dict | None}
-OPTIONAL = {"format": int, "extended_from": int, "exposed": bool, "left_out": list, "notes": list}
+# {key of the header: its types as JSON has them}, and those that it may lack
+KEYS: dict[str, tuple[type, ...]] = {"views": (list,), "step": (int,)}
+KEYS |= {"finished": (bool,), "initial_points": (int,), "grid": (dict,), "depth_range": (list,)}
+KEYS |= {"pixels": (dict, type(None)), "format": (int,), "extended_from": (int,)}
+KEYS |= {"exposed": (bool,), "left_out": (list,), "notes": (list,)}
+OPTIONAL = {"extended_from", "exposed", "left_out", "notes"}
+MEND = "delete it to train again, or restore a copy"
 OTHER_RUN = "its config.json may belong to another run"
+Arrays = Mapping[str, np.ndarray | DeviceRows]
+
+
+def save_checkpoint(path: Path, header: dict[str, Any], arrays: Arrays) -> None:
+    """Write {name: array} and a JSON header as np.savez does, without a copy of a whole array. The
+    same content gives the same bytes: no times are stored. The SH coefficients of a finished run
+    become float16, which changes its images by less than 0.001 dB (docs/training.md). Raises
+    Diverged for NaN and Inf, UserError for a header that is too large to be read, and leaves the
+    file as it was.
+    """
+    text = json.dumps({"format": FORMAT, **header}, sort_keys=True).encode()
+    if len(text) > MOST_HEADER:
+        raise UserError(
+            f"{path}: its header would have {len(text)} bytes, more than the {MOST_HEADER} that are"
+            " read; train on fewer photographs"
+        )
+    is_finished = header.get("finished", False)
+    with atomic_file(path, noted=False) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in {"header": np.frombuffer(text, np.uint8), **arrays}.items():
+            is_rounded = is_finished and name.startswith("points.sh")
+            dtype = np.dtype(np.float16) if is_rounded else array.dtype
+            kind = np.lib.format.dtype_to_descr(dtype)
+            facts = {"descr": kind, "fortran_order": False, "shape": tuple(array.shape)}
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, facts)
+                for piece in _finite_pieces(name, array, dtype):
+                    member.write(piece.reshape(-1).view(np.uint8).data)
+
+
+def check_finite(arrays: Arrays) -> None:
+    """Raise Diverged naming the first array that holds NaN or Inf."""
+    for name, array in arrays.items():
+        for _ in _finite_pieces(name, array, array.dtype):
+            pass
+
+
+def _finite_pieces(name, array, dtype):
+    """The rows of an array, some at a time. Raises Diverged."""
+    for rows in [array] if isinstance(array, np.ndarray) else array.pieces():
+        with np.errstate(over="ignore"):  # infinite, which is told
+            piece = np.ascontiguousarray(rows, dtype)
+        if not _is_finite(piece):
+            raise Diverged(f"{name} holds NaN or Inf")
+        yield piece
+
+
+def _is_finite(array):
+    return array.dtype.kind != "f" or bool(np.isfinite(array).all())
+
+
+class Form(NamedTuple):
+    """What an array is before it is read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    def __str__(self) -> str:
+        return f"{self.dtype} {self.shape}"
+
+
+class Checkpoint:
+    """An opened checkpoint. header: its JSON object; forms: {name: Form} of the other arrays as
+    they are stored, none of which has been read.
+
+    Raises ValueError, and what zipfile raises, for anything else than save_checkpoint() writes.
+    """
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
+        self.path, self._archive = path, archive
+        entries = archive.infolist()
+        if sum(entry.file_size for entry in entries) > path.stat().st_size:
+            raise ValueError("it unfolds to more than the file holds")
+        self.forms = {entry.filename.removesuffix(".npy"): self._form(entry) for entry in entries}
+        text = self.forms.pop("header", None)
+        if text is None or text.dtype != np.uint8 or math.prod(text.shape) > MOST_HEADER:
+            raise ValueError("it has no header")
+        self.header = strict_json(self._read("header").tobytes())
+        if not isinstance(self.header, dict):
+            raise ValueError("its header is no JSON object")
+        if self.header.get("format") != FORMAT:
+            found = quoted(self.header.get("format"), 40)
+            raise UserError(f"{path}: format {found}, this version reads {FORMAT}; train again")
+
+    def _form(self, entry):
+        """The Form of an array, which is as large as its part of the file."""
+        with self._archive.open(entry) as member:
+            if np.lib.format.read_magic(member) != (1, 0):  # others have headers of up to 4 GiB
+                raise ValueError("holds an array of another version than 1.0")
+            shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+            if member.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
+                raise ValueError(f"{shown(entry.filename, 40)} is not as large as {shape} {dtype}")
+        return Form(shape, dtype)
+
+    def _read(self, name):
+        with self._archive.open(f"{name}.npy") as member:
+            return np.lib.format.read_array(member, allow_pickle=False)
+
+    def array(self, name: str) -> np.ndarray:
+        """One of its arrays, float32 where float16 is stored. Raises UserError naming file and
+        array where it cannot be read, or holds NaN or Inf.
+        """
+        with _refused(self.path):
+            array = self._read(name)
+        if not _is_finite(array):
+            raise UserError(f"{self.path}: {name} holds NaN or Inf; {MEND}")
+        return array.astype(np.float32) if array.dtype == np.float16 else array
 
 
 @contextmanager
 def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
     """The checkpoint in the folder of a run with these settings, until the block ends. Its header
-    has the keys of NEEDED, and its forms are exactly those of stored_forms().
+    has the KEYS, and its forms are exactly those of stored_forms().
 
-    Raises UserError as opened_checkpoint does, and naming what in the file is not of this run.
+    Raises UserError naming the file when it is missing, truncated, corrupt, of another format, or
+    not of this run.
     """
-    with opened_checkpoint(folder.checkpoint) as stored:
+    path = folder.checkpoint
+    if not path.is_file():
+        raise UserError(f"{path}: no such checkpoint; train first")
+    with ExitStack() as stack:
+        with _refused(path):
+            stored = Checkpoint(path, stack.enter_context(opened_zip(path)))
         problem, mend = _problem_of_header(stored.header, config.train.iterations), MEND
         if not problem:
             problem, mend = _problem_of_forms(stored, config), OTHER_RUN
         if not problem and not _are_ids(stored.array("points.ids"), stored.header["grid"]):
             problem, mend = "points.ids are no vertices of its grid in ascending order", MEND
         if problem:
-            raise UserError(f"{folder.checkpoint}: {problem}; {mend}")
+            raise UserError(f"{path}: {problem}; {mend}")
         yield stored
 
 
@@ -52,37 +177,44 @@ def load_run_state(
     UserError as opened_run does.
     """
     with opened_run(folder, config) as stored:
-        return stored.header, stored.arrays()
+        return stored.header, {name: stored.array(name) for name in stored.forms}
+
+
+@contextmanager
+def _refused(path):
+    """What is wrong with the file becomes a UserError; zipfile meets broken bytes with whatever
+    comes up.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise refusal(path, error, "a checkpoint", MEND) from None
 
 
 def _problem_of_header(header, steps):
     """What in a header is not as a training of so many steps writes it; "" where all is."""
-    for key, kind in (NEEDED | OPTIONAL).items():
-        if key in NEEDED and key not in header:
-            return f"its header lacks {key}"
-        if key not in header:
-            continue
-        is_flag = isinstance(header[key], bool)  # which Python takes for a whole number
-        if not isinstance(header[key], kind) or is_flag != (kind is bool):
-            return f"{key} in its header is of another kind"
-    if unknown := sorted(header.keys() - NEEDED.keys() - OPTIONAL.keys()):
+    if lacking := sorted(KEYS.keys() - OPTIONAL - header.keys()):
+        return f"its header lacks {lacking[0]}"
+    if unknown := sorted(header.keys() - KEYS.keys()):
         return f"its header holds {shown(unknown[0], 40)}, which this version does not know"
+    if wrong := [key for key, value in header.items() if type(value) not in KEYS[key]]:
+        return f"{wrong[0]} in its header is of another kind"
     if not 1 <= header["step"] <= steps:
         return f"it is of step {shown(str(header['step']))}, of {steps} in its config.json"
     try:
         views, grid = kept_views(header["views"]), Grid.of_header(header["grid"])
         near, far = header["depth_range"]
-        lengths = [*grid.origin, grid.edge, near, far]
-        names, left_out = {view.name for view in views}, set(header.get("left_out", []))
         sound = (
-            all(abs(length) < MOST_LENGTH for length in lengths)
+            all(abs(x) < MOST_LENGTH for x in (*grid.origin, grid.edge, near, far))
             and grid.edge > 0 <= near < far
             and [type(n) for n in grid.dims] == [int, int, int]
             and min(grid.dims) > 0
             and grid.id_count <= MOST_IDS
             and 0 < header["initial_points"] <= MOST_IDS
             and 0 <= header.get("extended_from", 0) <= header["step"]
-            and left_out < names
+            and set(header.get("left_out", [])) < {view.name for view in views}
         )
     except (KeyError, TypeError, ValueError, OverflowError):
         sound = False
@@ -100,10 +232,9 @@ def _problem_of_forms(stored, config):
     most = min(math.prod(header["grid"]["dims"]), header["initial_points"] * 8**refined)
     if not 0 < n <= most:
         return f"points.ids is {ids or 'missing'}, expected 1 to {most} points"
-    half = forms.get("points.sh0", ids).dtype == np.float16
     step = None if header["finished"] else header["step"]
     gains = 0 if step is None else _views_with_gains(header, config)
-    expected = stored_forms(config, n, step, half and header["finished"], gains)
+    expected = stored_forms(config, n, step, gains)
     for name in sorted(expected.keys() | forms.keys()):
         found, wanted = forms.get(name), expected.get(name)
         if wanted is None:
@@ -129,34 +260,24 @@ def _views_with_gains(header, config):
     return views if is_kept and config.train.exposure != "off" else 0
 
 
-def stored_forms(
-    config: Config, n: int, step: int | None, half: bool = False, gains: int = 0
-) -> dict[str, Form]:
+def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> dict[str, Form]:
     """{name: Form} of the arrays that a checkpoint holds after `step` steps, None: of a finished
-    training, with n points left. half: with coefficients of 16 bits, as a compressed run has them.
-    gains: the views that have them.
+    training, with n points left. gains: the views that have them.
     """
-    degree, colours = config.points.sh_degree, np.float16 if half else np.float32
-    settings = config.network
-    layers = unet_layers(settings.widths, blocks=settings.blocks)
-    network = parameter_table(layers)
+    degrees = SH_DEGREES[: config.points.sh_degree + 1]
+    sh_dtype = np.float16 if step is None else np.float32
+    network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
     table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
     table["points.offset"] = (n, 4), np.float32
-    table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), colours) for d in SH_DEGREES[: degree + 1]}
+    table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}
     if step is not None:
-        table |= _training_state(config, n, step, network)
+        table |= {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
+        state = PointState.table(n)
+        if config.train.ema and step >= ema_start(config.train.iterations):
+            state |= {f"a.{name}": row for name, row in PointState.ema_table(n).items()}
+            table |= {f"average.{name}": row for name, row in network.items()}
+        table |= {f"state.{name}": row for name, row in state.items()}
     if gains:
-        table["exposure"] = ((gains, 3, 4), np.float32)
+        table["exposure"] = (gains, 3, 4), np.float32
     return {name: Form(tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in table.items()}
-
-
-def _training_state(config, n, step, network):
-    """The table of what is there until the last step is done."""
-    settings = config.train
-    points = PointState.table(n)
-    table = {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
-    if settings.ema and step >= ema_start(settings.iterations):
-        points |= {f"a.{name}": row for name, row in PointState.ema_table(n).items()}
-        table |= {f"average.{name}": row for name, row in network.items()}
-    return table | {f"state.{name}": row for name, row in points.items()}

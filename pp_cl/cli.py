@@ -91,7 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # letters that its encoding lacks
             stream.reconfigure(errors="backslashreplace")
     try:
-        options = _parser().parse_args(argv)
+        words = sys.argv[1:] if argv is None else list(argv)
+        options = _parser(words[:1]).parse_args(words)
         json_alone = getattr(options, "json", None) is sys.stdout
         with redirect_stdout(sys.stderr) if json_alone else nullcontext():
             options.run(options)
@@ -140,7 +141,8 @@ def _fail(message, status=2):
     return status
 
 
-def _parser():
+def _parser(first):
+    """The parser of the command that the first word names, else of all. first: [] or [word]."""
     parser = _Parser(
         prog="pp-cl",
         description="Reconstruct an object from photographs with OpenCL.",
@@ -148,8 +150,8 @@ def _parser():
     )
     parser.add_argument("--version", action="version", version=f"pp-cl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
-    for name, path in COMMANDS.items():
-        module = importlib.import_module(path)
+    for name in first if {*first} <= COMMANDS.keys() and first else COMMANDS:
+        module = importlib.import_module(COMMANDS[name])
         command = commands.add_parser(
             name,
             help=module.HELP,

@@ -10,14 +10,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pp_cl.checkpoint import opened_run
-from pp_cl.engine.views import MIN_SIDE, fitting_downscale
 from pp_cl.errors import UserError, quoted, shown, suggestion
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.files.untrusted import read_regular
 from pp_cl.presets import IMAGE_SIZES, PRESETS
-from pp_cl.scene.load import scene_frames
 from pp_cl.settings import FORMAT, Config, every_setting
+
+# what other packages may use; docs/api.md lists it
+__all__ = ["PRESETS", "configure", "field_of", "load_config", "preset"]
+__all__ += ["refuse_setting", "run_config", "scene_config"]
 
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
@@ -328,6 +329,10 @@ def scene_config(
     them, images are reduced to about the preset's size, by the largest training image, as long as
     the smallest keeps enough pixels. Raises UserError as configure() and scene_frames() do.
     """
+    # here, so that --help needs neither numpy nor OpenCL
+    from pp_cl.engine.views import MIN_SIDE, fitting_downscale
+    from pp_cl.scene.load import scene_frames
+
     given = list(given)
     config = configure(preset(preset_name), scene, given)
     if "scene.downscale" not in [key for key, _, _ in given]:
@@ -343,6 +348,8 @@ def _resumed(folder, stored, scene, given):
     """The settings of a run with a checkpoint, which may change in FREE alone, and where it is
     finished in its length.
     """
+    from pp_cl.checkpoint import opened_run
+
     config, free = configure(load_config(folder.config), scene, given), {*FREE}
     if stored.train.minutes:  # planned meanwhile, as train.iterations are
         config.train.refine_at = stored.train.refine_at

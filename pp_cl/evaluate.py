@@ -1,9 +1,8 @@
 """Measures a run on the views of a split."""
 
-import os
 import time
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,17 +10,14 @@ from tqdm import tqdm
 
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View
-from pp_cl.errors import UserError
-from pp_cl.files.atomic import check_target, remove_leftovers, write_json
-from pp_cl.files.contact_sheet import write_comparison
-from pp_cl.files.image import write_png
-from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest, remove_ours
+from pp_cl.files.atomic import own, remove_ours, write_json
+from pp_cl.files.image import image_files, write_png
+from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
 from pp_cl.metrics.published import differences, published_rows
 from pp_cl.run import Run, load
 
 SHOWN_VIEWS = 4  # rows of the comparison image
-MOVE = "move it away, or choose another --out"
 
 
 class Rendered(NamedTuple):
@@ -40,7 +36,7 @@ class Rendered(NamedTuple):
 
 
 def evaluate_run(
-    folder: Path | str,
+    run: Run | Path | str,
     split: str = "test",
     metrics: tuple[str, ...] = ("psnr", "ssim"),
     *,
@@ -49,11 +45,11 @@ def evaluate_run(
     scene: str | None = None,
     out: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Measure the run in a folder as `pp-cl eval` does, into `out`, else into its own folder;
-    returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write every
-    view, too. device, scene: as load() takes them.
+    """Measure a run, or the one in a folder, as `pp-cl eval` does, into `out`, else into its own
+    folder; returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write
+    every view, too. device, scene: of a folder, as load() takes them.
     """
-    run = load(folder, device, scene=scene)
+    run = run if isinstance(run, Run) else load(run, device, scene=scene)
     return evaluate(run, split, metrics, save_images=save_images, out=out)
 
 
@@ -76,15 +72,12 @@ def evaluate(
     written as it is now.
     """
     target = run.folder.evaluation(split) if out is None else Path(out)
-    _check_target(target, is_new=out is not None)
     scene = run.scene(split)
     views = scene.splits[split]
     images = [target / "images" / file for file in image_files([view.name for view in views])]
-    if save_images:
-        check_ours(images, MOVE)
     measure = Metrics(run.dev, metrics)
-    begin_manifest(target)
-    remove_leftovers(target)
+    written = [target / "metrics.json", target / "comparison.png", *(images if save_images else [])]
+    own(target, written, "move it away, or choose another --out", alone=out is not None)
     if save_images:
         remove_ours((target / "images").rglob("*"))
     rows: list[dict[str, Any]] = []
@@ -113,18 +106,6 @@ def evaluate(
     return result
 
 
-def _check_target(target, *, is_new):
-    """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
-    files and no evaluation.
-    """
-    if target.exists() and not target.is_dir():
-        raise UserError(f"{target}: is not a folder; choose another --out")
-    check_target(target / "metrics.json")
-    if is_new and target.exists() and not has_manifest(target) and any(target.iterdir()):
-        raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
-    check_ours([target / "metrics.json", target / "comparison.png"], MOVE)
-
-
 def _published(scene, split, views):
     """{"published": rows of the scene, "published_differs": how this measurement differs from
     them}.
@@ -149,19 +130,6 @@ def _about(run, costs):
         "seconds_per_frame": float(np.median(seconds)),
         "computed_fraction": float(np.mean(computed)),
     }
-
-
-def image_files(names: list[str]) -> list[PurePosixPath]:
-    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
-    those that all of them share go.
-    """
-    paths = [PurePosixPath(name) for name in names]
-    shared = os.path.commonpath([path.parent for path in paths])
-    paths = [path.relative_to(shared) for path in paths]
-    files = [path.with_suffix(".png") for path in paths]
-    if len(set(files)) < len(files):  # a.jpg beside a.png
-        files = [path.with_name(f"{path.name}.png") for path in paths]
-    return files
 
 
 def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:

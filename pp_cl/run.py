@@ -26,9 +26,9 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.scene.identity import difference, kept_views, learned
+from pp_cl.scene.identity import difference, kept_views
 from pp_cl.scene.image_file import Photograph
-from pp_cl.scene.load import DEMO, Scene, open_scene, scene_format, scene_frames
+from pp_cl.scene.load import DEMO, Scene, list_split, open_scene, scene_format, scene_frames
 from pp_cl.settings import Config
 
 COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
@@ -79,10 +79,8 @@ class Run:
         path, header = self.config.scene.path, self.header
         try:
             views = read()
-            told = difference(header, scene_frames(path), views)
-            if told:  # else views were dropped or taken back since, which changes no result
-                listed = learned(header, scene_frames(path, edited=False))
-                told = difference(header, listed, views)
+            # views that were dropped or taken back since change no result
+            told = difference(header, list_split(path, edited=False).photographs, views)
         except UserError as error:
             warnings.warn(
                 f"{path}: cannot be compared with the scene of {self.folder} ({error})",
@@ -135,10 +133,18 @@ class Run:
         radius = np.linalg.norm(points - centre, axis=1).max() + self.model.grid.edge
         return centre, float(radius)
 
-    def render(self, camera: Camera, *, samples: int = 1, features: bool = False) -> Picture:
+    def render(
+        self,
+        camera: Camera,
+        *,
+        samples: int = 1,
+        features: bool = False,
+        early_stop: float | None = None,
+    ) -> Picture:
         """The model as the camera sees it. samples: it is the mean of so many images, a square
-        number, shifted by fractions of a pixel. features: with the network's input. Raises
-        ValueError for another number of samples, UserError where the image holds NaN.
+        number, shifted by fractions of a pixel. features: with the network's input. early_stop: in
+        place of raster.early_stop. Raises ValueError for another number of samples, UserError where
+        the image holds NaN.
         """
         side = math.isqrt(samples)
         if samples < 1 or side * side != samples:
@@ -151,6 +157,7 @@ class Run:
                 camera.shifted(dx, dy),
                 self.gamma,
                 with_features=features,
+                early_stop=early_stop,
                 depth_range=depths,
             )
             for dy in shifts
@@ -158,6 +165,11 @@ class Run:
         )
         self.checked(picture.colour)
         return picture
+
+    @property
+    def nearest(self) -> float:
+        """World units: points that are nearer to the eye are not drawn."""
+        return NEAREST * self.ball[1]
 
     def checked(self, image: np.ndarray) -> np.ndarray:
         """An image of the run. Raises UserError naming the checkpoint where it holds NaN: finite
@@ -176,7 +188,7 @@ class Run:
             return None
         centre, radius = self.ball
         distance = float(np.linalg.norm(camera.eye - centre))
-        return max(distance - radius, NEAREST * radius), distance + radius
+        return max(distance - radius, self.nearest), distance + radius
 
 
 def _over_white(picture):
@@ -249,9 +261,12 @@ def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Ru
     return Run(dev, place, config, header, model)
 
 
-def load(folder: Path | str, device: str | None = None, *, scene: str | None = None) -> Run:
-    """The run in a folder, finished or not. device: as `pp-cl devices` lists them, else the default
-    one. scene: the folder of its scene, if that has moved. Raises UserError naming the file that is
-    missing or broken.
+def load(
+    folder: Path | str, device: str | Device | None = None, *, scene: str | None = None
+) -> Run:
+    """The run in a folder, finished or not. device: an opened one, or as `pp-cl devices` lists
+    them, else the default one. scene: the folder of its scene, if that has moved. Raises UserError
+    naming the file that is missing or broken.
     """
-    return load_run(open_device(device), folder, scene=scene)
+    dev = device if isinstance(device, Device) else open_device(device)
+    return load_run(dev, folder, scene=scene)

@@ -1,5 +1,5 @@
 """What is made of photographs and runs: scenes, videos, pages, splats, meshes, a viewer, sweeps."""
 
-from pp_studio.export.formats import export as export_run
+import lazy_loader
 
-__all__ = ["export_run"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_path
+from pp_cl.files import atomic_path
 
 LOOPED = ("gif", "webp")  # as pages show without a player
 FORMATS = ("mp4", "webm", *LOOPED)

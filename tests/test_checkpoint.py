@@ -1,7 +1,9 @@
-"""Checkpoints of runs: what a training writes is what is expected; anything else is refused in one
-line that names the file, whoever reads it, before memory is taken for it.
+"""Checkpoints of runs: the same content gives the same bytes, and nothing is half-written; what a
+training writes is what is expected; anything else is refused in one line that names the file,
+whoever reads it, before memory is taken for it.
 """
 
+import errno
 import io
 import shutil
 import tracemalloc
@@ -25,11 +27,19 @@ from support.checkpoints import (
 from support.refused import failure
 from support.runs import arguments, train_and_interrupt
 
-from pp_cl.checkpoint import load_run_state, stored_forms
+from pp_cl.checkpoint import (
+    FORMAT,
+    check_finite,
+    load_run_state,
+    opened_run,
+    save_checkpoint,
+    stored_forms,
+)
 from pp_cl.config import load_config
+from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.training.exposure import decided_at
-from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import FORMAT, save_checkpoint
+from pp_cl.errors import Diverged, UserError
+from pp_cl.files import atomic
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
 from pp_studio.view.drawing import draw
@@ -61,6 +71,81 @@ def npy(array, **options):
     return file.getvalue()
 
 
+# ---- the file
+
+SOME = {
+    "points.ids": np.arange(5, dtype=np.uint32),
+    "points.opacity": np.linspace(0, 1, 5, dtype=np.float32),
+}
+
+
+def test_equal_content_gives_equal_bytes(dev, tmp_path):
+    """Also where arrays come in pieces. That they come back: tests/test_properties.py."""
+    rows = {name: DeviceRows(dev, dev.upload(array)) for name, array in SOME.items()}
+    for name, arrays in (("a", SOME), ("b", SOME), ("c", rows)):
+        save_checkpoint(tmp_path / f"{name}.npz", {"step": 3}, arrays)
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+    with zipfile.ZipFile(tmp_path / "a.npz") as stored:  # zlib's bytes could change with a version
+        assert {entry.compress_type for entry in stored.infolist()} == {zipfile.ZIP_STORED}
+
+
+def test_forms_and_single_arrays_are_read_without_the_others(folder, config):
+    header, arrays = contents(config)
+    write_run(folder, config, header, arrays)
+    data = bytearray(folder.checkpoint.read_bytes())
+    data[data.index(arrays["points.sh2"].tobytes())] ^= 1  # read, it is corrupt
+    folder.checkpoint.write_bytes(data)
+    with opened_run(folder, config) as stored:
+        assert stored.header["step"] == STEP
+        assert {n: (f.shape, f.dtype) for n, f in stored.forms.items()} == {
+            name: (array.shape, array.dtype) for name, array in arrays.items()
+        }
+        np.testing.assert_array_equal(stored.array("points.ids"), arrays["points.ids"])
+        with pytest.raises(UserError, match=r"npz: cannot be read as a checkpoint \(Bad CRC"):
+            stored.array("points.sh2")
+    folder.checkpoint.unlink()
+    with pytest.raises(UserError, match="no such checkpoint"), opened_run(folder, config):
+        pass
+
+
+def test_a_header_that_could_not_be_read_is_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("pp_cl.checkpoint.MOST_HEADER", 100)
+    save_checkpoint(tmp_path / "a.npz", {"step": 3}, SOME)
+    before = (tmp_path / "a.npz").read_bytes()
+    with pytest.raises(UserError, match="a.npz: its header"):
+        save_checkpoint(tmp_path / "a.npz", {"views": "x" * 100}, SOME)
+    assert (tmp_path / "a.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_never_written(tmp_path, value):
+    path = tmp_path / "checkpoint.npz"
+    save_checkpoint(path, {"step": 1}, SOME)
+    before = path.read_bytes()
+    broken = {"whole": np.arange(3), "broken": np.array([[0, value]], np.float32)}
+    with pytest.raises(Diverged, match="^broken holds NaN or Inf$"):
+        save_checkpoint(path, {"step": 2}, broken)
+    assert path.read_bytes() == before and [path] == list(tmp_path.iterdir())
+    with pytest.raises(Diverged, match="^broken holds"):
+        check_finite(broken)
+    check_finite(SOME)
+
+
+def test_a_full_disk_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "checkpoint.npz"
+    save_checkpoint(path, {"step": 1}, SOME)
+    before = path.read_bytes()
+
+    def full(*_args, **_kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(atomic.os, "fsync", full)
+    with pytest.raises(UserError, match="free some space") as caught:
+        save_checkpoint(path, {"step": 2}, SOME)
+    assert str(path) in str(caught.value)
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
 # ---- whole ones
 
 
@@ -71,7 +156,7 @@ def test_what_fits_is_read_as_it_was_written(folder, config, step):
     found_header, found = load_run_state(folder, load_config(folder.config))
     assert found_header == {"format": FORMAT, **header} and found.keys() == arrays.keys()
     for name, array in arrays.items():
-        assert found[name].dtype == array.dtype
+        assert found[name].dtype == (np.float32 if array.dtype == np.float16 else array.dtype)
         np.testing.assert_array_equal(found[name], array)
 
 
@@ -194,16 +279,26 @@ def test_a_finished_run_holds_no_state_and_an_unfinished_one_does(folder, config
     assert "is missing" in refusal(folder, config)
 
 
-def test_coefficients_of_16_bits_are_those_of_a_finished_run_in_all_degrees(folder, config):
+def test_coefficients_of_a_finished_run_are_rounded_and_of_no_other(folder, config):
     header, arrays = contents(config, STEPS)
-    for degree in range(3):
-        arrays[f"points.sh{degree}"] = arrays[f"points.sh{degree}"].astype(np.float16)
-        write_run(folder, config, header, arrays)
-        if degree < 2:
-            assert f"points.sh{degree + 1} is float32" in refusal(folder, config)
-    assert load_run_state(folder, config)[1]["points.sh2"].dtype == np.float16
+    names = [name for name in arrays if name.startswith("points.sh")]
+    rng = np.random.default_rng(8)
+    given = {name: rng.normal(0, 3, arrays[name].shape).astype(np.float32) for name in names}
+    write_run(folder, config, header, arrays | given)
+    stored, found = load_checkpoint(folder.checkpoint)[1], load_run_state(folder, config)[1]
+    assert len(names) == 3
+    for name in names:
+        assert stored[name].dtype == np.float16 and found[name].dtype == np.float32
+        np.testing.assert_array_equal(found[name], given[name].astype(np.float16))
+    large = arrays | {names[0]: np.full_like(given[names[0]], 1e5)}
+    with pytest.raises(Diverged, match="points.sh0 holds NaN or Inf"):
+        save_checkpoint(folder.checkpoint, header, large)
     header, arrays = contents(config)
-    arrays |= {name: a.astype(np.float16) for name, a in arrays.items() if "points.sh" in name}
+    write_run(folder, config, header, arrays | {"points.sh1": arrays["points.sh1"] * 0.1})
+    np.testing.assert_array_equal(
+        load_run_state(folder, config)[1]["points.sh1"], arrays["points.sh1"] * np.float32(0.1)
+    )
+    arrays |= {name: arrays[name].astype(np.float16) for name in names}
     write_run(folder, config, header, arrays)
     assert "points.sh0 is float16" in refusal(folder, config)
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 from support.runs import arguments
 
+from pp_cl.checkpoint import save_checkpoint
 from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
-from pp_cl.files.run_folder import RunFolder
 
 RARELY = {"train__checkpoint_every": 1000}
 
@@ -24,11 +24,11 @@ def whole(runs, scene, tmp_path_factory):
 @pytest.fixture
 def saved(monkeypatch):
     """The steps at which checkpoints are written while every step takes a minute."""
-    steps, now, save, train_step = [], [0.0], RunFolder.save, Trainer.train_step
+    steps, now, train_step = [], [0.0], Trainer.train_step
 
-    def saving(self, header, arrays):
+    def saving(path, header, arrays):
         steps.append(header["step"])
-        save(self, header, arrays)
+        save_checkpoint(path, header, arrays)
 
     def stepping(self):
         now[0] += 60
@@ -36,7 +36,7 @@ def saved(monkeypatch):
 
     clock = SimpleNamespace(monotonic=lambda: now[0], perf_counter=time.perf_counter)
     monkeypatch.setattr("pp_cl.session.training.time", clock)
-    monkeypatch.setattr(RunFolder, "save", saving)
+    monkeypatch.setattr("pp_cl.session.training.save_checkpoint", saving)
     monkeypatch.setattr(Trainer, "train_step", stepping)
     return steps
 

@@ -99,3 +99,15 @@ def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_b
     del errors[0]
     with pytest.raises(ImportError):
         main(["devices"])
+
+
+def test_a_command_imports_its_own_module_alone():
+    ours = ("pp_studio", "pp_cl.commands.")
+    code = (
+        "import json, sys\nfrom pp_cl.cli import main\n"
+        "try: main(['devices', '--help'])\nexcept SystemExit: pass\n"
+        f"print(json.dumps([n for n in sys.modules if n.startswith({ours})]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *_, last = done.stdout.splitlines()
+    assert set(json.loads(last)) == {"pp_cl.commands.devices", "pp_cl.commands.options"}

@@ -13,7 +13,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl import load
 from pp_cl.cli import main
-from pp_cl.evaluate import image_files, render_views
+from pp_cl.evaluate import render_views
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.metrics.psnr_ssim import psnr
 
@@ -73,21 +73,6 @@ def test_what_an_earlier_evaluation_left_goes_with_the_next(run):
     own.unlink()
 
 
-@pytest.mark.parametrize(
-    "names, files",
-    [
-        (["test/r_0.png", "test/r_1.png"], ["r_0.png", "r_1.png"]),
-        (["cam0/0001.png", "cam1/0001.jpg"], ["cam0/0001.png", "cam1/0001.png"]),
-        (["images/a/1.png", "images/b/1.png"], ["a/1.png", "b/1.png"]),
-        (["test/1.png", "2.png"], ["test/1.png", "2.png"]),
-        (["test/1.png", "test/1.jpg"], ["1.png.png", "1.jpg.png"]),
-        (["r_0.png"], ["r_0.png"]),
-    ],
-)
-def test_every_image_has_a_file_of_its_own(names, files):
-    assert [str(path) for path in image_files(names)] == files
-
-
 def changed_scene(run, tmp_path, split, name):
     """(copy of the run's scene in which a pixel of a photograph differs)."""
     scene = json.loads((run / "config.json").read_text())["scene"]["path"]
@@ -129,7 +114,7 @@ def test_published_rows_are_printed_beside_what_compares(run, tmp_path, capsys, 
     command = ["eval", str(run), "--scene", str(tmp_path / "34_1479_4753"), "--out"]
     for compares in (False, True):
         if compares:
-            monkeypatch.setattr("pp_cl.run.differences", lambda *_: "")
+            monkeypatch.setattr("pp_cl.evaluate.differences", lambda *_: "")
         out = tmp_path / f"eval{compares}"
         assert main([*command, str(out)]) == 0
         result = json.loads((out / "metrics.json").read_text())

@@ -49,7 +49,7 @@ from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import find_reader, load_scene
-from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.masks import cut_out, read_mask_of_size
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
@@ -207,7 +207,7 @@ def test_an_image(world, data):
 @fuzzed()
 @given(data=st.data())
 def test_a_mask(world, data):
-    """By every rule, of a photograph with or without an object."""
+    """Of a file, and by colour, of a photograph with or without an object."""
     draw = data.draw
     with world.watched() as folder:
         image, file = ball_views()["train"][0].image, folder / "a.png"
@@ -216,12 +216,11 @@ def test_a_mask(world, data):
             damage.damage_file(draw, file)
         if draw(st.booleans()):
             image = np.random.default_rng(0).integers(0, 256, image.shape).astype(np.uint8)
-        source = one(draw, "given", "alpha", "color", "box", "none")
-        rule = MaskRule(source, one(draw, "", str(folder)), one(draw, 10.0, 1e-6, 1.0, 100.0))
+        tolerance = one(draw, 10.0, 1e-6, 1.0, 100.0)
         name = f"{draw(damage.words)}.png" if draw(st.booleans()) else "images/a.png"
-        made = taken(lambda: rule.apply(image.copy(), file if rule.is_of_files else None))
-        if made is not None and rule.is_by_colour:
-            made = taken(lambda: cut_out(made, name, rule.tolerance))
+        made = taken(lambda: read_mask_of_size(file, image.shape[1::-1]))
+        assert made is None or (made.shape == image.shape[:2] and made.dtype == np.uint8)
+        made = taken(lambda: cut_out(image, name, tolerance))
         assert made is None or (made.shape == image.shape and made.dtype == np.uint8)
 
 

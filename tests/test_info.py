@@ -14,8 +14,8 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.files.contact_sheet import GAP, HEADER
 from pp_cl.files.image import read_rgba
+from pp_cl.files.sheets import GAP, HEADER
 from pp_cl.scene.outline import OUTLINE
 
 BALL = 0.8  # its radius, support.scenes
@@ -136,17 +136,20 @@ def test_a_scene_takes_settings(tmp_path, facts):
     assert facts(path, "--set", "scene.downscale=4")["downscale"] == 4
 
 
-def test_a_scene_without_masks_or_hull_has_a_picture(tmp_path, facts, capsys):
+def test_a_scene_without_hull_has_a_picture(tmp_path, facts, capsys):
     scene = Path(write_ball_scene(tmp_path / "ball", views=5))
-    *others, path = (scene / "train").iterdir()
-    Image.open(path).convert("RGB").save(path)
+    *others, last = (scene / "train").iterdir()
+    pixels = np.array(Image.open(last))
+    pixels[..., 3] = 0
+    pixels[2:5, 2:5, 3] = 255
+    Image.fromarray(pixels).save(last)
     found = facts(scene, "--picture", tmp_path / "sheet.png")
-    assert found["hull"] is None and "has no transparent pixel" in found["problem"]
+    assert found["hull"] is None and "the mask rejects every place" in found["problem"]
     image = read_rgba(tmp_path / "sheet.png")[..., :3]
     assert not (image == OUTLINE).all(-1).any()
     assert main(["info", str(scene)]) == 0
     assert "hull        none: " in capsys.readouterr().out
-    for path in others:
+    for path in (*others, last):
         Image.open(path).convert("RGB").save(path)
     found = facts(scene, "--picture", tmp_path / "sheet.png")
     assert found["masks"]["with_alpha"] == 0 and found["masks"]["object"] is None

@@ -13,7 +13,6 @@ from pp_cl.cli import main
 from pp_cl.config import assign, preset
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.views import View
-from pp_cl.files.contact_sheet import GAP, tiles
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.hull import build_grid
@@ -113,11 +112,3 @@ def test_info_lists_the_sizes(scene, capsys, tmp_path):
     assert main(["info", scene, "--picture", str(tmp_path / "a.png")]) == 0
     said = capsys.readouterr().out
     assert all(f"4 of {w}x{h}" in said for w, h in SIZES)
-
-
-def test_pictures_of_different_sizes_lie_in_equal_cells():
-    images = [np.full((h, w, 3), i, np.uint8) for i, (w, h) in enumerate(SIZES)]
-    picture = tiles(images, 2)
-    assert picture.shape == (2 * 48 + GAP, 2 * 48 + GAP, 3)
-    assert (picture[:29, 50:87] == 1).all() and (picture[29:48, 50:98] == 255).all()
-    assert (picture[50:90, :24] == 2).all()

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from support.checkpoints import load_checkpoint
 
+from pp_cl.checkpoint import FORMAT, save_checkpoint
 from pp_cl.config import assign, load_config, preset, text_of
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
-from pp_cl.files.checkpoint import FORMAT, save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid

@@ -16,25 +16,33 @@ docs/results/NAME.json (NAME may be KIND/TABLE), which holds
 """
 
 import argparse
+import ast
 import importlib
 import inspect
 import json
-import operator
 import re
 import string
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from types import ModuleType
+from typing import Any, get_origin
 
-import pp_cl
-import pp_studio
 from pp_cl.commands import COMMANDS
 from pp_cl.config import text_of
 from pp_cl.presets import PRESETS
 from pp_cl.settings import Config, every_setting
 from tools.provenance import ROOT, digest, sentence
 
+# the modules whose names other packages may import: pp_studio imports no others
+PUBLIC = (
+    "pp_cl",
+    *(f"pp_cl.{name}" for name in ("engine", "scene", "files", "config", "errors")),
+    *(f"pp_cl.{name}" for name in ("commands", "commands.options", "commands.signals")),
+    "pp_studio",
+)
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
 MARKER = re.compile(r"^<!-- (?:end )?table", re.MULTILINE)
 
@@ -127,34 +135,75 @@ def _command(name: str) -> tuple[str, list[tuple[str, str]]]:
 
 
 def api() -> str:
-    """What `from pp_cl import` gives, in the order of use, by signature and docstring."""
-    names = [
-        "train_scene",
-        "load",
-        "Run.cameras",
-        "Run.render",
-        "Picture",
-        "Picture.save",
-        "Picture.over",
-        "Picture.rgba",
-        "evaluate_run",
-        "Camera",
-        "Camera.look_at",
+    """Every public name by module: its signature with types, and its docstring, of modules below
+    pp_cl the first sentence of it.
+    """
+    lines: list[str] = []
+    seen: dict[int, str] = {}  # {a class or function: the module that has named it before}
+    for name in PUBLIC:
+        module = importlib.import_module(name)
+        lines += [f"## {name}", "", _first_sentence(module.__doc__), ""]
+        told = _first_sentence if "." in name else inspect.cleandoc
+        for one in public_names(module):
+            thing = getattr(module, one)
+            first = seen.setdefault(id(thing), name)
+            known = [f"- `{one}`: see {first}"]
+            lines += _entry(one, thing, told) if first == name else known
+        lines += [""]
+    return "\n".join(line.rstrip() for line in lines).rstrip()
+
+
+def public_names(module: ModuleType) -> list[str]:
+    """The names that others may import from a module: its __all__, else all that it defines."""
+    defined = [
+        n for n, v in vars(module).items() if getattr(v, "__module__", "") == module.__name__
     ]
-    lines = [line for name in names for line in _entry(pp_cl, name)]
-    return "\n".join([*lines, *_entry(pp_studio, "export_run")]).rstrip()
+    named = getattr(module, "__all__", defined)
+    return sorted((n for n in named if n[0] != "_"), key=lambda n: (n.lower(), n))
 
 
-def _entry(package: ModuleType, name: str) -> list[str]:
-    """The call or the class, and the docstring."""
-    thing = operator.attrgetter(name)(package)
-    written = name
-    if inspect.isroutine(thing):
-        signature = inspect.signature(thing)
-        shown = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
-        shown = [p for p in shown if p.name != "self"]
-        written += str(inspect.Signature(shown))
-    return [f"    {written}", "", inspect.getdoc(thing), ""]
+def _first_sentence(text: str | None) -> str:
+    paragraph = " ".join((text or "").strip().partition("\n\n")[0].split())
+    return re.split(r"(?<=\.)\s", paragraph)[0]
+
+
+def _entry(name: str, thing: Any, told: Callable[[str | None], str], indent: str = "") -> list[str]:
+    """The lines of a name: a constant, a type, a function, or a class with its public methods."""
+    if not (inspect.isroutine(thing) or inspect.isclass(thing)):
+        if isinstance(thing, (int, str)):
+            return [f"- `{name} = {thing!r}`"]
+        is_type = get_origin(thing) is not None
+        value = re.sub(r"(collections\.abc|typing)\.", "", str(thing)) if is_type else ""
+        return [f"- `{name} = {value}`" if is_type else f"- `{name}: {type(thing).__name__}`"]
+    text = textwrap.indent(told(thing.__doc__), f"{indent}  ").strip()
+    lines = [f"{indent}- `{name}{_signature(thing)}`: {text}"]
+    if inspect.isclass(thing) and not issubclass(thing, Exception):
+        for own, member in vars(thing).items():
+            if own[0] == "_" or own in getattr(thing, "_fields", ()):
+                continue
+            if isinstance(member, (property, cached_property)):
+                function = member.fget if isinstance(member, property) else member.func
+                returned = _signature(function).partition(" -> ")[2]
+                text = textwrap.indent(told(function.__doc__), f"{indent}    ").strip()
+                lines.append(f"{indent}  - `.{own}: {returned}`: {text}")
+            elif isinstance(member, (classmethod, staticmethod)) or inspect.isfunction(member):
+                lines += _entry(f".{own}", getattr(member, "__func__", member), told, f"{indent}  ")
+    return lines
+
+
+def _signature(thing: Any) -> str:
+    """As the source has it, with types: of a function, or of what makes an object of a class."""
+    (node,) = ast.parse(textwrap.dedent(inspect.getsource(thing))).body
+    if isinstance(node, ast.ClassDef):
+        inits = [one for one in node.body if getattr(one, "name", "") == "__init__"]
+        if not inits:  # a dataclass, a NamedTuple
+            fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
+            shown = [ast.unparse(one) for one in fields if ast.unparse(one.target)[0] != "_"]
+            return f"({', '.join(one.split(' = field(')[0] for one in shown)})" if shown else ""
+        (node,) = inits
+    node.args.args = [one for one in node.args.args if one.arg not in ("self", "cls")]
+    returned = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+    return re.sub(r"'([A-Z]\w+)'", r"\1", f"({ast.unparse(node.args)}){returned}")
 
 
 def _written(action: argparse.Action) -> str:

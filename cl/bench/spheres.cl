@@ -9,8 +9,8 @@ kernel void spheres_backward(
     const uint n,  // spheres
     const float gamma,
     global const float *camera,                // (21) camera.h
-    global const float *point_radius,          // (N)
     global const float4 *point_camera,         // (N, 4) x, y, z, t
+    global const float *point_shape,           // (N, 1) radius
     global const float *opacity,               // (N)
     global const uchar *point_is_shaded,       // (N) 0: has no gradients
     global const uint *point_offset,           // (N+1)
@@ -29,7 +29,7 @@ kernel void spheres_backward(
     }
     const Camera cam = camera_load(camera);
     const float3 centre = point_camera[i].xyz;
-    const float t = point_camera[i].w, radius = point_radius[i];
+    const float t = point_camera[i].w, radius = point_shape[i];
     const float width = t / least_focal(&cam), least = LEAST_RADIUS * width;
     const float per_depth = 1.0f / (gamma * (cam.far - cam.near)),
                 dl_ddepth = -opacity[i] * per_depth;

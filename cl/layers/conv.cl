@@ -47,23 +47,18 @@ ALWAYS_INLINE void convolve(
         global const float16 *w = weight + ky * KERNEL_SIZE * kx_stride;
         for (int c = 0; c < channels; c++) {
             float16 wc[BLOCKS][KERNEL_SIZE];
-#pragma unroll
-            for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-                for (int kx = 0; kx < KERNEL_SIZE; kx++)
+            UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
                     wc[b][kx] = w[b * block_stride + kx * kx_stride + c];
-#pragma unroll
-            for (int column = -PAD; column < PIXELS + PAD; column++) {
+            UNROLLED_FOR (int column = -PAD; column < PIXELS + PAD; column++) {
                 const float value = column < 0 ? as_float(as_int(pixel[left + c]) & left_mask)
                                     : column >= PIXELS
                                         ? as_float(as_int(pixel[right + c]) & right_mask)
                                         : pixel[column * channels + c];
-#pragma unroll
-                for (int kx = 0; kx < KERNEL_SIZE; kx++) {
+                UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++) {
                     const int p = column - kx + PAD;
                     if (p >= 0 && p < PIXELS)
-#pragma unroll
-                        for (int b = 0; b < BLOCKS; b++)
+                        UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
                             acc[b][p] += value * wc[b][kx];
                 }
             }
@@ -104,10 +99,8 @@ kernel void conv_forward(
     const int x0 = min(tile_x, width - PIXELS);
     if (!any_is_computed(tile_count, x0, y, width)) return;
     float16 acc[BLOCKS][PIXELS];
-#pragma unroll
-    for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-        for (int p = 0; p < PIXELS; p++)
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
             acc[b][p] = bias[block + b];
 
     const int kx_stride = c1 + c2, block_stride = TAPS * kx_stride;
@@ -116,10 +109,8 @@ kernel void conv_forward(
             acc, source ? x2 : x, weight + block * block_stride + source * c1, source ? c2 : c1,
             kx_stride, block_stride, x0, y, height, width);
 
-#pragma unroll
-    for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-        for (int p = 0; p < PIXELS; p++)
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
             if (x0 + p >= tile_x && tile_is_computed(tile_count, x0 + p, y, width)) {
                 // max(., 0) would hide a NaN
                 const float16 value =
@@ -152,18 +143,14 @@ kernel void conv_backward_input(
     const int x0 = min(tile_x, width - PIXELS);
     if (!any_is_computed(tile_count, x0, y, width)) return;
     float16 acc[BLOCKS][PIXELS];
-#pragma unroll
-    for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-        for (int p = 0; p < PIXELS; p++)
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
             acc[b][p] = 0.0f;
 
     convolve(acc, grad_out, flipped + block * TAPS * co, co, co, TAPS * co, x0, y, height, width);
 
-#pragma unroll
-    for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-        for (int p = 0; p < PIXELS; p++)
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
             if (x0 + p >= tile_x && tile_is_computed(tile_count, x0 + p, y, width)) {
                 const size_t at = ((size_t)y * width + x0 + p) * c + (block + b) * 16;
                 const int lanes = c - (block + b) * 16;

@@ -87,20 +87,16 @@ kernel void conv_backward_weights(
         global const float *grad = grad_out + (size_t)y * width * co + block * 16;
         global const float *count = tile_count + y / SIDE * tile_columns(width);
         float16 window[KERNEL_SIZE];  // window[kx]: dL/dout at column + PAD - kx
-#pragma unroll
-        for (int kx = 0; kx < KERNEL_SIZE; kx++)
+        UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
             window[kx] = 0.0f;
         if (PAD) window[0] = counted(grad, count[0], lanes);
         for (int begin = 0; begin < width; begin += SUMMED) {
             float16 acc[KERNEL_SIZE][CI_GROUP], sum = 0.0f;
-#pragma unroll
-            for (int kx = 0; kx < KERNEL_SIZE; kx++)
-#pragma unroll
-                for (int i = 0; i < CI_GROUP; i++)
+            UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
                     acc[kx][i] = 0.0f;
             for (int column = begin; column < min(begin + SUMMED, width); column++) {
-#pragma unroll
-                for (int kx = KERNEL_SIZE - 1; kx > 0; kx--)
+                UNROLLED_FOR (int kx = KERNEL_SIZE - 1; kx > 0; kx--)
                     window[kx] = window[kx - 1];
                 const int ahead = column + PAD;
                 window[0] = ahead < width ? counted(grad + ahead * co, count[ahead / SIDE], lanes)
@@ -109,19 +105,15 @@ kernel void conv_backward_weights(
                 if (count[max(column - PAD, 0) / SIDE] == 0.0f &&
                     count[min(column + PAD, width - 1) / SIDE] == 0.0f)
                     continue;
-#pragma unroll
-                for (int i = 0; i < CI_GROUP; i++) {
+                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++) {
                     const float value = pixel[column * c + i];
-#pragma unroll
-                    for (int kx = 0; kx < KERNEL_SIZE; kx++)
+                    UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
                         acc[kx][i] += value * window[kx];
                 }
                 sum += window[PAD];
             }
-#pragma unroll
-            for (int kx = 0; kx < KERNEL_SIZE; kx++)
-#pragma unroll
-                for (int i = 0; i < CI_GROUP; i++)
+            UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
                     out[kx * ci + i] += acc[kx][i];
             if (with_bias) *bias += sum;
         }

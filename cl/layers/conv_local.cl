@@ -95,12 +95,10 @@ ALWAYS_INLINE void convolve(
 #pragma unroll 4
 #endif
         for (int c = 0; c < CHUNK; c++)
-#pragma unroll
-            for (int ky = 0; ky < KERNEL_SIZE; ky++) {
+            UNROLLED_FOR (int ky = 0; ky < KERNEL_SIZE; ky++) {
                 local const float4 *w =
                     weights + (c * TAPS + ky * KERNEL_SIZE) * QUADS + item_quad();
-#pragma unroll
-                for (int row = 0; row < ROWS; row++) {
+                UNROLLED_FOR (int row = 0; row < ROWS; row++) {
                     local const float *line = mine + c * GROUP_TILES * PITCH + (row + ky) * LINE;
                     const float4 a = *(local const float4 *)line;
 #if KERNEL_SIZE == 3
@@ -109,10 +107,8 @@ ALWAYS_INLINE void convolve(
 #else
                     const float v[SPAN] = {a.x, a.y, a.z, a.w};
 #endif
-#pragma unroll
-                    for (int kx = 0; kx < KERNEL_SIZE; kx++)
-#pragma unroll
-                        for (int p = 0; p < SIDE; p++)
+                    UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                        UNROLLED_FOR (int p = 0; p < SIDE; p++)
                             acc[row * SIDE + p] += v[p + kx] * w[kx * QUADS];
                 }
             }
@@ -149,8 +145,7 @@ kernel void conv_local_forward(
     const int height = tile_list[0], width = tile_list[1], ci = c1 + c2;
     const int channel = (get_group_id(1) * QUADS + item_quad()) * 4;
     float4 acc[ROWS * SIDE];
-#pragma unroll
-    for (int p = 0; p < ROWS * SIDE; p++)
+    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++)
         acc[p] = bias[channel / 4];
     global const float4 *w = weight + get_group_id(1) * QUADS * TAPS * ci;
     for (int source = 0; source < (c2 ? 2 : 1); source++)
@@ -160,8 +155,7 @@ kernel void conv_local_forward(
 
     if (channel >= co || first_tile() + item_tile() >= tile_list[2]) return;
     const int2 at = corner[item_tile()] + (int2)(0, item_line());
-#pragma unroll
-    for (int p = 0; p < ROWS * SIDE; p++) {
+    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++) {
         const int px = at.x + p % SIDE, py = at.y + p / SIDE;
         // max(., 0) would hide a NaN
         const float4 value = relu ? select(acc[p], (float4)(0.0f), acc[p] < 0.0f) : acc[p];
@@ -191,8 +185,7 @@ kernel void conv_local_backward_input(
     const int height = tile_list[0], width = tile_list[1];
     const int channel = (get_group_id(1) * QUADS + item_quad()) * 4;
     float4 acc[ROWS * SIDE];
-#pragma unroll
-    for (int p = 0; p < ROWS * SIDE; p++)
+    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++)
         acc[p] = 0.0f;
     convolve(
         acc, values, weights, corner, grad_out, flipped + get_group_id(1) * QUADS * TAPS * co, co,
@@ -200,8 +193,7 @@ kernel void conv_local_backward_input(
 
     if (channel >= c || first_tile() + item_tile() >= tile_list[2]) return;
     const int2 at = corner[item_tile()] + (int2)(0, item_line());
-#pragma unroll
-    for (int p = 0; p < ROWS * SIDE; p++) {
+    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++) {
         const int px = at.x + p % SIDE, py = at.y + p / SIDE;
         if (px >= width || py >= height) continue;
         const size_t to = ((size_t)py * width + px) * c + channel;

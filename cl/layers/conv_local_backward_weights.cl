@@ -78,10 +78,8 @@ kernel void conv_local_backward_weights(
                          quad % 4;
     for (int from = begin; from < end; from += summed) {
         float4 acc[KERNEL_SIZE][4];
-#pragma unroll
-        for (int kx = 0; kx < KERNEL_SIZE; kx++)
-#pragma unroll
-            for (int i = 0; i < 4; i++)
+        UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+            UNROLLED_FOR (int i = 0; i < 4; i++)
                 acc[kx][i] = 0.0f;
         const int to = min(from + summed, end);
         for (int t = from; t < to; t += STAGE) {
@@ -99,14 +97,11 @@ kernel void conv_local_backward_weights(
                     local const float4 *seen =
                         values + (tile * SPAN + row + ky) * SPAN * CI_QUADS + lane;
                     float4 g[SIDE];
-#pragma unroll
-                    for (int p = 0; p < SIDE; p++)
+                    UNROLLED_FOR (int p = 0; p < SIDE; p++)
                         g[p] = grads[((tile * SIDE + row) * SIDE + p) * QUADS + quad];
-#pragma unroll
-                    for (int column = 0; column < SPAN; column++) {
+                    UNROLLED_FOR (int column = 0; column < SPAN; column++) {
                         const float4 v = seen[column * CI_QUADS];
-#pragma unroll
-                        for (int kx = 0; kx < KERNEL_SIZE; kx++) {
+                        UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++) {
                             const int p = column - kx;
                             if (p >= 0 && p < SIDE) {
                                 acc[kx][0] += v.x * g[p];
@@ -118,10 +113,8 @@ kernel void conv_local_backward_weights(
                     }
                 }
         }
-#pragma unroll
-        for (int kx = 0; kx < KERNEL_SIZE; kx++)
-#pragma unroll
-            for (int i = 0; i < 4; i++) {
+        UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+            UNROLLED_FOR (int i = 0; i < 4; i++) {
                 global float4 *sum = out + (kx * ci + i) * 4;
                 if (c0 + lane * 4 + i < c) *sum = from == begin ? acc[kx][i] : *sum + acc[kx][i];
             }

@@ -97,16 +97,14 @@ kernel void upsample2_forward(
         return;
     const int left = max(column - 1, 0) * c, right = min(column + 1, w - 1) * c;
     floats line[3][2];  // rows row - 1, row, row + 1 of x at the two columns of out
-#pragma unroll
-    for (int i = 0; i < 3; i++) {
+    UNROLLED_FOR (int i = 0; i < 3; i++) {
         global const float *pixels = x + (size_t)clamp(row - 1 + i, 0, h - 1) * w * c + first;
         const floats near = 0.75f * load_lanes(pixels + column * c, count);
         line[i][0] = near + 0.25f * load_lanes(pixels + left, count);
         line[i][1] = near + 0.25f * load_lanes(pixels + right, count);
     }
     global float *corner = out + ((size_t)row * 4 * w + column * 2) * c + first;
-#pragma unroll
-    for (int i = 0; i < 4; i++)
+    UNROLLED_FOR (int i = 0; i < 4; i++)
         store_lanes(
             0.75f * line[1][i % 2] + 0.25f * line[i / 2 * 2][i % 2],
             corner + (i / 2 * 2 * w + i % 2) * c, count);
@@ -131,8 +129,7 @@ kernel void upsample2_backward(
     const int x0 = max(2 * column - 1, 0) * c, x1 = 2 * column * c, x2 = x1 + c,
               x3 = min(2 * column + 2, 2 * w - 1) * c;
     floats dL_dx = 0.0f;
-#pragma unroll
-    for (int dy = 0; dy < 4; dy++) {
+    UNROLLED_FOR (int dy = 0; dy < 4; dy++) {
         const int y = clamp(2 * row - 1 + dy, 0, 2 * h - 1);
         global const float *grad = grad_out + (size_t)y * 2 * w * c + first;
         const floats outer = load_lanes(grad + x0, count) + load_lanes(grad + x3, count);

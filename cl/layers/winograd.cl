@@ -34,10 +34,8 @@ ALWAYS_INLINE void multiply(
         for (int block = 0; block < blocks; block += BLOCKS)
             for (int tile = 0; tile < padded; tile += TOGETHER) {
                 float16 acc[BLOCKS][TOGETHER];
-#pragma unroll
-                for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-                    for (int i = 0; i < TOGETHER; i++)
+                UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                    UNROLLED_FOR (int i = 0; i < TOGETHER; i++)
                         acc[b][i] = 0.0f;
                 for (int chunk = 0; chunk < ci / 16; chunk++) {
                     global const float *value =
@@ -46,20 +44,15 @@ ALWAYS_INLINE void multiply(
 #pragma unroll 4
                     for (int c = 0; c < 16; c++) {
                         float16 wc[BLOCKS];
-#pragma unroll
-                        for (int b = 0; b < BLOCKS; b++)
+                        UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
                             wc[b] = transformed[weight + b * ci + c];
-#pragma unroll
-                        for (int i = 0; i < TOGETHER; i++)
-#pragma unroll
-                            for (int b = 0; b < BLOCKS; b++)
+                        UNROLLED_FOR (int i = 0; i < TOGETHER; i++)
+                            UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
                                 acc[b][i] += value[i * 16 + c] * wc[b];
                     }
                 }
-#pragma unroll
-                for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-                    for (int i = 0; i < TOGETHER; i++)
+                UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                    UNROLLED_FOR (int i = 0; i < TOGETHER; i++)
                         m[position * PITCH(blocks * 16) + (block + b) * TILES + tile + i] =
                             acc[b][i];
             }
@@ -82,15 +75,12 @@ ALWAYS_INLINE void transform_back(
         const int2 corner = listed_corner(tile_list, first + tile);
         for (int block = 0; block < co / 16; block++) {
             float16 t[POSITIONS];
-#pragma unroll
-            for (int i = 0; i < POSITIONS; i++)
+            UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
                 t[i] = m[i * pitch + block * TILES + tile];
             transform_output_tile(t);
             const float16 offset = bias ? bias[block] : (float16)0.0f;
-#pragma unroll
-            for (int i = 0; i < WINO_M; i++)
-#pragma unroll
-                for (int j = 0; j < WINO_M; j++)
+            UNROLLED_FOR (int i = 0; i < WINO_M; i++)
+                UNROLLED_FOR (int j = 0; j < WINO_M; j++)
                     if (corner.y + i < height && corner.x + j < width) {
                         const size_t at =
                             ((size_t)(corner.y + i) * width + corner.x + j) * co + block * 16;

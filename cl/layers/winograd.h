@@ -87,31 +87,25 @@ ALWAYS_INLINE void transform_kernel_gradient(float16 *t, const int step) {
 
 // Of a tile of inputs, S x S.
 ALWAYS_INLINE void transform_input_tile(float16 *t) {
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
+    UNROLLED_FOR (int i = 0; i < WINO_S; i++)
         transform_input(t + i, WINO_S);
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
+    UNROLLED_FOR (int i = 0; i < WINO_S; i++)
         transform_input(t + i * WINO_S, 1);
 }
 
 // S x S values of a tile -> M x M outputs, in rows of S.
 ALWAYS_INLINE void transform_output_tile(float16 *t) {
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
+    UNROLLED_FOR (int i = 0; i < WINO_S; i++)
         transform_output(t + i, WINO_S);
-#pragma unroll
-    for (int i = 0; i < WINO_M; i++)
+    UNROLLED_FOR (int i = 0; i < WINO_M; i++)
         transform_output(t + i * WINO_S, 1);
 }
 
 // 3 x 3 weights, in rows of S -> S x S values.
 ALWAYS_INLINE void transform_kernel_tile(float16 *t) {
-#pragma unroll
-    for (int i = 0; i < 3; i++)
+    UNROLLED_FOR (int i = 0; i < 3; i++)
         transform_kernel(t + i, WINO_S);
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
+    UNROLLED_FOR (int i = 0; i < WINO_S; i++)
         transform_kernel(t + i * WINO_S, 1);
 }
 
@@ -175,8 +169,7 @@ ALWAYS_INLINE void load_tile(
         row = WINO_S * 16;
         column = 16;
     }
-#pragma unroll
-    for (int i = 0; i < POSITIONS; i++)
+    UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
         if (i % WINO_S < side && i / WINO_S < side)
             t[i] = vload16(0, corner + i / WINO_S * row + i % WINO_S * column);
 }
@@ -202,8 +195,7 @@ ALWAYS_INLINE void transform_tiles(
             load_tile(
                 t, WINO_S, patch, x + chunk * 16, channels, corner.x, corner.y, height, width);
             transform_input_tile(t);
-#pragma unroll
-            for (int i = 0; i < POSITIONS; i++)
+            UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
                 v[i * pitch + chunk * TILES + tile] = t[i];
         }
     }

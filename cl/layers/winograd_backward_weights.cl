@@ -44,20 +44,15 @@ ALWAYS_INLINE void transform_gradients(
             load_tile(
                 t, WINO_M, patch, grad_out + block * 16, channels, corner.x, corner.y, height,
                 width);
-#pragma unroll
-            for (int i = 0; i < WINO_M; i++)
-#pragma unroll
-                for (int j = 0; j < WINO_M; j++)
+            UNROLLED_FOR (int i = 0; i < WINO_M; i++)
+                UNROLLED_FOR (int j = 0; j < WINO_M; j++)
                     sum += t[i * WINO_S + j] *= times;
             round += sum;
-#pragma unroll
-            for (int i = 0; i < WINO_M; i++)
+            UNROLLED_FOR (int i = 0; i < WINO_M; i++)
                 transform_gradient(t + i, WINO_S);
-#pragma unroll
-            for (int i = 0; i < WINO_S; i++)
+            UNROLLED_FOR (int i = 0; i < WINO_S; i++)
                 transform_gradient(t + i * WINO_S, 1);
-#pragma unroll
-            for (int i = 0; i < POSITIONS; i++)
+            UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
                 z[i * PITCH(CO_PART) + block * TILES + tile] = t[i];
         }
         sums[block] += round;
@@ -79,10 +74,8 @@ ALWAYS_INLINE void multiply_gradients(
         for (int block = 0; block < blocks; block += BLOCKS)
             for (int row = 0; row < rows; row += ROWS) {
                 float16 acc[BLOCKS][ROWS];
-#pragma unroll
-                for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-                    for (int i = 0; i < ROWS; i++)
+                UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                    UNROLLED_FOR (int i = 0; i < ROWS; i++)
                         acc[b][i] = 0.0f;
                 global const float16 *grad = z + position * PITCH(CO_PART) + block * TILES;
                 global const float *value =
@@ -90,20 +83,15 @@ ALWAYS_INLINE void multiply_gradients(
 #pragma unroll 4
                 for (int tile = 0; tile < count; tile++) {
                     float16 g[BLOCKS];
-#pragma unroll
-                    for (int b = 0; b < BLOCKS; b++)
+                    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
                         g[b] = grad[b * TILES + tile];
-#pragma unroll
-                    for (int i = 0; i < ROWS; i++)
-#pragma unroll
-                        for (int b = 0; b < BLOCKS; b++)
+                    UNROLLED_FOR (int i = 0; i < ROWS; i++)
+                        UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
                             acc[b][i] += value[tile * 16 + row % 16 + i] * g[b];
                 }
                 global float16 *sum = sums + (position * (CO_PART / 16) + block) * ci_part + row;
-#pragma unroll
-                for (int b = 0; b < BLOCKS; b++)
-#pragma unroll
-                    for (int i = 0; i < ROWS; i++)
+                UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                    UNROLLED_FOR (int i = 0; i < ROWS; i++)
                         sum[b * ci_part + i] =
                             first_round ? acc[b][i] : sum[b * ci_part + i] + acc[b][i];
             }
@@ -120,17 +108,13 @@ ALWAYS_INLINE void store_gradients(
     const int first_sum) {
     for (int row = 0; row < rows; row++) {
         float16 t[POSITIONS];
-#pragma unroll
-        for (int i = 0; i < POSITIONS; i++)
+        UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
             t[i] = sums[i * (CO_PART / 16) * ci_part + row];
-#pragma unroll
-        for (int i = 0; i < WINO_S; i++)
+        UNROLLED_FOR (int i = 0; i < WINO_S; i++)
             transform_kernel_gradient(t + i, WINO_S);
-#pragma unroll
-        for (int i = 0; i < 3; i++)
+        UNROLLED_FOR (int i = 0; i < 3; i++)
             transform_kernel_gradient(t + i * WINO_S, 1);
-#pragma unroll
-        for (int i = 0; i < 9; i++)
+        UNROLLED_FOR (int i = 0; i < 9; i++)
             grad_weight[i * ci + row] = first_sum
                                             ? t[i / 3 * WINO_S + i % 3]
                                             : grad_weight[i * ci + row] + t[i / 3 * WINO_S + i % 3];

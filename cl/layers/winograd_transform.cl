@@ -23,8 +23,7 @@ kernel void winograd_transform(
     const int c = (item - row[0]) % channels, block = (item - row[0]) / channels;
     global const float *weight = weights + row[3];
     float16 t[POSITIONS];
-#pragma unroll
-    for (int i = 0; i < 9; i++) {
+    UNROLLED_FOR (int i = 0; i < 9; i++) {
         global const float *tap =
             weight + ((c / 16 * 9 + 8 - i) * ci + first + block * 16) * 16 + c % 16;
         t[i / 3 * WINO_S + i % 3] =
@@ -34,7 +33,6 @@ kernel void winograd_transform(
                    : vload16((block * 9 + i) * ci + c, weight);
     }
     transform_kernel_tile(t);
-#pragma unroll
-    for (int i = 0; i < POSITIONS; i++)
+    UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
         transformed[row[4] + WEIGHT_AT(i, block, blocks, channels) + c] = t[i];
 }

@@ -43,19 +43,16 @@ kernel void alpha_weights(
             pair_point_closeness + (uint)pair_key[min(i + HITS_AHEAD, pixel_offset[hw] - 1)]);
         uint2 hits[BATCH];
         float o[BATCH];
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             hits[j] = pair_point_closeness[(uint)pair_key[j == 0 ? i : min(i + j, end - 1)]];
             o[j] = opacity[hits[j].x];
         }
-        UNROLLED for (uint j = 0; j < BATCH && i < end && T >= early_stop; j++, i++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH && i < end && T >= early_stop; j++, i++) {
             const uint2 hit = hits[j];
             const float d = as_float(hit.y);
             float alpha = o[j] * d;
-            bool shows = true;
-            if (FOOTPRINT == GAUSSIAN) {
-                shows = !(alpha < LEAST_ALPHA);
-                alpha = !shows ? 0.0f : alpha > MOST_ALPHA ? MOST_ALPHA : alpha;
-            }
+            const bool shows = !(alpha < LEAST_ALPHA);
+            alpha = !shows ? 0.0f : alpha > MOST_ALPHA ? MOST_ALPHA : alpha;
             pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
             if (SLOPES) pixel_slope[i] = shows ? T * d : 0.0f;
             point_is_shaded[hit.x] = 1;

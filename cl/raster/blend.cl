@@ -21,15 +21,9 @@
 // of the softmax (b, s), and the point adds the gain.
 #include "common.h"
 #include "lanes.h"
-#include "raster/offset.h"
+#include "raster/footprint.h"
 #include "reduce.h"
 
-#ifndef MOVES
-#define MOVES 0  // 1: gradients of the offsets of soft points that are composited by alpha
-#endif
-#ifndef CLAMPED
-#define CLAMPED 0  // 1: features that shade.cl has clamped to 0 have no gradient
-#endif
 #ifndef GAINS
 #define GAINS 0  // 1: pair_gradient has no gains yet: softmax_gradient wrote it
 #endif
@@ -58,13 +52,13 @@ kernel void blend_forward(
         float b[BATCH];
         floats feature[BATCH];
         bool listed = true;
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             const ulong entry = j == 0 || i + j < end ? pixel_entry[i + j] : NONE;
             listed = listed && (uint)entry != NONE;
             b[j] = listed ? upper_float(entry) : 0.0f;
             feature[j] = listed ? load_part(shaded_features, point_slot[(uint)entry]) : 0.0f;
         }
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             sum += b[j] * feature[j];
             weights += b[j];
         }
@@ -137,7 +131,7 @@ kernel void alpha_gradient(
     for (uint i = end; i > begin;) {
         ulong key[BATCH];
         float weight[BATCH], slope[BATCH], of_point[BATCH];
-        UNROLLED for (uint j = 0; j < BATCH; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
             const uint at = i - begin > j ? i - 1 - j : begin;
             const ulong entry = pixel_entry[at];
             key[j] = pair_key[at];
@@ -145,7 +139,7 @@ kernel void alpha_gradient(
             slope[j] = pixel_slope[at];
             of_point[j] = dot16(G, shaded_features[point_slot[(uint)entry]]);
         }
-        UNROLLED for (uint j = 0; j < BATCH && i > begin; j++) {
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH && i > begin; j++) {
             i--;
             const float b = weight[j];
             float own = of_point[j];
@@ -169,39 +163,22 @@ kernel void alpha_gradient(
 }
 
 // One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes
-// the gradients of its features and, the first one, of its opacity and offset, and gains where GAINS.
+// the gradients of its features and, the first one, of its opacity, and gains where GAINS.
 kernel void blend_backward(
-    const uint s,                              // visible points
-    const float edge,                          // of the grid, world units
-    const float radius,                        // of a point without offsets, world units
-    global const uint *shaded,                 // (S) their indices
-    global const float *camera,                // (21) camera.h
-    global const float *point_radius,          // (N) read with MOVES, as the next ones
-    global const float4 *point_camera,         // (N, 4) x, y, z, distance
-    global const float4 *point_white,          // (?, 4) (N, 4) read of Gaussians, as the next one
-    global const float *cloud_offset,          // (?, OFFSETS) (N, OFFSETS), cloud.h
-    global const float *opacity,               // (N)
-    global const uint *point_offset,           // (N+1)
-    global const uint *pair_pixel,             // (P)
-    global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
-    global float2 *pair_gradient,              // (P, 2) b, s gain; s is read with GAINS
-    global const float *pixel_blend,           // (?) (HW) G.F, read with GAINS
-    global const float16 *shaded_features,     // (?, 16) a row for each, read with CLAMPED, GAINS
-    global const float16 *grad_features,       // (H, W, 16) G
-    global float16 *grad_shaded_features,      // (?, 16) alike
-    global float *grad_opacity,                // (?) alike
-    global float *grad_offset)                 // (?, OFFSETS) alike, with MOVES
+    const uint s,                           // visible points
+    global const uint *shaded,              // (S) their indices
+    global const uint *point_offset,        // (N+1)
+    global const uint *pair_pixel,          // (P)
+    global float2 *pair_gradient,           // (P, 2) b, s gain; s is read with GAINS
+    global const float *pixel_blend,        // (?) (HW) G.F, read with GAINS
+    global const float16 *shaded_features,  // (?, 16) a row for each, read with CLAMPED, GAINS
+    global const float16 *grad_features,    // (H, W, 16) G
+    global float16 *grad_shaded_features,   // (?, 16) alike
+    global float *grad_opacity)             // (?) alike
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
-    const Camera cam = camera_load(camera);
-    OffsetGradient moved;
-#if MOVES && FOOTPRINT == GAUSSIAN
-    moved = offset_begin(&cam, point_camera[i], point_white[i]);
-#elif MOVES
-    moved = offset_begin(&cam, point_camera[i], point_radius[i]);
-#endif
     const float16 feature = GAINS ? shaded_features[g] : 0.0f;
     floats dL_df = 0.0f;
     float dL_do = 0.0f;
@@ -216,19 +193,9 @@ kernel void blend_backward(
         }
         dL_df += of_hit.x * G;
         dL_do += of_hit.y;
-        if (MOVES && ROW_PART == 0) {
-            const float d = as_float(pair_point_closeness[pair].y);  // 0 at the very rim
-            if (d > 0.0f) offset_add(&moved, &cam, q, d, opacity[i] * of_hit.y / d);
-        }
     }
+    // features that shade.cl has clamped to 0 have no gradient
     if (CLAMPED) dL_df = load_part(shaded_features, g) == 0.0f ? 0.0f : dL_df;
     store_part(dL_df, grad_shaded_features, g);
-    if (ROW_PART != 0) return;
-    grad_opacity[g] = dL_do;
-#if MOVES && FOOTPRINT == GAUSSIAN
-    OFFSETS_AT(grad_offset, g) =
-        offset_end(&moved, &cam, edge, radius, OFFSETS_AT(cloud_offset, i));
-#elif MOVES
-    OFFSETS_AT(grad_offset, g) = offset_end(&moved, &cam, edge);
-#endif
+    if (ROW_PART == 0) grad_opacity[g] = dL_do;
 }

@@ -6,11 +6,6 @@
 #include "common.h"
 #include "raster/footprint.h"
 
-// Distance from the eye. range: the pair's depth. d: its closeness, at the rim a rounding below 0.
-static inline float surface_range(const float range, const float radius, const float d) {
-    return FOOTPRINT == SOFT && !(d < 0.0f) ? range - radius * sqrt(d * (2.0f - d)) : range;
-}
-
 // One work-item per pixel: reads its hits, nearest first, and writes the share of the pixel that is
 // not background, and the depth of that along the camera's axis: the mean by weight, and where half
 // of the weight is reached, which grows evenly from hit to hit. A pixel whose list an early stop has
@@ -18,7 +13,7 @@ static inline float surface_range(const float range, const float radius, const f
 kernel void depth_forward(
     const uint hw,                             // pixels
     global const float *camera,                // (21) camera.h
-    global const float *point_radius,          // (N)
+    global const float *point_shape,           // (N, SHAPE) footprint.h
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
@@ -41,7 +36,8 @@ kernel void depth_forward(
         const uint2 hit = pair_point_closeness[(uint)pair_key[i]];
         const float b = as_float((uint)(pixel_entry[i] >> 32));
         const float range = as_float((uint)(pair_key[i] >> 32));
-        const float z = axis * surface_range(range, point_radius[hit.x], as_float(hit.y));
+        global const float *shape = point_shape + (size_t)SHAPE * hit.x;
+        const float z = axis * surface_range(range, shape, as_float(hit.y));
         depth += b * z;
         if (reached < 0.5f * alpha) {
             const float share = b > 0.0f ? fmin((0.5f * alpha - reached) / b, 1.0f) : 1.0f;

@@ -2,14 +2,11 @@
 // direction from the eye.
 #include "common.h"
 #include "lanes.h"
+#include "raster/footprint.h"
 #include "sh.h"
 
 #ifndef DEGREE
 #define DEGREE 2  // of the highest harmonics in use: 0, 1 or 2
-#endif
-
-#ifndef CLAMPED
-#define CLAMPED 0  // 1: features below 0 become 0, as viewers of 3D Gaussian splatting draw colours
 #endif
 
 // Blends `features` of the coefficients of point i, read by LOAD(index, array), in the direction

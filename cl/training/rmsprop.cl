@@ -41,7 +41,7 @@
 // Moves `count` coefficients of point i, from basis function `first` on.
 #define MOVE(sh, first, count, rate)                                                               \
     {                                                                                              \
-        UNROLLED for (size_t k = 0; k < count; k++) {                                              \
+        GPU_UNROLLED_FOR (size_t k = 0; k < count; k++) {                                          \
             const size_t at = i * count + k;                                                       \
             const floats moved = load_part(sh, at) - rate * basis[first + k] * scaled;             \
             store_part(BOUNDED_SH(moved, first + k), sh, at);                                      \

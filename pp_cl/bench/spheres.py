@@ -35,9 +35,9 @@ def project_spheres(
         positions=positions,
         point_radius=point_radius,
         point_camera=b.point_camera,
+        point_shape=b.point_shape,
         point_box=b.point_box,
         point_count=b.point_count,
-        point_white=b.point_white,
     )
     return ProjectedPoints(
         footprint,
@@ -45,8 +45,7 @@ def project_spheres(
         b.point_camera,
         b.point_box,
         b.point_count,
-        point_radius,
-        b.point_white,
+        b.point_shape,
     )
 
 
@@ -87,8 +86,8 @@ def spheres_backward(
         # alpha depends on the order of the hits alone
         gamma=math.inf if weights.blend == "alpha" else gamma,
         camera=points.camera_buffer,
-        point_radius=points.point_radius,
         point_camera=points.point_camera,
+        point_shape=points.point_shape,
         opacity=opacity,
         point_is_shaded=weights.point_is_shaded,
         point_offset=pairs.point_offset,

@@ -2,6 +2,8 @@
 printed.
 """
 
+__all__ = ["COMMANDS"]
+
 # the module of each command, imported when it is given; in the order of the help
 COMMANDS = {
     "devices": "pp_cl.commands.devices",

@@ -18,8 +18,8 @@ from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement, disagreements
-from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.edits import read_edits
+from pp_cl.scene.gaze import looked_at, up_of
 from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
 from pp_cl.scene.identity import kept_views
 from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits

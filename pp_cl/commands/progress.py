@@ -1,13 +1,9 @@
-"""How a long command shows that it goes on, on a terminal and elsewhere, and how Ctrl-C and SIGTERM
-stop it in good order.
-"""
+"""How a long command shows that it goes on, on a terminal and elsewhere."""
 
 import shutil
-import signal
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -23,7 +19,6 @@ GIB = 2**30
 FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"
 # of a terminal that does not tell its size, where tqdm would show nothing
 SIZE = 100, 20
-STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Progress:
@@ -102,29 +97,3 @@ class Progress:
 def _print(line, stream):
     with suppress(OSError):  # of a full disk, which is no reason to stop
         print(line, file=stream, flush=True)
-
-
-@contextmanager
-def first_signal() -> Iterator[list[int]]:
-    """A list that is empty until Ctrl-C or SIGTERM comes, and then holds its number. A second one
-    does what it did before. To be entered in the main thread.
-    """
-    caught = []
-    before = {number: signal.getsignal(number) for number in STOPPING}
-    # nohup, and & in a script, leave signals ignored; None is a handler that is not Python's
-    before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
-
-    def restore():
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    def note(number, _frame):
-        caught.append(number)
-        restore()
-
-    for number in before:
-        signal.signal(number, note)
-    try:
-        yield caught
-    finally:
-        restore()

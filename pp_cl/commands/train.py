@@ -49,14 +49,13 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.config import run_config
     from pp_cl.drivers import open_device
     from pp_cl.files.run_folder import RunFolder
-    from pp_cl.files.scalars import writer_class
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
 
     if options.view:
         require("the viewer", "viser")
     if options.tensorboard:
-        writer_class()  # refuses before the work where it is missing
+        require("--tensorboard", "tensorboardX")
     folder = RunFolder(options.out)
     given, is_new = shared.read_short(options, SHORT) + options.set, not folder.config.exists()
     preset = options.preset
@@ -170,7 +169,8 @@ def _sizes(cameras):
 
 def _run(training, options):
     """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
-    from pp_cl.commands.progress import Progress, first_signal
+    from pp_cl.commands.progress import Progress
+    from pp_cl.commands.signals import first_signal
     from pp_cl.errors import Stopped
     from pp_cl.files.scalars import curves
 

@@ -12,3 +12,7 @@ layers/: the convolutions and the small layers; choice says which is taken where
 training/: target, crops, loss, exposure; optim, state, schedule; smooth, prune.
 device/: device and kernel build and launch by name; buffers, launch, scan, host.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -11,6 +11,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
+from pp_cl.engine.network.means import Means
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 
@@ -32,7 +33,7 @@ class Model:
         depth_range: tuple[float, float],
         cloud: PointCloud,
         *,
-        net: UNet,
+        net: UNet | Means,
     ):
         self.dev = dev
         self.grid = grid
@@ -89,7 +90,7 @@ class Model:
         *,
         degree: int,
     ) -> Model:
-        """Model of a checkpoint's header and arrays, as training/checkpoint.py has checked them;
+        """Model of a checkpoint's header and arrays, as pp_cl/checkpoint.py has checked them;
         the arrays are taken out of `arrays`, net takes the parameters stored there.
         """
         grid = Grid.of_header(header["grid"])

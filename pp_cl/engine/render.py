@@ -7,7 +7,7 @@ project -> pairs -> blend weights -> shade the visible points -> blend their fea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -28,6 +28,7 @@ from pp_cl.engine.raster.blend import (
 from pp_cl.engine.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
 from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid, projection_table
 from pp_cl.engine.raster.weights import (
+    ALL,
     BlendWeights,
     blend_weights,
     list_weights,
@@ -102,6 +103,11 @@ class RenderResult:
     image: Array = field(init=False)
     computed_fraction: float = 1.0
 
+    def fragments(self) -> np.ndarray:
+        """(height, width) int64: the points that cover each pixel, without the padding."""
+        counts = np.diff(self.pairs.pixel_offset.get().astype(np.int64))
+        return self.cropped(counts.reshape(self.size))
+
     def clamped(self) -> np.ndarray:
         """(height, width, 3) float32 image without the padding, clamped to [0, 1]."""
         return np.clip(self.cropped(self.dev.download(self.image)), 0, 1)
@@ -125,6 +131,11 @@ class Renderer:
         self._by_pair = False
         self._room, self._shaded_room = [1, 1], [1, 1]
         self.release()
+
+    @property
+    def point_radius(self) -> float:
+        """The radius in world units of points whose offset is 0."""
+        return point_radius(self.settings, self.model.grid.edge, self.model.depth_range)
 
     def release(self) -> None:
         """Free the buffers; the next view makes them anew."""
@@ -174,7 +185,7 @@ class Renderer:
                 self.model.grid_buffer,
                 point_id=cloud.ids,
                 cloud_offset=cloud.offset,
-                radius=point_radius(self.settings, self.model.grid.edge, self.model.depth_range),
+                radius=self.point_radius,
             )
         pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop, training)
         result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)
@@ -271,6 +282,28 @@ class Renderer:
                 spread_weight=spread_weight,
                 edge=self.model.grid.edge if moves else 0.0,
             )
+
+    def blend(self, result: RenderResult, features: np.ndarray) -> np.ndarray:
+        """(H, W, 16) float32: features (S, 16) of the visible points result.weights.shaded, blended
+        by the weights of a view, without its padding. They take the place of result.features.
+
+        result: of the last forward(training=True).
+        """
+        self.dev.write(result.shaded_features[: len(features)], features)
+        blend_forward(
+            self.dev, result.pairs, result.weights, result.shaded_features, result.features
+        )
+        return result.cropped(self.dev.download(result.features))
+
+    def gather(self, result: RenderResult, pixels: np.ndarray) -> np.ndarray:
+        """(S, 16) float32, the transpose of blend(): of each visible point the sum over the pixels
+        (H, W, 16), without the padding, times its weights there.
+        """
+        padded = np.zeros((*result.size, 16), np.float32)
+        result.cropped(padded)[:] = pixels
+        result.weights = replace(result.weights, tracked=ALL)
+        gradients = self.backward_features(result, self.dev.upload(padded))
+        return self.dev.download(gradients.shaded_features[: result.weights.shaded.size])
 
     def record_weights(
         self,

@@ -1,32 +1,33 @@
-"""Atomic writes: to a temporary name, synced, then renamed; and the user's cache folder."""
+"""Files are written under a temporary name, synced and renamed; folders that the program fills know
+which files in them are its own, and it replaces and removes no others.
+"""
 
 import errno
+import functools
+import hashlib
 import json
 import os
+import re
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from platformdirs import user_cache_dir
 
-from pp_cl.errors import UserError
-from pp_cl.files.manifest import TEMPORARY, note
+from pp_cl.errors import UserError, shown
 
 READER_SECONDS = 5  # which a viewer takes to read a large checkpoint
-# what file systems say that cannot sync a folder, and folders that may be written, not read
-UNKNOWN_TO_FOLDERS = (
-    errno.EINVAL,
-    errno.ENOTSUP,
-    errno.EOPNOTSUPP,
-    errno.ENOSYS,
-    errno.EBADF,
-    errno.EACCES,
-    errno.EPERM,
-)
+DISK = (errno.EIO, errno.ENOSPC, errno.EDQUOT)  # errors of a disk, not of what a system cannot do
+# of what is being written, with the number of its process
+TEMPORARY = re.compile(r"\..+\.(\d+)\.pp-cl\.tmp(\..*)?", re.DOTALL)
+# In a folder that the program fills, its manifest: a line of JSON [path in the folder, SHA-256] for
+# each file that it has written there or below, also for former ones. A line is added before the
+# file gets its name; after a kill in between it says nothing of a file of others.
+MANIFEST = ".pp-cl-files.jsonl"
 
 
 @contextmanager
@@ -36,8 +37,7 @@ def atomic_file(path: Path | str, *, noted: bool = True) -> Iterator[BinaryIO]:
     noted: in the manifest of the folder that the program fills, if it is one. Raises UserError
     naming the file when the disk is full or may not be written; nothing half-written stays behind.
     """
-    path = Path(path)
-    with _named(_temporary(path), path, noted) as temporary, open(temporary, "wb") as file:
+    with _renamed(Path(path), noted=noted) as temporary, open(temporary, "wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
@@ -50,26 +50,50 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Raises UserError naming the file when the library cannot write it.
     """
-    with _named(_temporary(path, path.suffix), path) as temporary:
-        try:
-            yield temporary
-        except RuntimeError as error:  # of libraries in C++
-            raise _refusal(path, error) from error
+    kinds = OSError, RuntimeError  # the latter of libraries in C++
+    with _renamed(path, path.suffix) as temporary, told(path, kinds):
+        yield temporary
 
 
 @contextmanager
-def _named(temporary, path, noted=True):
-    """The temporary path; what is written there gets its name when the block ends well."""
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder that appears as `folder` only when the block ends well.
+
+    Raises UserError if that holds something, or cannot be written; one of a file in the temporary
+    folder names the place that it would have had.
+    """
+    folder = folder.resolve()
+    check_new_folder(folder)
+    with _renamed(folder) as temporary:
+        try:
+            temporary.mkdir(parents=True)
+            yield temporary
+            if folder.is_dir():
+                folder.rmdir()  # it is empty; Windows replaces no folder
+        except UserError as error:
+            raise UserError(str(error).replace(str(temporary), str(folder))) from error
+
+
+@contextmanager
+def _renamed(path, suffix="", *, noted=True):
+    """A temporary path; what is there when the block ends well gets the name `path`, else it is
+    removed.
+    """
+    temporary = _temporary(path, suffix)
     try:
-        yield temporary
-        if noted:
-            note(temporary, path)
-        _replace(temporary, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise _refusal(path, error) from error
+        with told(path):
+            yield temporary
+            if noted:
+                _note(temporary, path)
+            _replace(temporary, path)
+            _sync_folder(path.parent)
     finally:
         _remove(temporary)
+
+
+def _temporary(path, suffix=""):
+    """The name under which a file is written."""
+    return path.parent / f".{path.name}.{os.getpid()}.pp-cl.tmp{suffix}"  # `.` and `/` have no name
 
 
 def _replace(temporary, path):
@@ -84,61 +108,68 @@ def _replace(temporary, path):
             time.sleep(0.1)
 
 
-def _temporary(path, suffix=""):
-    """The name under which a file is written."""
-    return path.parent / f".{path.name}.{os.getpid()}.pp-cl.tmp{suffix}"  # `.` and `/` have no name
-
-
-def mend(error: OSError) -> str:
-    """What to do about a file that cannot be opened or written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "free some space"
-    if error.errno in (errno.EMFILE, errno.ENFILE):
-        return "allow more open files (ulimit -n)"
-    if error.errno == errno.ENAMETOOLONG:
-        return "choose a shorter name"
-    return "check the folder, its permissions and the disk"
-
-
-def _refusal(path, error):
-    """The UserError of a path that cannot be written. error: an OSError, or one of a library."""
-    if isinstance(error, OSError) and error.errno:
-        return UserError(f"{path}: cannot be written ({error.strerror}); {mend(error)}")
-    reason = " ".join(str(error).split())[:120]
-    return UserError(
-        f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
-    )
+def _sync_folder(folder):
+    """Make a rename in the folder survive a power cut, where system and file system know how."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    try:
+        descriptor = os.open(folder, os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        if error.errno in DISK:
+            raise
 
 
 def _remove(temporary):
     """Remove what did not get its final name; what stays is removed by the next start."""
     with suppress(OSError):
-        temporary.unlink(missing_ok=True)
+        if temporary.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
+
+
+def mend(error: Exception) -> str:
+    """What to do about a file that cannot be opened or written."""
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "free some space"
+    if number in (errno.EMFILE, errno.ENFILE):
+        return "allow more open files (ulimit -n)"
+    if number == errno.ENAMETOOLONG:
+        return "choose a shorter name"
+    return "check the folder, its permissions and the disk"
 
 
 @contextmanager
-def atomic_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that appears as `folder` only when the block ends well.
-
-    Raises UserError if that holds something, or cannot be written; one of a file in the temporary
-    folder names the place that it would have had.
+def told(
+    path: Path | str, kinds: tuple[type[Exception], ...] = (OSError,), then: str = ""
+) -> Iterator[None]:
+    """An exception of these kinds in the block becomes a UserError that names the file and the
+    remedy. then: what follows in it.
     """
-    folder = folder.resolve()
-    check_new_folder(folder)
-    unfinished = _temporary(folder)
     try:
-        unfinished.mkdir(parents=True)
-        yield unfinished
-        note(unfinished, folder)
-        if folder.is_dir():
-            folder.rmdir()  # it is empty; Windows replaces no folder
-        _replace(unfinished, folder)
-    except OSError as error:
-        raise _refusal(folder, error) from error
-    except UserError as error:
-        raise UserError(str(error).replace(str(unfinished), str(folder))) from error
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+        yield
+    except kinds as error:
+        reason = getattr(error, "strerror", None) or shown(str(error), 120)
+        raise UserError(f"{path}: cannot be written ({reason}); {mend(error)}{then}") from error
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write a text file atomically; names that are no UTF-8 are escaped."""
+    with atomic_file(path) as file:
+        file.write(text.encode(errors="backslashreplace"))
+
+
+def write_json(path: Path | str, value: Any) -> None:
+    """Write JSON atomically; NaN and Inf are refused with ValueError."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+# ---- before anything is computed
 
 
 def check_new_folder(folder: Path) -> None:
@@ -163,39 +194,110 @@ def check_target(path: Path) -> None:
     """
     tried = Path(os.path.abspath(path))
     try:
-        while not tried.parent.exists():
-            tried = tried.parent
-        _temporary(tried).touch()
-    except OSError as error:
-        raise _refusal(path, error) from None
+        with told(path):
+            while not tried.parent.exists():
+                tried = tried.parent
+            _temporary(tried).touch()
     finally:
         _remove(_temporary(tried))
 
 
-def _sync_folder(folder):
-    """Make a rename in the folder survive a power cut, where system and file system know how."""
-    if not hasattr(os, "O_DIRECTORY"):
-        return
-    try:
-        descriptor = os.open(folder, os.O_DIRECTORY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-    except OSError as error:
-        if error.errno not in UNKNOWN_TO_FOLDERS:
-            raise
+# ---- the program's own files
 
 
-def write_text(path: Path | str, text: str) -> None:
-    """Write a text file atomically; names that are no UTF-8 are escaped."""
-    with atomic_file(path) as file:
-        file.write(text.encode(errors="backslashreplace"))
+def own(
+    folder: Path, files: Iterable[Path] = (), mend: str = "move it away", *, alone: bool = False
+) -> None:
+    """Make a folder, where it is missing, one that the program fills, and remove what processes
+    that were killed have left unfinished in it.
+
+    files: will be written in it. alone: nothing of others may be there before. Raises UserError,
+    with nothing changed, where the folder cannot be written or holds other files, and as
+    check_ours does for `files`.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is not a folder; choose another --out")
+    check_target(folder / MANIFEST)
+    if alone and folder.exists() and not is_owned(folder) and any(folder.iterdir()):
+        raise UserError(f"{folder}: holds other files; choose a new or empty folder for --out")
+    check_ours(files, mend)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / MANIFEST).touch()
+    remove_leftovers(folder)
 
 
-def write_json(path: Path | str, value: Any) -> None:
-    """Write JSON atomically; NaN and Inf are refused with ValueError."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+def is_owned(folder: Path) -> bool:
+    """Whether the program fills a folder."""
+    return (folder / MANIFEST).is_file()
+
+
+def ours(paths: Iterable[Path]) -> list[Path]:
+    """Those of the files that are as the program has written them."""
+    lines = functools.cache(lambda home: {*(home / MANIFEST).read_bytes().splitlines()})
+    return [
+        path
+        for path in paths
+        if path.is_file() and not path.is_symlink() and (home := _home(path))
+        if _line(home, path, path) in lines(home)
+    ]
+
+
+def check_ours(paths: Iterable[Path], mend: str = "move it away") -> None:
+    """Raise UserError naming the first file that is there and not ours(): it would be lost.
+
+    mend: what to do about it.
+    """
+    there = [path for path in paths if os.path.lexists(path)]
+    if others := set(there) - set(ours(there)):
+        first = min(others)
+        raise UserError(f"{first}: pp-cl did not write this, or not as it is now; {mend}")
+
+
+def remove_ours(paths: Iterable[Path]) -> None:
+    """Remove those of the files that are ours(), and the folders that are empty without them."""
+    for path in ours(paths):
+        path.unlink()
+        for folder in path.parents:
+            if any(folder.iterdir()):  # at the latest the one with the manifest
+                break
+            folder.rmdir()
+
+
+def _home(path):
+    """The folder nearest above a path that the program fills, None where there is none, or a folder
+    in between is not finished, of which all is noted at its end.
+    """
+    for folder in Path(os.path.abspath(path)).parents:
+        if is_owned(folder):
+            return folder
+        if TEMPORARY.fullmatch(folder.name):
+            return None
+    return None
+
+
+def _note(file, path):
+    """Add a file, or all in a folder, that is about to become `path`, to the manifest nearest above
+    that, if there is one.
+    """
+    if home := _home(path):
+        inside = sorted(file.rglob("*")) if file.is_dir() else [file]
+        lines = [_line(home, path / one.relative_to(file), one) for one in inside if one.is_file()]
+        with open(home / MANIFEST, "ab") as manifest:
+            # the end of a line stands before it: the last one may be cut, of a process that was
+            # killed
+            manifest.write(b"".join(b"\n" + line for line in lines))
+            manifest.flush()
+            os.fsync(manifest.fileno())
+
+
+def _line(home, path, file):
+    """The line of a manifest for what stands in `file` and is, or will be, called `path`."""
+    with open(file, "rb") as opened:
+        digest = hashlib.sha256()
+        while part := opened.read(2**20):
+            digest.update(part)
+    relative = Path(os.path.abspath(path)).relative_to(home)
+    return json.dumps([relative.as_posix(), digest.hexdigest()]).encode()
 
 
 def remove_leftovers(folder: Path | str) -> None:
@@ -225,6 +327,9 @@ def _lives(process):
     except (ProcessLookupError, OverflowError):
         return False
     return True
+
+
+# ---- the user's cache
 
 
 def cache_folder() -> Path:

@@ -1,9 +1,6 @@
 """OpenEXR images (linear light, premultiplied by alpha, with depth), by the package OpenEXR."""
 
-import os
-import threading
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import Imath
@@ -16,11 +13,9 @@ from pp_cl.files.srgb import linear_to_srgb
 from pp_cl.files.untrusted import MOST_PIXELS, refusal
 
 COLOURS = (("R", "G", "B"), ("Y",))  # what makes an image
-STRIP = 256  # rows that are read at once: the most that a compression of OpenEXR has in a chunk
-# bytes of a strip, or of a tile, with all of its channels: they are unpacked together
-MOST_CHUNK = 2**29
+# bytes of a tile, or of the most rows that a compression packs together, with all channels
+MOST_CHUNK, CHUNK_ROWS = 2**29, 256
 FLOAT = Imath.PixelType(Imath.PixelType.FLOAT)
-_one_at_a_time = threading.Lock()
 
 
 def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
@@ -36,56 +31,63 @@ def exr_size(path: Path | str) -> tuple[int, int]:
     """(width, height) of the display window of an image, from its header. Raises UserError as
     read_exr_rgba does.
     """
-    return _size(path, _header(path)["displayWindow"])
+    return _window(path, _header(path), "displayWindow")[1]
 
 
 def read_exr_rgba(path: Path | str) -> np.ndarray:
     """(H, W, 4) uint8 straight sRGB of an image's display window.
 
     Linear light between 0 and 1 becomes sRGB, what is brighter is cut off; no alpha means 255, and
-    outside of the data window nothing is there: alpha 0. Only the channels of the image are kept,
-    STRIP rows at a time. Raises UserError naming a file that is missing or broken, has several
-    parts, no colours, or more pixels than are read, or holds NaN or infinite pixels.
+    outside of the data window nothing is there: alpha 0. Raises UserError naming a file that is
+    missing or broken, has several parts, no colours, or more pixels than are read, or holds NaN or
+    infinite pixels; of broken ones the library prints lines of its own.
     """
     header = _header(path)
-    width, height = _size(path, header["displayWindow"])
-    columns, rows = _size(path, header["dataWindow"])
-    names = _wanted(path, header, (columns, rows))
-    (left, top), (right, bottom) = (np.array(corner, int) for corner in header["displayWindow"])
-    x, y = (int(v) for v in header["dataWindow"][0])
-    begin, end = max(x, left), min(x + columns, right + 1)
-    image, broken = np.zeros((height, width, 4), np.uint8), 0
-    with _refused(path):
-        file = OpenEXR.InputFile(str(path))
-    with closing(file):
-        for first in range(y, y + rows if begin < end else y, STRIP):
-            last = min(first + STRIP, y + rows) - 1
-            low, high = max(first, top), min(last, bottom) + 1
-            if low < high:
-                planes = _strip(path, file, names, (first, last))
-                planes = planes[low - first : high - first, begin - x : end - x]
-                broken += int((~np.isfinite(planes)).any(axis=2).sum())
-                if not broken:
-                    image[low - top : high - top, begin - left : end - left] = _straight(planes)
-    if broken:
-        raise UserError(f"{path}: {broken} pixels are NaN or infinite; fix or remove the image")
+    first_shown, (width, height) = _window(path, header, "displayWindow")
+    first, (columns, rows) = _window(path, header, "dataWindow")
+    names = _wanted(path, header, columns * min(rows, CHUNK_ROWS))
+    try:
+        with closing(OpenEXR.InputFile(str(path))) as file:
+            read = [np.frombuffer(one, np.float32) for one in file.channels(names, FLOAT)]
+    except Exception as error:  # the library's exceptions have no common class
+        raise refusal(path, error, "OpenEXR") from error
+    planes = [plane.reshape(rows, columns) for plane in read]
+    broken = ~np.logical_and.reduce([np.isfinite(plane) for plane in planes])
+    if broken.any():
+        raise UserError(
+            f"{path}: {broken.sum()} pixels are NaN or infinite; fix or remove the image"
+        )
+    stored = np.empty((rows, columns, 4), np.uint8)
+    for row, light in enumerate(zip(*planes, strict=True)):
+        stored[row] = _straight(np.stack(light, axis=1))
+    image = np.zeros((height, width, 4), np.uint8)
+    x, y = first - first_shown
+    left, right = np.clip([x, x + columns], 0, width)
+    top, bottom = np.clip([y, y + rows], 0, height)
+    image[top:bottom, left:right] = stored[top - y : bottom - y, left - x : right - x]
     return image
 
 
-def _straight(planes):
-    """(H, W, 4) uint8 straight sRGB of linear, premultiplied light."""
-    alpha = np.clip(planes[..., 3:], 0, 1)
-    colour = linear_to_srgb(np.clip(planes[..., :3] / np.maximum(alpha, 1e-6), 0, 1))
-    return (np.concatenate([colour, alpha], axis=2) * 255 + 0.5).astype(np.uint8)
+def _straight(light):
+    """(N, 4) uint8 straight sRGB of linear, premultiplied light: gray or RGB, with or without alpha
+    behind it.
+    """
+    count = light.shape[1]
+    colours, alpha = (light, 1) if count % 2 else (light[:, :-1], np.clip(light[:, -1:], 0, 1))
+    rgba = np.empty((len(light), 4), np.float32)
+    rgba[:, :3] = linear_to_srgb(np.clip(colours / np.maximum(alpha, 1e-6), 0, 1))
+    rgba[:, 3:] = alpha
+    return (rgba * 255 + 0.5).astype(np.uint8)
 
 
 def _header(path):
     """The header of a file of one part with pixels. Raises UserError."""
     if not Path(path).is_file():
         raise UserError(f"{path}: no such file; copy it there")
-    with _refused(path):
-        parts = OpenEXR.File(str(path), header_only=True).parts
-        headers = [part.header for part in parts]
+    try:
+        headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+    except Exception as error:  # the library's exceptions have no common class
+        raise refusal(path, error, "OpenEXR") from error
     if len(headers) > 1:
         raise UserError(f"{path}: has {len(headers)} parts; save the image as a file of one part")
     if not headers or headers[0].get("type") not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
@@ -93,35 +95,24 @@ def _header(path):
     return headers[0]
 
 
-@contextmanager
-def _refused(path) -> Iterator[None]:
-    """What the library raises becomes a UserError, and what it prints by itself goes nowhere."""
-    with _one_at_a_time:
-        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 2)
-        try:
-            yield
-        except Exception as error:  # the library's exceptions have no common class
-            raise refusal(path, error, "OpenEXR") from error
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            os.close(nowhere)
-
-
-def _size(path, window):
-    """(width, height) of a window of the header. Raises UserError for one that no image has."""
-    width, height = (int(v) for v in np.array(window[1], int) - np.array(window[0], int) + 1)
+def _window(path, header, name):
+    """(x and y of the first pixel, (width, height)) of a window in the header. Raises UserError
+    for one that no image has.
+    """
+    first, last = (np.array(corner, int) for corner in header[name])
+    width, height = map(int, last - first + 1)
     if width < 1 or height < 1 or width * height > MOST_PIXELS:
         raise UserError(
             f"{path}: {width}x{height} pixels, which must be 1 to {MOST_PIXELS}; copy the file"
             " again, or reduce it"
         )
-    return width, height
+    return first, (width, height)
 
 
-def _wanted(path, header, size):
-    """The names of R, G, B, or of Y three times, and of A where it is there. Raises UserError."""
+def _wanted(path, header, chunk):
+    """The names of R, G and B, or of Y, and of A where it is there. chunk: pixels that are packed
+    together, but for tiles. Raises UserError.
+    """
     channels = {channel.name: channel for channel in header["channels"]}
     layers = {name[: name.rfind(".") + 1] for name in channels}  # with the point behind their name
     found = [
@@ -136,27 +127,15 @@ def _wanted(path, header, size):
             f"{path}: has {'no' if not whole else 'several'} images among its channels"
             f" ({', '.join(sorted(channels))[:80]}); keep one of R, G, B and A, or of Y"
         )
-    layer, colours = whole[0]
-    names = colours * (3 // len(colours)) + [f"{layer}A"] * (f"{layer}A" in channels)
+    layer, names = whole[0]
+    names += [f"{layer}A"] * (f"{layer}A" in channels)
     if any((channels[name].xSampling, channels[name].ySampling) != (1, 1) for name in names):
         raise UserError(f"{path}: its channels differ in size; save it without subsampling")
     tiles = header.get("tiles")
-    pixels = tiles.xSize * tiles.ySize if tiles else size[0] * min(size[1], STRIP)
-    if 4 * len(channels) * pixels > MOST_CHUNK:
+    packed = 4 * len(channels) * (tiles.xSize * tiles.ySize if tiles else chunk)
+    if packed > MOST_CHUNK:
         raise UserError(
-            f"{path}: {len(channels)} channels of {pixels} pixels are packed together, more than"
-            f" {MOST_CHUNK} bytes; save R, G, B and A alone"
+            f"{path}: {len(channels)} channels are packed together, {packed} bytes and more than"
+            f" {MOST_CHUNK}; save R, G, B and A alone"
         )
     return names
-
-
-def _strip(path, file, names, rows):
-    """(H, W, 4) float32 of the rows (first, last) of the data window. Raises UserError."""
-    with _refused(path):
-        wanted = list(dict.fromkeys(names))
-        read = dict(zip(wanted, file.channels(wanted, FLOAT, *rows), strict=True))
-    count = rows[1] - rows[0] + 1
-    planes = [np.frombuffer(read[name], np.float32).reshape(count, -1) for name in names]
-    if len(planes) == 3:
-        planes.append(np.ones_like(planes[0]))
-    return np.stack(planes, axis=2)

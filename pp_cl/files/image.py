@@ -1,9 +1,10 @@
 """Reads and writes 8-bit image files."""
 
 import io
+import os
 import warnings
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
@@ -208,3 +209,16 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
     Image.fromarray(image if image.dtype == np.uint8 else to_8bit(image)).save(encoded, "PNG")
     with atomic_file(Path(path)) as file:
         file.write(encoded.getbuffer())
+
+
+def image_files(names: list[str]) -> list[PurePosixPath]:
+    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
+    those that all of them share go.
+    """
+    paths = [PurePosixPath(name) for name in names]
+    shared = os.path.commonpath([path.parent for path in paths])
+    paths = [path.relative_to(shared) for path in paths]
+    files = [path.with_suffix(".png") for path in paths]
+    if len(set(files)) < len(files):  # a.jpg beside a.png
+        files = [path.with_name(f"{path.name}.png") for path in paths]
+    return files

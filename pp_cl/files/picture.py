@@ -32,10 +32,12 @@ class Picture:
     median_depth: np.ndarray
     features: np.ndarray | None = None
 
-    def over(self, background: tuple[float, float, float]) -> np.ndarray:
+    def over(self, background: tuple[float, float, float] | None) -> np.ndarray:
         """(H, W, 3) float32 in [0, 1]: the object over a colour, sRGB in [0, 1]; where nothing is,
-        exactly that colour. Over white it is `colour`, as the network made it.
+        exactly that colour. Over white it is `colour`, as the network made it; over None rgba().
         """
+        if background is None:
+            return self.rgba()
         if tuple(background) == WHITE:
             return self.colour
         rgba = self.rgba()
@@ -63,13 +65,9 @@ class Picture:
             channels |= {f"feature.{i:02d}": self.features[..., i] for i in range(count)}
         return {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
 
-    def image(self, background: tuple[float, float, float] | None) -> np.ndarray:
-        """over(background), or rgba() where that is None."""
-        return self.rgba() if background is None else self.over(background)
-
     def save(self, path: Path | str, background: tuple[float, float, float] | None = WHITE) -> None:
         """Write an 8-bit PNG; background None: transparent. Raises UserError as write_png does."""
-        write_png(path, self.image(background))
+        write_png(path, self.over(background))
 
     def _repr_png_(self) -> bytes:
         """The picture over white, by which a notebook shows it."""

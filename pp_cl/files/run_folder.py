@@ -5,18 +5,15 @@ import math
 import os
 import socket
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import mend, remove_leftovers, write_text
-from pp_cl.files.checkpoint import Rows, save_checkpoint
-from pp_cl.files.manifest import begin_manifest, check_ours, remove_ours
+from pp_cl.files.atomic import check_ours, own, remove_ours, told, write_text
 from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
 MASKS_PICTURE = "masks.png"
@@ -25,11 +22,12 @@ MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
 MOST_LOG = 2**25  # bytes of a log: 80,000 rows
 MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
 MOST_NUMBER = 1e300  # in a row
+GOES_ON = "; the same command goes on"
 MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews, views: paths in it, which need not
+    """path: the folder; config, checkpoint, log, previews: paths in it, which need not
     exist.
     """
 
@@ -39,7 +37,6 @@ class RunFolder:
         self.checkpoint = self.path / "checkpoint.npz"
         self.log = self.path / "log.jsonl"
         self.previews = self.path / "previews"
-        self.views = self.path / "views"
 
     def __str__(self) -> str:
         return str(self.path)
@@ -60,21 +57,17 @@ class RunFolder:
         if not file.exists():
             return None
         try:
-            result = json.loads(read_json_text(file, MOST_METRICS))
-            found = {
-                "mean": {name: float(value) for name, value in result["mean"].items()},
-                "step": result["step"],
-                "finished": result["finished"],
-                "points": result["points"]["final"],
-                "device": result["device"],
-            }
+            result = strict_json(read_json_text(file, MOST_METRICS))
+            found = {name: result[name] for name in ("mean", "step", "finished", "device")}
+            found["points"] = result["points"]["final"]
             kinds = {"step": int, "finished": bool, "points": int, "device": str}
-            is_right = all(type(found[key]) is kind for key, kind in kinds.items())
-            if not (is_right and all(map(math.isfinite, found["mean"].values()))):
+            if any(type(found[name]) is not kind for name, kind in kinds.items()):
                 raise ValueError("values of another kind")
+            if not all(math.isfinite(value) for value in found["mean"].values()):
+                raise ValueError("infinite values")
+            return found
         except Exception as error:  # whatever stands there
             raise refusal(file, error, "metrics", f"run `pp-cl eval {self}` again") from None
-        return found
 
     def check_usable(self) -> None:
         """Raise UserError if the folder is a file, or holds files that belong to no run."""
@@ -112,7 +105,7 @@ class RunFolder:
                 f"{lock.lock_file}: cannot be locked ({error.strerror}); check the file system"
             ) from error
         try:
-            with _told(owner):
+            with told(owner):
                 owner.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
             yield
         finally:
@@ -134,8 +127,7 @@ class RunFolder:
         """Make the folders, remove what a killed process left unfinished, and pictures that belong
         to no checkpoint; write config.json, which makes the folder one of a run, before the rest.
         """
-        begin_manifest(self.path)
-        remove_leftovers(self.path)
+        own(self.path)
         if not self.checkpoint.exists():
             remove_ours([self.path / MASKS_PICTURE, *self.previews.glob("step_*.png")])
         self.configure(config_json)
@@ -148,10 +140,6 @@ class RunFolder:
     def rows(self) -> list[dict[str, Any]]:
         """The rows of the log, up to the first that is broken."""
         return _rows(self.log)
-
-    def save(self, header: dict[str, Any], arrays: Mapping[str, np.ndarray | Rows]) -> None:
-        """Replace the checkpoint."""
-        save_checkpoint(self.checkpoint, header, arrays)
 
     def open_log(self, step: int) -> "Log":
         """The log, cut off after `step`: later rows will be made again."""
@@ -172,7 +160,7 @@ class Log:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with _told(self._file.name):
+        with told(self._file.name, then=GOES_ON):
             self._file.close()
 
     def write(self, row: dict[str, Any]) -> None:
@@ -180,20 +168,9 @@ class Log:
         NaN.
         """
         data = (json.dumps(row, allow_nan=False) + "\n").encode()
-        with _told(self._file.name):
+        with told(self._file.name, then=GOES_ON):
             while data:
                 data = data[self._file.write(data) :]
-
-
-@contextmanager
-def _told(path):
-    """A write that fails becomes a UserError naming the file."""
-    try:
-        yield
-    except OSError as error:
-        raise UserError(
-            f"{path}: cannot be written ({error.strerror}); {mend(error)}; the same command goes on"
-        ) from error
 
 
 def read_row(line: bytes | str) -> dict[str, Any] | None:
@@ -202,16 +179,13 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
     something else.
     """
     try:
-        row = strict_json(line) if len(line) <= MOST_LINE else None
-        if not isinstance(row, dict) or not _is_kept(row):
-            return None
-    except (ValueError, RecursionError):
+        row = strict_json(line) if len(line) <= MOST_LINE else {}
+        numbers = [row["step"], row["seconds"], row.get("loss", 0), row.get("psnr", 0)]
+        is_row = type(numbers[0]) is int and all(type(n) in (int, float) for n in numbers)
+        is_row = is_row and min(numbers[:2]) >= 0 and type(row.get("device", "")) is str
+        return row if is_row and _is_kept(row) else None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
-    whole, device = type(row.get("step")) is int, row.get("device", "")
-    numbers = [row.get(name, 0) for name in ("step", "seconds", "loss", "psnr")]
-    is_row = whole and "seconds" in row and isinstance(device, str)
-    is_row = is_row and all(type(number) in (int, float) for number in numbers)
-    return row if is_row and min(numbers[:2]) >= 0 else None
 
 
 def _is_kept(value, levels=MOST_LEVELS):
@@ -227,13 +201,18 @@ def _is_kept(value, levels=MOST_LEVELS):
 def _rows(path, step=math.inf):
     """The rows of a log up to `step`, or to one that says finished where a step is given. The first
     that is broken, and all after it, are left out with a warning; of a log that may be growing its
-    last line without one.
+    last line without one. Raises UserError for a log that is too long.
     """
+    size = path.stat().st_size if path.is_file() else 0
+    if size > MOST_LOG:
+        raise UserError(
+            f"{path}: is larger than {MOST_LOG} bytes; move it away, and raise train.log_every"
+        )
     rows, last = [], {"step": 0, "seconds": 0}
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(path.read_bytes().splitlines(True) if size else (), 1):
         row = read_row(line)
         if row is None or any(row[name] < last[name] for name in last):
-            if line.endswith(b"\n") or len(line) > MOST_LINE or step < math.inf:
+            if line.endswith(b"\n") or step < math.inf:
                 warnings.warn(
                     f"{path}: line {number} is no row of a log; it is left out, as is all after it",
                     stacklevel=2,
@@ -244,16 +223,3 @@ def _rows(path, step=math.inf):
         rows.append(row)
         last = {name: row[name] for name in last}
     return rows
-
-
-def _lines(path):
-    """The lines of a log, in pieces where they are too long. Raises UserError for a log that is too
-    long itself.
-    """
-    if path.is_file():
-        if path.stat().st_size > MOST_LOG:
-            raise UserError(
-                f"{path}: is larger than {MOST_LOG} bytes; move it away, and raise train.log_every"
-            )
-        with path.open("rb") as file:
-            yield from iter(lambda: file.readline(MOST_LINE + 1), b"")

@@ -5,20 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pp_cl.errors import UserError
-
 BESIDES = ("step", "seconds")  # numbers of a row of the log that are no curves
-
-
-def writer_class() -> Any:
-    """What writes for TensorBoard. Raises UserError where tensorboardX is missing."""
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        raise UserError(
-            "--tensorboard: needs tensorboardX; install it with `pip install tensorboardX`"
-        ) from None
-    return SummaryWriter
 
 
 @contextmanager
@@ -26,9 +13,10 @@ def curves(folder: Path, step: int) -> Iterator[Callable[[int, dict[str, Any] | 
     """What writes the row of a step, if there is one, into a folder that TensorBoard reads.
 
     step: from which on rows will be written, anew where an interrupted training wrote them before.
-    Raises UserError where tensorboardX is missing.
     """
-    with writer_class()(str(folder), purge_step=step) as writer:
+    from tensorboardX import SummaryWriter
+
+    with SummaryWriter(str(folder), purge_step=step) as writer:
 
         def write(step: int, row: dict[str, Any] | None) -> None:
             for name, value in scalars(row or {}):

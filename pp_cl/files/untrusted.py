@@ -1,7 +1,6 @@
 """Opens files of other programs, after checking that they are regular files and small enough."""
 
 import errno
-import io
 import json
 import os
 import stat
@@ -30,29 +29,23 @@ def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
     descriptor = os.open(path, os.O_RDONLY | flags)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+        raise OSError(errno.ENOTSUP, "Not a regular file", str(path))
     with open(descriptor, "rb") as file:
         yield file
 
 
-class _Pieces(io.FileIO):
-    """An opened file, of which at most MOST_DIRECTORY bytes are read at once."""
-
-    def read(self, size: int | None = -1) -> bytes:
-        if size is not None and size > MOST_DIRECTORY:
-            raise ValueError(f"its directory is larger than {MOST_DIRECTORY} bytes")
-        return super().read(size)
-
-
 @contextmanager
 def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The zip file, until the block ends. Raises OSError where it cannot be read, ValueError
-    for a directory of more than MOST_DIRECTORY bytes, and what zipfile raises.
+    """The zip file, until the block ends. Raises OSError as opened_regular, ValueError for a
+    directory of more than MOST_DIRECTORY bytes, and what zipfile raises.
     """
-    if stat.S_ISFIFO(path.stat().st_mode):  # it would never end
-        raise ValueError("is no regular file")
-    with _Pieces(path) as file, zipfile.ZipFile(file) as archive:
-        yield archive
+    with opened_regular(path) as file:
+        # what zipfile itself finds at the file's end says how much it will read at once
+        end = zipfile._EndRecData(file)  # type: ignore[attr-defined]
+        if end is not None and end[zipfile._ECD_SIZE] > MOST_DIRECTORY:  # type: ignore[attr-defined]
+            raise ValueError(f"its directory is larger than {MOST_DIRECTORY} bytes")
+        with zipfile.ZipFile(file) as archive:
+            yield archive
 
 
 def read_regular(path: Path | str, most: int, encoding: str = "utf-8") -> str:
@@ -93,7 +86,8 @@ def refusal(
     """
     if isinstance(error, FileNotFoundError):
         return UserError(f"{path}: no such file; copy it there")
-    if isinstance(error, OSError) and error.errno is not None:
+    # EINVAL: the content names a place before the file's beginning
+    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
         return UserError(
             f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
         )

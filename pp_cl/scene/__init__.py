@@ -1,1 +1,5 @@
 """Scenes: photographs with cameras and masks, and the visual hull where the points start."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

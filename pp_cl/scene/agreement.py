@@ -53,12 +53,6 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
 
     It counts the masks that hold each of about 32^3 positions in a (2, 3) box.
     """
-    empty = [view.name for view in views if view.hull_alpha.max() <= MASK_THRESHOLD]
-    if empty:
-        return (
-            f"{listing(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): fix or remove"
-            " the image"
-        )
     _, on_mask, beside = mask_votes(views, box)
     agreeing = on_mask.sum(0).max()
     objections = beside[:, on_mask.sum(0) == agreeing].mean(1)

@@ -14,6 +14,7 @@ CROPPED_MARGIN = 0.5
 # of the box of the eyes, world units: what float32 computes with (docs/scenes.md)
 LEAST_REACH, MOST_REACH = 1e-12, 1e15
 LEAST_SHARE = 1e-9  # of a distance: less of it is rounding
+LEAST_SLACK = 1e-6  # of the cameras' reach: less is the solver's rounding
 SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog
 
 
@@ -44,13 +45,6 @@ def reach_of(views: Sequence[View]) -> float:
             " with; correct its pose, or scale all positions down"
         )
     return reach
-
-
-def corners_of(box: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of a (2, 3) box: bit i of a row's number says whether it lies on the upper
-    side of axis i.
-    """
-    return np.array([[box[n >> axis & 1][axis] for axis in range(3)] for n in range(8)])
 
 
 def _all_of(views):
@@ -86,6 +80,28 @@ def bounding_box(views: Sequence[View]) -> np.ndarray:
                 break
             return box
     raise UserError(f"{_all_of(views)} do not bound the object: it must be seen from several sides")
+
+
+def looking_elsewhere(views: Sequence[View]) -> list[View]:
+    """The views whose pyramids miss the place that is the least outside of all pyramids together:
+    none where all meet. As a sum, that is where most of them meet, however far off the others are.
+    """
+    from scipy.optimize import linprog  # takes long to import
+
+    unit = 2.0 ** math.frexp(reach_of(views))[1]
+    planes = [_silhouette_planes(view, None) for view in views]
+    owner = np.repeat(np.arange(len(views)), [len(some) for some in planes])
+    stacked = np.concatenate(planes)
+    outside = (owner[:, None] == np.arange(len(views))).astype(float)  # how far, by view
+    found = linprog(
+        np.append(np.zeros(3), np.ones(len(views))),
+        -np.column_stack([stacked[:, :3], outside]),
+        -stacked[:, 3] / unit,
+        bounds=[(None, None)] * 3 + [(0, None)] * len(views),
+    )
+    if found.status != SOLVED:
+        return []
+    return [v for v, far in zip(views, found.x[3:], strict=True) if far > LEAST_SLACK]
 
 
 def _silhouette_planes(view, cropped_margin):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pp_cl.engine.camera import Camera
-from pp_cl.scene.camera_path import looked_at
+from pp_cl.scene.gaze import looked_at
 from pp_cl.scene.readers.frame import GL_FROM_CV
 
 STATED = "stated"

@@ -12,7 +12,7 @@ from pp_cl.files.atomic import write_json
 from pp_cl.scene.convention import AXES
 from pp_cl.scene.readers.common import checked_box, fail_at, read_json
 
-FILE = "pp_cl.json"
+EDITS = "pp_cl.json"
 
 
 class Edits(NamedTuple):
@@ -28,7 +28,7 @@ class Edits(NamedTuple):
 
 def read_edits(folder: Path) -> Edits:
     """The edits of a scene. Raises UserError naming the file and the key that is wrong."""
-    file = folder / FILE
+    file = folder / EDITS
     if not file.exists():
         return Edits()
     found = read_json(file)
@@ -46,11 +46,12 @@ def read_edits(folder: Path) -> Edits:
 
 
 def write_edits(folder: Path, edits: Edits) -> None:
-    """Write the edits into a scene's folder; none at all remove the file. Raises UserError where
-    that cannot be done.
+    """Write the edits into a scene's folder; none at all remove the file. Raises UserError for a
+    box without volume, and where that cannot be done.
     """
-    file = folder / FILE
-    box = None if edits.box is None else edits.box.tolist()
+    file, box = folder / EDITS, None
+    if edits.box is not None:
+        box = checked_box(np.array(edits.box).tolist(), fail_at(file, "box")).tolist()
     kept = {"box": box, "dropped": sorted(edits.dropped), "axes": edits.axes}
     kept = {key: value for key, value in kept.items() if value}
     if kept:

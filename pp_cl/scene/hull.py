@@ -15,7 +15,7 @@ from pp_cl.engine.grid import Grid, smallest_edge
 from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import explain_empty_hull
-from pp_cl.scene.bounds import bounding_box, reach_of
+from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
 CELL_CAP = 2**27
@@ -152,17 +152,11 @@ def build_grid(
     The search starts from the box that the masks allow and rescales the edge from the measured
     count, until the count is `points` to 1.02 points. At CELL_CAP vertices of the grid, or after
     8 rounds, the best carving is taken: the smallest with enough points, else the largest. Raises
-    UserError for an impossible `points`, a view without a mask where others have one, masks or
-    poses that leave no vertex, cameras that make no scene.
+    UserError for an impossible `points`, masks or poses that leave no vertex, cameras that make no
+    scene.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
-    masked = [view.has_mask or view.is_masked for view in views]
-    if any(masked) and not all(masked):
-        raise UserError(
-            f"{views[masked.index(False)].name}: has no transparent pixel, but other photographs"
-            " have: give it a mask that is 0 around the object"
-        )
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     limit = None if box is None else box - corner
@@ -295,19 +289,25 @@ class Agreement(NamedTuple):
 def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) -> Agreement:
     """How far masks agree, by what share of each lies where their hull does not.
 
-    The hull of masks that agree covers all of them. Where a mask lies beside it by MOST_BESIDE and
-    several times the usual share, it belongs to another place or another camera, and is left out.
-    Where all do a little, masks are wrong here and there: then as many are forgiven as it takes.
+    Views that look elsewhere are left out. The hull of masks that agree covers all of them. Where a
+    mask lies beside it by MOST_BESIDE and several times the usual share, it belongs to another
+    place or another camera, and is left out. Where all do a little, masks are wrong here and there:
+    then as many are forgiven as it takes.
     box: as build_grid() takes it. Raises UserError as build_grid() does.
     """
-    kept = list(views)
-    left_out: dict[str, float] = {}
-    is_masked = any(one.has_mask for one in kept)
-    if not is_masked or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
-        return Agreement(kept, left_out, 0)
-    most = int(MOST_LEFT_OUT * len(kept))
+    if not any(one.has_mask for one in views):
+        return Agreement(list(views), {}, 0)
+    most = int(MOST_LEFT_OUT * len(views))
+    elsewhere = looking_elsewhere(views)
+    left_out = {view.name: 1.0 for view in elsewhere if len(elsewhere) <= most}
+    kept, forgiven = [view for view in views if view.name not in left_out], most // 2
+    try:
+        if _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
+            return Agreement(kept, left_out, 0)
+    except UserError:  # no place is in all masks
+        forgiven = most
     while len(left_out) < most:
-        shares = _shares_beside(dev, kept, box, most // 2)
+        shares = _shares_beside(dev, kept, box, forgiven)
         worst = int(shares.argmax())
         if shares[worst] <= max(MOST_BESIDE, TIMES_USUAL * np.median(shares)):
             break

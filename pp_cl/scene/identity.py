@@ -2,7 +2,6 @@
 scene, and to check that a training resumes with the same photographs.
 """
 
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,38 +10,22 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.views import View
 from pp_cl.errors import listing
-from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import MOST, numbers
 
-STRAIGHT = Distortion()  # of a lens without distortion
-DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
 POSE, LENS, RANGE = 12, 6, 2  # numbers of a kept view; it may have no depth range
-CLOSE = 1e-6  # world units or pixels: cameras are the same
+CLOSE = 1e-6  # world units or pixels: cameras are the same, as another processor rounds them
 MOST_SIDE = 2**24  # what float32 holds as whole numbers
 
 
-def pixel_digest(
-    image: np.ndarray, distortion: Distortion = STRAIGHT, ignored: np.ndarray | None = None
-) -> str:
-    """Hex digest of the pixels of a uint8 image, its mask among them, of the distortion that is
-    removed from it, and of which pixels are ignored.
-    """
-    digest = hashlib.sha256(np.ascontiguousarray(image).data)
-    digest.update(repr(distortion).encode() if distortion else b"")
-    digest.update(b"" if ignored is None else np.packbits(ignored).data)
-    return digest.hexdigest()[:DIGITS]
-
-
-def identity(views: Sequence[View], listed: Sequence[View | Photograph]) -> dict[str, Any]:
-    """{"scene": digest of the names and cameras, "pixels": {name: digest} of the views, None where
-    the program makes them, "views": for kept_views()}: what the header of a checkpoint holds of its
-    training views. listed: those that the scene lists, of which some could not be read.
+def identity(views: Sequence[View]) -> dict[str, Any]:
+    """{"pixels": {name: digest} of the views, None where the program makes them, "views": for
+    kept_views()}: what the header of a checkpoint holds of its training views.
     """
     made = any(view.digest is None for view in views)
     pixels = None if made else {view.name: view.digest for view in views}
     kept = [[view.name, kept_camera(view.file_camera, view.depth_range)] for view in views]
-    return {"scene": fingerprint(listed), "pixels": pixels, "views": kept}
+    return {"pixels": pixels, "views": kept}
 
 
 def kept_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> list[float]:
@@ -76,46 +59,19 @@ def _unpacked(name, stored):
     return Photograph(name, camera, tuple(near_far) or None)
 
 
-def fingerprint(views: Sequence[View | Photograph]) -> str:
-    """Hex digest of the views' names and the cameras of their files."""
-    digest = hashlib.sha256()
-    for view in views:
-        camera = view.camera if isinstance(view, Photograph) else view.file_camera
-        digest.update(f"{view.name} {camera.width}x{camera.height} ".encode())
-        numbers = np.append(camera.pose.ravel(), [camera.fx, camera.fy, camera.cx, camera.cy])
-        digest.update(np.round(numbers, 6).tobytes())
-    return digest.hexdigest()
-
-
-def _are_alike(kept, listed):
-    """Whether listed views have the names and, but for rounding, the cameras of kept ones: another
-    processor rounds otherwise.
-    """
-    cameras = {o.name: o.camera if isinstance(o, Photograph) else o.file_camera for o in listed}
-    return cameras.keys() == {name for name, _ in kept} and all(
-        np.allclose(kept_camera(cameras[name]), numbers[: POSE + LENS], rtol=0, atol=CLOSE)
-        for name, numbers in kept
-    )
-
-
-def learned(header: dict[str, Any], listed: Sequence[Photograph]) -> list[Photograph]:
-    """Those of the training views that a scene lists without the user's edits that a checkpoint's
-    header has: what the scene listed then, if some were dropped or taken back since.
-    """
-    names = {name for name, _ in header["views"]}
-    return [one for one in listed if one.name in names]
-
-
 def difference(
-    header: dict[str, Any], listed: Sequence[View | Photograph], views: Sequence[View]
+    header: dict[str, Any], listed: Sequence[Photograph], views: Sequence[View] = ()
 ) -> str:
-    """How training views differ from those of a checkpoint's header, in words; "" where they are
-    the same.
+    """How the training views of a checkpoint's header differ from those that a scene lists, in
+    words; "" where all of them are listed, with the same cameras. The scene may list more.
 
-    listed: all of them; views: those whose pixels are compared, where the header has their digests.
+    views: those whose pixels are compared, where the header has their digests.
     """
-    if fingerprint(listed) != header["scene"] and not _are_alike(header["views"], listed):
-        return "its training views have other names or cameras"
+    cameras = {one.name: kept_camera(one.camera) for one in listed}
+    for name, kept in header["views"]:
+        now = cameras.get(name)
+        if now is None or not np.allclose(now, kept[: POSE + LENS], rtol=0, atol=CLOSE):
+            return "its training views have other names or cameras"
     known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]
     return f"{listing(changed)}: other pixels, or another mask" if changed else ""

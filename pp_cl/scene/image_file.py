@@ -1,16 +1,27 @@
-"""Images that a scene lists, before their pixels are read, and how far reading reduces them."""
+"""Images that a scene lists, how far reading reduces them, and reading one: its pixels, its mask,
+its lens's distortion removed.
+"""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from pp_cl.engine.camera import Camera
-from pp_cl.scene.distortion import Distortion
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.views import MASK_THRESHOLD, View
+from pp_cl.errors import Unusable
+from pp_cl.files.image import read_rgba
+from pp_cl.scene.distortion import Distortion, undistort
+from pp_cl.scene.masks import OPAQUE, MaskRule, cut_out, read_mask_of_size
 
 # Of a scene's photographs in memory, as RGBA; more than this is reduced while it is read. A fixed
 # number, not what happens to be free: the same command gives the same bits on every machine.
 KEPT_BYTES = 2**29
+STRAIGHT = Distortion()  # of a lens without distortion
+DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
 
 
 @dataclass(frozen=True)
@@ -66,3 +77,62 @@ def shrink(image: np.ndarray, factor: int) -> np.ndarray:
         small[row, :, :3] = (sums[:, :3] + opacity // 2) // np.maximum(opacity, 1)
         small[row, :, 3:] = (opacity + area // 2) // area
     return small
+
+
+def read_view(
+    folder: Path, photograph: Photograph, rule: MaskRule, dev: Device | None, factor: int = 1
+) -> View:
+    """The View of a photograph of the scene in a folder, with its mask, free of distortion and
+    reduced `factor` times. dev: removes distortion; None where there is none.
+
+    Raises Unusable where the image or a mask cannot be used.
+    """
+    camera = photograph.camera
+
+    def used(image):
+        if photograph.distortion:
+            return undistort(dev, image, camera, photograph.distortion, factor)
+        return shrink(image, factor)
+
+    size, ignored = (camera.width, camera.height), None
+    if photograph.ignore:
+        mask = read_mask_of_size(folder / photograph.ignore, size) > OPAQUE // 2
+        mask = np.where(mask != photograph.ignores_black, np.uint8(OPAQUE), np.uint8(0))
+        ignored = used(np.dstack([mask] * 4))[..., 3] > MASK_THRESHOLD
+    image = read_rgba(folder / photograph.name, size)
+    if photograph.mask:
+        image[..., 3] = read_mask_of_size(folder / photograph.mask, image.shape[1::-1])
+    elif rule.source in ("box", "none"):
+        image[..., 3] = OPAQUE
+    digest = pixel_digest(image, photograph.distortion, ignored)
+    image = used(image)
+    if rule.is_by_colour:
+        image = cut_out(image, photograph.name, rule.tolerance)
+    if ignored is not None:
+        image = np.where(ignored[..., None], np.uint8(0), image)
+    if image[..., 3].max() <= MASK_THRESHOLD:
+        text = f"{folder / photograph.name}: its mask is empty; correct it, or remove the image"
+        raise Unusable(text, "an empty mask")
+    return View(
+        photograph.name,
+        camera.downscaled(factor) if factor > 1 else camera,
+        image,
+        photograph.depth_range,
+        digest=digest,
+        shrunk=factor,
+        unshrunk_camera=camera if factor > 1 else None,
+        is_masked=photograph.mask is not None,
+        ignored=ignored,
+    )
+
+
+def pixel_digest(
+    image: np.ndarray, distortion: Distortion = STRAIGHT, ignored: np.ndarray | None = None
+) -> str:
+    """Hex digest of the pixels of a uint8 image, its mask among them, of the distortion that is
+    removed from it, and of which pixels are ignored.
+    """
+    digest = hashlib.sha256(np.ascontiguousarray(image).data)
+    digest.update(repr(distortion).encode() if distortion else b"")
+    digest.update(b"" if ignored is None else np.packbits(ignored).data)
+    return digest.hexdigest()[:DIGITS]

@@ -6,58 +6,47 @@ import math
 import mimetypes
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from threading import Lock
 from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.views import (
-    MASK_THRESHOLD,
-    View,
-    border,
-    check_downscale,
-    evenly,
-)
+from pp_cl.engine.views import View, border, check_downscale, evenly
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, listing, quoted
-from pp_cl.files.image import is_transparent, read_mask, read_rgba
+from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
-from pp_cl.scene.distortion import BAND_BYTES, undistort
-from pp_cl.scene.edits import FILE as EDITS
-from pp_cl.scene.edits import read_edits
-from pp_cl.scene.identity import pixel_digest
-from pp_cl.scene.image_file import Photograph, shrink, shrink_factor
-from pp_cl.scene.kept import KeptViews
-from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, of_size
-from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
-from pp_cl.scene.readers.common import read_json
-from pp_cl.scene.readers.found import (
+from pp_cl.scene.distortion import BAND_BYTES
+from pp_cl.scene.edits import EDITS, read_edits
+from pp_cl.scene.found import (
     IGNORE_FOLDERS,
     MASK_FOLDERS,
-    Notes,
+    LeftOut,
     find_masks,
     folder_named,
+    usable,
 )
+from pp_cl.scene.image_file import Photograph, read_view, shrink_factor
+from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, read_mask_of_size
+from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
+from pp_cl.scene.readers.common import read_json
 from pp_cl.scene.silhouette import within_silhouettes
 from pp_cl.settings import Config
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, splits(folder) names its splits, read_split(folder, split, notes) gives a list
-# of Photograph of one of them without reading pixels and tells notes what it leaves out, and
-# box(folder), which only some have, gives the box that the files state around the object. The first
-# that recognises a folder reads it.
+# holds such files, splits(folder) names its splits, read_split(folder, split, left_out) gives a
+# list of Photograph of one of them without reading pixels and adds the views that cannot be used to
+# left_out, and box(folder), which only some have, gives the box that the files state around the
+# object. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
 # Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
@@ -70,17 +59,20 @@ LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measu
 
 INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
 BESIDE = 0.5  # of what is transparent, that a mask which is not of the object holds
-NO_MASK, BAD_MASK = "no mask", "a mask that cannot be used"
+WRONG = "what the scene's files say of it is wrong"  # of a view whose error is no Unusable
 OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
 LEAST_VIEWS = 8  # for training that are left where some are left out
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
 
 class Listing(NamedTuple):
-    """The photographs of a split, and a line for each kind of thing that was done to use them."""
+    """The photographs of a split, without their pixels. left_out: the names of those that cannot be
+    used, and why. done: (name of a photograph, what was done to use it).
+    """
 
     photographs: list[Photograph]
-    notes: list[str]
+    left_out: LeftOut
+    done: list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -104,20 +96,17 @@ def open_scene(
     splits: tuple[str, ...],
     most: int | None = None,
     listed: Mapping[str, Listing] | None = None,
-    kept: KeptViews | None = None,
 ) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
     `demo` is rendered on the device.
 
-    most, listed, kept: as load_scene() takes them.
+    most, listed: as load_scene() takes them.
     """
     path, downscale, masks = config.scene.path, config.scene.downscale, mask_rule(config)
     if path == DEMO:
         rendered = {split: demo.demo_views(dev, split, most) for split in splits}
         return Scene(DEMO, None, _reduced(rendered, downscale))
-    scene = load_scene(
-        path, splits, most, masks, downscale=downscale, listed=listed, dev=dev, kept=kept
-    )
+    scene = load_scene(path, splits, most, masks, downscale=downscale, listed=listed, dev=dev)
     views = scene.splits.get("train", [])
     masked = [view for view in views if view.has_mask]
     shares = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked]
@@ -172,36 +161,34 @@ def scene_splits(path: Path | str) -> list[str]:
     return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
 
 
+# Listing a split ----------------------------------------------------------------------------------
+
+
 def scene_frames(
     path: str | Path, split: str = "train", *, edited: bool = True
 ) -> list[Photograph]:
-    """list_split()'s photographs; what it notes becomes warnings."""
-    photographs, notes = list_split(path, split, edited=edited)
-    _tell(Path(path), [f"{split}: {line}" for line in notes])
-    return photographs
-
-
-def _tell(folder, notes):
-    """Warn of each note once, however often a command asks: equal warnings of one line are one."""
-    for note in notes:
-        warnings.warn(f"{folder}: {note}", stacklevel=1)
+    """list_split()'s photographs; what it left out and did becomes warnings."""
+    found = list_split(path, split, edited=edited)
+    _tell(Path(path), _lines(split, *found))
+    return found.photographs
 
 
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> Listing:
     """The photographs of a split, without their pixels; edited: but for those that the user has
-    dropped. Those that cannot be used are left out. Raises UserError where there are none, where
-    too few are left (Notes.check), and for cameras in other axes than the format's.
+    dropped. Raises UserError where there are none, where too few are left, and for cameras in other
+    axes than the format's.
     """
     if path == DEMO:
-        return Listing(demo.demo_frames(split), [])
-    folder, reader, notes = Path(path), find_reader(path), Notes()
+        return Listing(demo.demo_frames(split), [], [])
+    folder, reader = Path(path), find_reader(path)
     present = reader.splits(folder)
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
-    photographs = reader.read_split(folder, split, notes)
+    left_out: LeftOut = []
+    photographs = reader.read_split(folder, split, left_out)
     edits = read_edits(folder)
-    dropped: Set[str] = edits.dropped if edited else frozenset()
-    photographs = [one for one in photographs if one.name not in dropped]
+    if edited:
+        photographs = [one for one in photographs if one.name not in edits.dropped]
     if edits.axes:
         photographs = [replace(o, camera=read_as(o.camera, edits.axes)) for o in photographs]
     elif axes := other_axes([one.camera for one in photographs]):
@@ -210,41 +197,77 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
             f' the kind "{axes}". If so, write {{"axes": "{axes}"}} into {folder / EDITS}; if they'
             f' are right, {{"axes": "{STATED}"}}'
         )
-    if not photographs:
-        notes.check(0)
-        lacks = f"; {EDITS} drops some" if dropped else ""
+    if not photographs and not left_out:
+        lacks = f"; {EDITS} drops some" if edited and edits.dropped else ""
         raise UserError(f"{folder}: split {split} has no photographs{lacks}; add some")
-    lensed = notes.usable(photographs, lambda one: _checked(folder, one), lambda one: one.name)
-    photographs = list(lensed)
-    notes.check(len(photographs), LEAST_VIEWS if split == "train" else 1)
-    photographs = _masked(folder, reader, photographs, split, notes)
+
+    def checked(photograph):
+        check_lens(folder / photograph.name, photograph)
+        return photograph
+
+    photographs = list(usable(photographs, checked, lambda one: one.name, left_out))
+    _check_left(photographs, left_out, LEAST_VIEWS if split == "train" else 1)
+    photographs, done = _masked(folder, reader, photographs, split)
     photographs = _ignoring(folder, IGNORE_FOLDERS, photographs, split)
-    if ignoring := [one.name for one in photographs if one.ignore and not one.ignores_black]:
-        notes.done["pixels are ignored where the masks in ignore are white"] = ignoring
-    return Listing(photographs, notes.lines(len(photographs)))
+    ignored = "pixels are ignored where the masks in ignore are white"
+    done += [(one.name, ignored) for one in photographs if one.ignore and not one.ignores_black]
+    return Listing(photographs, left_out, done)
 
 
-def _masked(folder, reader, photographs, split, notes):
-    """The photographs, with the masks of a folder of masks where the format names none; images of a
-    transforms.json have their own alpha, if they have one. Where masks are of the object, what a
-    transforms.json names besides says where images are of use, as nerfstudio takes it.
+def check_lens(file: Path, photograph: Photograph) -> None:
+    """Raise Unusable naming the file of a photograph whose camera shows nothing in float32, or
+    whose distortion folds.
     """
-    named = [one for one in photographs if one.mask]
+    camera = photograph.camera
+    for what, values, least in (
+        ("focal lengths", (camera.fx, camera.fy), LEAST_FOCAL),
+        ("a principal point", (camera.cx, camera.cy), -MOST_FOCAL),
+    ):
+        if not least <= min(values) <= max(values) <= MOST_FOCAL:
+            raise Unusable(
+                f"{file}: its camera has {what} of {values[0]:.3g} and {values[1]:.3g} pixels,"
+                f" which must be {least:g} to {MOST_FOCAL:g}; correct the scene's file of cameras",
+                BROKEN_CAMERA,
+            )
+    if photograph.distortion.folds(camera):
+        raise Unusable(
+            f"{file}: its distortion coefficients fold the image over; correct them, or undistort"
+            " the images with the program that found them",
+            "distortion that folds",
+        )
+
+
+def _check_left(left, left_out, least):
+    """Raise the error of the first view that was left out where fewer than `least`, or less than
+    half, are left.
+    """
+    if left_out and len(left) < max(least, len(left_out)):
+        raise left_out[0][1]
+
+
+def _masked(folder, reader, photographs, split):
+    """(The photographs, with the masks of a folder of masks where the format names none; what was
+    done). Images of a transforms.json have their own alpha, if they have one. Where masks are of
+    the object, what a transforms.json names besides says where images are of use, as nerfstudio
+    takes it.
+    """
+    named, done = [one for one in photographs if one.mask], []
     if named:
         if reader is not transforms or not _are_besides(folder, named[0]):
-            return photographs
+            return photographs, done
         what = "masks that frames name are taken for where images are of use"
-        notes.done[what] = [one.name for one in named]
+        done = [(one.name, what) for one in named]
         photographs = [
             replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in photographs
         ]
     place = folder_named(folder, MASK_FOLDERS)
     if place and reader is transforms and _are_cut_out(folder, photographs):
-        return photographs
-    masks = _masks_in(folder, photographs, split)
+        return photographs, done
+    masks = _masks_in(folder, photographs, split, MASK_FOLDERS)
     if masks and reader is transforms:
-        notes.done[f"masks are taken from {folder / place}, which no frame names"] = list(masks)
-    return [replace(one, mask=masks.get(one.name)) for one in photographs]
+        what = f"masks are taken from {folder / place}, which no frame names"
+        done += [(name, what) for name in masks]
+    return [replace(one, mask=masks.get(one.name)) for one in photographs], done
 
 
 def _are_cut_out(folder, photographs):
@@ -255,7 +278,7 @@ def _are_cut_out(folder, photographs):
     return False
 
 
-def _masks_in(folder, photographs, split, places=MASK_FOLDERS):
+def _masks_in(folder, photographs, split, places):
     """{photograph: its mask} of those that have one in one of the places in a folder. Raises
     UserError where a place has none for any training photograph.
     """
@@ -277,7 +300,7 @@ def _are_besides(folder, photograph):
     with suppress(UserError):
         if is_transparent(image):
             outside = read_rgba(image)[..., 3] < OPAQUE // 2
-            mask = of_size(read_mask(folder / photograph.mask), outside.shape[::-1], folder)
+            mask = read_mask_of_size(folder / photograph.mask, outside.shape[::-1])
             return bool(outside.any() and (mask[outside] > OPAQUE // 2).mean() > BESIDE)
     return False
 
@@ -294,29 +317,31 @@ def _ignoring(folder, places, photographs, split):
     ]
 
 
-def _checked(folder, photograph):
-    """The photograph; an Unusable for a camera that shows nothing in float32, and where its
-    distortion folds.
-    """
-    image, camera = folder / photograph.name, photograph.camera
-    focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    for what, values, least in (
-        ("focal lengths", focal, LEAST_FOCAL),
-        ("a principal point", middle, -MOST_FOCAL),
-    ):
-        if not least <= min(values) <= max(values) <= MOST_FOCAL:
-            return Unusable(
-                f"{image}: its camera has {what} of {values[0]:.3g} and {values[1]:.3g} pixels,"
-                f" which must be {least:g} to {MOST_FOCAL:g}; correct the scene's file of cameras",
-                BROKEN_CAMERA,
-            )
-    if photograph.distortion.folds(camera):
-        return Unusable(
-            f"{image}: its distortion coefficients fold the image over; correct them, or undistort"
-            " the images with the program that found them",
-            "distortion that folds",
-        )
-    return photograph
+def _lines(split, used, left_out, done):
+    """One line for each kind of thing that was left out or done in a split."""
+    count = len(used) + len(left_out)
+    gone = _by_kind((name, getattr(error, "why", WRONG)) for name, error in left_out)
+    return [
+        f"{split}: {len(names)} of {count} views left out: {why} ({listing(names)})"
+        for why, names in gone.items()
+    ] + [f"{split}: {what} ({listing(names)})" for what, names in _by_kind(done).items()]
+
+
+def _by_kind(pairs):
+    """{kind: names} of pairs of a name and a kind."""
+    kinds: dict[str, list[str]] = {}
+    for name, kind in pairs:
+        kinds.setdefault(kind, []).append(name)
+    return kinds
+
+
+def _tell(folder, lines):
+    """Warn of each line once, however often a command asks: equal warnings of one line are one."""
+    for line in lines:
+        warnings.warn(f"{folder}: {line}", stacklevel=1)
+
+
+# Finding a scene ----------------------------------------------------------------------------------
 
 
 def measured_split(path: str) -> str:
@@ -378,80 +403,55 @@ def _found_instead(folder):
     )
 
 
+# Reading images -----------------------------------------------------------------------------------
+
+
 def load_scene(
     path: str | Path,
     splits: Iterable[str] = ("train",),
     most: int | None = None,
     masks: MaskRule = AS_GIVEN,
     *,
+    dev: Device | None = None,
     downscale: int | None = None,
     listed: Mapping[str, Listing] | None = None,
-    dev: Device | None = None,
-    kept: KeptViews | None = None,
 ) -> Scene:
     """Scene of the given splits from a folder; a progress bar shows on a terminal.
 
-    most: views to read of each split, spread evenly; None: all. downscale: how many times its
-    images are reduced, those of a large scene in part while they are read; None: as they are
-    stored. listed: what list_split() gave of some splits, so that their files are not read again.
-    dev: where distortion is removed, and silhouettes are found for training views whose masks are
-    missing; the default device is opened for it where none is given.
-    kept: where images that are reduced while they are read are looked for first. Raises UserError
-    naming the file, and the key where there is one, for whatever is missing, broken or
-    contradictory.
+    most: views to read of each split, spread evenly; None: all. dev: removes distortion, and finds
+    silhouettes for training views whose masks are missing, which are left out without it.
+    downscale: how many times its images are reduced, those of a large scene in part while they are
+    read; None: as they are stored. listed: what list_split() gave of some splits, so that their
+    files are not read again. Raises UserError naming the file, and the key where there is one, for
+    whatever is missing, broken or contradictory, and for distortion without a device.
     """
-    folder, listed, lines = Path(path), listed or {}, []
-    chosen = {}
+    folder, lines = Path(path), []
     for option, given in (("--masks", masks.folder), ("--ignore", masks.ignore)):
         if given and not os.path.isdir(given):
             raise UserError(f"{given}: no such folder; {option} takes one of masks")
+    chosen = {}
     for split in splits:
-        frames, notes = listed.get(split) or list_split(folder, split)
-        chosen[split] = evenly(frames, most)
-        lines += [f"{split}: {line}" for line in notes]
-        if masks.folder:
-            own = Path(masks.folder).absolute()
-            files = _masks_in(own, chosen[split], split, ["."])
-            masked = {name: str(own / mask) for name, mask in files.items()}
-            chosen[split] = [replace(one, mask=masked.get(one.name)) for one in chosen[split]]
-        if masks.ignore:
-            chosen[split] = _ignoring(Path(masks.ignore), ["."], chosen[split], split)
+        found = (listed or {}).get(split) or list_split(folder, split)
+        lines += _lines(split, *found)
+        chosen[split] = _by_rule(masks, evenly(found.photographs, most), split)
     photographs = [one for some in chosen.values() for one in some]
     _check_alike(folder, photographs, downscale)
-    factor = shrink_factor(_sizes(photographs), downscale or 1)
     if dev is None and any(one.distortion for one in photographs):
-        dev = open_device()
-    read = partial(_read_view, _Reducer(dev, factor), folder, masks, kept if factor > 1 else None)
-    with ThreadPoolExecutor(reading(photographs, masks, factor)[0]) as pool:
-        reads, count = pool.map(read, photographs), len(photographs)
-        bar = tqdm(reads, "reading images", count, unit="image", leave=False, disable=None)
-        found = list(bar)
-    views: dict[str, list[View]] = {}
-    is_some = any(isinstance(view, View) and view.is_masked for view in found)
-    left = iter(zip(photographs, found, strict=True))
-    for split, some in chosen.items():
-        told, is_whole = Notes(), split == "train" and most is None
-        bare: list[View] = []
-
-        def used(pair, bare=bare):
-            photograph, view = pair
-            if isinstance(view, Unusable) or not is_some or view.is_masked or view.has_mask:
-                return view
-            bare.append(view)
-            file = folder / photograph.name
-            return Unusable(f"{file}: has no mask, as others have; add it, or remove all", NO_MASK)
-
-        pairs = [next(left) for _ in some]
-        usable = list(told.usable(pairs, used, lambda pair: pair[0].name))
-        told.check(len(usable), LEAST_VIEWS if is_whole else 1)
-        if is_whole and bare:
-            with suppress(UserError):  # else they stay left out
-                usable += within_silhouettes(dev or open_device(), usable, bare)
-                told.done[OF_OTHERS] = told.left_out.pop(NO_MASK)
-                order = {one.name: i for i, one in enumerate(some)}
-                usable.sort(key=lambda view: order[view.name])
-        views[split] = usable
-        lines += [f"{split}: {line}" for line in told.lines(len(usable))]
+        raise UserError(f"{folder}: its images have distortion, which only a device removes")
+    factor = shrink_factor([(p.camera.width, p.camera.height) for p in photographs], downscale or 1)
+    left_out: dict[str, LeftOut] = {split: [] for split in chosen}
+    views = {
+        split: _read_views(folder, some, masks, dev, factor, left_out[split])
+        for split, some in chosen.items()
+    }
+    has_masks = any(v.is_masked or v.has_mask for some in views.values() for v in some)
+    for split, some in views.items():
+        is_whole, done = split == "train" and most is None, []
+        if has_masks:
+            dev_or_none = dev if is_whole else None
+            views[split], done = _all_masked(folder, some, dev_or_none, left_out[split])
+        _check_left(views[split], left_out[split], LEAST_VIEWS if is_whole else 1)
+        lines += _lines(split, views[split], left_out[split], done)
     _tell(folder, lines)
     views = _reduced(views, downscale // factor) if downscale else views
     return Scene(folder.resolve().name, folder, views, lines)
@@ -461,23 +461,20 @@ def _reduced(splits, downscale):
     return {split: [view.reduced(downscale) for view in views] for split, views in splits.items()}
 
 
-def reading(
-    photographs: Sequence[Photograph], masks: MaskRule = AS_GIVEN, factor: int = 1
-) -> tuple[int, int]:
-    """(how many photographs are read side by side, bytes that this takes beside the images that
-    stay): as many as there are cores, but no more than READING_BYTES hold. factor: how many times
-    they are reduced meanwhile.
+def _by_rule(rule, photographs, split):
+    """The photographs, with the masks of the rule's folders, and none where its masks are no
+    files.
     """
-    per_pixel = DECODED + (CUT_OUT / factor**2 if masks.is_by_colour else 0)
-    pixels = max(one.camera.width * one.camera.height for one in photographs)
-    most = math.ceil(per_pixel * pixels)
-    workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(photographs)))
-    is_bent = any(one.distortion for one in photographs)
-    return workers, workers * most + (BAND_COPIES * BAND_BYTES if is_bent else 0)
-
-
-def _sizes(photographs):
-    return [(one.camera.width, one.camera.height) for one in photographs]
+    if rule.folder:
+        own = Path(rule.folder).absolute()
+        masks = _masks_in(own, photographs, split, ["."])
+        files = {name: str(own / mask) for name, mask in masks.items()}
+        photographs = [replace(one, mask=files.get(one.name)) for one in photographs]
+    elif rule.source != "given":
+        photographs = [replace(one, mask=None) for one in photographs]
+    if rule.ignore:
+        photographs = _ignoring(Path(rule.ignore), ["."], photographs, split)
+    return photographs
 
 
 def _check_alike(folder, photographs, downscale):
@@ -493,76 +490,51 @@ def _check_alike(folder, photographs, downscale):
             check_downscale(one.name, one.camera, downscale)
 
 
-@contextmanager
-def _unusable(why):
-    """A UserError in the block becomes an Unusable."""
-    try:
-        yield
-    except UserError as error:
-        raise Unusable(error, why) from error
+def _read_views(folder, photographs, masks, dev, factor, left_out):
+    """The views of the photographs that can be used, several read at a time."""
+
+    def read(photograph):
+        try:
+            return read_view(folder, photograph, masks, dev, factor)
+        except UserError as error:
+            return error
+
+    with ThreadPoolExecutor(reading(photographs, masks, factor)[0]) as pool:
+        reads, count = pool.map(read, photographs), len(photographs)
+        found = list(tqdm(reads, "reading images", count, unit="image", leave=False, disable=None))
+    for photograph, error in zip(photographs, found, strict=True):
+        if isinstance(error, UserError):
+            left_out.append((photograph.name, error))
+    return [view for view in found if isinstance(view, View)]
 
 
-class _Reducer:
-    """Frees images of distortion and reduces them `factor` times, for several threads."""
-
-    def __init__(self, dev, factor):
-        self.dev, self.factor, self._lock = dev, factor, Lock()
-
-    def __call__(self, image, photograph):
-        if not photograph.distortion:
-            return shrink(image, self.factor)
-        with self._lock:  # one of the threads uses the device
-            camera, lens = photograph.camera, photograph.distortion
-            return undistort(self.dev, image, camera, lens, self.factor)
-
-
-def _read_view(reduced, folder, masks, kept, photograph):
-    """The View of a photograph, with its mask, free of distortion and reduced; an Unusable where it
-    cannot be used.
+def _all_masked(folder, views, dev, left_out):
+    """(views that all have masks, what was done): those without one are used inside the hull of the
+    others' masks where there is a device and that hull can be had, and left out else.
     """
-    camera, factor = photograph.camera, reduced.factor
-    file, mask = folder / photograph.name, None
-    if photograph.mask and masks.is_of_files:
-        mask = folder / photograph.mask
-    ignore = photograph.ignore and folder / photograph.ignore
-    found = kept and kept.find(photograph, [file, mask, ignore], (masks, factor))
-    try:
-        with _unusable(BAD_MASK):
-            ignored = _read_ignored(reduced, ignore, photograph) if ignore else None
-        if found:
-            image, digest = found
-        else:
-            image = read_rgba(file, (camera.width, camera.height))
-            with _unusable(BAD_MASK):
-                image = masks.apply(image, mask)
-            digest = pixel_digest(image, photograph.distortion, ignored)
-            image = reduced(image, photograph)
-            if masks.is_by_colour:
-                with _unusable("no uniform background"):
-                    image = cut_out(image, photograph.name, masks.tolerance)
-            if ignored is not None:
-                image = np.where(ignored[..., None], np.uint8(0), image)
-    except Unusable as error:
-        return error
-    view = View(
-        photograph.name,
-        camera.downscaled(factor) if factor > 1 else camera,
-        image,
-        photograph.depth_range,
-        digest=digest,
-        shrunk=factor,
-        unshrunk_camera=camera if factor > 1 else None,
-        is_masked=mask is not None,
-        ignored=ignored,
-    )
-    if kept and not found:
-        kept.take(view)
-    return view
+    bare = [view for view in views if not (view.is_masked or view.has_mask)]
+    masked = [view for view in views if view.is_masked or view.has_mask]
+    if bare and dev and len(masked) >= max(LEAST_VIEWS, len(bare) + len(left_out)):
+        with suppress(UserError):
+            filled = {view.name: view for view in within_silhouettes(dev, masked, bare)}
+            views = [filled.get(view.name, view) for view in views]
+            return views, [(name, OF_OTHERS) for name in filled]
+    for view in bare:
+        text = f"{folder / view.name}: has no mask, as others have; add it, or remove all"
+        left_out.append((view.name, Unusable(text, "no mask")))
+    return masked, []
 
 
-def _read_ignored(reduced, file, photograph):
-    """(H, W) bool: the pixels of a view that a mask says nothing is known of, in part or wholly."""
-    camera = photograph.camera
-    mask = of_size(read_mask(file), (camera.width, camera.height), file) > OPAQUE // 2
-    mask = np.where(mask != photograph.ignores_black, np.uint8(OPAQUE), np.uint8(0))
-    return reduced(np.dstack([mask] * 4), photograph)[..., 3] > MASK_THRESHOLD
+def reading(
+    photographs: Sequence[Photograph], masks: MaskRule = AS_GIVEN, factor: int = 1
+) -> tuple[int, int]:
+    """(how many photographs are read side by side, bytes that this takes beside the images that
+    stay): as many as there are cores, but no more than READING_BYTES hold. factor: how many times
+    they are reduced meanwhile.
+    """
+    per_pixel = DECODED + (CUT_OUT / factor**2 if masks.is_by_colour else 0)
+    pixels = max(one.camera.width * one.camera.height for one in photographs)
+    most = math.ceil(per_pixel * pixels)
+    workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(photographs)))
+    is_bent = any(one.distortion for one in photographs)
+    return workers, workers * most + (BAND_COPIES * BAND_BYTES if is_bent else 0)

@@ -11,12 +11,13 @@ from skimage.color import rgb2lab
 from skimage.measure import label
 
 from pp_cl.engine.views import border
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import read_mask, same_shape
-from pp_cl.scene.readers.found import mask_names
+from pp_cl.scene.found import find_mask
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = 255
+BAD_MASK = "a mask that cannot be used"
 HOLE = 5e-5  # of the image: smaller regions are none
 EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
@@ -37,28 +38,11 @@ class MaskRule:
     ignore: str = ""
 
     @property
-    def is_of_files(self) -> bool:
-        """Whether masks are files, of the folder or named by the scene."""
-        return bool(self.folder) or self.source == "given"
-
-    @property
     def is_by_colour(self) -> bool:
         """Whether cut_out() makes the masks, of the images as they are used: it takes long, and
         large ones take no better masks.
         """
         return self.source == "color" and not self.folder
-
-    def apply(self, image: np.ndarray, mask: Path | None) -> np.ndarray:
-        """The image (H, W, 4) uint8, its alpha overwritten by the file of its mask, or by what the
-        rule says without one. Raises UserError naming a mask that cannot be read or has
-        another size.
-        """
-        if mask is not None:
-            alpha = read_mask(mask)
-            image[..., 3] = of_size(alpha, image.shape[1::-1], mask)
-        elif self.source in ("box", "none"):
-            image[..., 3] = OPAQUE
-        return image
 
 
 AS_GIVEN = MaskRule()
@@ -69,27 +53,31 @@ def named_mask(folder: Path, *names: str) -> Path:
     alone. Raises UserError.
     """
     for name in names:
-        for given in (*mask_names(name), *mask_names(PurePosixPath(name).name)):
-            if (folder / given).is_file():
-                return folder / given
+        if found := find_mask(folder, name) or find_mask(folder, PurePosixPath(name).name):
+            return folder / found
     usual = PurePosixPath(names[0]).stem
     raise UserError(f"{folder}: no mask for {names[0]}; add {usual}.png, white where the object is")
 
 
-def of_size(alpha: np.ndarray, size: tuple[int, int], file: Path) -> np.ndarray:
-    """The mask (H, W) of a file resized to an image of (width, height) pixels, whose shape it must
-    have but for rounding. Raises UserError.
+def read_mask_of_size(file: Path, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) uint8 mask of a file, 255 where the object is, resized to an image of (width, height)
+    pixels, whose shape it must have but for rounding. Raises Unusable.
     """
-    height, width = alpha.shape
+    try:
+        mask = read_mask(file)
+    except UserError as error:
+        raise Unusable(error, BAD_MASK) from error
+    height, width = mask.shape
     if size == (width, height):
-        return alpha
+        return mask
     if not same_shape((width, height), size):
-        raise UserError(
+        raise Unusable(
             f"{file}: {width}x{height} pixels, but its image has {size[0]}x{size[1]}; make it the"
-            " image's size"
+            " image's size",
+            BAD_MASK,
         )
     warnings.warn(f"{file.parent}: masks are resized to their images", stacklevel=1)
-    return np.array(Image.fromarray(alpha).resize(size, Image.Resampling.BILINEAR))
+    return np.array(Image.fromarray(mask).resize(size, Image.Resampling.BILINEAR))
 
 
 def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = False) -> np.ndarray:
@@ -99,17 +87,17 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
     further than `tolerance` from it, a distance in CIELAB. Places of that colour which the object
     encloses are opaque, since nothing tells a hole from a spot; with_holes: but for the smallest
     they are holes. Pixels at the edge are a mixture of the background and of the nearest colour
-    within the object. Raises UserError naming the photograph where its border is of several
-    colours.
+    within the object. Raises Unusable naming the photograph where its border is of several colours.
     """
     colour = image[..., :3] / 255.0
     behind = np.median(border(colour), axis=0)
     distance = np.linalg.norm(rgb2lab(colour) - rgb2lab(behind), axis=2)
     share = (border(distance) < 2 * tolerance).mean()
     if share < BORDER_SHARE:
-        raise UserError(
+        raise Unusable(
             f"{name}: only {share:.0%} of its border have one colour, so --mask-from color finds no"
-            " background; give masks with --masks FOLDER, or a higher scene.mask_tolerance"
+            " background; give masks with --masks FOLDER, or a higher scene.mask_tolerance",
+            "no uniform background",
         )
     outside = _regions(distance < tolerance, with_holes)
     within = distance_transform_edt(~outside) > EDGE

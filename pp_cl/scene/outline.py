@@ -13,8 +13,8 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
-from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
+from pp_cl.files.sheets import contact_sheet
 from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.hull import Hull, silhouette
 from pp_cl.scene.image_file import shrink

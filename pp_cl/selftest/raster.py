@@ -60,7 +60,7 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         place, hit = dense.camera_space(camera, positions), points.point_count.get() > 0
         yield exact(hit | ~_inside(camera, place), np.ones(n, bool))
         radius = 0.01 * np.exp(offset[hit, 3])
-        yield relative(points.point_radius.get()[hit], radius, PLACED)
+        yield relative(points.point_shape.get()[hit, 0], radius, PLACED)
         yield relative(points.point_camera.get()[hit, :3], place[hit], PLACED)
         yield relative(
             points.point_camera.get()[hit, 3], np.linalg.norm(place[hit], axis=1), PLACED

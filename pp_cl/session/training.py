@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.checkpoint import load_run_state, opened_run
+from pp_cl.checkpoint import check_finite, load_run_state, opened_run, save_checkpoint
 from pp_cl.config import configure, load_config, refuse_setting, run_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
@@ -23,21 +23,18 @@ from pp_cl.engine.step import Trainer
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_target
-from pp_cl.files.checkpoint import check_finite
-from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
-from pp_cl.scene.identity import difference, identity, learned
-from pp_cl.scene.kept import KeptViews
+from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import (
     Listing,
     list_split,
     measured_split,
     open_scene,
-    scene_frames,
 )
 from pp_cl.session.budget import Budget
 from pp_cl.session.memory import Room
@@ -69,7 +66,7 @@ class Training:
 
     info: what a checkpoint's header holds beside the model's. room: the available memory and the
     plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
-    views on which train.eval_every measures PSNR. kept: images that a resume need not read again.
+    views on which train.eval_every measures PSNR.
     """
 
     folder: RunFolder
@@ -79,7 +76,6 @@ class Training:
     room: Room
     hull: HullFacts | None
     measured: list[View]
-    kept: KeptViews
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
     _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
@@ -102,7 +98,6 @@ class Training:
         with self.folder.owned():
             self._check_unchanged()
             self.folder.create(self.config.to_json())
-            self.kept.write()
             if self.hull and self.hull.picture is not None:
                 write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
             self._saved = self.trainer.step
@@ -164,7 +159,6 @@ class Training:
             # but a finished run is not resumed.
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
             self._save(finished=True)
-            self.kept.remove()
         return seconds
 
     def _after_step(self, log, terms, seconds):
@@ -209,7 +203,8 @@ class Training:
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         header |= {"exposed": True} if trainer.is_exposed else {}
-        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        arrays = trainer.model.arrays() if finished else trainer.arrays()
+        save_checkpoint(self.folder.checkpoint, header, arrays)
         self._expect_save()
         self._saved = trainer.step
 
@@ -255,7 +250,7 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     listing = list_split(config.scene.path)
     room = Room(config, net, listing.photographs)
     room.check_unseen()
-    views, info, kept = _read_views(dev, folder, config, listing)
+    views, info = _read_views(dev, config, listing)
 
     start = time.perf_counter()
     agreement, hull, depth_range = fitting_hull(dev, config, views, room)
@@ -269,7 +264,7 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     if agreement.left_out:
         info["left_out"] = list(agreement.left_out)
     facts, measured = HullFacts(hull.capped, seconds, picture), _measured_views(dev, config)
-    return Training(folder, config, trainer, info, room, facts, measured, kept)
+    return Training(folder, config, trainer, info, room, facts, measured)
 
 
 def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
@@ -290,19 +285,16 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     room = Room(extended, net, listing.photographs)
     grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
     room.check_points(grid, points, header["depth_range"], header["step"])
-    views, info, kept = _read_views(dev, folder, config, listing)
-    if mismatch := difference(header, listing.photographs, views):
-        unedited = scene_frames(config.scene.path, edited=False)
-        if not difference(header, learned(header, unedited), views):
-            mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
+    views, info = _read_views(dev, config, listing)
+    mismatch = difference(header, list_split(config.scene.path, edited=False).photographs, views)
+    if not mismatch and {view.name for view in views} != {name for name, _ in header["views"]}:
+        mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
+    if mismatch:
         raise UserError(
             f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
             " use another --out"
         )
 
-    for name, array in arrays.items():
-        if name.startswith("points.") and array.dtype == np.float16:  # of a compressed run
-            arrays[name] = array.astype(np.float32)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
     left_out = header.get("left_out", [])
     trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])
@@ -311,18 +303,14 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
     measured = _measured_views(dev, config)
-    return Training(folder, config, trainer, info, room, None, measured, kept)
+    return Training(folder, config, trainer, info, room, None, measured)
 
 
-def _read_views(dev: Device, folder: RunFolder, config: Config, listing: Listing):
-    """(the training views, what a checkpoint's header holds of them, their images that a resume
-    need not read again).
-    """
-    kept = KeptViews(folder.views)
-    scene = open_scene(dev, config, ("train",), listed={"train": listing}, kept=kept)
+def _read_views(dev: Device, config: Config, listing: Listing):
+    """(the training views, what a checkpoint's header holds of them)."""
+    scene = open_scene(dev, config, ("train",), listed={"train": listing})
     views = scene.splits["train"]
-    info = identity(views, listing.photographs)
-    return views, info | ({"notes": scene.notes} if scene.notes else {}), kept
+    return views, identity(views) | ({"notes": scene.notes} if scene.notes else {})
 
 
 def _measured_views(dev, config):
@@ -378,8 +366,7 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     if stored is None or is_finished(stored, config):
         now = config.scene.path
         if there.scene.path != now:
-            listed = [] if stored is None else scene_frames(now, edited=False)
-            if stored is None or difference(stored[0], learned(stored[0], listed), []):
+            if stored is None or difference(stored[0], list_split(now, edited=False).photographs):
                 refuse_setting(folder, "scene.path", there.scene.path, now)
             folder.configure(configure(there, now).to_json())
     return stored

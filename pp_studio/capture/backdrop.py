@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
-from pp_cl.engine.views import evenly
+from pp_cl.engine import evenly
 from pp_studio.capture.packages import needed
 from pp_studio.capture.window import Window, dilated
 

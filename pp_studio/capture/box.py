@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pp_cl.engine.camera import Camera
-from pp_cl.scene.camera_path import level, looked_at, up_of
+from pp_cl import Camera
+from pp_cl.scene import looked_at, up_of
+from pp_studio.camera_path import level
 
 SEEN = 0.75  # of the cameras that see what most of them see: what the object's points have
 NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from which on it is alone
@@ -111,3 +112,10 @@ def _table(points):
 def _spread(points):
     """(2,) width of points in x and y, but for some at the ends."""
     return np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0)
+
+
+def corners_of(box: np.ndarray) -> np.ndarray:
+    """(8, 3) corners of a (2, 3) box: bit i of a row's number says whether it lies on the upper
+    side of axis i.
+    """
+    return np.array([[box[n >> axis & 1][axis] for axis in range(3)] for n in range(8)])

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.engine.grid import Grid, smallest_edge
+from pp_cl.engine import Grid, smallest_edge
 from pp_cl.errors import UserError
-from pp_cl.scene.bounds import corners_of
 from pp_studio.capture import backdrop
+from pp_studio.capture.box import corners_of
 from pp_studio.capture.packages import needed
 from pp_studio.capture.window import CUT_SIDE, Window, dilated, disc
 

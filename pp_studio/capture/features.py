@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import mend
+from pp_cl.files import mend
 from pp_studio.capture.packages import needed
 
 LENS = "SIMPLE_RADIAL"  # with more, few photographs agree on a wrong focal length

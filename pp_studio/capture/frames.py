@@ -12,15 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 from tqdm import tqdm
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import atomic_file, atomic_folder
-from pp_cl.files.image import ORIENTATION, in_srgb, is_deep_png
-from pp_cl.files.manifest import has_manifest
-from pp_cl.files.untrusted import opened_regular
-from pp_cl.scene.readers.found import MASK_FOLDERS
+from pp_cl.files import (
+    atomic_file,
+    atomic_folder,
+    in_srgb,
+    is_deep_png,
+    is_owned,
+    opened_regular,
+)
+from pp_cl.scene import MASK_FOLDERS
 from pp_studio.capture.packages import needed
 
 ENDINGS = (
@@ -132,7 +136,7 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
     found = []
     for place, folders, files in os.walk(folder):
         here = Path(place)
-        if here != folder and has_manifest(here):
+        if here != folder and is_owned(here):
             folders.clear()
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]
@@ -158,7 +162,11 @@ def _take(folder, file, target):
             upright = in_srgb(file, turned)
             is_kept = image.format in KEPT and upright is turned
             is_kept = is_kept and image.mode in ("RGB", "RGBA", "L")
-            is_kept = is_kept and image.getexif().get(ORIENTATION, 1) == 1 and not is_deep_png(file)
+            is_kept = (
+                is_kept
+                and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+                and not is_deep_png(file)
+            )
             content = opened.seek(0) or opened.read() if is_kept else None
             lens, exif = _lens(image.getexif())
             # folders are of a round each, or of a camera

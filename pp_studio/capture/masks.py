@@ -15,14 +15,18 @@ from skimage.measure import label
 from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
-from pp_cl.engine.views import View, evenly, fitting_downscale
+from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, listing, shown
-from pp_cl.files.contact_sheet import contact_sheet
-from pp_cl.files.image import read_mask, read_rgba, write_png
-from pp_cl.scene.agreement import disagreements
-from pp_cl.scene.image_file import Photograph, shrink
-from pp_cl.scene.masks import MaskRule, cut_out, named_mask, of_size
-from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
+from pp_cl.files import contact_sheet, read_mask, read_rgba, write_png
+from pp_cl.scene import (
+    MaskRule,
+    Photograph,
+    cut_out,
+    disagreements,
+    named_mask,
+    read_mask_of_size,
+    shrink,
+)
 from pp_studio.capture.cut import (
     FORGIVEN,
     GROWTHS,
@@ -44,6 +48,8 @@ UNIFORM = 0.9  # of a photograph's border, and of the photographs, that show the
 SPOT = 0.5  # of a region that a mask encloses, behind which others see the object
 ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
 CHECKED_SIDE = 200  # pixels of the masks that are compared
+SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of a picture, and their longer side in pixels
+OUTLINE = (255, 0, 160)  # a colour that few objects have
 SECONDS = 600  # that a program may take for a mask
 
 
@@ -124,7 +130,7 @@ def _found(scene, photograph, given, sources, fitted, words):
     file, size = scene / photograph.name, (photograph.camera.width, photograph.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)
-        return "given", fitted(photograph.name, of_size(read_mask(mask), size, mask))
+        return "given", fitted(photograph.name, read_mask_of_size(mask, size))
     if words is not None:
         return "by the program", _of_program(words, file, size[::-1])
     if not photograph.name.lower().endswith(OPAQUE):
@@ -175,7 +181,7 @@ def _kept(scene, photograph):
     UserError for one of another shape.
     """
     file = mask_file(scene, photograph.name)
-    return of_size(read_mask(file), (photograph.camera.width, photograph.camera.height), file)
+    return read_mask_of_size(file, (photograph.camera.width, photograph.camera.height))
 
 
 def _window(scene, photograph, box):

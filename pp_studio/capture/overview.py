@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pp_cl.engine.camera import Camera
-from pp_cl.scene.bounds import corners_of
-from pp_cl.scene.camera_path import up_of
+from pp_cl import Camera
+from pp_cl.scene import up_of
+from pp_studio.capture.box import corners_of
 
 FINER = 2  # times the drawing is larger before it is reduced, each way, against jagged lines
 MARGIN = 0.08  # of a panel's width around what must be in it

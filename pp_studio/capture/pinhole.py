@@ -2,6 +2,7 @@
 know of.
 """
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,15 +13,14 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from pp_cl.engine.device.device import Device
+from pp_cl.engine import Device
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_file
-from pp_cl.files.image import read_rgba, write_png
-from pp_cl.scene.distortion import undistort
-from pp_cl.scene.image_file import Photograph
-from pp_cl.scene.load import reading
+from pp_cl.files import atomic_file, read_rgba, write_png
+from pp_cl.scene import Photograph, undistort
 from pp_studio.capture.frames import QUALITY
 from pp_studio.capture.packages import needed
+
+DECODED, MOST_DECODED = 18, 3 * 2**28  # bytes of a pixel that is decoded, and of all at once
 
 
 def write_images(dev: Device, frames: Path, images: Path, photographs: Sequence[Photograph]) -> int:
@@ -53,7 +53,9 @@ def write_images(dev: Device, frames: Path, images: Path, photographs: Sequence[
             with atomic_file(images / name) as file:
                 Image.fromarray(image[..., :3]).save(file, "JPEG", **QUALITY)
 
-    with ThreadPoolExecutor(reading(photographs)[0]) as pool:
+    most = max(one.camera.width * one.camera.height for one in photographs)
+    threads = min(os.cpu_count() or 1, MOST_DECODED // (DECODED * most))
+    with ThreadPoolExecutor(max(1, threads)) as pool:
         made = pool.map(write, left)
         list(tqdm(made, "images", len(left), unit="image", leave=False, disable=None))
     return len(left)

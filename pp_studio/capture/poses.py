@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.engine.camera import Camera
+from pp_cl import Camera
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_folder
-from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.image_file import Photograph
+from pp_cl.files import atomic_folder
+from pp_cl.scene import Distortion, Photograph
 from pp_studio.capture.features import cores, forget_focal_lengths, quiet
 from pp_studio.capture.packages import needed
 

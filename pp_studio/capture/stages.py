@@ -15,32 +15,34 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pp_cl.drivers import open_device
-from pp_cl.engine.views import evenly, fitting_downscale
+from pp_cl import open_device
+from pp_cl.engine import evenly, fitting_downscale
 from pp_cl.errors import UserError, listing
-from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
-from pp_cl.files.contact_sheet import contact_sheet
-from pp_cl.files.image import read_rgba, write_png
-from pp_cl.files.manifest import (
-    begin_manifest,
+from pp_cl.files import (
+    atomic_folder,
+    atomic_path,
     check_ours,
-    has_manifest,
-    note_in_place,
+    contact_sheet,
     ours,
+    own,
+    read_rgba,
     remove_ours,
+    write_json,
+    write_png,
 )
-from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.edits import read_edits
-from pp_cl.scene.image_file import shrink
-from pp_cl.scene.masks import named_mask
-from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
-from pp_cl.scene.readers.common import read_json
-from pp_cl.scene.readers.frame import frame_keys
-from pp_cl.scene.readers.transforms import SINGLE
+from pp_cl.scene import (
+    Distortion,
+    frame_keys,
+    named_mask,
+    read_edits,
+    read_json,
+    shrink,
+)
 from pp_studio.capture import STAGES, box, features, frames, masks, pinhole, poses, still
 from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
+SCENE_FILE = "transforms.json"
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
 SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
 # decimals of what the scene states: the last digits depend on how COLMAP's threads share a sum
@@ -56,7 +58,7 @@ LEFT = {
     "images": ("images",),
     "box": (),
     "masks": ("masks",),
-    "scene": (SINGLE, "sparse", "points.ply"),
+    "scene": (SCENE_FILE, "sparse", "points.ply"),
 }
 CHANGING = (*LEFT["features"][1:], *LEFT["matches"])  # in place
 # {option: (the stage that depends on it, what it is where it is not given)}
@@ -112,8 +114,6 @@ class Capture:
             files = {stage: self._files(stage) for stage in left}
             for stage in left:
                 check_ours(files[stage])
-            note_in_place(self.scene, [self.scene / name for name in CHANGING])
-            remove_leftovers(self.scene)
             for path in mended if replace_masks else ():
                 path.unlink()
             for stage in reversed(left):
@@ -121,6 +121,8 @@ class Capture:
                     if stage == "matches" and self.database.exists():
                         features.forget_matches(self.database)
                     remove_ours(files[stage])
+                    for name in {*CHANGING} & {*LEFT[stage]}:
+                        (self.scene / name).unlink(missing_ok=True)
             if changed or not self.kept.exists():
                 write_json(self.kept, self.options)
             for stage in done:
@@ -150,10 +152,8 @@ class Capture:
     @contextmanager
     def _locked(self):
         """While it is entered, no other process captures into the folder, which is made."""
-        if self.scene.exists() and not has_manifest(self.scene) and any(self.scene.iterdir()):
-            raise UserError(f"{self.scene}: exists already; choose a new or empty folder")
+        own(self.scene, alone=True)
         try:
-            begin_manifest(self.scene)
             self.work.mkdir(exist_ok=True)
             with FileLock(self.work / ".pp-cl.lock", timeout=0):
                 yield
@@ -221,11 +221,11 @@ class Capture:
                     named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
-        """What a stage has left, and what else lies in its folders, but for masks of others. Its
-        JSON comes first: without it the stage is not done.
+        """What a stage has left, and what else lies in its folders, but for masks of others and
+        what changes in place. Its JSON comes first: without it the stage is not done.
         """
         found = [self._file(stage), self._file(stage).with_suffix(".png")]
-        for path in (self.scene / name for name in LEFT[stage]):
+        for path in (self.scene / name for name in LEFT[stage] if name not in CHANGING):
             inside = path.rglob("*") if path.is_dir() else [path]
             inside = [one for one in inside if one.is_symlink() or not one.is_dir()]
             found += ours(inside) if stage == "masks" else inside
@@ -256,9 +256,9 @@ class Capture:
 
     def _frames(self):
         found = frames.take_images(self.source, self.frames)
-        names = [one["name"] for one in evenly(found["images"], SHOWN_VIEWS)]
+        names = [one["name"] for one in evenly(found["images"], masks.SHOWN_VIEWS)]
         shown = [read_rgba(self.frames / name) for name in names]
-        shown = [shrink(one, fitting_downscale(one.shape[:2], SHOWN_SIZE)) for one in shown]
+        shown = [shrink(one, fitting_downscale(one.shape[:2], masks.SHOWN_SIZE)) for one in shown]
         self._show("frames", contact_sheet(shown, names))
         left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
         line = f"{len(found['images'])} images" + _left_out(left_out, "left out")
@@ -401,7 +401,7 @@ class Capture:
         with atomic_path(self.scene / "points.ply") as unfinished:
             model.export_PLY(unfinished)
         write_json(
-            self.scene / SINGLE,
+            self.scene / SCENE_FILE,
             {
                 "camera_model": "OPENCV",
                 "ply_file_path": "points.ply",
@@ -409,7 +409,7 @@ class Capture:
                 "frames": places,
             },
         )
-        return {"line": f"wrote {self.scene / SINGLE} with {len(found)} photographs"}
+        return {"line": f"wrote {self.scene / SCENE_FILE} with {len(found)} photographs"}
 
     def _world(self):
         """(pycolmap's model in the scene's world, (2, 3) box of the object there: the user's, if

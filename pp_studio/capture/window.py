@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.engine.camera import Camera
+from pp_cl import Camera
 from pp_cl.errors import UserError
-from pp_cl.scene.bounds import corners_of
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene import Photograph
+from pp_studio.capture.box import corners_of
 from pp_studio.capture.packages import needed
 
 cv2 = needed("cv2")

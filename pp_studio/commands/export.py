@@ -69,9 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the run, say what was written."""
-    from pp_cl.drivers import open_device
-    from pp_cl.run import find_run, load_run
-    from pp_studio.export.formats import check_target, export
+    from pp_cl import find_run, load, open_device
+    from pp_studio.export.formats import check_target, export_run
     from pp_studio.export.length import set_length
 
     name, folders = options.format, [find_run(one) for one in options.run_folders]
@@ -90,7 +89,7 @@ def run(options: argparse.Namespace) -> None:
     device = open_device(options.device)
 
     def loaded(folder):
-        run = load_run(device, folder.path, scene=options.scene)
+        run = load(folder.path, device, scene=options.scene)
         if not run.header["finished"]:
             print(
                 f"{folder}: unfinished, step {run.header['step']} of"
@@ -103,7 +102,7 @@ def run(options: argparse.Namespace) -> None:
     if ends:
         unit = set_length(run, *ends)
         print(f"a unit of the scene is {unit:.6g} m")
-    written = export(
+    written = export_run(
         run,
         name,
         path,

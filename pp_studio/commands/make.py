@@ -48,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Do the steps that are left, and say what to open."""
-    from pp_cl.files.run_folder import RunFolder
-    from pp_cl.run import load
+    from pp_cl import RunFolder, load
     from pp_studio.export.result import INDEX, SPLAT, begin_result, write_result
 
     out, is_scene = Path(options.out), _is_scene(options.source)
@@ -84,7 +83,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _is_scene(source):
     """Whether it is one that `pp-cl train` reads; else there is no pose yet."""
-    from pp_cl.scene.load import scene_format
+    from pp_cl.scene import scene_format
 
     if source != "demo" and not Path(source).exists():
         raise UserError(
@@ -113,7 +112,7 @@ def _hints(options):
 
 def _captured(scene: Path) -> list[str]:
     """What the stages of a capture have found, but for what the last one has written."""
-    from pp_cl.scene.readers.common import read_json
+    from pp_cl.scene import read_json
     from pp_studio.capture import STAGES
 
     *stages, _ = STAGES
@@ -134,7 +133,7 @@ def _film():
 
 def _held_out(scene):
     """The split that is measured: train where no views are held out."""
-    from pp_cl.scene.load import scene_splits
+    from pp_cl.scene import scene_splits
 
     return "test" if "test" in scene_splits(scene) else "train"
 

@@ -96,9 +96,8 @@ def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a film of them where one is asked for."""
     from tqdm import tqdm
 
-    from pp_cl.drivers import open_device
-    from pp_cl.files.manifest import begin_manifest, check_ours
-    from pp_cl.run import load_run
+    from pp_cl import load
+    from pp_cl.files import own
     from pp_studio.export.film import render_film, render_frames
     from pp_studio.video import check_video
 
@@ -106,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
     style, count = _style(options, kind), _frame_count(options, kind)
     if kind in FILMS:
         check_video(kind)
-    run = load_run(open_device(options.device), options.run_folder, scene=options.scene)
+    run = load(options.run_folder, options.device, scene=options.scene)
     cameras = _cameras(run, options.path, count, size=options.size, fov=options.fov)
     sizes = {(camera.width, camera.height) for camera in cameras}
     if kind in FILMS and len(sizes) > 1:
@@ -116,8 +115,7 @@ def run(options: argparse.Namespace) -> None:
         )
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
     if kind in FILMS and not options.out:
-        check_ours([out], "move it away, or choose another --out")
-        begin_manifest(out.parent)
+        own(out.parent, [out], "move it away, or choose another --out")
     seconds = []
     with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
 
@@ -205,8 +203,8 @@ def _frame_count(options, kind):
 
 def _cameras(run, path, count, *, size, fov):
     """The cameras of a path, `count` of an orbit or spiral, with size and angle of view."""
-    from pp_cl.scene.camera_path import Surroundings
-    from pp_cl.scene.readers.camera_file import read_cameras
+    from pp_cl.scene import read_cameras
+    from pp_studio.camera_path import Surroundings
 
     def shaped(camera):
         camera = camera.resized(*size) if size else camera

@@ -6,8 +6,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from pp_cl.commands import options as shared
+from pp_cl.config import PRESETS
 from pp_cl.errors import Stopped, UserError
-from pp_cl.presets import PRESETS
 
 HELP = "train and measure scenes x settings x seeds, with one table; the same command resumes"
 EPILOG = """\
@@ -67,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
-    from pp_cl.files.manifest import begin_manifest, check_ours, note_in_place
-    from pp_cl.files.run_folder import RunFolder
+    from pp_cl import RunFolder
+    from pp_cl.files import own
     from pp_studio.sweep.result import failed_row, finished_row
     from pp_studio.sweep.table import TABLES, markdown, run_text, values_text, write_tables
 
@@ -89,9 +89,7 @@ def run(options: argparse.Namespace) -> None:
         return
     print(told, flush=True)
     missing = [job for job in jobs if job.folder not in rows]
-    check_ours([out / name for name in TABLES])
-    begin_manifest(out)
-    note_in_place(out.resolve(), [job.log for job in missing])
+    own(out, [out / name for name in TABLES])
     if missing:
         rows |= _run(options, missing, len(jobs))
     # folders as seen from `out`, which may be moved
@@ -109,7 +107,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _jobs(options):
     """The runs that the options ask for. Raises UserError."""
-    from pp_cl.files.run_folder import RunFolder
+    from pp_cl import RunFolder
     from pp_studio.sweep.plan import plan, read_varied
 
     if options.scheduler and options.workers:
@@ -133,8 +131,8 @@ def _run(options, jobs, total):
     """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after Ctrl-C or
     SIGTERM.
     """
-    from pp_cl.commands.progress import first_signal
-    from pp_cl.drivers import separate_devices
+    from pp_cl import separate_devices
+    from pp_cl.commands.signals import first_signal
     from pp_studio.sweep.cluster import client_of, local_client, run_jobs
     from pp_studio.sweep.table import run_text, values_text
 

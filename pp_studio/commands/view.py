@@ -14,7 +14,7 @@ from pp_cl.commands import options as shared
 from pp_studio.view.server import LOOPBACK, PORT
 
 if TYPE_CHECKING:
-    from pp_cl.session.training import OnStep, Training
+    from pp_cl import OnStep, Training
 
 HELP = "look at a run, also while it is trained, or at a scene in the browser"
 EPILOG = """A scene: its cameras, and sparse points or visual hull. Its box can be moved and views
@@ -48,10 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
-    from pp_cl.drivers import open_device
+    from pp_cl import find_run, open_device, stored_config
     from pp_cl.errors import UserError, name_of, require
-    from pp_cl.run import find_run, stored_config
-    from pp_cl.scene.load import scene_splits
+    from pp_cl.scene import scene_splits
     from pp_studio.view.run_view import RunView
     from pp_studio.view.scene_page import ScenePage
     from pp_studio.view.server import started

@@ -13,15 +13,21 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from pp_cl.engine.camera import Camera
+from pp_cl import Camera, Run
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import check_file, check_target, remove_leftovers, write_json
-from pp_cl.files.exr import write_exr
-from pp_cl.files.image import read_rgba, write_png
-from pp_cl.files.manifest import NAME, begin_manifest, check_ours, remove_ours
-from pp_cl.files.picture import WHITE
-from pp_cl.files.untrusted import read_regular
-from pp_cl.run import Run
+from pp_cl.files import (
+    MANIFEST,
+    check_file,
+    check_ours,
+    check_target,
+    own,
+    read_regular,
+    read_rgba,
+    remove_ours,
+    write_exr,
+    write_json,
+    write_png,
+)
 from pp_studio.video import write_video
 
 MOST_IDENTITY = 1000  # bytes of it
@@ -41,7 +47,7 @@ class Style:
     """
 
     suffix: str = "png"
-    background: tuple[float, float, float] | None = WHITE
+    background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     samples: int = 1
     features: bool = False
 
@@ -78,8 +84,7 @@ def render_frames(
                 )
             check_ours([*paths, folder / IDENTITY])
             remove_ours(folder.iterdir())
-        begin_manifest(folder)
-        remove_leftovers(folder)
+        own(folder)
         write_json(folder / IDENTITY, identity)
         for camera, path in zip(cameras, paths, strict=True):
             start, there = time.perf_counter(), path.exists()
@@ -88,7 +93,7 @@ def render_frames(
                 if style.suffix == "exr":
                     write_exr(path, picture.channels())
                 else:
-                    write_png(path, picture.image(style.background))
+                    write_png(path, picture.over(style.background))
             on_frame(None if there else time.perf_counter() - start)
     return paths
 
@@ -114,7 +119,7 @@ def render_film(
         images = (image[..., :3] for image in images)
     write_video(film, images, fps)
     remove_ours(folder.iterdir())
-    if {path.name for path in folder.iterdir()} <= {LOCK, NAME}:
+    if {path.name for path in folder.iterdir()} <= {LOCK, MANIFEST}:
         shutil.rmtree(folder)
 
 

@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.engine.views import View
+from pp_cl import Run
+from pp_cl.engine import View
 from pp_cl.errors import UserError, require
-from pp_cl.evaluate import image_files
-from pp_cl.files.atomic import check_file, check_new_folder, write_text
-from pp_cl.files.manifest import begin_manifest, check_ours
-from pp_cl.run import Run
-from pp_cl.scene.readers.transforms import write_scene
+from pp_cl.files import check_file, check_new_folder, check_ours, image_files, own, write_text
+from pp_cl.scene import write_scene
 from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.length import metres_per_unit
@@ -53,7 +51,7 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
     return path
 
 
-def export(
+def export_run(
     run: Run,
     name: str,
     path: Path | str,
@@ -136,7 +134,7 @@ def export(
 def _begin_default(name, path):
     """Make the folder of a file that has no --out, as its name says."""
     if path.parts[-2:] == ("export", FORMATS[name][0]):
-        begin_manifest(path.parent)
+        own(path.parent)
 
 
 def renderings(run: Run) -> dict[str, list[View]]:

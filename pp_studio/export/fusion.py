@@ -8,9 +8,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pp_cl.engine.camera import Camera
-from pp_cl.engine.grid import Grid
-from pp_cl.files.picture import Picture
+from pp_cl import Camera, Picture
+from pp_cl.engine import Grid
 
 TRUNCATION = 4.0  # of the distances, in grid edges: depths scatter by one or two
 # What a view in which a vertex is hidden says for its being inside, in views. Without it, one ray

@@ -9,25 +9,15 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from pyopencl.array import Array
 from tqdm import tqdm
 
-from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.simple import mean_backward, mean_forward
-from pp_cl.engine.model import Model
-from pp_cl.engine.raster.points import MOST_SH_OF_GAUSSIANS, PointCloud, offset_width, sh_blocks
-from pp_cl.engine.step import Trainer
-from pp_cl.engine.training.crops import Crop, Crops
-from pp_cl.engine.views import MIN_SIDE, View
+from pp_cl import Config, Run
+from pp_cl.engine import MIN_SIDE, Crop, Crops, Means, Model, PointCloud, Trainer, View
 from pp_cl.errors import UserError
-from pp_cl.run import Run
-from pp_cl.scene.camera_path import between
-from pp_cl.settings import Config, TrainConfig
+from pp_studio.camera_path import between
 from pp_studio.export.harmonics import fit_harmonics
 
 STEPS = 7000
@@ -56,50 +46,13 @@ FACTORS = np.array(
 )
 
 
-class Means:
-    """In place of a UNet, without parameters: the image is the first three features, the means of
-    `scale` x `scale` pixels.
-    """
-
-    def __init__(self, dev: Device):
-        self.dev, self.scale = dev, 1
-        self.all_parameters, self.all_gradients = dev.zeros((1,)), dev.zeros((1,))
-        self._features: Any = None  # of the last forward()
-
-    multiple = 1  # of which the sides of images are
-
-    @staticmethod
-    def is_planned(size: tuple[int, int]) -> bool:
-        """See UNet: no tiles are left out."""
-        return False
-
-    @staticmethod
-    def gradient_tiles(*_: object) -> Callable[[], None]:
-        """There is no background to leave out."""
-        return lambda: None
-
-    def forward(self, x: Array, training: bool = True, plan: None = None) -> Array:
-        """(H, W, 3) image of the features x (scale H, scale W, C)."""
-        height, width, _ = x.shape
-        image = self.dev.empty((height // self.scale, width // self.scale, 3))
-        mean_forward(self.dev, x, image, self.scale)
-        self._features = x
-        return image
-
-    def backward(self, grad_image: Array) -> Array:
-        """(scale H, scale W, C) gradient of the features of the last forward()."""
-        grad_features = self.dev.empty(self._features.shape)
-        mean_backward(self.dev, grad_image, grad_features, self.scale)
-        return grad_features
-
-
 class LargeCrops(Crops):
     """Crops whose cameras have `scale` times the pixels each way, each the mean of as many of a
     window's as make `samples` of them a pixel of the image.
     """
 
-    def __init__(self, views: list[View], train: TrainConfig, scale: int, samples: float):
-        super().__init__(views, replace(train, crop=CROP // scale), 0)
+    def __init__(self, views: list[View], config: Config, scale: int, samples: float):
+        super().__init__(views, replace(config.train, crop=CROP // scale), 0)
         self.scale, self.samples = scale, samples / scale
 
     def draw(self, step: int) -> Crop:
@@ -117,7 +70,7 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     """
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud, net = _cloud(run, coefficients), Means(dev)
-    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)  # type: ignore[arg-type]
+    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)
     views = _photographs(run)
     if len(views) < ENOUGH:
         listed = run.photographs("train")
@@ -138,7 +91,7 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     for step in steps:
         if step in (0, round(COARSE * len(steps))):
             net.scale = scale if step else 1
-            trainer.crops = LargeCrops(trainer.views, config.train, net.scale, samples)
+            trainer.crops = LargeCrops(trainer.views, config, net.scale, samples)
         trainer.train_step()
     trainer.check()
     trainer.finish()
@@ -176,19 +129,13 @@ def _cloud(run, coefficients):
     rows = np.flatnonzero(coefficients.any((1, 2)))
     if not len(rows):
         raise UserError(f"{run.folder}: the training views show no points; train it longer")
+    offset = np.zeros((len(rows), 9), np.float32)
     given = cloud.offset.get()[rows]
-    offset = np.zeros((len(rows), offset_width("gaussian")), np.float32)
     offset[:, :3], offset[:, 3:6] = given[:, :3], given[:, 3:]  # round, as large as the points
     sh = np.zeros((len(rows), 9, 16), np.float32)
     sh[..., :3] = coefficients[rows][:, ORDER] / FACTORS[:, None]
-    sh[:, 1:] = sh[:, 1:].clip(-MOST_SH_OF_GAUSSIANS, MOST_SH_OF_GAUSSIANS)
-    begins = np.cumsum([block.count for block in sh_blocks(2)])[:-1]
-    return PointCloud(
-        dev.upload(cloud.ids.get()[rows]),
-        dev.upload(offset),
-        dev.upload(cloud.opacity.get()[rows].clip(0, MOST_OPAQUE)),
-        [dev.upload(part) for part in np.split(sh, begins, axis=1)],
-    )
+    opacity = cloud.opacity.get()[rows].clip(0, MOST_OPAQUE)
+    return PointCloud.of_gaussians(dev, cloud.ids.get()[rows], offset, opacity, sh)
 
 
 def _config(given: Config, scale: int) -> Config:

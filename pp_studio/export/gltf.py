@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.files.atomic import atomic_file
-from pp_cl.files.image import to_8bit
-from pp_cl.files.srgb import srgb_to_linear
+from pp_cl.files import atomic_file, srgb_to_linear, to_8bit
 
 POINTS, TRIANGLES = 0, 4  # of a primitive
 TYPES = {np.dtype("f4"): 5126, np.dtype("u1"): 5121, np.dtype("u4"): 5125}

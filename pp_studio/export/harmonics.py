@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
-from pp_cl.run import Run
+from pp_cl import Run
 from pp_studio.export.observe import directions, look, observe, progress
 
 COUNT = 9  # functions of basis()

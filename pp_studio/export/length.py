@@ -8,11 +8,10 @@ import re
 import numpy as np
 from scipy.optimize import root
 
+from pp_cl import Run
 from pp_cl.errors import UserError, quoted, shown, suggestion
-from pp_cl.files.atomic import write_json
-from pp_cl.files.untrusted import read_json_text
-from pp_cl.run import Run
-from pp_cl.scene.load import scene_frames
+from pp_cl.files import read_json_text, write_json
+from pp_cl.scene import scene_frames
 
 FILE = "length.json"  # in the folder of a run
 MOST_BYTES = 2**16

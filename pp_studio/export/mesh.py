@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from tqdm import tqdm
 
+from pp_cl import Run
 from pp_cl.errors import UserError
-from pp_cl.run import Run
 from pp_studio.export.fusion import box_around, fuse
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.points import (

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.engine.camera import Camera
-from pp_cl.engine.raster.blend import blend_forward
-from pp_cl.engine.raster.weights import ALL
-from pp_cl.engine.render import RenderResult
-from pp_cl.run import Run
+from pp_cl import Camera, Run
+from pp_cl.engine import RenderResult
 
 COLOURS = slice(3)  # of the 16 features that are blended here; that behind them is 0 in all points
 
@@ -45,23 +43,17 @@ class Observation:
         """((HW, 3), (HW,)) float32: colours (S, 3) blended by the weights, and what the weights of
         a pixel leave of 1.
         """
-        dev, view = self.run.dev, self.view
         rows = np.zeros((len(colours), 16), np.float32)
         rows[:, COLOURS] = colours
-        dev.write(view.shaded_features[: len(rows)], rows)
-        blend_forward(dev, view.pairs, view.weights, view.shaded_features, view.features)
-        pixels = view.cropped(dev.download(view.features)).reshape(-1, 16)
+        pixels = self.run.renderer.blend(self.view, rows).reshape(-1, 16)
         rest = pixels[:, 3]  # of the background, whose features are 1
         return pixels[:, COLOURS] - rest[:, None], rest
 
     def gathered(self, pixels: np.ndarray) -> np.ndarray:
         """(S, 3) float32: of each point, the sum over the pixels (HW, 3) times its weights."""
-        dev, view = self.run.dev, self.view
-        padded = np.zeros((*view.size, 16), np.float32)
-        inside = view.cropped(padded)
-        inside[..., COLOURS] = pixels.reshape(*inside.shape[:2], 3)
-        gradients = self.run.renderer.backward_features(view, dev.upload(padded))
-        return dev.download(gradients.shaded_features[: len(self.shaded)])[:, COLOURS]
+        features = np.zeros((self.camera.height, self.camera.width, 16), np.float32)
+        features[..., COLOURS] = pixels.reshape(*features.shape[:2], 3)
+        return self.run.renderer.gather(self.view, features)[:, COLOURS]
 
 
 def observe(
@@ -85,10 +77,8 @@ def progress(cameras: list[Camera], text: str) -> Iterable[Camera]:
 
 def look(run: Run, camera: Camera, *, blending: bool = False) -> Observation:
     """What the points contribute to a camera's view."""
-    if not blending:
-        return Observation(run, camera, run.renderer.forward(camera, run.gamma, until="weights"))
-    view = run.renderer.forward(camera, run.gamma, until="features", training=True)
-    view.weights = replace(view.weights, tracked=ALL)
+    until: Literal["features", "weights"] = "features" if blending else "weights"
+    view = run.renderer.forward(camera, run.gamma, until=until, training=blending)
     return Observation(run, camera, view)
 
 

@@ -1,5 +1,5 @@
 "use strict";
-// Draws the points of #points as pp-cl's rasteriser does (cl/raster/footprint.h, alpha.cl), with
+// Draws the points of #points as pp-cl's rasteriser does (cl/raster/footprint/soft.h, alpha.cl), with
 // colours from harmonics instead of the network. Axes of a camera: x right, y down, z forward.
 
 const header = JSON.parse(document.getElementById("header").textContent);

@@ -11,14 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.engine.camera import Camera
-from pp_cl.engine.grid import Grid
-from pp_cl.engine.raster.points import MOST_OFFSET
+from pp_cl import Camera, Run
+from pp_cl.engine import Grid
 from pp_cl.errors import UserError, name_of
-from pp_cl.files.atomic import atomic_folder, write_text
-from pp_cl.files.image import to_8bit, write_png
-from pp_cl.run import NEAREST, Run
-from pp_cl.scene.camera_path import level, up_of
+from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
+from pp_cl.scene import up_of
+from pp_studio.camera_path import level
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 # Bytes of a point: place (3, uint16), opacity (uint16), coefficients (27, uint8), logarithm of the
@@ -44,7 +42,8 @@ def pack(run: Run, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     low, high = np.quantile(by_function, [OUTLIERS, 1 - OUTLIERS], axis=1).astype(np.float32)
     span = np.maximum(high - low, np.float32(1e-6))
     scaled = (coefficients - low[:, None]) / span[:, None] * 255
-    rows["radius"] = np.rint((run.model.cloud.offset.get()[:, 3] + MOST_OFFSET) * 255)
+    cloud = run.model.cloud
+    rows["radius"] = np.rint((cloud.offset.get()[:, 3] + cloud.most_offset) * 255)
     rows["colour"] = np.rint(scaled.clip(0, 255)).reshape(len(rows), -1)
     return rows, low, span
 
@@ -139,7 +138,7 @@ def _header(run, low, span):
     """What the page must know beside the points."""
     grid = run.model.grid
     origin, unit = lattice(grid)
-    centre, radius = run.ball
+    centre, _ = run.ball
     eye, up = first_look(run)
     return {
         "count": run.model.cloud.count,
@@ -147,7 +146,7 @@ def _header(run, low, span):
         "origin": origin.tolist(),
         "unit": unit,
         "radius": float(run.config.raster.radius * grid.edge),
-        "nearest": float(NEAREST * radius),
+        "nearest": run.nearest,
         "centre": centre.tolist(),
         # of the finest camera, in world units at the distance of the centre
         "pixel": min(

@@ -9,14 +9,10 @@ from pathlib import Path
 import numpy as np
 import plyfile
 
-from pp_cl.engine.camera import Camera
-from pp_cl.engine.raster.points import PointCloud
-from pp_cl.engine.render import point_radius
+from pp_cl import Camera, Picture, Run
+from pp_cl.engine import PointCloud
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_file
-from pp_cl.files.image import to_8bit
-from pp_cl.files.picture import Picture
-from pp_cl.run import Run
+from pp_cl.files import atomic_file, to_8bit
 from pp_studio.export.observe import observe
 
 COMMENTS = (
@@ -79,8 +75,7 @@ def coloured_points(
         colours[rows],
         best[rows],
         cloud.opacity.get()[rows],
-        point_radius(run.config.raster, edge, run.model.depth_range)
-        * np.exp(cloud.offset.get()[rows, 3]),
+        run.renderer.point_radius * np.exp(cloud.offset.get()[rows, 3]),
     )
 
 

@@ -8,11 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pp_cl.errors import UserError, name_of
-from pp_cl.files.atomic import atomic_file, write_text
-from pp_cl.files.image import write_png
-from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest
-from pp_cl.run import Run
+from pp_cl import Run
+from pp_cl.errors import name_of
+from pp_cl.files import atomic_file, own, write_png, write_text
 from pp_studio.export.page import card, filled, page_text, still
 
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
@@ -30,13 +28,8 @@ def begin_result(folder: Path) -> None:
     """Make the folder. Raises UserError where it holds other files, or one in the place of a file
     of the result that is not the program's.
     """
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"--out {folder}: is not a folder; choose another one")
-    if folder.exists() and not has_manifest(folder) and any(folder.iterdir()):
-        raise UserError(f"--out {folder}: holds other files; choose a new or empty folder")
-    begin_manifest(folder)
-    names = (INDEX, MODEL, SPLAT, STILL, VIEWS, *FILMS)
-    check_ours([folder / name for name in names], "move it away, or choose another --out")
+    files = [folder / name for name in (INDEX, MODEL, SPLAT, STILL, VIEWS, *FILMS)]
+    own(folder, files, "move it away, or choose another --out", alone=True)
 
 
 def write_result(run: Run, split: str, folder: Path, film: str, told: Sequence[str] = ()) -> None:

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl.files.atomic import atomic_path
-from pp_cl.files.image import to_8bit
-from pp_cl.run import Run
-from pp_cl.scene.camera_path import up_of
+from pp_cl import Run
+from pp_cl.files import atomic_path, to_8bit
+from pp_cl.scene import up_of
 from pp_studio.export.gaussians import (
     CONSTANT,
     FACTORS,

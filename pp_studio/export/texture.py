@@ -14,12 +14,9 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from pp_cl.engine.camera import Camera
+from pp_cl import Camera, Picture, Run
 from pp_cl.errors import require
-from pp_cl.files.atomic import atomic_file
-from pp_cl.files.image import to_8bit
-from pp_cl.files.picture import Picture
-from pp_cl.run import Run
+from pp_cl.files import atomic_file, to_8bit
 from pp_studio.export.fusion import COVERED
 from pp_studio.export.mesh import surface
 from pp_studio.export.observe import progress

@@ -14,10 +14,9 @@ from typing import Any
 
 from tqdm import tqdm
 
+from pp_cl import evaluate_run, train_scene
 from pp_cl.errors import UserError, one_line
-from pp_cl.evaluate import evaluate
-from pp_cl.scene.load import scene_splits
-from pp_cl.session.training import train_scene
+from pp_cl.scene import scene_splits
 from pp_studio.sweep.plan import Job
 from pp_studio.sweep.result import failed_row, finished_row
 
@@ -91,7 +90,7 @@ def _trained_and_evaluated(job, device, is_stopped):
     )
     if not run.header["finished"]:
         return failed_row(job, "stopped")
-    evaluate(run, "test", job.metrics)
+    evaluate_run(run, "test", job.metrics)
     return finished_row(job)
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
+from pp_cl import Config
 from pp_cl.config import configure, preset
 from pp_cl.errors import UserError
-from pp_cl.scene.load import DEMO, check_folder
-from pp_cl.settings import Config
+from pp_cl.scene import check_folder
 
 Given = tuple[str, str, str]  # key, text of the value, origin, as session.run_config takes them
 
@@ -77,9 +77,9 @@ def plan(
             raise UserError(f"{origin} {key}: {taken[key]} sets it; leave one of both out")
     jobs: dict[str, Job] = {}
     for scene, *values in itertools.product(scenes, *varied.values()):
-        if scene != DEMO:
+        if scene != "demo":
             check_folder(Path(scene))
-        name = DEMO if scene == DEMO else Path(scene).resolve().name
+        name = scene if scene == "demo" else Path(scene).resolve().name
         setting = dict(zip(varied, values, strict=True))
         own = [*given, *((key, text, "--vary") for key, text in setting.items())]
         path = configure(preset(preset_name or "tiny"), scene, own).scene.path

@@ -2,9 +2,9 @@
 
 from typing import Any
 
+from pp_cl import RunFolder
 from pp_cl.config import load_config, refuse_setting, run_config
 from pp_cl.errors import UserError
-from pp_cl.files.run_folder import RunFolder
 from pp_studio.sweep.plan import Job
 
 

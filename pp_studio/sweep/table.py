@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pp_cl.files.atomic import write_json, write_text
+from pp_cl.files import write_json, write_text
 
 TABLES = ("sweep.json", "sweep.md")
 Row = dict[str, Any]  # of a run, see sweep/result.py, or of means

@@ -2,23 +2,19 @@
 beside them.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from pp_cl.engine.camera import Camera
-from pp_cl.engine.model import Model
-from pp_cl.engine.render import Renderer
-from pp_cl.engine.training.target import Target
-from pp_cl.engine.views import View
+from pp_cl import Camera, Run
+from pp_cl.engine import Model, Renderer, Target, View
 from pp_cl.errors import UserError
-from pp_cl.files.contact_sheet import ERROR_GAIN
-from pp_cl.files.image import to_8bit
-from pp_cl.files.srgb import linear_to_srgb, srgb_to_linear
-from pp_cl.run import Run, rendered_picture
+from pp_cl.files import linear_to_srgb, srgb_to_linear, to_8bit
 
 SHOWN = ("colour", "alpha", "depth", "normals", "fragments", "error", "photograph")
 OWN_CAMERA = SHOWN[5:]  # are shown from the nearest training view's own camera
+ERROR_GAIN = 4  # times an error is shown
 DARK = np.array([23, 24, 27]) / 255  # sRGB, where nothing is
 LEAST_ALPHA = 0.5  # of a pixel that has a depth to look at: those below mix edge and background
 # eleven colours of viridis, from low to high (matplotlib, CC0)
@@ -52,10 +48,8 @@ def draw(
     if show == "photograph":
         image = to_8bit(truth)
     else:
-        renderer = run.renderer
-        if kept < 1:
-            renderer = Renderer(run.dev, most_opaque(run.model, kept), run.config.raster)
-        image, scale = _rendered(run, renderer, camera, show, early_stop, truth)
+        shown = most_opaque(run, kept) if kept < 1 else run
+        image, scale = _rendered(shown, camera, show, early_stop, truth)
         line += scale
     if exposure:
         light = srgb_to_linear(np.arange(256) / 255) * 2.0**exposure
@@ -63,17 +57,15 @@ def draw(
     return image, line
 
 
-def _rendered(run, renderer, camera, show, early_stop, truth):
+def _rendered(run, camera, show, early_stop, truth):
     """(image, its scale) of what is rendered."""
-    options = {"early_stop": early_stop, "depth_range": run.depth_range(camera)}
     if show == "fragments":
         # the whole view, as until="weights" would change the buffers that a training goes on with
-        drawn = renderer.forward(camera, run.gamma, **options)
-        hits = np.diff(drawn.pairs.pixel_offset.get().astype(np.int64))
-        hits = drawn.cropped(hits.reshape(drawn.size))
+        options = {"early_stop": early_stop, "depth_range": run.depth_range(camera)}
+        hits = run.renderer.forward(camera, run.gamma, **options).fragments()
         return colour_scale(hits, 0, hits.max(), hits > 0), f"0 to {hits.max()} fragments"
-    picture = rendered_picture(renderer, camera, run.gamma, **options)
-    colour, is_known = run.checked(picture.colour), picture.alpha >= LEAST_ALPHA
+    picture = run.render(camera, early_stop=early_stop)
+    is_known = picture.alpha >= LEAST_ALPHA
     if show == "alpha":
         return to_8bit(np.repeat(picture.alpha[..., None], 3, axis=2)), ""
     if show == "depth":
@@ -85,8 +77,8 @@ def _rendered(run, renderer, camera, show, early_stop, truth):
         normals = normals_from_depth(np.where(is_known, picture.depth, np.nan), camera)
         return to_8bit(np.where(np.isnan(normals), DARK, (normals + 1) / 2)), ""
     if show == "error":
-        return to_8bit(ERROR_GAIN * np.abs(colour - truth)), f", error x{ERROR_GAIN}"
-    return to_8bit(colour), ""
+        return to_8bit(ERROR_GAIN * np.abs(picture.colour - truth)), f", error x{ERROR_GAIN}"
+    return to_8bit(picture.colour), ""
 
 
 def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:
@@ -99,15 +91,20 @@ def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> i
     return int(np.argmin(np.array(apart) + radius * np.array(turned)))
 
 
-def most_opaque(model: Model, share: float) -> Model:
-    """A copy of a model with that share of its points, in (0, 1], those of the highest opacity, and
-    at least one; it has the same network.
+def most_opaque(run: Run, share: float) -> Run:
+    """The run with that share of its points, in (0, 1], those of the highest opacity, and at least
+    one; it has the same network.
     """
+    model = run.model
     opacity = model.cloud.opacity.get()
     count = max(1, round(share * len(opacity)))
     keep = np.sort(np.argsort(-opacity, kind="stable")[:count]).astype(np.uint32)
-    cloud = model.cloud.rows(model.dev, model.dev.upload(keep))
-    return Model(model.dev, model.grid, model.depth_range, cloud, net=model.net)
+    cloud = model.cloud.rows(run.dev, run.dev.upload(keep))
+    thinned = Model(run.dev, model.grid, model.depth_range, cloud, net=model.net)
+    found = replace(run, model=thinned)
+    found.renderer = Renderer(run.dev, thinned, run.config.raster)  # the network is frozen already
+    found.ball = run.ball
+    return found
 
 
 def colour_scale(values: Any, low: float, high: float, is_known: np.ndarray) -> np.ndarray:

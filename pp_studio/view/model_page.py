@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pp_cl.engine.camera import Camera
-from pp_cl.engine.views import MIN_SIDE, View
+from pp_cl import Camera, Run
+from pp_cl.engine import MIN_SIDE, View
 from pp_cl.errors import UserError, name_of
-from pp_cl.run import Run
-from pp_cl.scene.camera_path import through, up_of
-from pp_cl.scene.readers.frame import frame_keys
+from pp_cl.scene import frame_keys, up_of
+from pp_studio.camera_path import through
 from pp_studio.view.drawing import DARK, OWN_CAMERA, SHOWN, draw
 from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pp_cl.engine.device.device import Device
+from pp_cl import OnStep, Run, RunFolder, Training, load
+from pp_cl.engine import Device
 from pp_cl.errors import UserError, name_of
-from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import Run, load_run
-from pp_cl.session.training import OnStep, Training
 from pp_studio.view.model_page import ModelPage
 from pp_studio.view.server import started
 
@@ -51,7 +49,7 @@ class RunView:
         """
         if self._is_new(self._folder.checkpoint):
             try:
-                self._take(load_run(self._dev, self._folder.path, scene=self._scene))
+                self._take(load(self._folder.path, self._dev, scene=self._scene))
             except UserError as error:
                 self.told.content = str(error)
         elif self.page is None and not self._folder.checkpoint.exists():

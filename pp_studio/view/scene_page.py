@@ -8,20 +8,29 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl import open_device
 from pp_cl.config import configure, preset, scene_config
-from pp_cl.drivers import open_device
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_rgba
-from pp_cl.scene.camera_path import looked_at, up_of
-from pp_cl.scene.edits import FILE, read_edits, write_edits
-from pp_cl.scene.hull import agreeing, build_grid
-from pp_cl.scene.load import open_scene, scene_box, scene_frames, scene_splits
-from pp_cl.scene.readers.common import checked_box, fail_at
-from pp_cl.scene.sparse import GREY, sparse_points
+from pp_cl.files import read_rgba
+from pp_cl.scene import (
+    EDITS,
+    agreeing,
+    build_grid,
+    looked_at,
+    open_scene,
+    read_edits,
+    scene_box,
+    scene_frames,
+    scene_splits,
+    sparse_points,
+    up_of,
+    write_edits,
+)
 from pp_studio.view.space import CHOSEN, VIEW, Space, thumbnail
 
 SHOWN_POINTS = 20_000  # that a browser draws while it turns
 WIDE = 0.3  # of the distance of the cameras, half the side of a box that nothing states
+GREY = 150  # of points without colour
 DROPPED, SUGGESTED = (216, 72, 72), (150, 150, 150)  # colours
 UNREADABLE = np.zeros((1, 1, 3), np.uint8)
 
@@ -120,12 +129,9 @@ class ScenePage:
         """Write what the user has changed: box, dropped, or `toggled`, a view that is dropped or
         kept after all. What cannot be is not written.
         """
-        line = f"written to {FILE}"
+        line = f"written to {EDITS}"
         with self._lock:
             try:
-                if changed.get("box") is not None:
-                    box = np.array(changed["box"]).tolist()
-                    changed["box"] = checked_box(box, fail_at(Path("the box")))
                 edits = read_edits(self._folder)._replace(**changed)
                 if toggled is not None:
                     edits = edits._replace(dropped=edits.dropped ^ {toggled})

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from pp_cl.engine.camera import Camera
+from pp_cl import Camera
 
 FARTHEST = 1e6  # of an eye from the origin of the page, in its units
 FRUSTUM = 0.3  # its length, in the page's units

@@ -8,7 +8,7 @@ from support.checkpoints import load_checkpoint
 from support.runs import arguments
 
 from pp_cl.cli import main
-from pp_cl.commands.progress import first_signal
+from pp_cl.commands.signals import first_signal
 from pp_cl.engine.step import Trainer
 
 ROOT = Path(__file__).parents[2]

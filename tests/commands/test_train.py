@@ -8,6 +8,7 @@ from support.refused import failure
 from support.runs import SETTINGS, arguments
 from support.scenes import write_ball_scene
 
+from pp_cl.checkpoint import save_checkpoint
 from pp_cl.cli import main
 from pp_cl.config import begin_with, load_config, run_config
 from pp_cl.errors import UserError
@@ -139,18 +140,17 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
     tmp_path, monkeypatch
 ):
     """Or they would be missing for ever where a kill comes between."""
-    scene, out, found, save = write_ball_scene(tmp_path / "ball"), tmp_path / "run", {}, []
+    scene, folder, found = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run"), {}
 
-    def saving(self, header, arrays):
-        rows = [json.loads(line) for line in self.log.read_text().splitlines()]
-        pictures = sorted(int(path.stem[5:]) for path in self.previews.iterdir())
+    def saving(path, header, arrays):
+        rows = [json.loads(line) for line in folder.log.read_text().splitlines()]
+        pictures = sorted(int(path.stem[5:]) for path in folder.previews.iterdir())
         found[header["step"]] = rows[-1]["step"], rows[-1].get("finished"), pictures[-1:]
-        return save[0](self, header, arrays)
+        save_checkpoint(path, header, arrays)
 
-    save.append(RunFolder.save)
-    monkeypatch.setattr(RunFolder, "save", saving)
+    monkeypatch.setattr("pp_cl.session.training.save_checkpoint", saving)
     monkeypatch.setattr("pp_cl.session.training.PREVIEWS", 3)
-    assert main(arguments(scene, out, train__checkpoint_every=20)) == 0
+    assert main(arguments(scene, folder.path, train__checkpoint_every=20)) == 0
     assert found == {20: (20, None, [20]), 40: (40, None, [40]), 60: (60, True, [60])}
 
 

@@ -9,9 +9,16 @@ import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import (
+    MANIFEST,
     atomic_file,
     atomic_folder,
+    check_ours,
+    is_owned,
+    ours,
+    own,
     remove_leftovers,
+    remove_ours,
+    write_json,
     write_text,
 )
 
@@ -112,3 +119,74 @@ def test_windows_waits_for_a_reader_and_replaces_no_folder(tmp_path, monkeypatch
     monkeypatch.setattr("pp_cl.files.atomic.READER_SECONDS", 0.2)
     with pytest.raises(UserError, match="cannot be written"):
         write_text(tmp_path / "a", "other")
+
+
+def test_json_never_holds_nan(tmp_path):
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json(tmp_path / "a.json", {"x": float("nan")})
+    assert not (tmp_path / "a.json").exists()
+
+
+# ---- whose files are whose
+
+
+def test_what_was_written_is_ours_until_somebody_changes_it(tmp_path):
+    """In a folder that the program fills, however deep; not beside it, and not behind a link."""
+    filled = tmp_path / "filled"
+    own(filled)
+    (filled / "a" / "b").mkdir(parents=True)
+    written = [filled / "x.txt", filled / "a" / "b" / "y.txt", filled / "gone.txt"]
+    for path in (*written, tmp_path / "beside.txt"):
+        write_text(path, path.name)
+    with atomic_folder(filled / "z") as folder:
+        (folder / "inside").mkdir()
+        write_text(folder / "inside" / "1.txt", "one")
+        write_text(folder / "2.txt", "two")
+    written += [filled / "z" / "inside" / "1.txt", filled / "z" / "2.txt"]
+    (filled / "mine.txt").write_text("mine")
+    (filled / "link.txt").symlink_to("x.txt")
+    others = [filled / "mine.txt", filled / "link.txt", tmp_path / "beside.txt", filled / "none"]
+    assert ours([*others, *written]) == written
+    written.pop(2).unlink()
+    written[0].write_text("changed")
+    assert ours(written) == written[1:]
+    with pytest.raises(UserError, match=r"x.txt: pp-cl did not write this, .*; put it elsewhere"):
+        check_ours(written, "put it elsewhere")
+    write_text(written[0], "new")
+    check_ours([*written, filled / "none"])
+    remove_ours([*written, *others])
+    assert not any(path.exists() for path in written)
+    assert {path.name for path in filled.iterdir()} == {"mine.txt", "link.txt", MANIFEST}
+
+
+def test_a_manifest_whose_last_line_was_cut_by_a_kill_goes_on(tmp_path):
+    own(tmp_path)
+    write_text(tmp_path / "a", "a")
+    manifest = tmp_path / MANIFEST
+    with manifest.open("ab") as file:
+        file.write(b'\n["b", "0123')
+    write_text(tmp_path / "c", "c")
+    assert ours([tmp_path / "a", tmp_path / "b", tmp_path / "c"]) == [
+        tmp_path / "a",
+        tmp_path / "c",
+    ]
+
+
+def test_a_folder_becomes_ours_only_where_nothing_would_be_lost(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="file: is not a folder"):
+        own(tmp_path / "file")
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "a.txt").write_text("mine")
+    (foreign / f".a.{DEAD}.pp-cl.tmp").touch()
+    with pytest.raises(UserError, match="foreign: holds other files"):
+        own(foreign, alone=True)
+    with pytest.raises(UserError, match=r"a\.txt: pp-cl did not write this"):
+        own(foreign, [foreign / "a.txt"])
+    assert not is_owned(foreign) and len(list(foreign.iterdir())) == 2
+    own(foreign, [foreign / "b.txt"])
+    assert is_owned(foreign) and {p.name for p in foreign.iterdir()} == {"a.txt", MANIFEST}
+    write_text(foreign / "b.txt", "ours")
+    own(foreign, [foreign / "b.txt"], alone=True)
+    assert ours(foreign.iterdir()) == [foreign / "b.txt"]

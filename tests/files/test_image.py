@@ -12,7 +12,14 @@ from support.profile import display_p3, in_srgb
 from support.refused import refusing
 
 from pp_cl.errors import Unusable, UserError
-from pp_cl.files.image import image_size, read_mask, read_rgba, to_8bit, write_png
+from pp_cl.files.image import (
+    image_files,
+    image_size,
+    read_mask,
+    read_rgba,
+    to_8bit,
+    write_png,
+)
 
 
 @pytest.fixture
@@ -179,3 +186,18 @@ def test_to_8bit():
     assert levels.tolist() == [0, 0, 0, 1, 254, 255, 255]
     with pytest.raises(ValueError, match="NaN"):
         to_8bit([0.5, np.nan])
+
+
+@pytest.mark.parametrize(
+    "names, files",
+    [
+        (["test/r_0.png", "test/r_1.png"], ["r_0.png", "r_1.png"]),
+        (["cam0/0001.png", "cam1/0001.jpg"], ["cam0/0001.png", "cam1/0001.png"]),
+        (["images/a/1.png", "images/b/1.png"], ["a/1.png", "b/1.png"]),
+        (["test/1.png", "2.png"], ["test/1.png", "2.png"]),
+        (["test/1.png", "test/1.jpg"], ["1.png.png", "1.jpg.png"]),
+        (["r_0.png"], ["r_0.png"]),
+    ],
+)
+def test_every_image_has_a_file_of_its_own(names, files):
+    assert [str(path) for path in image_files(names)] == files

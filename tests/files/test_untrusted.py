@@ -55,7 +55,7 @@ def test_what_is_no_file_is_not_waited_for(tmp_path):
     for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):
         with pytest.raises(OSError, match="Not a regular file") as caught:
             read_regular(path, 100)
-        assert caught.value.errno == errno.EINVAL
+        assert caught.value.errno == errno.ENOTSUP
     with pytest.raises(FileNotFoundError):
         read_regular(tmp_path / "none", 100)
 

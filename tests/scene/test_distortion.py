@@ -7,6 +7,7 @@ import pytest
 from support.transforms_scenes import refused, write_scene
 
 from pp_cl.engine.camera import Camera
+from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import Distortion, undistort
 from pp_cl.scene.image_file import shrink
@@ -98,7 +99,9 @@ def test_photographs_of_a_scene_are_undistorted(dev, tmp_path):
     data = write_scene(tmp_path)
     data.update(k1=0.3, p1=0.01, camera_model="OPENCV")
     (tmp_path / "transforms_train.json").write_text(json.dumps(data))
-    for view in load_scene(tmp_path).splits["train"]:
+    with pytest.raises(UserError, match="its images have distortion, which only a device removes"):
+        load_scene(tmp_path)
+    for view in load_scene(tmp_path, dev=dev).splits["train"]:
         stored = read_rgba(tmp_path / view.name)
         expected = undistort(dev, stored, view.stored_camera, Distortion(k1=0.3, p1=0.01))
         np.testing.assert_array_equal(view.image, expected)

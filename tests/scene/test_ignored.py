@@ -130,7 +130,7 @@ def test_without_masks_they_have(tmp_path, expected):
     assert not same(trained(scene, tmp_path / "run", []), expected)
 
 
-def test_the_lens_moves_them_as_it_moves_the_image(tmp_path):
+def test_the_lens_moves_them_as_it_moves_the_image(tmp_path, dev):
     """What is beside them is as without the hand, but for the ringing of the spline."""
     scene = with_hand(tmp_path / "scene", (255, 0, 90, 255))
     hand_masks(scene / "ignore")
@@ -140,7 +140,8 @@ def test_the_lens_moves_them_as_it_moves_the_image(tmp_path):
         data = json.loads(file.read_text()) | {"k1": 0.15, "p1": 0.02}
         file.write_text(json.dumps(data))
     views, right = (
-        load_scene(folder, downscale=2).splits["train"] for folder in (scene, tmp_path / "ball")
+        load_scene(folder, downscale=2, dev=dev).splits["train"]
+        for folder in (scene, tmp_path / "ball")
     )
     assert [view.ignored is not None for view in views] == [True, False] * 4
     for view, other in zip(views, right, strict=True):

@@ -86,8 +86,8 @@ def test_a_large_scene_is_kept_reduced_and_stays_itself(dev, scene, monkeypatch)
         assert same(view.camera, before.camera)  # exact, since 2 is a power of two
         assert same(view.file_camera, before.stored_camera)
         assert before.file_camera is before.stored_camera
-    header = identity(whole, whole)
-    assert identity(views, views) == header
+    header = identity(whole)
+    assert identity(views) == header
     assert difference(header, scene_frames(scene), views) == ""
     moved = views[0].moved((1, 2, 3))
     assert same(moved.file_camera, whole[0].moved((1, 2, 3)).stored_camera)
@@ -102,7 +102,7 @@ def test_pixels_stay_as_stored_where_nothing_is_reduced(dev, scene, monkeypatch)
 
 def test_too_far_is_refused_before_a_photograph_is_read(dev, scene, monkeypatch):
     large(monkeypatch)
-    monkeypatch.setattr("pp_cl.scene.load.read_rgba", None)
+    monkeypatch.setattr("pp_cl.scene.image_file.read_rgba", None)
     with pytest.raises(UserError, match=r"--downscale 7: .* from 1 to 6, .*98x98"):
         opened(dev, scene, 7)
 

@@ -3,6 +3,8 @@ named. Each builds kernels of its own, so these are for the night and for change
 test-slow`. A fault in a kernel is seen by the cases themselves (test_cases.py), too.
 """
 
+import shutil
+
 import pytest
 
 from pp_cl.engine.device import device as device_module
@@ -23,9 +25,13 @@ FLIPS = [
     ("scene/hull", "counts & ~(in", "counts & (in", "scene: hull"),
     ("training/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
     ("raster/project", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
-    ("raster/project", "(wide + least", "(wide - least", "alpha: shapes of Gaussians"),
-    ("raster/pairs", "keys[a] < keys[b]", "keys[a] > keys[b]", "raster: thousands of equal depths"),
-    ("raster/pairs", "sorted[middle] <", "sorted[middle] >", "raster: thousands of equal depths"),
+    ("raster/footprint/disc.h", "1.0f), f->t", "1.0f), f->z", "raster: pairs, disc"),
+    ("raster/footprint/soft.h", "1.0f - sqrt(dis", "1.0f + sqrt(dis", "raster: pairs, soft"),
+    ("raster/footprint/sphere.h", "along - half", "along + half", "raster: pairs, sphere"),
+    ("raster/footprint/gaussian.h", "(wide + least", "(wide - least", "alpha: shapes of Gaussians"),
+    ("raster/pairs", "as_uint(closeness", "as_uint(-closeness", "raster: pairs, soft"),
+    ("raster/lists_by_bucket", "keys[a] < k", "keys[a] > k", "raster: thousands of equal depths"),
+    ("raster/lists_by_key", "[middle] < k", "[middle] > k", "raster: thousands of equal depths"),
     ("raster/shade", "features += basis[4 + b]", "features -= basis[4 + b]", "raster: shade"),
     ("raster/depth", "depth += b *", "depth -= b *", "raster: depth, softmax"),
     ("raster/depth", "before + share", "before - share", "raster: depth, alpha"),
@@ -39,7 +45,7 @@ FLIPS = [
     ("raster/blend", "feature) - pixel_blend", "feature) + pixel_blend", "softmax: backward, soft"),
     ("raster/blend", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
     ("raster/blend", "front.x - behind.x", "front.x + behind.x", "alpha: spread"),
-    ("raster/blend", "d, opacity[i]", "d, -opacity[i]", "alpha: offsets of points"),
+    ("raster/offset", "d, opacity[i]", "d, -opacity[i]", "alpha: offsets of points"),
     ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
@@ -71,21 +77,30 @@ FLIPS = [
 
 @pytest.mark.parametrize("file, text, flipped, name", FLIPS, ids=lambda v: v.replace("/", "."))
 def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, name):
-    assert (KERNELS / f"{file}.cl").read_text().count(text) == 1, "there is nothing to flip"
+    path = f"{file}.cl" if KERNELS.joinpath(f"{file}.cl").exists() else file
+    assert (KERNELS / path).read_text().count(text) == 1, "there is nothing to flip"
     case = next(case for case in CASES if case.name == name)
     monkeypatch.setattr(dev, "is_cpu", acts_as_cpu(dev, file, text))
     assert [row.passed for row in run_cases(dev, [case])] == [True]
-    monkeypatch.setattr(device_module, "Program", flipping(file, text, flipped))
-    others = {key: program for key, program in dev._programs.items() if key[0] != file}
+    if path == file:  # a header, which kernels of its wing include
+        folder = shutil.copytree(KERNELS, tmp_path / "cl")
+        (folder / file).write_text((folder / file).read_text().replace(text, flipped))
+        monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)
+        others = {
+            k: v for k, v in dev._programs.items() if k[0].split("/")[0] != file.split("/")[0]
+        }
+    else:
+        monkeypatch.setattr(device_module, "Program", flipping(file, text, flipped))
+        others = {key: program for key, program in dev._programs.items() if key[0] != file}
     monkeypatch.setattr(dev, "_programs", others)
     assert [row.case for row in run_cases(dev, [case]) if not row.passed] == [name]
 
 
 def acts_as_cpu(dev, file, text):
     """What the device does, but for what CPUs or GPUs alone run."""
-    if text == "sorted[middle] <":
+    if file == "raster/lists_by_key":
         return False
-    return dev.is_cpu or text == "keys[a] < keys[b]" or file.startswith("layers/winograd")
+    return dev.is_cpu or file == "raster/lists_by_bucket" or file.startswith("layers/winograd")
 
 
 def flipping(file, text, flipped):
@@ -105,4 +120,4 @@ def flipping(file, text, flipped):
 
 def test_every_kernel_file_is_flipped():
     files = {path.relative_to(KERNELS).with_suffix("").as_posix() for path in KERNELS.rglob("*.cl")}
-    assert files == {flip[0] for flip in FLIPS}
+    assert files == {file for file, *_ in FLIPS if not file.endswith(".h")}

@@ -7,12 +7,11 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from pp_cl.checkpoint import load_run_state, stored_forms
+from pp_cl.checkpoint import load_run_state, save_checkpoint, stored_forms
 from pp_cl.config import preset
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import opened_checkpoint, save_checkpoint
 from pp_cl.scene.demo import demo_frames
 from pp_cl.scene.identity import kept_camera
 from pp_cl.selftest.points import some_ids
@@ -20,7 +19,6 @@ from pp_cl.selftest.points import some_ids
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
     "pixels": None,
-    "scene": "5ce0e",
     "views": [[one.name, kept_camera(one.camera)] for one in demo_frames("train")[:3]],
     "step": STEP,
     "finished": False,
@@ -65,15 +63,16 @@ def contents(config, step=STEP, n=POINTS):
 
 def load_checkpoint(path):
     """(header, {name: numpy array}) of a checkpoint of any run."""
-    with opened_checkpoint(path) as stored:
-        return stored.header, stored.arrays()
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    return json.loads(arrays.pop("header").tobytes()), arrays
 
 
 def write_run(folder, config, header, arrays):
     """A run's folder with settings and this checkpoint, whatever its numbers are."""
     folder.path.mkdir(parents=True, exist_ok=True)
     folder.config.write_text(config.to_json())
-    with patch("pp_cl.files.checkpoint._check_piece"):
+    with patch("pp_cl.checkpoint._is_finite", lambda _: True):
         save_checkpoint(folder.checkpoint, header, arrays)
 
 

@@ -14,6 +14,7 @@ import signal
 import sys
 from pathlib import Path
 from unittest.mock import patch
+from zipfile import BadZipFile
 
 from support.checkpoints import load_checkpoint
 from support.runs import spoken
@@ -179,7 +180,7 @@ def _problem(path):
             lines = path.read_bytes().split(b"\n")[:-1]
             is_log = path.name == "log.jsonl"
             return "" if is_log and all(map(read_row, lines)) else "broken or unknown"
-    except (UserError, ValueError) as error:
+    except (UserError, ValueError, BadZipFile) as error:
         return str(error)
     return ""
 

@@ -5,6 +5,7 @@ import json
 from support.checkpoints import contents
 from support.runs import SETTINGS, set_words
 
+from pp_cl.checkpoint import save_checkpoint
 from pp_cl.config import run_config
 from pp_cl.files.run_folder import RunFolder
 from pp_studio.sweep.plan import plan
@@ -34,7 +35,9 @@ def pretend(job, psnr, ssim=0.5, *, points=10, seconds=2.0, step=None, finished=
     folder = RunFolder(job.folder)
     config = run_config(folder, job.scene, job.preset, job.given)
     folder.create(config.to_json())
-    folder.save(*contents(config, ITERATIONS if finished else ITERATIONS - 1, points))
+    save_checkpoint(
+        folder.checkpoint, *contents(config, ITERATIONS if finished else ITERATIONS - 1, points)
+    )
     with folder.open_log(0) as log:
         log.write({"step": ITERATIONS, "seconds": seconds, "finished": finished})
     folder.evaluation("test").mkdir()

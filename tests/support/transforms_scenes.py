@@ -9,7 +9,6 @@ from support.refused import refusing
 from pp_cl.engine.camera import look_at
 from pp_cl.files.image import write_png
 from pp_cl.scene.load import find_reader, load_scene
-from pp_cl.scene.readers.found import Notes
 
 SIZE = (24, 18)  # width, height of the images written here
 
@@ -53,12 +52,12 @@ def escape(file):
     file.symlink_to(outside)
 
 
-def left_out(folder, *words):
-    """Some views of the training split are left out; the error of the first has all the words."""
-    notes = Notes()
-    assert find_reader(folder).read_split(folder, "train", notes)
+def left_out(folder, *words, split="train"):
+    """Some views of a split are left out; the error of the first has all the words."""
+    gone: list = []
+    assert find_reader(folder).read_split(folder, split, gone)
     with refusing(*words):
-        notes.check(0)
+        raise gone[0][1]
 
 
 def refused(folder, *words, splits=("train",)):

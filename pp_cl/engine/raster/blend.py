@@ -14,7 +14,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.points import four_blocks, offset_width, stored_degree
-from pp_cl.engine.raster.project import FOOTPRINTS, MOVED, ProjectedPoints
+from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
 from pp_cl.engine.raster.weights import BlendWeights, clear_pairs
 
 ON_GPU = 4  # lanes there: each work-item reads vectors
@@ -34,8 +34,8 @@ def shade_forward(
     visible points. sh: of PointCloud.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
-    defines = {"LANES": lanes(dev), "DEGREE": stored_degree(sh)} | _clamping(points)
-    dev.program("raster/shade", **defines).launch(
+    macros = footprint_macros(points.footprint)
+    dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh), **macros).launch(
         "shade_forward_half" if sh_0.dtype == np.float16 else "shade_forward",
         shaded.size * row_parts(dev),
         s=shaded.size,
@@ -147,12 +147,8 @@ def blend_backward(
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    of_points = {"OFFSETS": offset_width(points.footprint)} | _clamping(points)
-    if not is_alpha:
-        of_points["GAINS"] = 1
-    if moves:
-        of_points |= {"FOOTPRINT": FOOTPRINTS.index(points.footprint), "MOVES": 1}
-    program = _program(dev, **of_points)
+    macros = footprint_macros(points.footprint)
+    program = _program(dev, GAINS=int(not is_alpha), **macros)
     if is_alpha:
         program.launch(
             "alpha_gradient",
@@ -178,26 +174,35 @@ def blend_backward(
         "blend_backward",
         shaded.size * row_parts(dev, ON_GPU),
         s=shaded.size,
-        edge=edge,
-        radius=points.radius,
         shaded=shaded,
-        camera=points.camera_buffer,
-        point_radius=points.point_radius,
-        point_camera=points.point_camera,
-        point_white=points.point_white,
-        cloud_offset=b.grad_offset if points.cloud_offset is None else points.cloud_offset,
-        opacity=opacity,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
-        pair_point_closeness=pairs.pair_point_closeness,
         pair_gradient=b.pair_gradient,
         pixel_blend=b.pixel_blend,
         shaded_features=shaded_features,
         grad_features=grad_features,
         grad_shaded_features=b.grad_shaded_features,
         grad_opacity=b.grad_opacity,
-        grad_offset=b.grad_offset,
     )
+    if moves:
+        dev.program("raster/offset", **macros).launch(
+            "offset_backward",
+            shaded.size,
+            s=shaded.size,
+            edge=edge,
+            radius=points.radius,
+            shaded=shaded,
+            camera=points.camera_buffer,
+            point_camera=points.point_camera,
+            point_shape=points.point_shape,
+            cloud_offset=b.grad_offset if points.cloud_offset is None else points.cloud_offset,
+            opacity=opacity,
+            point_offset=pairs.point_offset,
+            pair_pixel=pairs.pair_pixel,
+            pair_point_closeness=pairs.pair_point_closeness,
+            pair_gradient=b.pair_gradient,
+            grad_offset=b.grad_offset,
+        )
     return BlendGradients(
         b.grad_shaded_features,
         b.grad_opacity,
@@ -205,11 +210,6 @@ def blend_backward(
         b.pixel_spread,
         b.pair_gradient,
     )
-
-
-def _clamping(points):
-    """The define of shade.cl and blend.cl for the kind of points."""
-    return {"CLAMPED": 1} if points.footprint == "gaussian" else {}
 
 
 def _program(dev, **defines):

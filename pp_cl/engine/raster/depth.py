@@ -6,7 +6,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import FOOTPRINTS, ProjectedPoints
+from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.engine.raster.weights import BlendWeights
 
 
@@ -24,12 +24,12 @@ def depth_forward(
     the weight is reached, interpolated between hits; both infinite where alpha is 0. size: (H, W).
     """
     alpha, depth, median = (dev.empty(size) for _ in range(3))
-    dev.program("raster/depth", FOOTPRINT=FOOTPRINTS.index(points.footprint)).launch(
+    dev.program("raster/depth", **footprint_macros(points.footprint)).launch(
         "depth_forward",
         pairs.pixels,
         hw=pairs.pixels,
         camera=points.camera_buffer,
-        point_radius=points.point_radius,
+        point_shape=points.point_shape,
         pixel_offset=pairs.pixel_offset,
         pair_key=pairs.pair_key,
         pair_point_closeness=pairs.pair_point_closeness,

@@ -13,15 +13,14 @@ from pp_cl.engine.device.buffers import Buffers, Reading, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.device.scan import exclusive_scan, read_total
-from pp_cl.engine.raster.project import FOOTPRINTS, ProjectedPoints
+from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.errors import UserError
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
-# keys ranked at once by comparing all with all, on CPUs 16 a step; longer lists are merged
-RUN, CPU_RUN = 64, 128
 BUCKETS = 256  # of pairs, at most, which CPUs sort side by side
 MOST_CHUNKS = 64  # of pairs, which CPUs put into buckets side by side
-LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
+RUN = 64  # keys that GPUs rank at once by comparing all with all; longer lists are merged
+LONG_LIST = RUN * RUN  # keys of lists that they merge in more than one pass
 
 
 @dataclass(frozen=True)
@@ -72,13 +71,11 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
     """The buffers for n points, a number of pixels and room for a number of pairs."""
     return {
         "point_offset": ((n + 1,), np.uint32),
-        "pixel_count": ((pixels,), np.uint32),
         "pixel_offset": ((pixels + 1,), np.uint32),
         "pair_pixel": ((pairs,), np.uint32),
         "pair_point_closeness": ((pairs, 2), np.uint32),
         "pair_key": ((pairs,), np.uint64),
-        # on GPUs the depth and place of each pair, on CPUs its key by bucket; then for sorting
-        # keys, at last the entries of weights.py
+        # for sorting the keys, then the entries of weights.py
         "pair_scratch": ((pairs,), np.uint64),
     }
 
@@ -91,35 +88,25 @@ def find_pairs(
     """
     n, pixels = len(points.point_box), size[0] * size[1]
     b.require(pairs_table(n, pixels, room))
-    pair_place = b.pair_key if dev.is_cpu else b.pair_scratch  # until the keys are written
-    program = dev.program(
-        "raster/pairs",
-        LANES=lanes(dev),
-        RUN=CPU_RUN if dev.is_cpu else RUN,
-        BUCKETS=BUCKETS,
-        FOOTPRINT=FOOTPRINTS.index(points.footprint),
-    )
     exclusive_scan(dev, points.point_count, b.point_offset)
     count = read_total(dev, b.point_offset)
-    if not dev.is_cpu:
-        dev.fill(b.pixel_count, 0)
-    program.launch(
+    dev.program("raster/pairs", LANES=lanes(dev), **footprint_macros(points.footprint)).launch(
         "pairs_fill",
         -(-n // lanes(dev)),
         n=n,
         p=room,
         camera=points.camera_buffer,
-        point_radius=points.point_radius,
         point_camera=points.point_camera,
+        point_shape=points.point_shape,
         point_box=points.point_box,
-        point_white=points.point_white,
         point_offset=b.point_offset,
         pair_pixel=b.pair_pixel,
         pair_point_closeness=b.pair_point_closeness,
-        pair_place=pair_place,
-        pixel_count=b.pixel_count,
+        point_key=b.pair_key if dev.is_cpu else b.pair_scratch,
     )
-    pairs = Pairs(
+    list_keys = _list_by_bucket if dev.is_cpu else _list_by_key
+    list_keys(dev, b, n, pixels, room)
+    return Pairs(
         points.footprint,
         count,
         b.point_offset,
@@ -128,46 +115,47 @@ def find_pairs(
         b.pair_point_closeness,
         b.pair_key,
     )
-    make_lists = _list_by_bucket if dev.is_cpu else _list_in_parallel
-    make_lists(dev, program, b, n, pixels, room)
-    return pairs
 
 
-def _list_by_bucket(dev, program, b, n, pixels, room):
-    """Write the keys, sorted, and pixel_offset."""
+def _list_by_bucket(dev, b, n, pixels, room):
+    """Sort pair_key, which is by point, and write pixel_offset."""
+    program = dev.program("raster/lists_by_bucket", BUCKETS=BUCKETS)
     chunks = min(MOST_CHUNKS, dev.info["compute_units"])
     stretch = (-(-pixels // BUCKETS) - 1).bit_length()  # 2^stretch pixels each
-    bucket_size = dev.scratch("buckets", BUCKETS * chunks, np.uint32)
     shared = {
         "chunks": chunks,
         "stretch": stretch,
         "pair_pixel": b.pair_pixel,
-        "bucket_size": bucket_size,
+        "bucket_size": dev.scratch("buckets", BUCKETS * chunks, np.uint32),
     }
     filled = {"n": n, "p": room, "point_offset": b.point_offset, **shared}
     program.launch("pairs_bucket_sizes", chunks, local=1, **filled)
-    bucket_key = b.pair_scratch
-    program.launch(
-        "pairs_bucket", chunks, local=1, pair_place=b.pair_key, bucket_key=bucket_key, **filled
-    )
+    keys = {"point_key": b.pair_key, "bucket_key": b.pair_scratch}
+    program.launch("pairs_bucket", chunks, local=1, **keys, **filled)
     program.launch(
         "pairs_list",
         ((pixels - 1) >> stretch) + 1,
         local=1,
         hw=pixels,
-        bucket_key=bucket_key,
+        bucket_key=b.pair_scratch,
         pixel_offset=b.pixel_offset,
         pair_key=b.pair_key,
         **shared,
     )
 
 
-def _list_in_parallel(dev, program, b, _, pixels, room):
-    """Write the keys, sorted, and pixel_offset: one work-item per key."""
+def _list_by_key(dev, b, n, pixels, room):
+    """Sort the keys in pair_scratch, which are by point, into pair_key, and write pixel_offset."""
+    program = dev.program("raster/lists_by_key", RUN=RUN)
+    b.require({"pixel_count": ((pixels,), np.uint32)})
+    dev.fill(b.pixel_count, 0)
+    filled = {"n": n, "p": room, "point_offset": b.point_offset, "pair_pixel": b.pair_pixel}
+    program.launch("pairs_count", room, pixel_count=b.pixel_count, **filled)
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     shared = {"p": room, "hw": pixels, "pair_pixel": b.pair_pixel, "pixel_offset": b.pixel_offset}
     keys, other = b.pair_key, b.pair_scratch
-    program.launch("pairs_scatter", room, pair_place=other, pair_key=keys, **shared)
+    counted = {"point_key": other, "pixel_count": b.pixel_count}
+    program.launch("pairs_scatter", room, pair_key=keys, **counted, **shared)
     program.launch("pairs_sort_runs", room, pair_key=keys, sorted=other, **shared)
 
     def merge(source, target, width, group, least):

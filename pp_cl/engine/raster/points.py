@@ -126,6 +126,24 @@ class PointCloud:
         sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]
         return cls(dev.upload(ids, np.uint32), dev.zeros((n, 4)), opacities, sh)
 
+    @classmethod
+    def of_gaussians(
+        cls, dev: Device, ids: np.ndarray, offset: np.ndarray, opacity: np.ndarray, sh: np.ndarray
+    ) -> PointCloud:
+        """Gaussians for the footprint "gaussian". ids: (N,), ascending. offset: (N, 9) float32, of
+        cl/cloud.h: place in the cell, logarithms of the deviations, what is below the diagonal.
+        opacity: (N,). sh: (N, 9, 16), of degrees 0 to 2, whose coefficients above degree 0 are
+        clipped to what Gaussians may have.
+        """
+        padded = np.zeros((len(ids), offset_width("gaussian")), np.float32)
+        padded[:, : offset.shape[1]] = offset
+        most = np.full((9, 1), MOST_SH_OF_GAUSSIANS)
+        most[0] = np.inf
+        begins = [block.first for block in sh_blocks(2)[1:]]
+        blocks = np.split(sh.clip(-most, most).astype(np.float32), begins, axis=1)
+        arrays = dev.upload(ids, np.uint32), dev.upload(padded), dev.upload(opacity, np.float32)
+        return cls(*arrays, [dev.upload(block) for block in blocks])
+
     def learned(self) -> dict[str, Array]:
         """{name: array} of all that training changes: "offset", "opacity", and the SH by block."""
         names = (block.name for block in self.blocks)

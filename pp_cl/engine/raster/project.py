@@ -15,7 +15,7 @@ from pp_cl.engine.device.device import Device, Program
 from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
 
-# numbered as in cl/raster/footprint.h, which explains them
+# numbered as in cl/raster/footprint.h; each has its header beside that
 FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
 MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in edges of the grid
 LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
@@ -29,9 +29,9 @@ class ProjectedPoints:
     uint32, pixels that are hit. The others are undefined in a run of LANES points without hits.
     point_camera: (N, 4) float32, x, y, z in camera axes and the distance from the eye; (0, 0, 0,
     -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels
-    that may be hit; last < first means none. point_radius: (N,) float32, world units. Of Gaussians
-    alone: point_white, (N, 4) float32, from pixels to deviations (cl/raster/footprint.h); and the
-    cloud_offset and radius of project_grid().
+    that may be hit; last < first means none. point_shape: (N, 1) float32, the radius in world
+    units; of Gaussians (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h).
+    cloud_offset, radius: of project_grid().
     """
 
     footprint: str
@@ -39,8 +39,7 @@ class ProjectedPoints:
     point_camera: Array
     point_box: Array
     point_count: Array
-    point_radius: Array
-    point_white: Array
+    point_shape: Array
     cloud_offset: Array | None = None
     radius: float = 0.0
 
@@ -56,20 +55,23 @@ def projection_table(n: int, footprint: str = "soft") -> Table:
         "point_camera": ((n, 4), np.float32),
         "point_box": ((n, 4), np.uint16),
         "point_count": ((n,), np.uint32),
-        "point_radius": ((n,), np.float32),
-        "point_white": ((n if footprint == "gaussian" else 1, 4), np.float32),
+        "point_shape": ((n, footprint_macros(footprint)["SHAPE"]), np.float32),
+    }
+
+
+def footprint_macros(footprint: str) -> dict[str, int]:
+    """The defines of a program that includes cl/raster/footprint.h, for one of FOOTPRINTS."""
+    return {
+        "FOOTPRINT": FOOTPRINTS.index(footprint),
+        "OFFSETS": offset_width(footprint),
+        "SHAPE": 4 if footprint == "gaussian" else 1,
     }
 
 
 def projection_program(dev: Device, footprint: str) -> Program:
     """The kernels that project points of one of FOOTPRINTS."""
-    return dev.program(
-        "raster/project",
-        LANES=lanes(dev),
-        FOOTPRINT=FOOTPRINTS.index(footprint),
-        OFFSETS=offset_width(footprint),
-        MOST_OFFSET=f"{MOST_OFFSET}f",
-    )
+    macros = footprint_macros(footprint)
+    return dev.program("raster/project", LANES=lanes(dev), MOST_OFFSET=f"{MOST_OFFSET}f", **macros)
 
 
 def project_grid(
@@ -100,11 +102,10 @@ def project_grid(
         point_id=point_id,
         radius=radius,
         cloud_offset=cloud_offset,
-        point_radius=b.point_radius,
         point_camera=b.point_camera,
+        point_shape=b.point_shape,
         point_box=b.point_box,
         point_count=b.point_count,
-        point_white=b.point_white,
     )
     return ProjectedPoints(
         footprint,
@@ -112,8 +113,7 @@ def project_grid(
         b.point_camera,
         b.point_box,
         b.point_count,
-        b.point_radius,
-        b.point_white,
+        b.point_shape,
         cloud_offset,
         radius,
     )

@@ -15,7 +15,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.device.scan import nonzero
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import FOOTPRINTS
+from pp_cl.engine.raster.project import footprint_macros
 
 BLENDS = ("softmax", "alpha")
 NO_POINT = 0xFFFFFFFF  # of an entry behind which hits were dropped
@@ -100,9 +100,7 @@ def blend_weights(
         "point_is_shaded": b.point_is_shaded,
     }
     if blend == "alpha":
-        program = dev.program(
-            "raster/alpha", FOOTPRINT=FOOTPRINTS.index(pairs.footprint), **defines
-        )
+        program = dev.program("raster/alpha", **footprint_macros(pairs.footprint), **defines)
         program.launch("alpha_weights", pairs.pixels, transmittance=b.transmittance, **shared)
     else:
         program = dev.program("raster/softmax", DROPS=int(early_stop > 0), **defines)

@@ -17,6 +17,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError, quoted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
+from pp_cl.scene.found import LeftOut, find_image, usable
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     MOST,
@@ -25,7 +26,6 @@ from pp_cl.scene.readers.common import (
     progress,
     read_json,
 )
-from pp_cl.scene.readers.found import Notes, find_image
 from pp_cl.scene.readers.frame import Frame, rigid
 
 FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
@@ -53,7 +53,7 @@ def splits(folder: Path) -> list[str]:
     return sorted(listed) if listed else SPLITS
 
 
-def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     """The photographs of a split, in the order of their frame numbers.
 
     Version 1: frames that set_lists.json calls known are for training, unseen ones for testing.
@@ -75,7 +75,7 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     else:
         chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
     read = partial(_photograph, folder)
-    return list(notes.usable(progress(chosen), read, lambda one: f"frame {one.index}"))
+    return list(usable(progress(chosen), read, lambda one: f"frame {one.index}", left_out))
 
 
 def _whole(folder):

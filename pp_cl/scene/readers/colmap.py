@@ -8,6 +8,7 @@ over, since they are nearly all of a file.
 import os
 import struct
 import unicodedata
+import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -21,6 +22,7 @@ from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.found import LeftOut, find_image, folder_named, holds_images, usable
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     MOST,
@@ -30,7 +32,6 @@ from pp_cl.scene.readers.common import (
     progress,
     two_splits,
 )
-from pp_cl.scene.readers.found import Notes, find_image, folder_named, holds_images
 
 FILES = "a sparse model of COLMAP beside images"
 # and in numbered folders in them; the folder itself has the model of RealityScan
@@ -57,12 +58,11 @@ MODELS = {
     "FISHEYE": 4,
     "EUCM": 6,
 }
-# those that are read: with one focal length, with two
-ONE_FOCAL = (
-    *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"),
-    *("SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+NOT_READ = (
+    *("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "EUCM"),
 )
-TWO_FOCALS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "FISHEYE", "OPENCV_FISHEYE")
+ONE_FOCAL = ("SIMPLE_", "RADIAL")  # how models with one focal length begin
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
 MOST_ENTRIES = 2**17  # of a file, cameras or images
 MOST_NAME = 1024  # bytes of an image's name
@@ -100,7 +100,7 @@ def recognises(folder: Path) -> bool:
     return bool(_models(folder))
 
 
-def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     """The photographs of a split: test is every eighth in the order of their names.
 
     Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
@@ -108,12 +108,20 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """
     model = model_folder(folder) or folder
     if (count := len(_models(folder))) > 1:
-        notes.done[f"of {count} models the largest beside images is read"] = [str(model)]
+        text = f"of {count} models the largest beside images is read ({model})"
+        warnings.warn(f"{folder}: {text}", stacklevel=1)
     lenses, images = read_model(model)
+    for lens in lenses.values():
+        if isinstance(lens, Lens) and lens.model in NOT_READ:
+            raise UserError(
+                f"{model}: camera model {lens.model} is not read; convert with `colmap"
+                f" image_undistorter --image_path {folder / IMAGES} --input_path {model}"
+                " --output_path NEW` and give NEW"
+            )
     chosen = hold_out(sorted(images, key=lambda image: image.name), split)
     near = _images_of(folder, model) or folder / IMAGES
     read = partial(_photograph, folder, near.relative_to(folder).as_posix(), model, lenses)
-    return list(notes.usable(progress(chosen), read, lambda image: image.name))
+    return list(usable(progress(chosen), read, lambda image: image.name, left_out))
 
 
 def model_folder(folder: Path) -> Path | None:
@@ -165,21 +173,17 @@ def _photograph(folder, near, model, lenses, image):
     fail = fail_at(model, image.name)
     name, lens = find_image(folder, f"{near}/{image.name}", fail), lenses[image.camera]
     if isinstance(lens, Unusable):
-        return lens
-    if lens.model not in ONE_FOCAL + TWO_FOCALS:
-        raise UserError(
-            f"{model}: camera model {lens.model} is not read; convert with `colmap"
-            f" image_undistorter --image_path {folder / IMAGES} --input_path {model} --output_path"
-            " NEW` and give NEW"
-        )
-    numbers = lens.parameters
-    fx, fy, cx, cy, *coefficients = numbers if lens.model in TWO_FOCALS else (numbers[0], *numbers)
+        raise lens
+    numbers = list(lens.parameters)
+    if lens.model.startswith(ONE_FOCAL):
+        numbers.insert(0, numbers[0])
+    fx, fy, cx, cy, *coefficients = numbers
     is_fisheye = lens.model.endswith("FISHEYE")
     order = ("k1", "k2", "k3", "k4") if is_fisheye else PERSPECTIVE
     distortion = Distortion(**dict(zip(order, coefficients, strict=False)), fisheye=is_fisheye)
     w, x, y, z, *place = image.pose
     if not _are_numbers(image.pose) or abs(np.linalg.norm((w, x, y, z)) - 1) > 1e-3:
-        return Unusable(fail("its pose is no unit quaternion and place; fix it"), "no pose")
+        raise Unusable(fail("its pose is no unit quaternion and place; fix it"), "no pose")
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ place])
     camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
@@ -195,10 +199,9 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
     before text. Raises UserError naming the file, and the line or the place in it.
     """
     suffix = _suffix(folder)
-    is_binary = suffix == ".bin"
-    lenses, images, names = {}, [], set()
+    lenses: dict[int, Lens | Unusable] = {}
     file = folder / f"cameras{suffix}"
-    for where, (identity, lens) in _bounded(file, _binary_cameras if is_binary else _text_cameras):
+    for where, (identity, lens) in _entries(file, _binary_camera, CAMERA, _text_camera):
         model, width, height, parameters = lens
         if model not in MODELS:
             raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
@@ -210,8 +213,8 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
             text = f"{MODELS[model]} parameters, finite and not huge; copy the file again"
             lens = Unusable(f"{where}: {model} has {text}", BROKEN_CAMERA)
         lenses[identity] = lens
-    file = folder / f"images{suffix}"
-    for where, image in _bounded(file, _binary_images if is_binary else _text_images):
+    file, images = folder / f"images{suffix}", {}
+    for where, image in _entries(file, _binary_image, IMAGE, _text_image):
         # the name goes into messages of one line
         has_controls = any(unicodedata.category(letter) == "Cc" for letter in image.name)
         if has_controls or not 1 <= len(image.name) <= MOST_NAME:
@@ -222,31 +225,24 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
                 " both files from one model"
             )
         name = PurePosixPath(image.name)  # ./a.png is a.png
-        if name in names:
+        if name in images:
             raise UserError(f"{file}: {image.name}: stands there twice; remove one")
-        names.add(name)
-        images.append(image)
+        images[name] = image
+        if len(images) > MOST_ENTRIES:
+            raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
     if not images:
         raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
-    return lenses, images
+    return lenses, list(images.values())
 
 
-def read_points(folder: Path) -> Iterator[tuple[float, ...]]:
+def read_points(folder: Path) -> Iterator[Sequence[float]]:
     """Each (x, y, z, red, green, blue) of the points3D in a model's folder, which may have none.
     Raises UserError naming the file, and the line or the place in it.
     """
-    binary, text = folder / "points3D.bin", folder / "points3D.txt"
-    if binary.is_file():
-        return _binary_points(binary)
-    return _text_points(text) if text.is_file() else iter(())
-
-
-def _bounded(file, read):
-    """The entries of a file. Raises UserError where they are more than MOST_ENTRIES."""
-    for count, entry in enumerate(read(file)):
-        if count == MOST_ENTRIES:
-            raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
-        yield entry
+    for suffix in (".bin", ".txt"):
+        if (file := folder / f"points3D{suffix}").is_file():
+            yield from (point for _, point in _entries(file, _binary_point, POINT, _text_point))
+            return
 
 
 def _are_numbers(values):
@@ -254,91 +250,80 @@ def _are_numbers(values):
     return all(abs(value) < MOST for value in values)
 
 
+def _entries(file, take, form, parse):
+    """(place in words, entry) of each entry of a file, which take(opened) reads of a binary one,
+    and parse(line, next line) of a text file, whose lines are of a form. Files are not held whole:
+    points make them large. Raises UserError.
+    """
+    is_binary = file.suffix == ".bin"
+    try:
+        if is_binary:
+            yield from _binary_entries(file, take)
+        else:
+            yield from _text_entries(file, form, parse)
+    except (OSError, OverflowError, ValueError) as error:
+        raise refusal(file, error, "COLMAP's" if is_binary else "text") from None
+
+
 # Text ---------------------------------------------------------------------------------------------
 
-
-def _lines(file):
-    """(number, line) of a text file, one after the other."""
-    try:
-        with file.open(encoding="utf-8-sig") as opened:
-            for number, line in enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1):
-                if len(line) == MOST_LINE:
-                    raise ValueError(f"line {number} has {MOST_LINE} characters or more")
-                yield number, line.strip()
-    except (OSError, ValueError) as error:
-        raise refusal(file, error, "text") from None
+CAMERA = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
+IMAGE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+POINT = "POINT3D_ID X Y Z R G B"
 
 
-def _rows(file, lines, form, parse):
-    """(place in words, what parse(line) gives) of each of the lines that is no comment. Raises
-    UserError for one that is not of the form.
-    """
-    for number, line in lines:
-        if line and not line.startswith("#"):
+def _text_entries(file, form, parse):
+    with file.open(encoding="utf-8-sig") as opened:
+        lines = enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1)
+        for number, line in lines:
+            if len(line) == MOST_LINE:
+                raise ValueError(f"line {number} has {MOST_LINE} characters or more")
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
             where = f"{file}: line {number}"
             try:
-                row = parse(line)
+                entry = parse(line.strip())
             except (IndexError, ValueError, OverflowError):
                 raise UserError(f"{where}: is not {form}; copy the file again") from None
-            yield where, row
+            if form == IMAGE:  # a second line has its 2D points
+                number, line = next(lines, (0, ""))
+                points = line.split()
+                # else an image without its line of points would hide the next one
+                if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
+                    raise UserError(
+                        f"{file}: line {number}: must be the 2D points of {entry.name[:80]!r}, X Y"
+                        " POINT3D_ID each; give every image a second line, empty if it has none"
+                    )
+            yield where, entry
 
 
-def _text_cameras(file):
-    """Each (place in words, (id, Lens))."""
-
-    def parse(line):
-        identity, model, width, height, *parameters = line.split()
-        return int(identity), Lens(model, int(width), int(height), [float(p) for p in parameters])
-
-    return _rows(file, _lines(file), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", parse)
+def _text_camera(line):
+    identity, model, width, height, *parameters = line.split()
+    return int(identity), Lens(model, int(width), int(height), [float(p) for p in parameters])
 
 
-def _text_images(file):
-    """Each (place in words, Image); it has two lines, of which the second, its 2D points, may be
-    empty.
-    """
-
-    def parse(line):
-        words = line.split(maxsplit=9)
-        return Image(words[9], int(words[8]), [float(word) for word in words[1:8]])
-
-    lines, form = _lines(file), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    for where, image in _rows(file, lines, form, parse):
-        number, line = next(lines, (0, ""))
-        points = line.split()
-        # else an image without its line of points would hide the next one
-        if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
-            raise UserError(
-                f"{file}: line {number}: must be the 2D points of {image.name[:80]!r}, X Y"
-                " POINT3D_ID each; give every image a second line, empty if it has none"
-            )
-        yield where, image
+def _text_image(line):
+    words = line.split(maxsplit=9)
+    return Image(words[9], int(words[8]), [float(word) for word in words[1:8]])
 
 
-def _text_points(file):
-    def parse(line):
-        _, x, y, z, red, green, blue, *_ = map(float, line.split(maxsplit=8)[:8])
-        return x, y, z, red, green, blue
-
-    for _, point in _rows(file, _lines(file), "POINT3D_ID X Y Z R G B", parse):
-        yield point
+def _text_point(line):
+    _, x, y, z, red, green, blue = map(float, line.split(maxsplit=7)[:7])
+    return x, y, z, red, green, blue
 
 
 # Binary -------------------------------------------------------------------------------------------
 
 
-def _entries(file, take):
-    """take(opened) of a binary file, as often as its first number says; the file must end there."""
-    try:
-        with opened_regular(file) as opened:
-            (count,) = _take(opened, "Q")
-            for _ in range(count):  # a count that is too large ends at the file's end
-                yield take(opened)
-            size = os.fstat(opened.fileno()).st_size
-            if opened.tell() != size:
-                raise ValueError(f"its entries end at byte {opened.tell()}, the file at {size}")
-    except (OSError, OverflowError, ValueError) as error:
-        raise refusal(file, error, "COLMAP's") from None
+def _binary_entries(file, take):
+    """take(opened) as often as the file's first number says; the file must end there."""
+    with opened_regular(file) as opened:
+        (count,) = _take(opened, "Q")
+        for index in range(count):  # a count that is too large ends at the file's end
+            yield f"{file}: entry {index + 1}", take(opened)
+        size = os.fstat(opened.fileno()).st_size
+        if opened.tell() != size:
+            raise ValueError(f"its entries end at byte {opened.tell()}, the file at {size}")
 
 
 def _take(opened, form):
@@ -349,42 +334,27 @@ def _take(opened, form):
     return struct.unpack(f"<{form}", data)
 
 
-def _binary_cameras(file):
-    """Each (place in words, (id, Lens))."""
-    names = list(MODELS)
-
-    def take(opened):
-        identity, number, width, height = _take(opened, "IiQQ")
-        if not 0 <= number < len(names):
-            raise ValueError(f"camera {identity}: {number} {UNKNOWN}")
-        parameters = _take(opened, "d" * MODELS[names[number]])
-        lens = Lens(names[number], width, height, parameters)
-        return f"{file}: camera {identity}", (identity, lens)
-
-    return _entries(file, take)
+def _binary_camera(opened):
+    identity, number, width, height = _take(opened, "IiQQ")
+    if not 0 <= number < len(MODELS):
+        raise ValueError(f"camera {identity}: {number} {UNKNOWN}")
+    model = list(MODELS)[number]
+    return identity, Lens(model, width, height, _take(opened, "d" * MODELS[model]))
 
 
-def _binary_images(file):
-    """Each (place in words, Image)."""
-
-    def take(opened):
-        identity, *pose, camera = _take(opened, "IdddddddI")
-        at = opened.tell()
-        name, end, _ = opened.read(MOST_NAME).partition(b"\0")
-        if not end:
-            raise ValueError(f"the name at byte {at} does not end")
-        opened.seek(at + len(name) + 1)
-        (points,) = _take(opened, "Q")
-        opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
-        return f"{file}: image {identity}", Image(name.decode(), camera, pose)
-
-    return _entries(file, take)
+def _binary_image(opened):
+    _, *pose, camera = _take(opened, "IdddddddI")
+    at = opened.tell()
+    name, end, _ = opened.read(MOST_NAME).partition(b"\0")
+    if not end:
+        raise ValueError(f"the name at byte {at} does not end")
+    opened.seek(at + len(name) + 1)
+    (points,) = _take(opened, "Q")
+    opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
+    return Image(name.decode(), camera, pose)
 
 
-def _binary_points(file):
-    def take(opened):
-        _, *point, _, track = _take(opened, "QdddBBBdQ")
-        opened.seek(track * TRACK_BYTES, os.SEEK_CUR)
-        return point
-
-    return _entries(file, take)
+def _binary_point(opened):
+    _, *point, _, track = _take(opened, "QdddBBBdQ")
+    opened.seek(track * TRACK_BYTES, os.SEEK_CUR)
+    return point

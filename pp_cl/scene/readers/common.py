@@ -22,8 +22,8 @@ from pp_cl.files.untrusted import (
     read_regular,
     refusal,
 )
+from pp_cl.scene.found import Fail, LeftOut, numbered, usable
 from pp_cl.scene.image_file import Photograph
-from pp_cl.scene.readers.found import Fail, Notes, numbered
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
 SPLITS = ["test", "train"]  # of a format that knows none
@@ -77,7 +77,7 @@ def in_order(
     cameras: Sequence[str],
     images: Sequence[str],
     split: str,
-    notes: Notes,
+    left_out: LeftOut,
     read: Callable[[int, str], Photograph],
 ) -> list[Photograph]:
     """The photographs of a split whose cameras, called so in a file, stand there in the order of
@@ -97,7 +97,7 @@ def in_order(
         return read(index, places[index])
 
     chosen = hold_out(range(len(cameras)), split)
-    return list(notes.usable(chosen, read_one, cameras.__getitem__))
+    return list(usable(chosen, read_one, cameras.__getitem__, left_out))
 
 
 def fail_at(*place: object) -> Fail:
@@ -107,15 +107,14 @@ def fail_at(*place: object) -> Fail:
 
 def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
     """The camera of an image of `size`, which was reduced or enlarged after the camera was found,
-    and must have its shape but for rounding. Raises fail(text).
+    and must have its shape but for rounding. Raises Unusable with the text of fail().
     """
     width, height = camera.width, camera.height
     if not same_shape(size, (width, height)):
         is_turned = same_shape(size[::-1], (width, height))
         what = "turned; write the images upright" if is_turned else "another shape; copy it again"
-        raise fail(
-            f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, {what}"
-        )
+        text = f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, {what}"
+        raise Unusable(fail(text), "an image of another shape than its camera's")
     x, y = size[0] / width, size[1] / height
     fx, fy, cx, cy = x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy
     return Camera(camera.pose, fx, fy, cx, cy, *size)

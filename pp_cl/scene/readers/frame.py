@@ -1,7 +1,6 @@
 """One frame of a JSON file of cameras: its keys, checked, and the camera that they make."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.found import Fail, find_image
 from pp_cl.scene.readers.common import MOST, numbers
-from pp_cl.scene.readers.found import Fail, find_image
 
 # values of camera_model: perspective lenses, and fisheyes
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
@@ -83,15 +82,15 @@ class Frame:
             raise Unusable(self.error(key, text), BROKEN_CAMERA)
         return array
 
-    def image(self, key: str, folder: Path, endings: Sequence[str] = ("",)) -> str | None:
+    def image(self, key: str, folder: Path) -> str | None:
         """find_image() of the path that a key holds; None where it is absent. Raises UserError."""
         given = self.get(key)
+        kind = "mask" if key == "mask_path" else "image"
         if given is None:
             return None
         if not isinstance(given, str) or not given:
-            raise self.error(key, "must be the path of an image")
-        kind = "mask" if key == "mask_path" else "image"
-        return find_image(folder, given, partial(self.error, key), endings, kind)
+            raise Unusable(self.error(key, "must be the path of an image"), f"no {kind}")
+        return find_image(folder, given, partial(self.error, key), kind)
 
 
 def frame_keys(camera: Camera) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
+from pp_cl.scene.found import LeftOut, image_folder
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     fail_at,
@@ -16,7 +17,6 @@ from pp_cl.scene.readers.common import (
     read_npy,
     two_splits,
 )
-from pp_cl.scene.readers.found import Notes, image_folder
 from pp_cl.scene.readers.frame import rigid
 
 FILES = "poses_bounds.npy (LLFF)"
@@ -33,7 +33,7 @@ def recognises(folder: Path) -> bool:
     return (folder / POSES).is_file()
 
 
-def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     """The photographs of a split, in the order of their names.
 
     Where the images are smaller or larger than the poses say, the focal length is scaled. Near and
@@ -58,4 +58,4 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
 
     cameras = [f"row {index}" for index in range(len(rows))]
     images = folder_images(folder, image_folder(folder))
-    return in_order(file, cameras, images, split, notes, read)
+    return in_order(file, cameras, images, split, left_out, read)

@@ -10,9 +10,9 @@ from scipy.linalg import rq
 
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import image_size
+from pp_cl.scene.found import LeftOut, image_folder
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz, two_splits
-from pp_cl.scene.readers.found import Notes, image_folder
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
@@ -27,7 +27,7 @@ def recognises(folder: Path) -> bool:
     return _file(folder) is not None
 
 
-def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     """The photographs of a split: test is every eighth in the order of the images' names.
 
     The world is that of world_mat, in its own units. scale_mat, where it is there, moves the unit
@@ -39,10 +39,12 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in matrices)
     cameras = [f"world_mat_{index}" for index in range(count)]
 
-    def read(index, name):
-        key, scale = cameras[index], f"scale_mat_{index}"
+    for key in cameras:
         if key not in matrices:
             raise fail_at(file, key)("is missing; number the cameras from 0 on")
+
+    def read(index, name):
+        key, scale = cameras[index], f"scale_mat_{index}"
         camera = _camera(matrices[key], image_size(folder / name), fail_at(file, key))
         if scale not in scales:
             return Photograph(name, camera)
@@ -52,7 +54,7 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
         return Photograph(name, camera, (float(near_far[0]), float(near_far[1])))
 
     images = folder_images(folder, image_folder(folder, IMAGES))
-    return in_order(file, cameras, images, split, notes, read)
+    return in_order(file, cameras, images, split, left_out, read)
 
 
 def box(folder: Path) -> np.ndarray | None:

@@ -8,9 +8,9 @@ from pathlib import Path
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
+from pp_cl.scene.found import LeftOut, usable
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import fail_at, fitted, folder_images, read_numbers
-from pp_cl.scene.readers.found import Notes
 from pp_cl.scene.readers.frame import rigid
 
 FILES = "rgb, pose and intrinsics.txt (NSVF)"
@@ -31,7 +31,7 @@ def splits(folder: Path) -> list[str]:
     return sorted(_names(folder))
 
 
-def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     """The photographs of a split, in the order of their names. Poses are camera-to-world with
     OpenCV's axes; near and far are Euclidean distances. Raises UserError naming the file.
     """
@@ -54,7 +54,7 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
         camera = Camera(pose, *lens, *(stated or size))
         return Photograph(name, fitted(camera, size, fail_at(file)), depth_range)
 
-    return list(notes.usable(names, read, str))
+    return list(usable(names, read, str, left_out))
 
 
 def _names(folder):

@@ -6,7 +6,6 @@ and a writer of the former.
 import math
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from pp_cl.engine.views import View
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
+from pp_cl.scene.found import LeftOut, usable
 from pp_cl.scene.image_file import Photograph
 from pp_cl.scene.readers.common import (
     SPLITS,
@@ -24,7 +24,6 @@ from pp_cl.scene.readers.common import (
     progress,
     read_json,
 )
-from pp_cl.scene.readers.found import CASED_ENDINGS, Notes
 from pp_cl.scene.readers.frame import Frame, distortion, frame_keys, pinhole
 
 FILES = "transforms_train.json or transforms.json"
@@ -49,7 +48,7 @@ def splits(folder: Path) -> list[str]:
     return sorted(listed) or SPLITS
 
 
-def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
     """The photographs of transforms_<split>.json; or those of transforms.json that its
     <split>_filenames names, and where it has no such lists every eighth for test, the others for
     train.
@@ -59,21 +58,15 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     files = _split_files(folder)
     file = files[split] if files else _single(folder)
     data = _read(file)
-    given, found = {}, {}  # by name: the path as the frame has it, and a Photograph or an Unusable
+    frames: dict[str, Frame] = {}  # by the name of the image, or the path that finds none
     for index, own in enumerate(progress(data["frames"])):
-        frame = Frame(file, data, own, index)
-        name = path = _plain(str(frame.get("file_path")))
-        one: Any
-        try:
-            one = _read_frame(folder, frame)
-            name = one.name
-        except Unusable as error:
-            one = error
-        if name in found:
+        frame = Frame(file, data, own if isinstance(own, dict) else {}, index)
+        name = _image(folder, frame) or _path(frame)
+        if name in frames:
             raise frame.error("file_path", f"{name!r} stands there twice; remove one")
-        given[name], found[name] = path, one
-    chosen = list(given) if files else _of_split(file, data, given, split)
-    return list(notes.usable(chosen, found.__getitem__, str))
+        frames[name] = frame
+    chosen = list(frames) if files else _of_split(file, data, frames, split)
+    return list(usable(chosen, lambda name: _photograph(folder, frames[name]), str, left_out))
 
 
 def box(folder: Path) -> np.ndarray | None:
@@ -119,45 +112,50 @@ def _has_image(folder, file):
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
         return True
-    for index, own in enumerate(frames):
-        try:
-            Frame(file, data, own, index).image("file_path", folder, ["", *CASED_ENDINGS])
-            return True
-        except Unusable:
-            continue
-        except UserError:
-            return True
-    return False
+    found = (Frame(file, data, own, i) for i, own in enumerate(frames) if isinstance(own, dict))
+    return any(_image(folder, frame) for frame in found)
+
+
+def _image(folder, frame):
+    """The name of a frame's image, None where it is not there."""
+    try:
+        return frame.image("file_path", folder)
+    except Unusable:
+        return None
+
+
+def _path(frame):
+    """The path of a frame's image as it has it, in other words where it has none."""
+    path = frame.get("file_path")
+    return _plain(path) if isinstance(path, str) else f"frames[{frame.index}]"
 
 
 def _plain(path):
     return PurePosixPath(path.replace("\\", "/")).as_posix()
 
 
-def _of_split(file, data, given, split):
-    """Those of a transforms.json's names, {name: as its frame has it}, that belong to a split, in
-    their order.
-    """
-    ordered = sorted(given)
+def _of_split(file, data, frames, split):
+    """The names of those of a transforms.json's frames that belong to a split, in their order."""
+    ordered = sorted(frames)
     names = data.get(f"{split}_filenames")
     if names is None:
         return hold_out(ordered, split)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{file}: {split}_filenames: must be a list of images' paths")
-    wanted = set(map(_plain, names))
-    missing = wanted - {*ordered, *given.values()}
+    wanted, paths = set(map(_plain, names)), {name: _path(frames[name]) for name in ordered}
+    missing = wanted - {*ordered, *paths.values()}
     if missing or not wanted:
         what = f"{min(missing)!r} is the path of no frame" if missing else "is empty"
         raise UserError(f"{file}: {split}_filenames: {what}; list images of the frames")
-    return [name for name in ordered if wanted & {name, given[name]}]
+    return [name for name in ordered if wanted & {name, paths[name]}]
 
 
-def _read_frame(folder, frame):
-    """The Photograph of one frame, its camera of the image's size."""
-    name = frame.image("file_path", folder, ["", *CASED_ENDINGS])
-    mask = frame.image("mask_path", folder)
+def _photograph(folder, frame):
+    """The Photograph of one frame, its camera of the image's size. Raises Unusable."""
+    name = frame.image("file_path", folder)
     if name is None:
         raise frame.error("file_path", "is missing; add the path of the image")
+    mask = frame.image("mask_path", folder)
     stated = frame.number("w", above=0), frame.number("h", above=0)
     size = image_size(folder / name, None if None in stated else stated)
     whole = [one or side for one, side in zip(stated, size, strict=True)]

@@ -4,7 +4,6 @@ import pytest
 from support.same_scene import same, views
 from support.transforms_scenes import refused
 
-from pp_cl.scene.readers.found import Notes
 from pp_cl.scene.readers.nsvf import read_split, splits
 from tools.scene_formats import nsvf
 
@@ -17,7 +16,7 @@ def scene(tmp_path):
 
 
 def lens_of(folder):
-    camera = read_split(folder, "train", Notes())[0].camera
+    camera = read_split(folder, "train", [])[0].camera
     return camera.fx, camera.fy, camera.cx, camera.cy
 
 
@@ -27,7 +26,7 @@ def lens_of(folder):
 def test_splits_are_those_of_the_names(scene):
     assert splits(scene) == ["test", "train", "val"]
     (scene / "rgb" / "9_other.png").write_bytes(b"")
-    assert [len(read_split(scene, split, Notes())) for split in splits(scene)] == [3, 6, 2]
+    assert [len(read_split(scene, split, [])) for split in splits(scene)] == [3, 6, 2]
 
 
 def test_where_there_is_no_2_test_is_1(tmp_path):
@@ -59,7 +58,7 @@ def test_intrinsics(scene, text, expected):
 
 def test_near_and_far(scene):
     (scene / "near_and_far.txt").write_text("1.5 6\n")
-    assert read_split(scene, "test", Notes())[0].depth_range == (1.5, 6.0)
+    assert read_split(scene, "test", [])[0].depth_range == (1.5, 6.0)
 
 
 # --------------------------------------------------------------------------------------------------

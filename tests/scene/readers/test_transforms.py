@@ -6,14 +6,13 @@ import os
 
 import numpy as np
 import pytest
-from support.transforms_scenes import SIZE, opengl_pose, refused, train_views, write_scene
+from support.transforms_scenes import SIZE, left_out, opengl_pose, refused, train_views, write_scene
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
-from pp_cl.scene.readers.found import Notes
 
 # -------------------------------------------------------------------------------------------------
 
@@ -178,7 +177,7 @@ def test_a_bad_depth_range(tmp_path, near, far, key):
         ({"frames": []}, "frames:"),
         ({"frames": {}}, "frames:"),
         ({"frames": "all"}, "frames:"),
-        ({"frames": [[1, 2]]}, "frames[0]:"),
+        ({"frames": [[1, 2]]}, "frames[0].file_path:"),
     ),
 )
 def test_bad_keys_of_the_whole_file(tmp_path, change, place):
@@ -220,7 +219,7 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
     """The latter writes the tangential coefficients as zeros beside."""
     keys |= {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0, "p2": 0}
     write_scene(tmp_path, edit=lambda data: data.update(keys))
-    [one, *_] = transforms.read_split(tmp_path, "train", Notes())
+    [one, *_] = transforms.read_split(tmp_path, "train", [])
     assert one.distortion == Distortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
     write_scene(tmp_path, edit=lambda data: data.update(keys, p2=0.1))
     refused(tmp_path, tmp_path / "transforms_train.json", "p2:")
@@ -235,3 +234,19 @@ def test_a_pipe_is_no_file_of_cameras(tmp_path):
     (tmp_path / "transforms_train.json").unlink()
     os.mkfifo(tmp_path / "transforms_train.json")
     refused(tmp_path, tmp_path, "no scene in it")
+
+
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        (lambda frames: frames[2].update(file_path=None), "frames[2].file_path: is missing"),
+        (lambda frames: frames[2].update(file_path=5), "frames[2].file_path: must be the path"),
+        (lambda frames: frames.__setitem__(2, "none"), "frames[2].file_path: is missing"),
+        (lambda frames: frames[2].update(near=1.0), "frames[2].far: near and far must both"),
+    ],
+)
+def test_a_frame_that_is_wrong_costs_its_view(tmp_path, change, told):
+    write_scene(tmp_path, count=10, edit=lambda data: change(data["frames"]))
+    left_out(tmp_path, told)
+    with pytest.warns(UserWarning, match="1 of 10 views left out"):
+        assert len(load_scene(tmp_path).splits["train"]) == 9

@@ -7,13 +7,12 @@ import subprocess
 
 import numpy as np
 import pytest
-from PIL import Image, TiffImagePlugin
+from PIL import ExifTags, Image, TiffImagePlugin
 from support.profile import display_p3, in_srgb
 
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import write_json
+from pp_cl.files.atomic import own, write_json
 from pp_cl.files.image import read_rgba
-from pp_cl.files.manifest import begin_manifest
 from pp_studio.capture import frames
 from pp_studio.capture.features import find_features
 from pp_studio.capture.frames import take_images
@@ -65,7 +64,7 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
         Image.fromarray(shots[i, ::-1]).save(folder / name)
     heif.from_pillow(Image.fromarray(shots[7, ::-1])).save(folder / "d.heic")
     exif = Image.Exif()
-    exif[frames.ORIENTATION] = 6
+    exif[ExifTags.Base.Orientation] = 6
     exif.get_ifd(frames.EXIF).update({FOCAL: 4.2, MAKER_NOTE: b"x" * 60_000})
     Image.fromarray(shots[3, ::-1]).save(folder / "turned.jpg", exif=exif)
     content = (folder / "turned.jpg").read_bytes()
@@ -83,7 +82,7 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
         size = read_rgba(tmp_path / "images" / one["name"]).shape[1::-1]
         assert size == tuple(one["size"]) == (SIZE if one["source"] != "turned.jpg" else SIZE[::-1])
     copy = Image.open(tmp_path / "images" / made["turned.jpg"]["name"]).getexif()
-    assert copy.get(frames.ORIENTATION, 1) == 1
+    assert copy.get(ExifTags.Base.Orientation, 1) == 1
     assert copy.get_ifd(frames.EXIF)[FOCAL] == pytest.approx(4.2)
 
 
@@ -94,7 +93,7 @@ def test_colours_of_another_profile_become_srgb(folder, tmp_path):
     for i, one in enumerate(noise):
         image = Image.fromarray(([200, 90, 60] + one).astype(np.uint8))
         exif = Image.Exif()
-        exif[frames.ORIENTATION] = 6 if i % 2 else 1
+        exif[ExifTags.Base.Orientation] = 6 if i % 2 else 1
         image.save(folder / f"{i}.png", icc_profile=display_p3(), exif=exif)
     with pytest.warns(UserWarning, match="colour profile of their own are read as sRGB"):
         taken = take_images(folder, tmp_path / "images")
@@ -293,7 +292,7 @@ def test_photographs_of_several_rounds(shots, tmp_path):
         (tmp_path / place).parent.mkdir(parents=True)
         Image.fromarray(shots[0]).save(tmp_path / place)
     (tmp_path / "low/7.DNG").write_bytes(b"raw")
-    begin_manifest(tmp_path / "scene")
+    own(tmp_path / "scene")
     taken = take_images(tmp_path, tmp_path / "scene/capture")
     ordered = [*places[:4], *places[8:], *places[4:8]]
     assert [one["source"] for one in taken["images"]] == ordered

@@ -8,9 +8,8 @@ import pytest
 from support.runs import spoken
 
 from pp_cl.cli import main
-from pp_cl.files.atomic import write_json
+from pp_cl.files.atomic import own, write_json
 from pp_cl.files.image import read_rgba
-from pp_cl.files.manifest import begin_manifest
 from pp_cl.run import load
 from pp_studio.capture import STAGES
 from pp_studio.commands import make
@@ -134,7 +133,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
     photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
     found.mkdir(parents=True)
-    begin_manifest(tmp_path / "out")
+    own(tmp_path / "out")
     hints = ["--turntable", "--masks", "M", "--box=-1,-1,-1,1,1,2"]
     with pytest.raises(Enough):
         spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])

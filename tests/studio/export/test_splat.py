@@ -16,7 +16,7 @@ from support.splats import colours, draw_splats, read_splats
 from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
-from pp_cl.scene.camera_path import up_of
+from pp_cl.scene.gaze import up_of
 from pp_studio.export import gaussians
 from pp_studio.export.gaussians import DEVIATION, fit_gaussians
 from pp_studio.export.splat import (

@@ -78,7 +78,7 @@ def test_fragments_are_those_of_the_pairs(run):
 
 def test_the_most_opaque_points_are_kept(run):
     opacity, ids = run.model.cloud.opacity.get(), run.model.cloud.ids.get()
-    fewer = most_opaque(run.model, 0.25)
+    fewer = most_opaque(run, 0.25).model
     kept = fewer.cloud.opacity.get()
     assert len(kept) == round(0.25 * len(opacity))
     assert kept.min() >= np.sort(opacity)[-len(kept)]
@@ -86,7 +86,7 @@ def test_the_most_opaque_points_are_kept(run):
     for whole, part in zip(run.model.cloud.sh, fewer.cloud.sh, strict=True):
         np.testing.assert_array_equal(part.get(), whole.get()[rows])
     np.testing.assert_array_equal(run.model.cloud.opacity.get(), opacity)
-    assert most_opaque(run.model, 1e-9).cloud.count == 1
+    assert most_opaque(run, 1e-9).model.cloud.count == 1
 
 
 def test_the_nearest_view_counts_place_and_direction():

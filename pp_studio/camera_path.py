@@ -10,33 +10,14 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from pp_cl.engine.camera import Camera, look_at
+from pp_cl import Camera
+from pp_cl.scene import looked_at, up_of
 
 MARGIN = 0.95  # of the image that the object may fill
 HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles a picture would spin
 TURNS = 2  # of a spiral
 NEIGHBOURS = 4  # of a camera, in whose directions another lies between()
 SAMPLED_POINTS = 20_000
-
-
-def up_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) unit vector that is up in the photographs: as far as possible across all horizontal
-    edges of the images (people hold a camera level), on the side of their mean upper edge.
-    """
-    right, up = (np.stack([camera.pose[:, axis] for camera in cameras]) for axis in (0, 1))
-    mean = -up.mean(axis=0)
-    # the mean decides where the right axes leave more than one direction open
-    spread = right.T @ right / len(cameras) - 0.1 * np.outer(mean, mean)
-    direction = np.linalg.eigh(spread)[1][:, 0]
-    return direction if direction @ mean >= 0 else -direction
-
-
-def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) the world position nearest to the optical axes of all cameras, by least squares."""
-    forward = np.stack([camera.pose[:, 2] for camera in cameras])
-    eyes = np.stack([camera.eye for camera in cameras])
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (N, 3, 3) projectors
-    return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, eyes), rcond=1e-9)[0]
 
 
 class Surroundings:
@@ -79,7 +60,8 @@ class Surroundings:
             + math.sin(e) * self.up
             for a, e in zip(angles, elevations, strict=True)
         ]
-        poses = [look_at(offset, (0, 0, 0), self.up) for offset in offsets]
+        size = {"fx": camera.fx, "width": camera.width, "height": camera.height}
+        poses = [Camera.look_at(offset, (0, 0, 0), self.up, **size).pose for offset in offsets]
         distance = max(self.distance, *(self._least_distance(camera, pose) for pose in poses))
         centred = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
         return [

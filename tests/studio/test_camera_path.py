@@ -8,7 +8,8 @@ from support.ball_views import CENTRE, ball_camera
 from support.scenes import ring_cameras
 
 from pp_cl.engine.camera import Camera
-from pp_cl.scene.camera_path import MARGIN, Surroundings, between, looked_at, through, up_of
+from pp_cl.scene.gaze import looked_at, up_of
+from pp_studio.camera_path import MARGIN, Surroundings, between, through
 
 
 def turned(cameras, rotation, shift):

@@ -1,5 +1,5 @@
-"""What the names in a scene's files mean: the image of a name, the mask of an image; and what was
-done so that a scene can be read, which is told once for each kind.
+"""What is found of what a scene's files name: the image of a name, the mask of an image; and what
+cannot be used is left out.
 """
 
 import os
@@ -11,80 +11,46 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
-from pp_cl.errors import Unusable, UserError, listing
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import ENDINGS
 
 # where programs put the images that a name may mean, in their order, beside images_2, images_4 ...
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
 MASK_FOLDERS = ("masks", "mask")
 IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says nothing
-CASED_ENDINGS = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Fail = Callable[[str], UserError]  # makes the error that names the file and the key
+LeftOut = list[tuple[str, UserError]]  # the names of views that cannot be used, and why
 
 
-class Notes:
-    """What was done so that a scene can be read. left_out, done: {kind: names}, the views that are
-    left out, and those for which something else was done.
+def usable(
+    items: Iterable[Item],
+    read: Callable[[Item], Result],
+    name: Callable[[Item], str],
+    left_out: LeftOut,
+) -> Iterator[Result]:
+    """What read() gives of the items, without those for which it raises UserError: these are added
+    to left_out by their name().
     """
-
-    def __init__(self) -> None:
-        self.left_out: dict[str, list[str]] = {}
-        self.done: dict[str, list[str]] = {}
-        self._first: UserError | None = None
-
-    def usable(
-        self,
-        items: Iterable[Item],
-        read: Callable[[Item], Result | Unusable],
-        name: Callable[[Item], str],
-    ) -> Iterator[Result]:
-        """What read() gives of the items, without those for which it raises or gives an Unusable:
-        they are left out.
-        """
-        for item in items:
-            try:
-                found = read(item)
-            except Unusable as error:
-                found = error
-            if isinstance(found, Unusable):
-                self.left_out.setdefault(found.why, []).append(name(item))
-                self._first = self._first or found
-            else:
-                yield found
-
-    def check(self, left: int, least: int = 1) -> None:
-        """Raise the error of the first view that was left out where fewer than `least`, or less
-        than half, are left.
-        """
-        gone = sum(map(len, self.left_out.values()))
-        if self._first and left < max(least, gone):
-            raise self._first
-
-    def lines(self, left: int) -> list[str]:
-        """One line for each kind. left: the views that are not left out."""
-        count = left + sum(map(len, self.left_out.values()))
-        return [
-            f"{len(names)} of {count} views left out: {why} ({listing(names)})"
-            for why, names in self.left_out.items()
-        ] + [f"{what} ({listing(names)})" for what, names in self.done.items()]
+    for item in items:
+        try:
+            yield read(item)
+        except UserError as error:
+            left_out.append((name(item), error))
 
 
 # --------------------------------------------------------------------------------------------------
 
 
-def find_image(
-    folder: Path, given: str, fail: Fail, endings: Sequence[str] = ("",), kind: str = "image"
-) -> str:
+def find_image(folder: Path, given: str, fail: Fail, kind: str = "image") -> str:
     """Path relative to the scene's folder of the image that a file there calls `given`.
 
-    In this order: as it is written, with the first of the endings that exists, also as Windows
-    writes paths; then for each tail of the path, the longest first, beside the file and in
-    IMAGE_FOLDERS: the name, with another ending (those that may have alpha first), in another case,
-    without an ending that stands there twice. Links that lie in the folder are followed. kind:
-    image, or mask, which is looked for in MASK_FOLDERS, never where images are.
+    In this order: as it is written, also as Windows writes paths; then for each tail of the path,
+    the longest first, beside the file and in IMAGE_FOLDERS: what _alike() finds. Links that lie in
+    the folder are followed. kind: image, or mask, which is looked for in MASK_FOLDERS, never where
+    images are.
 
     Raises fail(text) for a path that leaves the folder, Unusable with its text where no image is.
     """
@@ -96,14 +62,14 @@ def find_image(
                     f"{given[:80]!r} leaves the scene's folder; copy the image into it and write"
                     " its path from there"
                 )
-            for ending in endings:
-                path = os.path.join(root, form + ending)
-                if os.path.isfile(path) and (inside := _inside(root, path)):
-                    return inside
+            path = os.path.join(root, form)
+            if os.path.isfile(path) and (inside := _inside(root, path)):
+                return inside
         parts = [p for p in given.replace("\\", "/").split("/") if p not in ("", ".")]
+        places = MASK_FOLDERS if kind == "mask" else _image_folders(root)
         for start in range(len(parts)):
             *above, name = parts[start:]
-            for place in (".", *(MASK_FOLDERS if kind == "mask" else _image_folders(root))):
+            for place in (".", *places):
                 if kind == "mask" and place == "." and not above:
                     continue
                 there = posixpath.normpath(posixpath.join(place, *above))
@@ -111,8 +77,7 @@ def find_image(
                     return posixpath.normpath(posixpath.join(there, found))
     except (OSError, ValueError) as error:  # a name too long, a zero byte
         raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
-    bare = ", with or without the ending of an image" * (len(endings) > 1)
-    text = f"no {kind} at {given[:80]!r} in {folder}{bare}; copy it there or remove the frame"
+    text = f"no {kind} at {given[:80]!r} in {folder}; copy it there or remove the frame"
     raise Unusable(fail(text), f"no {kind}")
 
 
@@ -142,7 +107,7 @@ def _inside(root, path):
 
 def _image_folders(root):
     """IMAGE_FOLDERS that there are, in any case, and images_N, the largest images first."""
-    entries = _entries(root, os.stat(root).st_mtime_ns)
+    entries = sorted(os.listdir(root))
     reduced = {
         entry: int(number)
         for entry in entries
@@ -154,45 +119,78 @@ def _image_folders(root):
     return [place for place in places if os.path.isdir(os.path.join(root, place))]
 
 
-@lru_cache(maxsize=256)
-def _entries(folder, time):
-    """What lies in a folder. time: of its last change, so that what is kept here stays true."""
-    return sorted(os.listdir(folder))
-
-
 def _alike(folder, name):
-    """The file in a folder that a name means; None where there is none, or several."""
+    """The image in a folder that a name means: with another ending (those that may have alpha
+    first), without an ending that stands there twice, or, if it is the only one, in another case.
+    None where there is none.
+    """
     if not os.path.isdir(folder):
         return None
-    entries = _entries(folder, os.stat(folder).st_mtime_ns)
-    stem, ending = os.path.splitext(name)
-    stem = name if ending.lower() not in ENDINGS else stem
-    once = os.path.splitext(stem)[0] if stem.lower().endswith(ENDINGS) else stem
-    for names in ([name], *([one, *(one + e for e in CASED_ENDINGS)] for one in (stem, once))):
-        for one in names:
-            if one in entries and os.path.isfile(os.path.join(folder, one)):
-                return one
-        lower = {one.lower() for one in names}
-        found = [one for one in entries if one.lower() in lower]
-        found = [one for one in found if one.lower().endswith(ENDINGS)]
-        if len(found) == 1 and os.path.isfile(os.path.join(folder, found[0])):
-            return found[0]
-    return None
+    bare = _bare(name)
+    alike = _images(folder, os.stat(folder).st_mtime_ns).get(bare.lower(), [])
+    exact = [one for one in alike if _bare(one) == bare]
+    if name in exact:
+        found = name
+    elif exact:
+        found = min(exact, key=lambda one: ENDINGS.index(os.path.splitext(one)[1].lower()))
+    else:
+        found = alike[0] if len(alike) == 1 else None
+    return found if found and os.path.isfile(os.path.join(folder, found)) else None
+
+
+@lru_cache(maxsize=256)
+def _images(folder, time):
+    """{name without endings, in lower case: images in a folder}. time: of the folder's last change,
+    so that what is kept here stays true.
+    """
+    found = {}
+    for name in sorted(os.listdir(folder)):
+        if name.lower().endswith(ENDINGS):
+            found.setdefault(_bare(name).lower(), []).append(name)
+    return found
+
+
+def _bare(name):
+    """The name of an image without its ending, which may stand there twice."""
+    for _ in range(2):
+        name = os.path.splitext(name)[0] if name.lower().endswith(ENDINGS) else name
+    return name
 
 
 # Masks --------------------------------------------------------------------------------------------
 
 
-def mask_names(image: str) -> list[str]:
-    """What the mask of an image may be called in a folder of masks, as programs write them: its
-    path there with .png added, or its stem, maybe with _mask behind or mask_ before it, with the
-    ending of any image, of which .png may stand behind another.
+def find_mask(folder: Path, image: str, *, by_number: bool = False) -> str | None:
+    """Path in a folder of masks of the mask of an image, a path in the same tree: with .png added,
+    or its stem, maybe with _mask behind or mask_ before it, with the ending of any image. None
+    where there is none. by_number: else that with the same number, as DTU has it.
     """
-    path = PurePosixPath(image)
-    stems = (path.stem, f"{path.stem}_mask", f"mask_{path.stem}")
-    names = [f"{stem}{ending}" for stem in stems for ending in CASED_ENDINGS]
-    names += [f"{path.stem}{ending}.png" for ending in CASED_ENDINGS]
-    return [f"{image}.png", *(str(path.with_name(name)) for name in names)]
+    above, name = posixpath.split(image)
+    if not os.path.isdir(folder / above):
+        return None
+    masks = _masks(folder / above, os.stat(folder / above).st_mtime_ns)
+    stem = PurePosixPath(name).stem
+    found = masks.get(name) or masks.get(stem)
+    if not found and by_number and stem.isdecimal():
+        found = masks.get(int(stem))
+    is_there = found and os.path.isfile(folder / above / found)
+    return posixpath.join(above, found) if is_there else None
+
+
+@lru_cache(maxsize=256)
+def _masks(folder, time):
+    """{what an image may be called, or its number: its mask} in a folder last changed then."""
+    found = {}
+    names = [name for names in _images(folder, time).values() for name in names]
+    for name in names:
+        found[os.path.splitext(name)[0]] = name
+    for name in names:
+        bare = _bare(name)
+        for image in (bare, bare.removesuffix("_mask"), bare.removeprefix("mask_")):
+            found.setdefault(image, name)
+        if bare.isdecimal():
+            found.setdefault(int(bare), name)
+    return found
 
 
 def find_masks(
@@ -202,28 +200,23 @@ def find_masks(
     scene's folder; None where there is no such folder. places: what it may be called.
 
     A mask lies in the same tree, with or without the folder of images above it, and is named as
-    mask_names() has it; where names of images are there once only, it may also lie at the top of
-    its folder, or have the same number as DTU has it. Raises UserError where no image has one.
+    find_mask() has it; where names of images are there once only, it may also lie at the top of its
+    folder, or have the same number. Raises UserError where no image has one.
     """
     place = folder_named(folder, places)
     if place is None:
         return None
-    trees = {image: _in_tree(image) for image in images}
     often = Counter(PurePosixPath(image).name for image in images)
-    numbers = _numbered(folder / place)
     found = {}
-    for image, tree in trees.items():
-        name = PurePosixPath(tree).name
-        names = [*mask_names(tree), *mask_names(image)]
-        names += mask_names(name) if often[name] == 1 else []
-        # a name that is too long with .png is no file, where Path.is_file raises
-        mask = next((one for one in names if os.path.isfile(folder / place / one)), None)
-        stem = PurePosixPath(name).stem
-        mask = mask or (numbers.get(int(stem)) if stem.isdecimal() and often[name] == 1 else None)
+    for image in images:
+        mask = find_mask(folder / place, _in_tree(image)) or find_mask(folder / place, image)
+        name = PurePosixPath(image).name
+        if not mask and often[name] == 1:
+            mask = find_mask(folder / place, name, by_number=True)
         if mask:
-            found[image] = f"{place}/{mask}"
+            found[image] = posixpath.normpath(f"{place}/{mask}")
     if not found:
-        first = PurePosixPath(place) / f"{trees[images[0]]}.png"
+        first = PurePosixPath(place) / f"{_in_tree(images[0])}.png"
         usual = first.with_suffix("").with_suffix(".png")
         raise UserError(
             f"{folder / place}: no mask {first} or {usual}, nor one of another image; add them,"
@@ -260,9 +253,3 @@ def _in_tree(image):
             return image[len(place) + 1 :]
     first, _, rest = image.partition("/")
     return rest if first.startswith("images_") and rest else image
-
-
-def _numbered(folder):
-    """{number: name} of the images in a folder whose names are whole numbers."""
-    files = [file for file in folder.iterdir() if file.suffix.lower() in ENDINGS]
-    return {int(file.stem): file.name for file in files if file.stem.isdecimal()}

@@ -1,0 +1,60 @@
+"""Contact sheets: many images in one picture, predictions beside the truth or photographs of a
+scene.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from pp_cl.files.image import to_8bit, write_png
+
+ERROR_GAIN = 4
+GAP = 2  # pixels between the images
+HEADER = 14  # pixels for the captions
+CAPTIONS = ("prediction", "truth", f"error x{ERROR_GAIN}")
+LINE, INK = (200, 200, 200), (60, 60, 60)
+
+
+def contact_sheet(
+    images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
+) -> np.ndarray:
+    """(H, W, 3) uint8 picture of uint8 images, (H, W, 3) or (H, W, 4), row by row under their
+    captions, each in a cell as large as the largest; what is transparent, or beside a smaller
+    image, shows white. There are no more columns than images.
+    """
+    columns = min(columns, len(images))
+    rows = -(-len(images) // columns)
+    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
+    height += HEADER
+    size = columns * (width + GAP) - GAP, rows * (height + GAP) - GAP
+    sheet = Image.new("RGB", size, LINE)
+    draw = ImageDraw.Draw(sheet)
+    for cell in range(rows * columns):
+        x, y = cell % columns * (width + GAP), cell // columns * (height + GAP)
+        sheet.paste((255, 255, 255), (x, y, x + width, y + height))
+        if cell < len(images):
+            image = Image.fromarray(images[cell])
+            sheet.paste(image, (x, y + HEADER), image if image.mode == "RGBA" else None)
+            draw.text((x + 3, y + 1), captions[cell], fill=INK)
+    return np.array(sheet)
+
+
+def write_comparison(
+    path: Path, predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]
+) -> None:
+    """Write a PNG file of float (H, W, 3) images in [0, 1]: a row of prediction, truth and error
+    for each view, whose sizes may differ.
+
+    The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as
+    around the object.
+    """
+    pairs = zip(predictions, truths, strict=True)
+    images = [to_8bit(image) for p, t in pairs for image in (p, t, _error(p, t))]
+    write_png(path, contact_sheet(images, CAPTIONS * len(predictions), len(CAPTIONS)))
+
+
+def _error(prediction, truth):
+    error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
+    return np.repeat(1 - ERROR_GAIN * error, 3, axis=2)

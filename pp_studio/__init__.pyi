@@ -1,0 +1,1 @@
+from .export.formats import export_run as export_run

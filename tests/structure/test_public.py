@@ -1,0 +1,75 @@
+"""pp_studio is made on what docs/api.md lists, as any other package would be."""
+
+import ast
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+# underscores that are public all the same
+OF_TUPLES, OTHERS = ("_replace", "_asdict", "_fields"), ("self", "cls", "os")
+
+
+def listed(page):
+    """{module: names} of the sections and entries of docs/api.md."""
+    sections = re.split(r"(?m)^## (pp_\S+)$", page)[1:]
+    pairs = zip(sections[::2], sections[1::2], strict=True)
+    return {module: set(re.findall(r"(?m)^- `(\w+)", text)) for module, text in pairs}
+
+
+def faults(source, public):
+    """What a module imports of pp_cl that is not public, and the underscores that it reaches."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [one.name for one in node.names if one.name.partition(".")[0] == "pp_cl"]
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "pp_cl":
+            names = {one.name for one in node.names}
+            whole = {name for name in names if f"{node.module}.{name}" in public}  # a module
+            found += [f"{node.module}.{n}" for n in names - whole - public.get(node.module, set())]
+        elif isinstance(node, ast.Attribute) and node.attr[0] == "_" and node.attr[:2] != "__":
+            owner = getattr(node.value, "id", None)
+            if owner not in OTHERS and node.attr not in OF_TUPLES:
+                found.append(f".{node.attr}")
+        elif isinstance(node, ast.Constant) and re.fullmatch(r"pp_cl(\.\w+)+", str(node.value)):
+            found.append(f"{node.value!r}")
+    return found
+
+
+PUBLIC = listed((ROOT / "docs" / "api.md").read_text("utf-8"))
+
+
+@pytest.mark.parametrize(
+    "source, fault",
+    [
+        ("from pp_cl.engine.camera import Camera", "pp_cl.engine.camera.Camera"),
+        ("from pp_cl.engine import lanes", "pp_cl.engine.lanes"),
+        ("from pp_cl.engine import camera", "pp_cl.engine.camera"),
+        ("from pp_cl import config, run", "pp_cl.run"),
+        ("import pp_cl.run", "pp_cl.run"),
+        ("importlib.import_module('pp_cl.run')", "'pp_cl.run'"),
+        ("run._compare(list)", "._compare"),
+        ("self.run._compare(list)", "._compare"),
+    ],
+)
+def test_what_is_internal_is_found(source, fault):
+    assert faults(source, PUBLIC) == [fault]
+
+
+def test_what_is_public_is_none():
+    source = "from pp_cl import Run\nfrom pp_cl.commands import COMMANDS, options as shared\n"
+    assert not faults(source + "self._seen = edits._replace(box=run.__class__)", PUBLIC)
+
+
+def test_the_studio_uses_public_names_alone():
+    sources = sorted((ROOT / "pp_studio").rglob("*.py"))
+    found = {str(path): faults(path.read_text("utf-8"), PUBLIC) for path in sources}
+    assert found and not {path: wrong for path, wrong in found.items() if wrong}
+
+
+@pytest.mark.parametrize("module", PUBLIC)
+def test_what_is_listed_is_there(module):
+    assert PUBLIC[module]
+    assert all(hasattr(importlib.import_module(module), name) for name in PUBLIC[module])
