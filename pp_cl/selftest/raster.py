@@ -116,23 +116,21 @@ def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _check_pairs(scene, expected):
     """tests/engine/raster/test_pairs.py says more of each."""
-    pairs, total, hits = scene.pairs, scene.pairs.total, scene.hits()
+    pairs, hits, measured = scene.pairs, scene.hits(), scene.geometry()
     clear = expected["margin"] > BAND
     yield exact(hits[clear], expected["hit"][clear])
-    yield exact(hits.sum(), total)
-    points, pixels = scene.pair_points(), pairs.pair_pixel.get()[:total].astype(np.int64)
-    source = pairs.pair_point_closeness.get()[:total]
-    yield exact(source[:, 0], points)
-    closeness = source[:, 1].view(np.float32)
-    yield relative(closeness, expected["closeness"][points, pixels], CLOSENESS)
-    counts, keys = np.diff(pairs.pixel_offset.get().astype(np.int64)), pairs.pair_key.get()[:total]
+    yield exact(hits.sum(), pairs.total)
+    yield relative(measured["closeness"][hits], expected["closeness"][hits], CLOSENESS)
+    yield relative(measured["depth"][hits], expected["depth"][hits], RIM)
+    yield exact(pairs.pair_point_closeness.get()[: pairs.total, 0], scene.pair_points())
+    counts = np.diff(pairs.pixel_offset.get().astype(np.int64))
     yield exact(counts, hits.sum(axis=0))
-    pair = (keys & 0xFFFFFFFF).astype(np.int64)
-    depth = (keys >> 32).astype(np.uint32).view(np.float32)
-    yield exact(np.sort(pair), np.arange(total))
-    yield exact(pixels[pair], np.repeat(np.arange(len(counts)), counts))
-    yield relative(depth, expected["depth"][points[pair], pixels[pair]], RIM)
-    inner = pixels[pair][1:] == pixels[pair][:-1]
+    keys = pairs.pair_key.get()[: pairs.total]
+    pair = keys & 0xFFFFFFFF
+    yield exact(np.sort(pair), np.arange(pairs.total))
+    pixels = pairs.pair_pixel.get()[pair]
+    yield exact(pixels, np.repeat(np.arange(len(counts)), counts))
+    inner = pixels[1:] == pixels[:-1]
     yield exact((keys[1:] > keys[:-1])[inner], np.ones(inner.sum(), bool))
     yield exact(scene.seen, np.flatnonzero(hits.any(axis=1)))
 
