@@ -18,7 +18,15 @@ from tqdm import tqdm
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, listing, shown
 from pp_cl.files import contact_sheet, read_mask, read_rgba, write_png
-from pp_cl.scene import MaskRule, Photograph, cut_out, disagreements, named_mask, read_mask_of_size, shrink
+from pp_cl.scene import (
+    MaskRule,
+    Photograph,
+    cut_out,
+    disagreements,
+    named_mask,
+    read_mask_of_size,
+    shrink,
+)
 from pp_studio.capture.cut import (
     FORGIVEN,
     GROWTHS,
