@@ -12,7 +12,7 @@ from pp_cl.run import load_run
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.transforms import write_scene
 from pp_studio.export import AXES, FORMATS
-from pp_studio.export.formats import check_target, export, renderings
+from pp_studio.export.formats import check_target, export_run, renderings
 from pp_studio.export.splat import Y_DOWN, Y_UP, upright
 
 
@@ -22,7 +22,7 @@ def test_it_is_written_where_it_belongs_and_twice_alike(name, run, tmp_path):
     for _ in range(2):
         path = check_target(name, tmp_path, None)
         assert path.parent == tmp_path / "export"
-        said.append(export(run, name, path))
+        said.append(export_run(run, name, path))
         files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
         contents.append([file.read_bytes() for file in files])
         shutil.rmtree(tmp_path / "export")
@@ -31,16 +31,16 @@ def test_it_is_written_where_it_belongs_and_twice_alike(name, run, tmp_path):
 
 
 def test_a_path_may_be_a_text_and_a_format_that_there_is_not_is_one_line(run, tmp_path):
-    export(run, "glb", str(tmp_path / "a.glb"))
+    export_run(run, "glb", str(tmp_path / "a.glb"))
     assert (tmp_path / "a.glb").stat().st_size
     with pytest.raises(UserError, match="no format obj; choose from splat, "):
-        export(run, "obj", tmp_path / "a.obj")
+        export_run(run, "obj", tmp_path / "a.obj")
 
 
 def test_a_scene_can_be_given_its_folder(run, tmp_path):
     (tmp_path / "empty").mkdir()
     path = check_target("scene", tmp_path, tmp_path / "empty")
-    assert export(run, "scene", path) == "12 train views, 2 test views"
+    assert export_run(run, "scene", path) == "12 train views, 2 test views"
     assert len(load_scene(path, ("test",)).splits["test"]) == 2
 
 
@@ -50,7 +50,7 @@ def test_a_box_holds_a_part_and_axes_turn_it(name, run, tmp_path):
     suffix = FORMATS[name][1][0]
     for axes in AXES:
         path = tmp_path / f"{axes}{suffix}"
-        export(run, name, path, window=60, box=box, axes=axes)
+        export_run(run, name, path, window=60, box=box, axes=axes)
         read = trimesh.load(path, process=False)
         [some] = read.geometry.values() if suffix == ".glb" else [read]
         places[axes] = some.vertices

@@ -12,7 +12,7 @@ from support.refused import refusing
 
 from pp_cl.run import load_run
 from pp_cl.scene.distortion import Distortion
-from pp_studio.export.formats import export
+from pp_studio.export.formats import export_run
 from pp_studio.export.length import metres_per_unit, set_length, surface_point
 
 RADIUS = 0.8  # of the ball, scene units
@@ -61,7 +61,7 @@ def test_pixels_are_those_of_the_photograph_as_the_lens_has_it(mine, monkeypatch
 @pytest.mark.parametrize("name", ["mesh", "splat", "ply"])
 def test_exports_are_in_metres(mine, tmp_path, name):
     def spans(path):
-        export(mine, name, path, window=60)
+        export_run(mine, name, path, window=60)
         if name == "mesh":
             return trimesh.load(path).extents
         vertex = plyfile.PlyData.read(str(path))["vertex"]
@@ -75,7 +75,7 @@ def test_exports_are_in_metres(mine, tmp_path, name):
     assert spans(tmp_path / "b.ply") == pytest.approx(np.multiply(before, 0.24 / apart), rel=1e-3)
     kept = json.loads((mine.folder.path / "length.json").read_text())
     assert kept["between"] == [first, second] and kept["metres"] == 0.24
-    assert export(mine, name, tmp_path / "c.ply", window=60).endswith(", in metres")
+    assert export_run(mine, name, tmp_path / "c.ply", window=60).endswith(", in metres")
 
 
 def test_what_tells_no_length_is_refused(mine):

@@ -8,7 +8,7 @@ from support.gltf import glb
 
 from pp_cl.scene.gaze import up_of
 from pp_studio.export import texture
-from pp_studio.export.formats import export
+from pp_studio.export.formats import export_run
 from pp_studio.export.texture import texels, write_textured
 
 
@@ -41,7 +41,7 @@ def test_far_from_the_origin_the_file_has_the_same_shape(tmp_path):
 
 def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
-    said = export(run, "textured", tmp_path / "a.glb")
+    said = export_run(run, "textured", tmp_path / "a.glb")
     solid = trimesh.load(tmp_path / "a.glb", force="mesh")
     assert said == f"{len(solid.vertices)} vertices, {len(solid.faces)} faces"
     assert 300 < len(solid.faces) <= 600 and solid.visual.uv.shape == (len(solid.vertices), 2)

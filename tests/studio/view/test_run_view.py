@@ -179,7 +179,7 @@ def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copie
     assert "waiting" in view.told.content and view.page is None
     (copied / "checkpoint.npz").write_bytes(whole[:-100])
     view.look()
-    assert "corrupt" in view.told.content and view.page is None
+    assert "cannot be read" in view.told.content and view.page is None
     (copied / "checkpoint.npz").write_bytes(whole)
     view.look()
     assert view.told.content == ""
@@ -194,7 +194,7 @@ def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copie
         (copied / "checkpoint.npz").write_bytes(whole[:-100])
         second = view.page.run
         view.look()
-        assert "corrupt" in view.told.content and view.page.run is second
+        assert "cannot be read" in view.told.content and view.page.run is second
 
 
 def test_the_curve_follows_the_log(view, copied):
