@@ -92,7 +92,7 @@ def quoted(value: object, most: int = 100) -> str:
         return f"a {type(value).__name__}"
 
 
-def listing(names: Sequence[str]) -> str:
+def few_names(names: Sequence[str]) -> str:
     """A few of the names, and how many more there are."""
     more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     return ", ".join(names[:NAMES_SHOWN]) + more

@@ -173,10 +173,10 @@ class PulsarScene(BenchScene):
                 dev, b, pairs, camera, self.point_opacity, blend=blend, gamma=GAMMA
             )
         with dev.stage("blend"):
-            features = gather_rows(dev, self.device_features, weights.shaded)
+            features = gather_rows(dev, self.device_features, weights.visible)
             blend_forward(dev, pairs, weights, features, self.features)
         result = RenderResult(dev, self.camera, (0, 0), size, points, pairs, weights, None)
-        result.shaded_features, result.features = features, self.features
+        result.visible_features, result.features = features, self.features
         return result
 
     def backward(self, blend: str, result: RenderResult) -> None:
@@ -189,7 +189,7 @@ class PulsarScene(BenchScene):
                 self.buffers[blend],
                 *view,
                 opacity=opacity,
-                shaded_features=result.shaded_features,
+                visible_features=result.visible_features,
                 features=result.features,
                 grad_features=self.grad,
             )
@@ -225,7 +225,7 @@ def bench_raster(
                     "gamma": GAMMA,
                     "blend": blend,
                     "pairs": result.pairs.total,
-                    "shaded": int(result.weights.shaded.size),
+                    "visible": int(result.weights.visible.size),
                     "forward_ms": forward,
                     "backward_ms": sum(stages.values()) - forward,
                     "ms": float(np.median(times)),

@@ -1,4 +1,4 @@
-"""Photographs without a mask among others that have one: what the others' visual hull tells of
+"""Images without a mask among others that have one: what the others' visual hull tells of
 them.
 """
 

@@ -52,7 +52,7 @@ from pp_cl.settings import NetworkConfig
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
-WHITE = 1.0  # of a target where its photograph is transparent
+WHITE = 1.0  # of a target where its image is transparent
 SIMPLE = {"gate": gate_forward, "pool": avgpool2_forward, "upsample": upsample2_forward}
 
 Size = tuple[int, int]  # (height, width)

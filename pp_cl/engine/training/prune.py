@@ -62,7 +62,7 @@ def final_points_to_keep(
 
 def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Config) -> Array:
     """final_points_to_keep() of training views: in one of them, where there are many in two, as
-    what a single photograph shows is mostly a speck in others.
+    what a single image shows is mostly a speck in others.
     """
     dev, cloud, train = renderer.dev, renderer.model.cloud, config.train
     max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
@@ -76,8 +76,8 @@ def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Co
 
 def points_of_large_parts(model: Model) -> Array:
     """(M,) uint32, ascending: the points of parts that are large enough to be of the object."""
-    is_kept = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
-    return model.dev.upload(np.flatnonzero(is_kept), np.uint32)
+    is_large = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
+    return model.dev.upload(np.flatnonzero(is_large), np.uint32)
 
 
 def _listed(dev, keep, weight):
