@@ -107,10 +107,10 @@ class Checkpoint:
 
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
         self.path, self._archive = path, archive
-        entries = archive.infolist()
-        if sum(entry.file_size for entry in entries) > path.stat().st_size:
+        members = archive.infolist()
+        if sum(info.file_size for info in members) > path.stat().st_size:
             raise ValueError("it unfolds to more than the file holds")
-        self.forms = {entry.filename.removesuffix(".npy"): self._form(entry) for entry in entries}
+        self.forms = {info.filename.removesuffix(".npy"): self._form(info) for info in members}
         text = self.forms.pop("header", None)
         if text is None or text.dtype != np.uint8 or math.prod(text.shape) > MOST_HEADER:
             raise ValueError("it has no header")
@@ -121,14 +121,14 @@ class Checkpoint:
             found = quoted(self.header.get("format"), 40)
             raise UserError(f"{path}: format {found}, this version reads {FORMAT}; train again")
 
-    def _form(self, entry):
+    def _form(self, info):
         """The Form of an array, which is as large as its part of the file."""
-        with self._archive.open(entry) as member:
+        with self._archive.open(info) as member:
             if np.lib.format.read_magic(member) != (1, 0):  # others have headers of up to 4 GiB
                 raise ValueError("holds an array of another version than 1.0")
             shape, _, dtype = np.lib.format.read_array_header_1_0(member)
-            if member.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
-                raise ValueError(f"{shown(entry.filename, 40)} is not as large as {shape} {dtype}")
+            if member.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
+                raise ValueError(f"{shown(info.filename, 40)} is not as large as {shape} {dtype}")
         return Form(shape, dtype)
 
     def _read(self, name):

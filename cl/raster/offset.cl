@@ -11,7 +11,7 @@
 // the grid and as cloud.h has it.
 kernel void offset_backward(
     const uint s,                            // visible points
-    const float edge,                        // of the grid, world units
+    const float voxel_size,                  // of the grid, world units
     const float radius,                      // of a point without offsets, world units
     global const uint *visible,              // (S) their indices
     global const float *camera,              // (21) camera.h
@@ -37,5 +37,5 @@ kernel void offset_backward(
             offset_add(&sum, &cam, pair_pixel[pair], d, opacity[i] * dL_do / d);
     }
     const Offsets offset = FORM > 1 ? OFFSETS_AT(cloud_offset, i) : (Offsets)(0.0f);
-    OFFSETS_AT(grad_offset, g) = offset_end(&sum, &cam, edge, radius, offset);
+    OFFSETS_AT(grad_offset, g) = offset_end(&sum, &cam, voxel_size, radius, offset);
 }

@@ -90,10 +90,10 @@ class GridScene(BenchScene):
     def __init__(self, dev: Device, n: int, size: int):
         rng = np.random.default_rng(0)
         super().__init__(dev, size, rng)
-        edge = (4 / 3 * np.pi / n) ** (1 / 3)
-        side = int(2 / edge) + 2
-        grid = Grid((-edge * (side - 1) / 2,) * 3, edge, (side,) * 3)
-        squares = (grid.origin[0] + edge * np.arange(side)) ** 2
+        voxel_size = (4 / 3 * np.pi / n) ** (1 / 3)
+        side = int(2 / voxel_size) + 2
+        grid = Grid((-voxel_size * (side - 1) / 2,) * 3, voxel_size, (side,) * 3)
+        squares = (grid.origin[0] + voxel_size * np.arange(side)) ** 2
         inside = squares[:, None, None] + squares[:, None] + squares < 1
         ids = np.flatnonzero(inside).astype(np.uint32)
         self.positions, n = grid.positions(ids), len(ids)
@@ -146,7 +146,7 @@ class PulsarScene(BenchScene):
         self.opacity = np.ones(n, np.float32)
         self.positions = rng.random((n, 3), np.float32) + np.array([-0.5, -0.5, 1], np.float32)
         self.point_features = rng.random((n, CHANNELS), np.float32)
-        self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
+        self.buffers, self.capacity = {blend: Buffers(dev) for blend in BLENDS}, 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload(np.full(n, RADIUS), np.float32)
         self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
@@ -166,8 +166,8 @@ class PulsarScene(BenchScene):
                 point_radius=self.point_radius,
             )
         with dev.stage("pairs"):
-            pairs = find_all_pairs(dev, b, points, size, self.room)
-            self.room = pairs.capacity
+            pairs = find_all_pairs(dev, b, points, size, self.capacity)
+            self.capacity = pairs.capacity
         with dev.stage("weights"):
             weights = blend_weights(
                 dev, b, pairs, camera, self.point_opacity, blend=blend, gamma=GAMMA

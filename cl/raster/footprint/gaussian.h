@@ -156,7 +156,7 @@ static inline float3 inverse_spread(const float3 a0, const float3 a1, const floa
 static inline Offsets offset_end(
     const OffsetGradient *sum,
     const Camera *cam,
-    const float edge,
+    const float voxel_size,
     const float radius,
     const Offsets offset) {
     const float x = sum->centre.x, y = sum->centre.y, z = sum->centre.z;
@@ -178,7 +178,8 @@ static inline Offsets offset_end(
     const float dL_dx = fx * (sum->dL_du.x - ahead0 / z);
     const float dL_dy = fy * (sum->dL_du.y - ahead1 / z);
     const float dL_dz = -(x * dL_dx + y * dL_dy + dot(dL_dm0, m0) + dot(dL_dm1, m1)) / z;
-    const float3 place = edge * (dL_dx * cam->right + dL_dy * cam->down + dL_dz * cam->forward);
+    const float3 place =
+        voxel_size * (dL_dx * cam->right + dL_dy * cam->down + dL_dz * cam->forward);
     const float3 of_1 = m0.y * b0 + m1.y * b1, of_2 = m0.z * b0 + m1.z * b1;  // rows of dL/dL
     return (Offsets)(place, l0.x * (m0.x * b0.x + m1.x * b1.x), l1.y * of_1.y, l2.z * of_2.z,
                      radius * of_1.x, radius * of_2.x, radius * of_2.y, (float4)(0.0f),

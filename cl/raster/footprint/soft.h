@@ -59,10 +59,10 @@ offset_add(OffsetGradient *sum, const Camera *cam, const uint q, const float d, 
 static inline Offsets offset_end(
     const OffsetGradient *sum,
     const Camera *cam,
-    const float edge,
+    const float voxel_size,
     const float radius,
     const Offsets offset) {
     const float3 of = sum->dL_dc;
-    const float3 world = edge * (of.x * cam->right + of.y * cam->down + of.z * cam->forward);
+    const float3 world = voxel_size * (of.x * cam->right + of.y * cam->down + of.z * cam->forward);
     return (Offsets)(world, sum->growth > 0.0f ? 0.0f : sum->dL_dlog);
 }
