@@ -43,7 +43,7 @@ BROKEN_CAMERA = "a camera that is broken"  # why of an Unusable
 
 
 class Diverged(UserError):
-    """A training has come to numbers that are none. The message says where."""
+    """The loss or an image of a training is no longer finite. The message says where."""
 
 
 class BuildError(RuntimeError):

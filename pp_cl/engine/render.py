@@ -1,5 +1,5 @@
-"""The renderer: from a model and a camera to an image, and back to gradients. This is the
-one place that writes the order of the stages.
+"""The renderer: from a model and a camera to an image, and back to gradients. This is the one place
+that writes the order of the stages.
 
 project -> pairs -> blend weights -> shade the visible points -> blend their features -> U-Net
 """

@@ -25,18 +25,18 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An image, which is used reduced: its pixels are the means of blocks of
-    downscale x downscale stored pixels.
+    """An image, which is used reduced: its pixels are the means of blocks of downscale x downscale
+    stored pixels.
 
     name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
     image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
     in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
     None for one that the program makes itself. shrunk: how many times the stored image was reduced
-    while it was read from its file (shrink()). unshrunk_camera: of the file's image, where
-    that is another one. is_masked: a mask of its own says so where the object fills the image.
-    ignored: (H, W) bool, the pixels that say nothing, neither for the hull nor for the loss; the
-    image is 0 there. None: there are none.
+    while it was read from its file (shrink()). unshrunk_camera: of the file's image, where that is
+    another one. is_masked: a mask of its own says so where the object fills the image. ignored: (H,
+    W) bool, the pixels that say nothing, neither for the hull nor for the loss; the image is 0
+    there. None: there are none.
     """
 
     name: str

@@ -27,9 +27,7 @@ MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews: paths in it, which need not
-    exist.
-    """
+    """path: the folder; config, checkpoint, log, previews: paths in it, which need not exist."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)

@@ -1,6 +1,4 @@
-"""Contact sheets: many images in one image, predictions beside the truth or images of a
-scene.
-"""
+"""Contact sheets: many images in one image, predictions beside the truth or images of a scene."""
 
 from collections.abc import Sequence
 from pathlib import Path

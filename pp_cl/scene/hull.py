@@ -31,10 +31,11 @@ LEAST_SEEING = 3  # images that see a vertex: what lies behind the object is in 
 # the hull: masks moved by 6 % of the image have 0.05 to 0.13 there, right ones 0.03 at most.
 MOST_BESIDE, TIMES_USUAL = 0.05, 3.0
 MOST_LEFT_OUT = 1 / 8  # of the views
-# The mean share beside the hull for which masks are forgiven, one more until it is less or this
-# share of them is: rendered masks have 0, those of images 0.0001 to 0.016. What the hull lacks
-# is lost, and what it has too much training prunes: mary_rose's sound views gain 1.4 dB by 12
-# masks of 60 in place of 4.
+# A mask is wrong by the share of it that lies beside the hull: 0 for rendered masks, 0.0001 to
+# 0.016 for those of photographs. Where the mean share is larger than MOST_MISSED, a vertex stays
+# though some masks reject it: as few masks as bring the mean below, but at most MOST_FORGIVEN of
+# them. What the hull lacks is lost, while training prunes what it has too much: mary_rose's sound
+# views gain 1.4 dB where 12 of 60 masks may reject, in place of 4.
 MOST_MISSED, MOST_FORGIVEN = 0.0002, 1 / 4
 COMPARED_POINTS, COMPARED_SIZE = 60_000, 128  # pixels of the images in which this is looked up
 VERTEX_WORK = 10  # multiply-adds that project a vertex into a view, and find its pixel
@@ -58,8 +59,8 @@ class Carver:
     """Masks and cameras of the stored images, on the device, to carve any grid with.
 
     Masks are widened by a pixel, which keeps vertices that touch the silhouette, and by one of the
-    reduced image: by so much are poses and masks of images wrong. least: images that must see
-    a vertex.
+    reduced image: by so much are poses and masks of images wrong. least: images that must see a
+    vertex.
     """
 
     def __init__(self, dev: Device, views: Sequence[View]):

@@ -31,8 +31,8 @@ class ImageFile:
     name: path of the image relative to the scene's folder. camera: of the stored image, freed of
     distortion. depth_range: (near, far), Euclidean distances in world units, if the format states
     one. mask: path of its mask relative to the scene's folder, white where the object is; None: the
-    image's own alpha. lens: of the image as it lies in the file. ignore: path of an image
-    that is white where this one says nothing; if ignores_black, it is black there.
+    image's own alpha. lens: of the image as it lies in the file. ignore: path of an image that is
+    white where this one says nothing; if ignores_black, it is black there.
     """
 
     name: str
@@ -45,9 +45,9 @@ class ImageFile:
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], downscale: int) -> int:
-    """How many times to reduce images of these (width, height), in pixels, while they are
-    read, where a training reduces them `downscale` times: the least divisor of it with which they
-    take MOST_IMAGE_BYTES at most, else all of it.
+    """How many times to reduce images of these (width, height), in pixels, while they are read,
+    where a training reduces them `downscale` times: the least divisor of it with which they take
+    MOST_IMAGE_BYTES at most, else all of it.
     """
     divisors = (f for f in range(1, downscale + 1) if downscale % f == 0)
     return next((f for f in divisors if image_bytes(sizes, f) <= MOST_IMAGE_BYTES), downscale)
@@ -59,9 +59,8 @@ def image_bytes(sizes: Sequence[tuple[int, int]], factor: int) -> int:
 
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:
-    """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): means of blocks of
-    factor x factor pixels on premultiplied colour, rounded. Rows and columns that fill no block are
-    cut off.
+    """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): means of blocks of factor x
+    factor pixels on premultiplied colour, rounded. Rows and columns that fill no block are cut off.
     """
     if factor == 1:
         return image

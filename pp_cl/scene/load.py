@@ -1,5 +1,5 @@
-"""Scenes: images of one object with cameras and masks, from a folder in any format that
-READERS knows, or made by the program.
+"""Scenes: images of one object with cameras and masks, from a folder in any format that READERS
+knows, or made by the program.
 """
 
 import math
@@ -460,9 +460,7 @@ def _reduced(splits, downscale):
 
 
 def _by_rule(rule, image_files, split):
-    """The images, with the masks of the rule's folders, and none where its masks are no
-    files.
-    """
+    """The images, with the masks of the rule's folders, and none where its masks are no files."""
     if rule.folder:
         own = Path(rule.folder).absolute()
         masks = _masks_in(own, image_files, split, ["."])

@@ -190,8 +190,8 @@ class ScenePage:
         self._server.sleep_forever()
 
     def fill(self) -> None:
-        """Put the images into the frustums; and where the scene brings no points, show those
-        of a coarse visual hull of its masks.
+        """Put the images into the frustums; and where the scene brings no points, show those of a
+        coarse visual hull of its masks.
         """
         for name, frustum in self._frustums.items():
             frustum.image = self._read(name)

@@ -23,10 +23,10 @@ SIDE = 4
 class Tiles:
     """The tiles of a feature map that a kernel computes.
 
-    size: (height, width) of the feature map. number: how many tiles are computed. list: (?,)
-    int32: height, width, number, the computed tiles ascending. count: (rows, columns)
-    float32: in sums over the whole feature map a computed tile counts that often, for itself and
-    its copies; 0 for tiles that are not computed.
+    size: (height, width) of the feature map. number: how many tiles are computed. list: (?,) int32:
+    height, width, number, the computed tiles ascending. count: (rows, columns) float32: in sums
+    over the whole feature map a computed tile counts that often, for itself and its copies; 0 for
+    tiles that are not computed.
     """
 
     size: tuple[int, int]

@@ -87,11 +87,10 @@ class BlendGradients:
     """Of the visible points, a row for each or more, float32, valid until the next backward pass;
     those of all other points are 0.
 
-    visible_features: (S, 16). opacity: (S,). offset: (S, 4), of soft points composited by alpha, by
-    what the falloff of their fragments changes, and of Gaussians (S, 16); None if not asked for.
-    pixel_distortion: (HW,), undefined
-    without its weight. pair_gradient: (P, 2), by pair of a visible point the blend weight b and
-    what the fragment adds to dL/dopacity, both 0 where it is dropped or not tracked.
+    visible_features: (S, 16). opacity: (S,). offset: (S, 4) of soft points composited by alpha, (S,
+    16) of Gaussians, through the falloff of their fragments; None if not asked for. pixel_distortion: (HW,), undefined without its weight. pair_gradient: (P, 2), by pair of a
+    visible point the blend weight b and what the fragment adds to dL/dopacity, both 0 where it is
+    dropped or not tracked.
     """
 
     visible_features: Array

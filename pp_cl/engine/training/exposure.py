@@ -23,8 +23,8 @@ class Exposure:
     """A gain for each view and channel, relative to the views' mean, found while a training runs.
 
     state: (views, 3, 4) float32, of each channel the sums of rendering times image, of the
-    rendering squared and of the image squared, and the gain. is_applied: whether images
-    are divided by their gains, or these only look on.
+    rendering squared and of the image squared, and the gain. is_applied: whether images are divided
+    by their gains, or these only look on.
     """
 
     def __init__(self, dev: Device, views: int, is_applied: bool):
@@ -115,7 +115,7 @@ class Exposure:
 
 
 def decided_at(begun: int, views: int) -> int:
-    """The step after which it is known whether the images of a training differ. begun: the
-    step at which its moments started.
+    """The step after which it is known whether the images of a training differ. begun: the step at
+    which its moments started.
     """
     return begun + max(LOOKS * views, LEAST_STEPS)

@@ -65,8 +65,8 @@ class Optimiser:
         """One step by the gradients of the visible points, and by those of the network, which lie
         in model.net.gradients.
 
-        step: from 1. points: as projected into the rendered
-        view. visible: (S) uint32, the visible ones. sh_eps: eps of the SH coefficients.
+        step: from 1. points: as projected into the rendered view. visible: (S) uint32, the visible
+        ones. sh_eps: eps of the SH coefficients.
         """
         net = self.model.net
         rmsprop_update(

@@ -59,8 +59,8 @@ def progress(items: Sequence[Item]) -> Iterable[Item]:
 
 
 def folder_images(folder: Path, name: str) -> list[str]:
-    """Paths relative to the scene's folder of the images in its folder `name`, sorted,
-    hidden files left out. Raises UserError where there are none.
+    """Paths relative to the scene's folder of the images in its folder `name`, sorted, hidden files
+    left out. Raises UserError where there are none.
     """
     found = [
         file.name
@@ -80,9 +80,9 @@ def in_order(
     left_out: LeftOut,
     read: Callable[[int, str], ImageFile],
 ) -> list[ImageFile]:
-    """The images of a split whose cameras, called so in a file, stand there in the order of
-    the names of their images. Where images are gone, the numbers in the names of the others tell
-    which. read(index, image) gives an ImageFile. Raises UserError where nothing tells.
+    """The images of a split whose cameras, called so in a file, stand there in the order of the
+    names of their images. Where images are gone, the numbers in the names of the others tell which.
+    read(index, image) gives an ImageFile. Raises UserError where nothing tells.
     """
     places = numbered(images, len(cameras))
     if places is None:

@@ -1,5 +1,5 @@
-"""Views that no photographer takes: from inside the object, of millions of pixels, through
-one huge point.
+"""Views that no photographer takes: from inside the object, of millions of pixels, through one huge
+point.
 """
 
 import time

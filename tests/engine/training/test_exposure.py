@@ -1,5 +1,5 @@
-"""Images of one object at different exposures: that they differ is seen, their gains are
-found, and a training that stops goes on with them.
+"""Images of one object at different exposures: that they differ is seen, their gains are found, and
+a training that stops goes on with them.
 """
 
 import json
