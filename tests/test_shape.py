@@ -58,7 +58,10 @@ def test_a_refined_run_is_compared_on_its_last_grid(dev, scene, mesh, tmp_path):
     changes = {"train__refine_at": "0.3,1", "points__count": 300}
     facts = run_shape(dev, RunFolder(train(scene, tmp_path / "run", **changes)), mesh, 40_000)
     hull = build_grid(dev, load_scene(scene).splits["train"], 300)
-    assert facts["grid"] == {"dims": [2 * n for n in hull.grid.dims], "edge": hull.grid.edge / 2}
+    assert facts["grid"] == {
+        "dims": [2 * n for n in hull.grid.dims],
+        "voxel_size": hull.grid.voxel_size / 2,
+    }
     assert facts["before"]["points"] == 8 * len(hull.ids) > facts["after"]["points"]
     assert facts["before"]["recall"] > 0.8
 
@@ -73,9 +76,11 @@ def test_a_run_that_was_extended_is_compared_as_before(dev, scene, mesh, tmp_pat
 
 
 def test_a_mesh_alone(dev, mesh):
-    coarse, fine = (mesh_shape(dev, mesh, edge, 100_000)["surface"] for edge in (0.2, 0.1))
+    coarse, fine = (
+        mesh_shape(dev, mesh, voxel_size, 100_000)["surface"] for voxel_size in (0.2, 0.1)
+    )
     assert 3 < fine / coarse < 5
-    assert mesh_shape(dev, mesh, 0.1, 100_000)["grid"]["edge"] == 0.1
+    assert mesh_shape(dev, mesh, 0.1, 100_000)["grid"]["voxel_size"] == 0.1
 
 
 def test_another_scene_is_noticed(dev, mesh, trained, tmp_path):

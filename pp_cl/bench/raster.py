@@ -52,10 +52,10 @@ class GridScene:
     def __init__(self, dev: Device, n: int, size: int):
         rng = np.random.default_rng(0)
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
-        edge = (4 / 3 * np.pi / n) ** (1 / 3)
-        side = int(2 / edge) + 2
-        grid = Grid((-edge * (side - 1) / 2,) * 3, edge, (side,) * 3)
-        squares = (grid.origin[0] + edge * np.arange(side)) ** 2
+        voxel_size = (4 / 3 * np.pi / n) ** (1 / 3)
+        side = int(2 / voxel_size) + 2
+        grid = Grid((-voxel_size * (side - 1) / 2,) * 3, voxel_size, (side,) * 3)
+        squares = (grid.origin[0] + voxel_size * np.arange(side)) ** 2
         inside = squares[:, None, None] + squares[:, None] + squares < 1
         ids = np.flatnonzero(inside).astype(np.uint32)
         self.positions, n = grid.positions(ids), len(ids)
@@ -105,7 +105,7 @@ class PulsarScene:
         self.opacity = np.ones(n, np.float32)
         self.positions = rng.random((n, 3), np.float32) + np.array([-0.5, -0.5, 1], np.float32)
         self.point_features = rng.random((n, CHANNELS), np.float32)
-        self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
+        self.buffers, self.capacity = {blend: Buffers(dev) for blend in BLENDS}, 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload(np.full(n, RADIUS), np.float32)
         self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
@@ -120,16 +120,16 @@ class PulsarScene:
                 dev, b, self.footprint, camera, self.point_positions, point_radius=self.point_radius
             )
         with dev.stage("pairs"):
-            pairs = find_all_pairs(dev, b, points, size, self.room)
-            self.room = pairs.capacity
+            pairs = find_all_pairs(dev, b, points, size, self.capacity)
+            self.capacity = pairs.capacity
         with dev.stage("weights"):
             opacity = self.point_opacity
             weights = blend_weights(dev, b, pairs, camera, opacity, blend=blend, gamma=GAMMA)
         with dev.stage("blend"):
-            features = gather_rows(dev, self.device_features, weights.shaded)
+            features = gather_rows(dev, self.device_features, weights.visible)
             blend_forward(dev, pairs, weights, features, self.features)
         result = RenderResult(dev, self.camera, (0, 0), size, points, pairs, weights, None)
-        result.shaded_features, result.features = features, self.features
+        result.visible_features, result.features = features, self.features
         return result
 
     def backward(self, blend: str, result: RenderResult) -> None:
@@ -144,7 +144,7 @@ class PulsarScene:
                 self.buffers[blend],
                 *view,
                 opacity=opacity,
-                shaded_features=result.shaded_features,
+                visible_features=result.visible_features,
                 features=result.features,
                 grad_features=self.grad,
             )
@@ -162,8 +162,8 @@ SCENES: dict[str, type[Scene]] = {"grid": GridScene, "pulsar": PulsarScene}
 
 def features_error(scene: Scene, blend: str, features: np.ndarray) -> float:
     """Largest difference of an image's (H, W, 16) features from float64, over the range of the
-    points' features and the background, 1. Pixels where float32's rounding may decide over a hit
-    are left out. Every point meets every pixel: for small scenes.
+    points' features and the background, 1. Pixels where float32's rounding may decide over a
+    fragment are left out. Every point meets every pixel: for small scenes.
     """
     geometry = dense.geometry(
         scene.camera, scene.positions, RADIUS, scene.footprint, depth_range=scene.depth_range
@@ -208,7 +208,7 @@ def bench_raster(
                 "gamma": GAMMA,
                 "blend": blend,
                 "pairs": result.pairs.total,
-                "shaded": int(result.weights.shaded.size),
+                "visible": int(result.weights.visible.size),
                 "forward_ms": sum(stages.values()) - backward,
                 "backward_ms": backward,
                 "ms": float(np.median(times)),

@@ -51,8 +51,8 @@ def gate(x: np.ndarray) -> np.ndarray:
 def gate_backward(x: np.ndarray, grad_out: np.ndarray) -> np.ndarray:
     """(H, W, 2 C) gradient of the input of gate(), given that of its output (H, W, C)."""
     features, gates = np.split(x, 2, 2)
-    slope = np.exp(np.minimum(features, 0))
-    grad_features = grad_out * slope * _sigmoid(gates)
+    derivative = np.exp(np.minimum(features, 0))
+    grad_features = grad_out * derivative * _sigmoid(gates)
     grad_gates = grad_out * _elu(features) * _sigmoid(gates) * _sigmoid(-gates)
     return np.concatenate([grad_features, grad_gates], 2)
 

@@ -28,8 +28,8 @@ from pp_cl.engine.layers.tiles import (
     copy_list,
     grid_shape,
     tiles_copy,
+    tiles_covered,
     tiles_find,
-    tiles_hit,
 )
 from pp_cl.engine.network.tile_plan import halve
 from pp_cl.reference import lpips, network
@@ -244,14 +244,16 @@ def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray,
 
 
 def _tiles(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Which tiles hold something, which have hits, copies of them; tiles cut off by the border."""
+    """Which tiles hold something, which have fragments, copies of them; tiles cut off by the
+    border.
+    """
     for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
         odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))
         x = np.where(rng.random((h, w, c)) < 0.02, odd, 1).astype(np.float32)
         yield exact(tiles_find(dev, dev.upload(x), 1.0).get(), halve((x != 1).any(2), 2))
-        hits = rng.integers(1, 5, (h, w)) * (rng.random((h, w)) < 0.02)
-        offsets = dev.upload(np.concatenate([[0], np.cumsum(hits)]), np.uint32)
-        yield exact(tiles_hit(dev, offsets, (h, w)).get(), halve(hits > 0, 2))
+        fragments = rng.integers(1, 5, (h, w)) * (rng.random((h, w)) < 0.02)
+        offsets = dev.upload(np.concatenate([[0], np.cumsum(fragments)]), np.uint32)
+        yield exact(tiles_covered(dev, offsets, (h, w)).get(), halve(fragments > 0, 2))
         yield _copied_tiles(dev, rng, _normal(rng, h, w, c))
 
 

@@ -69,16 +69,16 @@ class Cloud:
     def step(
         self,
         grads: Gradients,
-        shaded: np.ndarray,
+        visible: np.ndarray,
         step: int | None = None,
         *,
         rates: Rates = RATES,
     ) -> None:
-        """One step, or that of another number. grads: as gradients() has them; those of `shaded`
+        """One step, or that of another number. grads: as gradients() has them; those of `visible`
         count.
         """
         self.steps = step or self.steps + 1
-        rows = {name: self.dev.upload(g[shaded], np.float32) for name, g in grads.items()}
+        rows = {name: self.dev.upload(g[visible], np.float32) for name, g in grads.items()}
         rmsprop_update(
             self.dev,
             self.steps,
@@ -87,12 +87,12 @@ class Cloud:
             rows["opacity"],
             rows["offset"] if rates.offset else None,
             points=self._points,
-            shaded=self.dev.upload(shaded, np.uint32),
+            visible=self.dev.upload(visible, np.uint32),
             cloud=self.cloud,
             state=self.state,
             sh_eps=EPSILONS["sh"],
         )
-        seen = np.isin(np.arange(self.n), shaded)
+        seen = np.isin(np.arange(self.n), visible)
         grads = {name: np.where(seen, g.T, 0).T for name, g in grads.items()}
         grads["offset"] = grads["offset"] * (rates.offset > 0)
         self.twin.step(

@@ -20,13 +20,13 @@ def test_rows(dev, name):
         assert min(stages.values()) > 0
         assert row["forward_ms"] + row["backward_ms"] == pytest.approx(sum(stages.values()))
         assert row["forward_ms"] > stages["weights"] and row["backward_ms"] >= stages["backward"]
-        assert 0 < row["shaded"] <= row["points"] and row["peak_device_bytes"] > 64 * row["points"]
+        assert 0 < row["visible"] <= row["points"] and row["peak_device_bytes"] > 64 * row["points"]
         assert 0 < row["max_err"] < 1e-4
 
 
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("blend", BLENDS)
-def test_a_wrong_picture_is_found(dev, name, blend):
+def test_a_wrong_image_is_found(dev, name, blend):
     scene = SCENES[name](dev, 500, 16)
     features = scene.forward(blend).features.get()
     assert features_error(scene, blend, features) < 1e-4

@@ -68,7 +68,7 @@ def test_the_object_is_whole_and_nothing_jumps(tilted, path):
         assert np.linalg.norm(eyes[0] - eyes[-1]) == pytest.approx(steps[0], rel=1e-6)
 
 
-def test_an_orbit_begins_at_the_first_photograph(tilted):
+def test_an_orbit_begins_at_the_first_image(tilted):
     cameras, points, up = tilted
     around = Surroundings(cameras, points)
     first = around.orbit(cameras[0], 10)[0].eye - around.centre

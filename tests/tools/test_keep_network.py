@@ -12,7 +12,7 @@ def test_the_network_of_a_run_is_kept(finished, tmp_path, monkeypatch, capsys):
     TOOL.main()
     assert "wrote" in capsys.readouterr().out
     _, arrays = load_checkpoint(finished / "checkpoint.npz")
-    with np.load(tmp_path / "demo.npz") as kept:
-        assert sorted(kept) == sorted(name for name in arrays if name.startswith("net."))
-        for name, array in kept.items():
+    with np.load(tmp_path / "demo.npz") as stored:
+        assert sorted(stored) == sorted(name for name in arrays if name.startswith("net."))
+        for name, array in stored.items():
             np.testing.assert_array_equal(array, arrays[name].astype(np.float16))

@@ -35,7 +35,7 @@ def test_a_row_is_what_a_training_took(session_device, tmp_path, monkeypatch):
     assert all(column["cell"].format(**row) for column in MEMORY)
 
 
-def test_the_photographs_of_a_phone_show_a_ball(tmp_path, monkeypatch):
+def test_the_images_of_a_phone_show_a_ball(tmp_path, monkeypatch):
     monkeypatch.setattr(TOOL, "PHONE", (80, 60))
     scene = load_scene(TOOL.write_phone_scene(tmp_path, count=6))
     views = scene.splits["train"]

@@ -38,14 +38,14 @@ FOUND |= {"pytorch": [TORCH], "stages": dict.fromkeys(TOOL.STEPS, STEP)}
 
 
 def test_what_was_found_is_kept_until_the_code_changes(tmp_path, monkeypatch):
-    calls, kept = [], tmp_path / "kept"
+    calls, store = [], tmp_path / "kept"
     monkeypatch.setattr(TOOL, "PARTS", {"a": lambda _: calls.append(1) or {"n": len(calls)}})
-    TOOL.begin(kept, "one")
-    assert TOOL.measure(kept, "a") == TOOL.measure(kept, "a") == {"n": 1}
-    TOOL.begin(kept, "one")
-    assert TOOL.measure(kept, "a") == {"n": 1}
-    TOOL.begin(kept, "two")
-    assert TOOL.measure(kept, "a") == {"n": 2}
+    TOOL.begin(store, "one")
+    assert TOOL.measure(store, "a") == TOOL.measure(store, "a") == {"n": 1}
+    TOOL.begin(store, "one")
+    assert TOOL.measure(store, "a") == {"n": 1}
+    TOOL.begin(store, "two")
+    assert TOOL.measure(store, "a") == {"n": 2}
 
 
 def test_tables_and_plots(tmp_path):

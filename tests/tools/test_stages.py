@@ -26,7 +26,7 @@ def test_stages_of_a_finished_run(tmp_path, monkeypatch):
 
 
 def test_bytes_grow_with_what_is_drawn():
-    few = TOOL.least_bytes(n=100, visible=10, hits=50, front=20, pixels=64, sh=576)
+    few = TOOL.least_bytes(n=100, visible=10, fragments=50, front=20, pixels=64, sh=576)
     assert few["shade"] == 10 * (576 + 64)
-    more = TOOL.least_bytes(n=100, visible=20, hits=100, front=40, pixels=64, sh=576)
+    more = TOOL.least_bytes(n=100, visible=20, fragments=100, front=40, pixels=64, sh=576)
     assert all(few[name] < more[name] < 2 * few[name] + 1 for name in few)

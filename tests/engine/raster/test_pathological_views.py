@@ -1,5 +1,5 @@
-"""Views that no photographer takes: from inside the object, of millions of pixels, through
-one huge point.
+"""Views that no photographer takes: from inside the object, of millions of pixels, through one huge
+point.
 """
 
 import time
@@ -19,8 +19,8 @@ pytestmark = pytest.mark.kernels
 
 
 def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=oracle.DEPTH_RANGE):
-    """A scene's hits, features and gradients against the oracle; returns the scene. Left out are
-    pixels where rounding decides over a hit, or makes up most of a closeness.
+    """A scene's fragments, features and gradients against the oracle; returns the scene. Left out
+    are pixels where rounding decides over a fragment, or makes up most of a falloff.
     """
     # a Gaussian's centre may lie hundreds of pixels beside the image, where float32 rounds it by
     # 3e-5 of one, and its deviation is half a pixel
@@ -28,16 +28,16 @@ def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=ora
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
     scene = PairedPoints(dev, camera, positions, radius, kind=kind, depth_range=depth_range)
     geometry = oracle.geometry(camera, positions, radius, kind, depth_range=depth_range)
-    hits, clear = scene.hits(), geometry["margin"] > 1e-3
-    assert np.array_equal(hits[clear], geometry["hit"][clear]) and (~clear).mean() < 0.02
+    fragments, clear = scene.fragments(), geometry["margin"] > 1e-3
+    assert np.array_equal(fragments[clear], geometry["fragment"][clear]) and (~clear).mean() < 0.02
     inner = (geometry["margin"] > 1e-2).all(axis=0)
     assert inner.mean() > 0.5
-    blend = oracle.blend(geometry | {"hit": hits}, opacity, gamma)
+    blend = oracle.blend(geometry | {"fragment": fragments}, opacity, gamma)
     features = scene.blend(opacity, gamma, point_features).reshape(-1, 16)
     assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-4 * unit
     grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
     gradients = scene.gradients(grad)
-    expected = oracle.gradients(geometry | {"hit": hits}, blend, point_features, grad)
+    expected = oracle.gradients(geometry | {"fragment": fragments}, blend, point_features, grad)
     assert relative_error(gradients["features"], expected[0]) < 1e-5 * unit
     assert relative_error(gradients["opacity"], expected[1]) < 5e-5 * unit
     return scene
@@ -70,7 +70,7 @@ def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
     positions = camera.eye + directions * (front + radius)[:, None]
     scene = check(dev, rng, camera, positions, radius, kind, depth_range=(0.5, 3.0))
     placed = scene.projected.point_camera.get()
-    left_out = ~(placed[:, 3] >= 0)  # NaN where nothing is known of a point that hits no pixel
+    left_out = ~(placed[:, 3] >= 0)  # NaN where nothing is known of a point that covers no pixel
     assert (left_out[front < 0.5 - 1e-4]).all() and (~left_out).sum() > 40
     assert (placed[~left_out, 2] < radius[~left_out]).any()  # reaches the plane of the eye
 
@@ -80,7 +80,7 @@ def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
 def test_one_point_over_the_whole_image(dev, rng, kind, size):
     camera = replace(make_camera(*size), fx=300.0, fy=300.0, cx=size[0] / 2, cy=size[1] / 2)
     scene = check(dev, rng, camera, camera.eye + 4 * camera.pose[:, 2:3].T, 1.9, kind, gamma=0.5)
-    assert scene.hits().all()
+    assert scene.fragments().all()
 
 
 @pytest.mark.large
@@ -105,7 +105,7 @@ def test_an_image_of_millions_of_pixels(dev):
     )
     scene = PairedPoints(dev, camera, positions, 0.004, kind="disc")
     offsets = scene.pairs.pixel_offset.get().astype(np.int64)
-    points = scene.pairs.pair_point_closeness.get()[:, 0][
+    points = scene.pairs.pair_point_falloff.get()[:, 0][
         scene.pairs.pair_key.get()[: scene.pairs.total] & 0xFFFFFFFF
     ]
     found = 0
@@ -114,7 +114,7 @@ def test_an_image_of_millions_of_pixels(dev):
         geometry = oracle.geometry(cut, positions, 0.004, "disc")
         for q in np.flatnonzero((geometry["margin"] > 0.02).all(axis=0)):
             at = (y0 + q // patch) * side + x0 + q % patch
-            expected = np.flatnonzero(geometry["hit"][:, q])
+            expected = np.flatnonzero(geometry["fragment"][:, q])
             assert set(points[offsets[at] : offsets[at + 1]]) == set(expected)
             found += len(expected)
     assert found > 1000
@@ -122,8 +122,8 @@ def test_an_image_of_millions_of_pixels(dev):
 
 @pytest.mark.large
 def test_long_lists_do_not_take_quadratic_time(dev):
-    """Eight times the hits in one pixel, 8 log-ish times the time; 64 if it were quadratic. The
-    best of some runs, by the time of all of a CPU's threads.
+    """Eight times the fragments in one pixel, 8 log-ish times the time; 64 if it were quadratic.
+    The best of some runs, by the time of all of a CPU's threads.
     """
     clock = time.process_time if dev.is_cpu else time.perf_counter
     camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)

@@ -18,8 +18,8 @@ pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
 
 def test_momentum_goes_on_without_a_gradient(dev, rng):
     """In arrays of any rank, for as long as training takes."""
-    start, slope = rng.standard_normal((2, 3, 11))
-    grads = slope * (0.3 + rng.standard_normal((1000, 3, 11)))
+    start, scale = rng.standard_normal((2, 3, 11))
+    grads = scale * (0.3 + rng.standard_normal((1000, 3, 11)))
     grads[2::3] = 0
     oracle, parameter, _ = adam_steps(dev, start, grads, rate=0.02, eps=1e-8)
     assert np.abs(oracle.parameter - start).max() > 1
@@ -81,7 +81,7 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
 
 
 def test_points_without_a_gradient_keep_their_values(dev, rng):
-    cloud, shaded = Cloud(dev, rng, 257), np.arange(0, 257, 2)
+    cloud, visible = Cloud(dev, rng, 257), np.arange(0, 257, 2)
     # all at a bound may stay there
     cloud.cloud.opacity.set(rng.uniform(0.3, 0.7, 257).astype(np.float32))
 
@@ -91,9 +91,9 @@ def test_points_without_a_gradient_keep_their_values(dev, rng):
 
     for _ in range(2):
         before = state()
-        cloud.step(gradients(rng, 257), shaded)
+        cloud.step(gradients(rng, 257), visible)
         after = state()
-        moved = np.isin(np.arange(257), shaded) & (np.arange(257) % 3 > 0)
+        moved = np.isin(np.arange(257), visible) & (np.arange(257) % 3 > 0)
         for new, old in zip(after, before, strict=True):
             np.testing.assert_array_equal(new[~moved], old[~moved])
             assert (new[moved] != old[moved]).any()

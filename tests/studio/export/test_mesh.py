@@ -20,7 +20,7 @@ def mesh(run):
 
 def test_it_is_the_ball(run, mesh):
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
-    assert np.median(distance) < 1.5 * run.model.grid.edge
+    assert np.median(distance) < 1.5 * run.model.grid.voxel_size
     made = trimesh.Trimesh(mesh.vertices, mesh.faces)
     assert made.is_watertight
     assert made.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.25)  # faces look outwards
@@ -52,7 +52,7 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
 
 
 def test_a_box_in_which_no_face_lies_is_one_line(run, mesh):
-    around = 0.01 * run.model.grid.edge * np.array([[-1], [1]])
+    around = 0.01 * run.model.grid.voxel_size * np.array([[-1], [1]])
     with pytest.raises(UserError, match="--box: holds no whole face"):
         surface(run, mesh.vertices[0] + around)
 

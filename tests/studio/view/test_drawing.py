@@ -32,13 +32,13 @@ def views(run):
     return run.scene("train").splits["train"]
 
 
-def test_a_picture_is_what_the_run_renders(run):
+def test_a_image_is_what_the_run_renders(run):
     image, line = draw(run, [], CAMERA)
     np.testing.assert_array_equal(image, to_8bit(run.render(CAMERA).colour))
     assert line == ""
 
 
-def test_every_quantity_is_another_picture(run, views):
+def test_every_quantity_is_another_image(run, views):
     images = {show: draw(run, views, CAMERA, show) for show in SHOWN}
     assert len({image.tobytes() for image, _ in images.values()}) == len(SHOWN)
     assert {image.shape for image, _ in images.values()} == {(48, 48, 3), (24, 24, 3)}
@@ -46,8 +46,8 @@ def test_every_quantity_is_another_picture(run, views):
     assert 0 < low < 4 < high
 
 
-@pytest.mark.parametrize("change", [{"early_stop": 0.5}, {"kept": 0.3}, {"exposure": -1}])
-def test_every_slider_changes_the_picture_and_spoils_nothing(run, change):
+@pytest.mark.parametrize("change", [{"early_stop": 0.5}, {"share": 0.3}, {"exposure": -1}])
+def test_every_slider_changes_the_image_and_spoils_nothing(run, change):
     before, changed, after = (draw(run, [], CAMERA, **c)[0] for c in ({}, change, {}))
     assert np.abs(changed.astype(int) - before).max() > 3
     np.testing.assert_array_equal(after, before)
@@ -57,12 +57,12 @@ def test_the_error_is_that_of_the_nearest_view_from_its_own_camera(run, views):
     view = views[5]
     near = replace(view.camera, pose=view.camera.pose + 1e-3 * np.eye(3, 4, 3))
     error, line = draw(run, views, near, "error")
-    photograph, name = draw(run, views, near, "photograph")
+    photo, name = draw(run, views, near, "photograph")
     assert line == f"{view.name}, error x4" and name == view.name
     rendering = to_8bit(run.render(view.camera).colour).astype(int)
-    expected = np.minimum(4 * np.abs(rendering - photograph), 255)
+    expected = np.minimum(4 * np.abs(rendering - photo), 255)
     assert np.abs(error - expected).max() <= 5  # both are rounded, four times
-    assert photograph.min() < 250 and error.max() > 5
+    assert photo.min() < 250 and error.max() > 5
     with pytest.raises(UserError, match="photographs"):
         draw(run, [], near, "error")
 
@@ -71,17 +71,17 @@ def test_fragments_are_those_of_the_pairs(run):
     camera = replace(CAMERA, width=45, height=43)  # is padded
     image, line = draw(run, [], camera, "fragments")
     view = run.renderer.forward(camera, run.gamma, until="weights")
-    hits = view.cropped(np.diff(view.pairs.pixel_offset.get().astype(int)).reshape(view.size))
-    assert line == f"0 to {hits.max()} fragments" and hits.max() > 1
-    np.testing.assert_array_equal(image, colour_scale(hits, 0, hits.max(), hits > 0))
+    fragments = view.cropped(np.diff(view.pairs.pixel_offset.get().astype(int)).reshape(view.size))
+    assert line == f"0 to {fragments.max()} fragments" and fragments.max() > 1
+    np.testing.assert_array_equal(image, colour_scale(fragments, 0, fragments.max(), fragments > 0))
 
 
 def test_the_most_opaque_points_are_kept(run):
     opacity, ids = run.model.cloud.opacity.get(), run.model.cloud.ids.get()
     fewer = most_opaque(run, 0.25).model
-    kept = fewer.cloud.opacity.get()
-    assert len(kept) == round(0.25 * len(opacity))
-    assert kept.min() >= np.sort(opacity)[-len(kept)]
+    left = fewer.cloud.opacity.get()
+    assert len(left) == round(0.25 * len(opacity))
+    assert left.min() >= np.sort(opacity)[-len(left)]
     rows = np.searchsorted(ids, fewer.cloud.ids.get())
     for whole, part in zip(run.model.cloud.sh, fewer.cloud.sh, strict=True):
         np.testing.assert_array_equal(part.get(), whole.get()[rows])

@@ -64,13 +64,13 @@ def test_cameras_points_and_a_suggested_box_are_shown(page, opened, folder):
 
 
 def test_a_view_of_two_splits_is_listed_once(served, folder):
-    """The page's list throws in the browser where two entries are equal."""
+    """The page's list throws in the browser where two items are equal."""
     shutil.copy(folder / "transforms_test.json", folder / "transforms_val.json")
     names = ScenePage(served[0], folder)._view.options
     assert len(names) == len(set(names)) == 10
 
 
-def test_a_photograph_that_exif_turns_is_upright(served, folder):
+def test_a_image_that_exif_turns_is_upright(served, folder):
     file, turned = folder / "transforms_train.json", Image.Exif()
     name = scene_frames(folder)[0].name
     data = json.loads(file.read_text())
