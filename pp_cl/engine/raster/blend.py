@@ -88,7 +88,8 @@ class BlendGradients:
     those of all other points are 0.
 
     visible_features: (S, 16). opacity: (S,). offset: (S, 4) of soft points composited by alpha, (S,
-    16) of Gaussians, through the falloff of their fragments; None if not asked for. pixel_distortion: (HW,), undefined without its weight. pair_gradient: (P, 2), by pair of a
+    16) of Gaussians, through the falloff of their fragments; None if not asked for.
+    pixel_distortion: (HW,), undefined without its weight. pair_gradient: (P, 2), by pair of a
     visible point the blend weight b and what the fragment adds to dL/dopacity, both 0 where it is
     dropped or not tracked.
     """
