@@ -56,7 +56,7 @@ ALWAYS_INLINE ints count_fragments(const Camera *cam, const Footprints *f) {
     ints fragments = 0;
     for (int row = 0; row < f->rows; row++)
         for (int column = 0; column < f->columns; column++)
-            fragments += footprints_test(f, &rim, column, row).fragment & 1;
+            fragments += footprints_test(f, &rim, column, row).covers & 1;
     return fragments;
 }
 
