@@ -4,7 +4,7 @@
 // footprints_box()  their shape, and the pixels that they may cover: the first and last along x and
 //                   y; false if none of those that are kept covers any
 // footprints_rim()  what follows from place and shape for all pixels
-// footprints_cover()  whether they fragment a pixel (px, py) each, with d and depth
+// footprints_cover()  whether they cover a pixel (px, py) each, with d and depth
 //
 // Beside them a header has surface_range() for depth.cl, the distance from the eye where a ray
 // meets the surface for which a point stands, and constants of blending and shading; where points

@@ -90,8 +90,12 @@ ALWAYS_INLINE Rim footprints_rim(const Camera *cam, const Footprints *f) {
 // Differs from Pulsar, whose distance from the ray is that at the centre's range, whose depth is
 // that of the sphere's front, up to a radius nearer, and whose d varies within every footprint of
 // at least a pixel.
-ALWAYS_INLINE ints
-disc_hit(const Footprints *f, const Rim *rim, const floats px, const floats py, floats *distance2) {
+ALWAYS_INLINE ints disc_covers(
+    const Footprints *f,
+    const Rim *rim,
+    const floats px,
+    const floats py,
+    floats *distance2) {
 #pragma OPENCL FP_CONTRACT OFF
     const floats mx = (px + rim->left) * rim->per_fx, my = (py + rim->top) * rim->per_fy;
     const floats m2 = mx * mx + my * my + 1.0f;

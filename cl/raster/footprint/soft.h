@@ -5,8 +5,8 @@ ALWAYS_INLINE Coverage
 footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {
 #pragma OPENCL FP_CONTRACT OFF
     floats distance2;
-    const ints fragment = disc_hit(f, rim, px, py, &distance2);
-    return (Coverage){fragment, 1.0f - sqrt(distance2) * rim->per_reach, f->t};
+    const ints covers = disc_covers(f, rim, px, py, &distance2);
+    return (Coverage){covers, 1.0f - sqrt(distance2) * rim->per_reach, f->t};
 }
 
 // The surface is that of the ball. d: at the rim a rounding below 0.
