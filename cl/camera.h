@@ -9,7 +9,7 @@ typedef struct {
     float fx, fy, cx, cy;  // pixels; the centre of pixel (x, y) is (x + 0.5, y + 0.5)
     float near, far;       // Euclidean distance from the eye
     int width, height;
-    float samples;  // of Gaussians: pixels of a viewer's picture, each way, whose mean a pixel is
+    float samples;  // of Gaussians: pixels of a viewer's rendering, each way, whose mean a pixel is
 } Camera;
 
 static inline Camera camera_load(global const float *c) {

@@ -1,7 +1,7 @@
-// Rows of what points learn of their places and sizes, from one buffer of OFFSETS floats a point: the
-// offset from the vertex of the grid, in edges, and the logarithm of the radius. Of Gaussians in place
-// of that the triangle L of the covariance L L^T, in deviations of one without offsets: the logarithms
-// of its diagonal, then (1, 0), (2, 0) and (2, 1), then zeros.
+// Rows of what points learn of their places and sizes, from one buffer of OFFSETS floats a point:
+// the offset from the vertex of the grid, in voxel sizes, and the logarithm of the radius. Of
+// Gaussians in place of that the triangle L of the covariance L L^T, in deviations of one without
+// offsets: the logarithms of its diagonal, then (1, 0), (2, 0) and (2, 1), then zeros.
 #ifndef PP_CLOUD_H
 #define PP_CLOUD_H
 

@@ -25,7 +25,7 @@
 // 16 channels of one pixel or point
 #define CHANNELS 16
 
-#define BACKGROUND 1.0f  // every feature of a pixel without hits
+#define BACKGROUND 1.0f  // every feature of a pixel without fragments
 
 // The upper half of a 16-vector lane by lane, for (float8)(...): Oclgrind 21.10 takes lane 11 of a
 // shuffle for undefined.

@@ -1,6 +1,6 @@
-// The regular grid of the points, read from one buffer of 8 floats: origin x, y, z; edge; nx, ny,
-// nz; 0. pp_cl/engine/grid.py writes it, and numbers the vertices alike: brick by brick, bricks and
-// the vertices in each x first. World coordinates count from a centre near the points.
+// The regular grid of the points, read from one buffer of 8 floats: origin x, y, z; voxel size; nx,
+// ny, nz; 0. pp_cl/engine/grid.py writes it, and numbers the vertices alike: brick by brick, bricks
+// and the vertices in each x first. World coordinates count from a centre near the points.
 #ifndef PP_GRID_H
 #define PP_GRID_H
 

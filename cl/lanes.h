@@ -27,10 +27,10 @@
 #define BATCH (LANES == 16 ? 1 : 4)
 #endif
 
-// Asks for what lies at a global address before it is read, on CPUs, where walks over hits and
-// points wait mostly for what lies anywhere in memory. They look so many hits or points ahead. A
-// simulator that cannot defines it as (void), too; NVIDIA's compiler takes no pointer for it.
-#define HITS_AHEAD 32
+// Asks for what lies at a global address before it is read, on CPUs, where walks over fragments and
+// points wait mostly for what lies anywhere in memory. They look so many fragments or points ahead.
+// A simulator that cannot defines it as (void), too; NVIDIA's compiler takes no pointer for it.
+#define FRAGMENTS_AHEAD 32
 #define POINTS_AHEAD 8
 #if LANES == 16 && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)

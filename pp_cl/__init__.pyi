@@ -3,7 +3,7 @@ from .drivers import separate_devices as separate_devices
 from .engine.camera import Camera as Camera
 from .errors import UserError as UserError
 from .evaluate import evaluate_run as evaluate_run
-from .files.picture import Picture as Picture
+from .files.rendered_view import RenderedView as RenderedView
 from .files.run_folder import RunFolder as RunFolder
 from .run import Run as Run
 from .run import find_run as find_run

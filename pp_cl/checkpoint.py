@@ -24,7 +24,7 @@ from pp_cl.errors import Diverged, UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.files.untrusted import opened_zip, refusal, strict_json
-from pp_cl.scene.identity import kept_views
+from pp_cl.scene.identity import unpacked_views
 from pp_cl.settings import Config
 
 FORMAT = 3  # raised when the arrays change meaning
@@ -52,7 +52,7 @@ def save_checkpoint(path: Path, header: dict[str, Any], arrays: Arrays) -> None:
     if len(text) > MOST_HEADER:
         raise UserError(
             f"{path}: its header would have {len(text)} bytes, more than the {MOST_HEADER} that are"
-            " read; train on fewer photographs"
+            " read; train on fewer images"
         )
     is_finished = header.get("finished", False)
     with atomic_file(path, noted=False) as file, zipfile.ZipFile(file, "w") as archive:
@@ -107,10 +107,10 @@ class Checkpoint:
 
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
         self.path, self._archive = path, archive
-        entries = archive.infolist()
-        if sum(entry.file_size for entry in entries) > path.stat().st_size:
+        members = archive.infolist()
+        if sum(info.file_size for info in members) > path.stat().st_size:
             raise ValueError("it unfolds to more than the file holds")
-        self.forms = {entry.filename.removesuffix(".npy"): self._form(entry) for entry in entries}
+        self.forms = {info.filename.removesuffix(".npy"): self._form(info) for info in members}
         text = self.forms.pop("header", None)
         if text is None or text.dtype != np.uint8 or math.prod(text.shape) > MOST_HEADER:
             raise ValueError("it has no header")
@@ -121,14 +121,14 @@ class Checkpoint:
             found = quoted(self.header.get("format"), 40)
             raise UserError(f"{path}: format {found}, this version reads {FORMAT}; train again")
 
-    def _form(self, entry):
+    def _form(self, info):
         """The Form of an array, which is as large as its part of the file."""
-        with self._archive.open(entry) as member:
+        with self._archive.open(info) as member:
             if np.lib.format.read_magic(member) != (1, 0):  # others have headers of up to 4 GiB
                 raise ValueError("holds an array of another version than 1.0")
             shape, _, dtype = np.lib.format.read_array_header_1_0(member)
-            if member.tell() + math.prod(shape) * dtype.itemsize != entry.file_size:
-                raise ValueError(f"{shown(entry.filename, 40)} is not as large as {shape} {dtype}")
+            if member.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
+                raise ValueError(f"{shown(info.filename, 40)} is not as large as {shape} {dtype}")
         return Form(shape, dtype)
 
     def _read(self, name):
@@ -204,11 +204,11 @@ def _problem_of_header(header, steps):
     if not 1 <= header["step"] <= steps:
         return f"it is of step {shown(str(header['step']))}, of {steps} in its config.json"
     try:
-        views, grid = kept_views(header["views"]), Grid.of_header(header["grid"])
+        views, grid = unpacked_views(header["views"]), Grid.of_header(header["grid"])
         near, far = header["depth_range"]
         sound = (
-            all(abs(x) < MOST_LENGTH for x in (*grid.origin, grid.edge, near, far))
-            and grid.edge > 0 <= near < far
+            all(abs(x) < MOST_LENGTH for x in (*grid.origin, grid.voxel_size, near, far))
+            and grid.voxel_size > 0 <= near < far
             and [type(n) for n in grid.dims] == [int, int, int]
             and min(grid.dims) > 0
             and grid.id_count <= MOST_IDS
@@ -256,8 +256,8 @@ def _views_with_gains(header, config):
     """
     views = len(header["views"]) - len(header.get("left_out", []))
     begun = header.get("extended_from", 0)
-    is_kept = "exposed" in header or header["step"] < decided_at(begun, views)
-    return views if is_kept and config.train.exposure != "off" else 0
+    has_gains = "exposed" in header or header["step"] < decided_at(begun, views)
+    return views if has_gains and config.train.exposure != "off" else 0
 
 
 def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> dict[str, Form]:

@@ -25,7 +25,7 @@ MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
-OPEN = ("train.refine_at", "raster.radius")  # that a training decides where they are 0
+AUTOMATIC = ("train.refine_at", "raster.radius")  # which a training chooses itself where they are 0
 MEND_SETTINGS = "restore it or start a new run"
 
 
@@ -182,7 +182,7 @@ def begin_with(
     length = "train.minutes" if config.train.minutes else "train.iterations"
     asked = {key for key, _, _ in given}
     left_out = set(LENGTH) if asked & set(LENGTH) else set(LENGTH) - {length}
-    left_out |= {*config.decided}
+    left_out |= {*config.automatic}
     settings = [
         (key, getattr(section, item.name), f"--config {path}")
         for key, section, item in every_setting(config)
@@ -208,22 +208,22 @@ def load_config(path: Path | str) -> Config:
     if not isinstance(stored, dict):
         raise broken(f"not settings but {quoted(stored, 40)}")
     number, name = stored.pop("format", None), stored.pop("preset", None)
-    decided = stored.pop("decided", [])
+    automatic = stored.pop("automatic", [])
     if type(number) is not int or number != FORMAT:
         raise UserError(
             f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
         )
     if type(name) is not str or name not in PRESETS:
         raise broken(f"key preset is missing or none of {', '.join(PRESETS)}")
-    if not isinstance(decided, list) or not all(key in OPEN for key in decided):
-        raise broken(f"decided is {quoted(decided, 40)}, no list of {', '.join(OPEN)}")
+    if not isinstance(automatic, list) or not all(key in AUTOMATIC for key in automatic):
+        raise broken(f"automatic is {quoted(automatic, 40)}, no list of {', '.join(AUTOMATIC)}")
     found: dict[str, Any] = {}
     for section, values in stored.items():
         if not isinstance(values, dict):
             raise broken(f"{shown(section, 40)} is no section of settings")
         found |= {f"{section}.{key}": value for key, value in values.items()}
     config = preset(name)
-    config.decided = decided
+    config.automatic = automatic
     for key, section, item in every_setting(config):
         if key not in found:
             raise broken(f"{key} is missing")
@@ -314,8 +314,9 @@ def run_config(
         return _resumed(folder, stored, scene, given)
     if not stored or other_preset:
         return scene_config(scene, preset_name or "tiny", given)
-    # a training that was stopped before its first checkpoint: what its images decided is open again
-    for key in stored.decided:
+    # a training that was stopped before its first checkpoint: what its images automatic is open
+    # again
+    for key in stored.automatic:
         assign(stored, key, field_of(key).default, "preset")
     if "train.iterations" in [key for key, _, _ in given]:
         stored.train.minutes = 0

@@ -43,7 +43,7 @@ BROKEN_CAMERA = "a camera that is broken"  # why of an Unusable
 
 
 class Diverged(UserError):
-    """A training has come to numbers that are none. The message says where."""
+    """The loss or an image of a training is no longer finite. The message says where."""
 
 
 class BuildError(RuntimeError):
@@ -92,7 +92,7 @@ def quoted(value: object, most: int = 100) -> str:
         return f"a {type(value).__name__}"
 
 
-def listing(names: Sequence[str]) -> str:
+def few_names(names: Sequence[str]) -> str:
     """A few of the names, and how many more there are."""
     more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     return ", ".join(names[:NAMES_SHOWN]) + more

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View
 from pp_cl.files.atomic import own, remove_ours, write_json
-from pp_cl.files.image import image_files, write_png
+from pp_cl.files.image import image_paths, write_png
 from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
 from pp_cl.metrics.published import differences, published_rows
@@ -63,7 +63,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
     RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former. Where the
-    run's photographs had gains, views are also measured after the best ones, exposed_alike().
+    run's images had gains, views are also measured after the best ones, exposed_alike().
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
     place of what an earlier evaluation left. A progress bar shows on a terminal. Raises UserError
@@ -74,7 +74,7 @@ def evaluate(
     target = run.folder.evaluation(split) if out is None else Path(out)
     scene = run.scene(split)
     views = scene.splits[split]
-    images = [target / "images" / file for file in image_files([view.name for view in views])]
+    images = [target / "images" / file for file in image_paths([view.name for view in views])]
     measure = Metrics(run.dev, metrics)
     written = [target / "metrics.json", target / "comparison.png", *(images if save_images else [])]
     own(target, written, "move it away, or choose another --out", alone=out is not None)

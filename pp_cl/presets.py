@@ -48,7 +48,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.sh_smoothing": 0.0,
         "train.ema": False,
         "train.mask_weight": 0.0,
-        "train.spread_weight": 0.0,
+        "train.distortion_weight": 0.0,
         "train.prune_every": 500,
         "train.refine_at": (1.0, 1.0),
         "train.checkpoint_every": 5000,

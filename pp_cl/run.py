@@ -24,14 +24,14 @@ from pp_cl.engine.training.schedule import gamma_at
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.files.picture import Picture, mean_picture
+from pp_cl.files.rendered_view import RenderedView, mean_rendered_view
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.scene.identity import difference, kept_views
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.identity import difference, unpacked_views
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.load import DEMO, Scene, list_split, open_scene, scene_format, scene_frames
 from pp_cl.settings import Config
 
-COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
+COMPARED_VIEWS = 2  # training images that tell whether a scene is the run's
 NEAREST = 0.05  # of a point to the eye, in radii of the object
 
 
@@ -64,10 +64,10 @@ class Run:
         """
         check_scene(self.config.scene.path)
         scene = open_scene(self.dev, self.config, (split,))
-        self._compare(lambda: scene.splits.get("train") or self._some_photographs())
+        self._compare(lambda: scene.splits.get("train") or self._some_views())
         return scene
 
-    def _some_photographs(self):
+    def _some_views(self):
         if not self.header["pixels"]:
             return []
         return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
@@ -80,7 +80,7 @@ class Run:
         try:
             views = read()
             # views that were dropped or taken back since change no result
-            told = difference(header, list_split(path, edited=False).photographs, views)
+            told = difference(header, list_split(path, edited=False).image_files, views)
         except UserError as error:
             warnings.warn(
                 f"{path}: cannot be compared with the scene of {self.folder} ({error})",
@@ -93,12 +93,12 @@ class Run:
                 " where its own is with --scene"
             )
 
-    def photographs(self, split: str) -> list[Photograph]:
+    def image_files(self, split: str) -> list[ImageFile]:
         """A split's views without their pixels. The run itself keeps those of train; for others
         raises UserError where the scene is missing, broken, or another one by names and cameras.
         """
         if split == "train":
-            return kept_views(self.header["views"])
+            return unpacked_views(self.header["views"])
         check_scene(self.config.scene.path)
         listed = scene_frames(self.config.scene.path, split)
         self._compare(list)
@@ -109,17 +109,17 @@ class Run:
         scene is not there.
         """
         downscale = self.config.scene.downscale
-        return [one.camera.downscaled(downscale) for one in self.photographs(split)]
+        return [one.camera.downscaled(downscale) for one in self.image_files(split)]
 
-    def rendered(self, photographs: Sequence[Photograph], *, opaque: bool) -> list[View]:
+    def rendered(self, image_files: Sequence[ImageFile], *, opaque: bool) -> list[View]:
         """Views at the resolution of the run whose images are its own renderings. opaque: over
         white, as it was trained; else straight RGBA. A progress bar shows on a terminal.
         """
         views = []
-        for one in tqdm(photographs, "rendering", unit="view", leave=False, disable=None):
+        for one in tqdm(image_files, "rendering", unit="view", leave=False, disable=None):
             camera = one.camera.downscaled(self.config.scene.downscale)
-            picture = self.render(camera)
-            image = _over_white(picture) if opaque else picture.rgba()
+            rendered = self.render(camera)
+            image = _over_white(rendered) if opaque else rendered.rgba()
             views.append(View(one.name, camera, to_8bit(image), one.depth_range))
         return views
 
@@ -130,7 +130,7 @@ class Run:
         """
         points = self.model.positions()
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
-        radius = np.linalg.norm(points - centre, axis=1).max() + self.model.grid.edge
+        radius = np.linalg.norm(points - centre, axis=1).max() + self.model.grid.voxel_size
         return centre, float(radius)
 
     def render(
@@ -140,7 +140,7 @@ class Run:
         samples: int = 1,
         features: bool = False,
         early_stop: float | None = None,
-    ) -> Picture:
+    ) -> RenderedView:
         """The model as the camera sees it. samples: it is the mean of so many images, a square
         number, shifted by fractions of a pixel. features: with the network's input. early_stop: in
         place of raster.early_stop. Raises ValueError for another number of samples, UserError where
@@ -151,7 +151,7 @@ class Run:
             raise ValueError(f"{samples} samples are no square number")
         shifts = (np.arange(side) + 0.5) / side - 0.5
         depths = self.depth_range(camera)
-        picture = mean_picture(
+        rendered = mean_rendered_view(
             rendered_picture(
                 self.renderer,
                 camera.shifted(dx, dy),
@@ -163,8 +163,8 @@ class Run:
             for dy in shifts
             for dx in shifts
         )
-        self.checked(picture.colour)
-        return picture
+        self.checked(rendered.colour)
+        return rendered
 
     @property
     def nearest(self) -> float:
@@ -191,8 +191,8 @@ class Run:
         return max(distance - radius, self.nearest), distance + radius
 
 
-def _over_white(picture):
-    return np.pad(picture.colour, ((0, 0), (0, 0), (0, 1)), constant_values=1)
+def _over_white(rendered):
+    return np.pad(rendered.colour, ((0, 0), (0, 0), (0, 1)), constant_values=1)
 
 
 def rendered_picture(
@@ -202,7 +202,7 @@ def rendered_picture(
     *,
     with_features: bool = False,
     **options: Any,
-) -> Picture:
+) -> RenderedView:
     """Colour, alpha and depth of a camera; with its features where asked for. options: of
     Renderer.forward().
     """
@@ -211,7 +211,7 @@ def rendered_picture(
         arrays = depth_forward(dev, result.points, result.pairs, result.weights, result.size)
     alpha, depth, median = (result.cropped(dev.download(array)) for array in arrays)
     features = result.cropped(dev.download(result.features)) if with_features else None
-    return Picture(result.clamped(), alpha, depth, median, features=features)
+    return RenderedView(result.clamped(), alpha, depth, median, features=features)
 
 
 def scene_is_there(path: str) -> bool:

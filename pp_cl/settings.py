@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-FORMAT = 1  # of config.json: raised when keys are added, change meaning or are removed
+FORMAT = 2  # of config.json: raised when keys are added, change meaning or are removed
 BLOCKS = ("double", "single", "gated")  # what a level of the network computes
 
 
@@ -167,7 +167,7 @@ class TrainConfig:
         0,
         1e3,
     )
-    spread_weight: float = setting(
+    distortion_weight: float = setting(
         0.6,
         "weight of the distortion loss: how far a pixel's blend weights lie apart along its ray, as"
         " a share of the grid's diagonal; rises from 0 during training; needs raster.blend=alpha"
@@ -255,10 +255,10 @@ class TrainConfig:
 
 @dataclass
 class Config:
-    """All settings of a run. decided: those of OPEN that nobody has set."""
+    """All settings of a run. automatic: those of AUTOMATIC that were 0."""
 
     preset: str = "tiny"
-    decided: list[str] = field(default_factory=list)
+    automatic: list[str] = field(default_factory=list)
     scene: SceneConfig = field(default_factory=SceneConfig)
     points: PointsConfig = field(default_factory=PointsConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
@@ -266,7 +266,7 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def to_json(self) -> str:
-        """The settings as JSON text: {"format": FORMAT, "preset": name, "decided": keys,
+        """The settings as JSON text: {"format": FORMAT, "preset": name, "automatic": keys,
         section: {name: value}}.
         """
         return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)

@@ -1,4 +1,4 @@
-"""Camera paths: around an object (orbit, spiral), made from the cameras of its photographs, and
+"""Camera paths: around an object (orbit, spiral), made from the cameras of its images, and
 through given cameras.
 """
 
@@ -14,7 +14,7 @@ from pp_cl import Camera
 from pp_cl.scene import looked_at, up_of
 
 MARGIN = 0.95  # of the image that the object may fill
-HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles a picture would spin
+HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles an image would spin
 TURNS = 2  # of a spiral
 NEIGHBOURS = 4  # of a camera, in whose directions another lies between()
 SAMPLED_POINTS = 20_000
@@ -23,7 +23,7 @@ SAMPLED_POINTS = 20_000
 class Surroundings:
     """Where cameras were around an object.
 
-    cameras: those of the photographs. points: (N, 3), world positions of the object's points.
+    cameras: those of the images. points: (N, 3), world positions of the object's points.
     """
 
     def __init__(self, cameras: Sequence[Camera], points: np.ndarray):
@@ -39,21 +39,21 @@ class Surroundings:
         self._aside = np.cross(self.up, self._ahead)
 
     def orbit(self, camera: Camera, frames: int) -> list[Camera]:
-        """A circle at the photographs' median elevation that begins where the first of them was
+        """A circle at the images' median elevation that begins where the first of them was
         taken; the last frame is one step before the first. camera: size and angle of view.
         """
         angles = 2 * math.pi * np.arange(frames) / frames
         return self._around(camera, angles, np.full(frames, np.median(self.elevations)))
 
     def spiral(self, camera: Camera, frames: int) -> list[Camera]:
-        """Two turns from the lowest tenth of the photographs' elevations to the highest."""
+        """Two turns from the lowest tenth of the images' elevations to the highest."""
         low, high = np.quantile(self.elevations, [0.1, 0.9])
         angles = TURNS * 2 * math.pi * np.arange(frames) / frames
         return self._around(camera, angles, np.linspace(low, high, frames))
 
     def _around(self, camera, angles, elevations):
         """Cameras at these angles that look at the centre, from one distance: that of the
-        photographs, or farther where the object would be cut off.
+        images, or farther where the object would be cut off.
         """
         offsets = [
             math.cos(e) * (math.cos(a) * self._ahead + math.sin(a) * self._aside)

@@ -1,4 +1,4 @@
-"""Films from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF and WebP with
+"""Videos from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF and WebP with
 Pillow.
 """
 
@@ -14,8 +14,8 @@ from pp_cl.files import atomic_path
 
 LOOPED = ("gif", "webp")  # as pages show without a player
 FORMATS = ("mp4", "webm", *LOOPED)
-MOST_FRAMES = 100_000  # of a film for pages
-# players take films without tags for BT.601 or BT.709 by their size; sRGB's primaries are BT.709's
+MOST_FRAMES = 100_000  # of a video for pages
+# players take videos without tags for BT.601 or BT.709 by their size; sRGB's primaries are BT.709's
 CONVERTED = "scale=out_color_matrix=bt709:out_range=tv"
 TAGGED = "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 COLOURS = ["-vf", f"{CONVERTED},{TAGGED}"]
@@ -25,7 +25,9 @@ MISSING = (
 
 
 def check_video(suffix: str) -> None:
-    """Raise UserError with the command that mends it where a film of this format cannot be made."""
+    """Raise UserError with the command that mends it where a video of this format cannot be
+    made.
+    """
     if suffix in LOOPED:
         return
     try:
@@ -38,7 +40,7 @@ def check_video(suffix: str) -> None:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write a film of uint8 frames of one size, (H, W, 3), or (H, W, 4) with straight alpha, which
+    """Write a video of uint8 frames of one size, (H, W, 3), or (H, W, 4) with straight alpha, which
     WebM keeps; atomically. An odd side is extended by a copy of its last row or column, as video
     needs even ones.
 
@@ -53,7 +55,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
 def _write_looped(path, frames, fps):
     images = map(Image.fromarray, frames)
-    # whole units, whose sum is off by less than one wherever the film ends
+    # whole units, whose sum is off by less than one wherever the video ends
     unit = 10 if path.suffix.lower() == ".gif" else 1
     ends = [round(i * 1000 / fps / unit) for i in range(MOST_FRAMES + 1)]
     durations = [unit * (end - start) for start, end in pairwise(ends)]
@@ -62,7 +64,7 @@ def _write_looped(path, frames, fps):
 
 
 def _write(path, frames, fps):
-    """Raises OSError where the film is not whole: imageio says nothing of a full disk."""
+    """Raises OSError where the video is not whole: imageio says nothing of a full disk."""
     import imageio.v2 as imageio
     from imageio_ffmpeg import count_frames_and_secs
 

@@ -54,15 +54,15 @@ def cache_of_its_own(tmp_path_factory):
     """What drivers showed the user stays unread: a cache folder for the session, with nothing in
     it but the weights of LPIPS.
     """
-    kept = cache_folder() / WEIGHTS_FILE
+    cached = cache_folder() / WEIGHTS_FILE
     folder = tmp_path_factory.mktemp("cache")
     lent = folder / WEIGHTS_FILE
-    if kept.exists():
-        lent.symlink_to(kept.resolve())
+    if cached.exists():
+        lent.symlink_to(cached.resolve())
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PP_CACHE", str(folder))
         yield
-    if lent.exists() and not lent.is_symlink() and not kept.exists():  # fetched by a test
+    if lent.exists() and not lent.is_symlink() and not cached.exists():  # fetched by a test
         shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
 
 

@@ -33,16 +33,16 @@ def test_a_run_alone_is_exported(alone, tmp_path):
 
 
 def test_a_run_alone_says_what_is_in_it(alone, tmp_path, capsys):
-    picture = tmp_path / "points.png"
-    assert main(["info", str(alone), "--picture", str(picture), "--json"]) == 0
+    sheet = tmp_path / "points.png"
+    assert main(["info", str(alone), "--picture", str(sheet), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["grid"]["edge_pixels"] > 0 and not found["scene_is_there"]
+    assert found["grid"]["voxel_size_pixels"] > 0 and not found["scene_is_there"]
     assert found["views"] == {"count": 8, "images": {"48x48": 8}}
     assert found["files"]["checkpoint.npz"] == (alone / "checkpoint.npz").stat().st_size
     assert sum(found["files"].values()) == sum(
         file.stat().st_size for file in alone.rglob("*") if file.is_file() and file.name[0] != "."
     )
-    image = read_rgba(picture)[..., :3]
+    image = read_rgba(sheet)[..., :3]
     drawn = (image == OUTLINE).all(-1)
     assert drawn.any() and image[~drawn].std() > 20, "the outline lies over renderings"
     assert main(["info", str(alone)]) == 0

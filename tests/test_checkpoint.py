@@ -57,7 +57,7 @@ def config():
 def rewritten(path, change, form=zipfile.ZIP_STORED):
     """Write the members of a checkpoint anew: change({name: bytes}) -> the same."""
     with zipfile.ZipFile(path) as old:
-        members = {entry.filename: old.read(entry) for entry in old.infolist()}
+        members = {zip_info.filename: old.read(zip_info) for zip_info in old.infolist()}
     with zipfile.ZipFile(path, "w", form) as new:
         for name, data in change(members).items():
             new.writestr(name, data)
@@ -84,7 +84,7 @@ def test_equal_content_gives_equal_bytes(dev, tmp_path):
         save_checkpoint(tmp_path / f"{name}.npz", {"step": 3}, arrays)
     assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
     with zipfile.ZipFile(tmp_path / "a.npz") as stored:  # zlib's bytes could change with a version
-        assert {entry.compress_type for entry in stored.infolist()} == {zipfile.ZIP_STORED}
+        assert {zip_info.compress_type for zip_info in stored.infolist()} == {zipfile.ZIP_STORED}
 
 
 def test_forms_and_single_arrays_are_read_without_the_others(folder, config):
@@ -189,7 +189,7 @@ HEADERS = {
     "no vertices": {"grid": HEADER["grid"] | {"dims": [9, 8, 0]}},
     "dims that are no whole numbers": {"grid": HEADER["grid"] | {"dims": [9.0, 8, 7]}},
     "more vertices than ids": {"grid": HEADER["grid"] | {"dims": [2**20, 2**20, 2]}},
-    "a grid without an edge": {"grid": {"origin": [0, 0, 0], "dims": [9, 8, 7]}},
+    "a grid without a voxel size": {"grid": {"origin": [0, 0, 0], "dims": [9, 8, 7]}},
     "a list for a grid": {"grid": [1, 2]},
     "step as a text": {"step": "50"},
     "step past the end": {"step": 10**9},

@@ -12,7 +12,7 @@ from support.runs import arguments, rows
 
 from pp_cl.engine.training.optim import Optimiser
 
-KEPT = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"
+SAVED = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"
 # {what happens: (the step after which, to what, other settings, what is said)}
 DIVERGENCES = {
     "points": (15, "points", {}, "the loss is not finite at step 16 (loss, l1, ssim, psnr)"),
@@ -31,7 +31,7 @@ def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
     _poison(monkeypatch, after, what)
     monkeypatch.setattr("pp_cl.session.training.PREVIEWS", 3 if case == "preview" else 1)
     line = failure(*arguments(scene, tmp_path / "run", **settings))
-    assert words in line and KEPT in line and str(tmp_path / "run") in line
+    assert words in line and SAVED in line and str(tmp_path / "run") in line
     header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
     assert header["step"] == 10 and all(np.isfinite(a).all() for a in arrays.values())
     logged = rows(tmp_path / "run")

@@ -1,4 +1,4 @@
-"""Evaluation: the file it writes, the pictures, and that it measures what it shows."""
+"""Evaluation: the file it writes, the images, and that it measures what it shows."""
 
 import json
 import shutil
@@ -34,12 +34,12 @@ def test_the_files_hold_what_was_measured_and_shown(run, capsys):
     assert len(values) == 2 and result["mean"]["psnr"] == pytest.approx(np.mean(values))
     scene = json.loads((run / "config.json").read_text())["scene"]["path"]
     for i, value in enumerate(values):
-        picture = np.asarray(Image.open(run / "eval" / "images" / f"r_{i}.png").convert("RGB"))
+        image = np.asarray(Image.open(run / "eval" / "images" / f"r_{i}.png").convert("RGB"))
         rgba = read_rgba(f"{scene}/test/r_{i}.png").astype(np.float64) / 255
         over_white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
         truth = np.rint(255 * over_white.reshape(30, 2, 30, 2, 3).mean((1, 3))).astype(np.uint8)
-        assert picture.shape == (30, 30, 3)
-        assert psnr(picture, truth) == pytest.approx(value, abs=0.02)
+        assert image.shape == (30, 30, 3)
+        assert psnr(image, truth) == pytest.approx(value, abs=0.02)
     assert main(["eval", str(run), "--split", "train", "--save-images"]) == 0
     assert len(json.loads((run / "eval" / "train" / "metrics.json").read_text())["per_image"]) == 8
     assert len(list((run / "eval" / "train" / "images").iterdir())) == 8
@@ -63,7 +63,7 @@ def test_what_an_earlier_evaluation_left_goes_with_the_next(run):
 
 
 def changed_scene(run, tmp_path, split, name):
-    """(copy of the run's scene in which a pixel of a photograph differs)."""
+    """(copy of the run's scene in which a pixel of an image differs)."""
     scene = json.loads((run / "config.json").read_text())["scene"]["path"]
     shutil.copytree(scene, tmp_path / "ball")
     pixels = np.array(Image.open(tmp_path / "ball" / split / name))

@@ -61,7 +61,7 @@ def test_exact_moves_give_the_same_bits(at_origin, far):
     for name, array in arrays.items():
         assert np.array_equal(array, expected_arrays[name]), name
     grid, other = header["grid"], expected["grid"]
-    assert (grid["edge"], grid["dims"]) == (other["edge"], other["dims"])
+    assert (grid["voxel_size"], grid["dims"]) == (other["voxel_size"], other["dims"])
     assert (np.subtract(grid["origin"], other["origin"]) == FAR).all()  # the world's, exactly
     assert header["depth_range"] == expected["depth_range"]
 
@@ -93,11 +93,11 @@ def test_exported_points_keep_their_places_in_the_world(far_run, tmp_path):
 def test_exported_splats_keep_their_places_in_the_world(far_run, tmp_path):
     table, origin = splats(far_run, np.eye(3), 60)
     write_splat_glb(tmp_path / "a.glb", table, origin)
-    edge = far_run.model.grid.edge
+    voxel_size = far_run.model.grid.voxel_size
     vertices = far_run.model.grid.positions(far_run.model.cloud.ids.get())
     away, _ = cKDTree(vertices).query(glb_points(tmp_path / "a.glb"), p=np.inf)
-    assert away.max() < (MOST_OF_GAUSSIANS + 1e-3) * edge < 1e-6 * np.abs(origin).max()
-    assert np.median(away) < edge / 2
+    assert away.max() < (MOST_OF_GAUSSIANS + 1e-3) * voxel_size < 1e-6 * np.abs(origin).max()
+    assert np.median(away) < voxel_size / 2
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb"])

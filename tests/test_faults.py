@@ -174,7 +174,7 @@ def test_a_process_that_is_killed(bench, name, part):
 
 
 @pytest.mark.parametrize("name", ["training that goes on", "evaluation"])
-def test_photographs_that_are_gone(bench, name):
+def test_images_that_are_gone(bench, name):
     begin, words, _ = bench.commands[name]
     restore(bench.run, begin)
     before, scene = content(bench.run), bench.run.parent / "scene"

@@ -108,7 +108,9 @@ def carve(device, views):
     hull, cameras = build_grid(device, views, 300), [view.camera for view in views]
     near, far = depth_range(views, hull)
     assert 0 <= near < far < math.inf and np.float32(near) < np.float32(far)
-    assert 0 < spacing_pixels(hull.grid, cameras) < math.inf and np.float32(hull.grid.edge) > 0
+    assert (
+        0 < spacing_pixels(hull.grid, cameras) < math.inf and np.float32(hull.grid.voxel_size) > 0
+    )
     check_finite(grid=hull.grid.packed(hull.grid.centre))
     check_finite(camera=cameras[0].packed((near, far), hull.grid.centre))
     return hull
@@ -156,12 +158,12 @@ def test_sparse_points_and_edits(world, data):
             assert points.shape == colours.shape == (len(points), 3) and colours.dtype == np.uint8
 
 
-def picture(draw, folder):
+def drawn_image(draw, folder):
     """(a new image file of some kind, its RGBA where the kind keeps it without loss)."""
     width, height = one(draw, (8, 8), (1, 1), (13, 7))
     noise = np.random.default_rng(draw(st.integers(0, 9))).integers(0, 256, (height, width, 4))
     kind = one(draw, "PNG", "PNG", "PNG", "JPEG", "WEBP", "EXR", "EXR")
-    file = folder / f"picture.{kind.lower()}"
+    file = folder / f"image.{kind.lower()}"
     if kind == "EXR":
         names = one(draw, "RGBA", "RGB", "Y", "YA", "Z", ("left.R", "left.G", "left.B", "A"))
         values = (noise[..., 0] + 1) / 256 * one(draw, 1, 1, 1e4, -1, math.nan, math.inf)
@@ -183,7 +185,7 @@ def picture(draw, folder):
 def test_an_image(world, data):
     """Other pixels than its own are nothing to go on with."""
     with world.watched() as folder:
-        file, pixels = picture(data.draw, folder)
+        file, pixels = drawn_image(data.draw, folder)
         how, whole = one(data.draw, "bytes", "bytes", "chunks", "whole"), file.read_bytes()
         if how == "chunks" and file.suffix == ".png":
             file.write_bytes(damage.damaged_png(data.draw, whole))
@@ -206,7 +208,7 @@ def test_an_image(world, data):
 @fuzzed()
 @given(data=st.data())
 def test_a_mask(world, data):
-    """Of a file, and by colour, of a photograph with or without an object."""
+    """Of a file, and by colour, of an image with or without an object."""
     draw = data.draw
     with world.watched() as folder:
         image, file = ball_views()["train"][0].image, folder / "a.png"
@@ -282,7 +284,7 @@ def check_state(header, arrays):
     assert (np.diff(ids) > 0).all() and (grid.coordinates(ids) < grid.dims).all()
     assert len(ids) == len(arrays["points.opacity"]) > 0
     near, far = header["depth_range"]
-    assert 0 <= near < far < math.inf and 0 < header["grid"]["edge"] < math.inf
+    assert 0 <= near < far < math.inf and 0 < header["grid"]["voxel_size"] < math.inf
     check_finite(**arrays)
 
 

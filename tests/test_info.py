@@ -1,4 +1,4 @@
-"""`pp-cl info`: what a run or a scene is, and the picture of its points."""
+"""`pp-cl info`: what a run or a scene is, and the image of its points."""
 
 import json
 import math
@@ -52,8 +52,8 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
     }
     assert found["grid"]["dims"] == header["grid"]["dims"]
     # 24 pixels across, angle of view 0.7, from a distance of 4
-    pixels = 12 / math.tan(0.35) * header["grid"]["edge"] / 4
-    assert found["grid"]["edge_pixels"] == pytest.approx(pixels, rel=0.02)
+    pixels = 12 / math.tan(0.35) * header["grid"]["voxel_size"] / 4
+    assert found["grid"]["voxel_size_pixels"] == pytest.approx(pixels, rel=0.02)
     assert found["files"]["checkpoint.npz"] == (finished / "checkpoint.npz").stat().st_size
     assert found["device"] == log[-1]["device"] and found["seconds"] == log[-1]["seconds"]
     assert found["psnr"] == log[-2]["psnr"]
@@ -87,9 +87,9 @@ def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts):
     old.rename(new)
     assert facts(run)["grid"] == before["grid"]
     assert f"{old}: the run's scene is not there; say where with --scene" in failure("eval", run)
-    picture = ("--picture", tmp_path / "points.png")
+    sheet = ("--picture", tmp_path / "points.png")
     assert facts(run, "--scene", new)["grid"] == before["grid"]
-    assert facts(run, "--scene", new, *picture)["picture"] == str(tmp_path / "points.png")
+    assert facts(run, "--scene", new, *sheet)["picture"] == str(tmp_path / "points.png")
     assert main(["eval", str(run), "--metrics", "psnr", "--scene", str(new)]) == 0
     again = json.loads((run / "eval" / "metrics.json").read_text())
     assert again["per_image"] == metrics["per_image"]
@@ -121,7 +121,7 @@ def test_a_scene_says_what_is_in_it(scene, facts):
     assert (np.abs(hull["box"]) < 1.5 * BALL).all()
 
 
-def test_a_scene_without_hull_has_a_picture(tmp_path, facts, capsys):
+def test_a_scene_without_hull_has_an_image(tmp_path, facts, capsys):
     scene = Path(write_ball_scene(tmp_path / "ball", views=5))
     *others, last = (scene / "train").iterdir()
     pixels = np.array(Image.open(last))
@@ -143,13 +143,13 @@ def test_a_scene_without_hull_has_a_picture(tmp_path, facts, capsys):
 
 
 def outlined(path, tile):
-    """(48, 48) bool: where a tile of a picture has the outline's colour."""
+    """(48, 48) bool: where a cell of a sheet has the outline's colour."""
     row, column = divmod(tile, 4)
     y, x = HEADER + row * (48 + HEADER + GAP), column * (48 + GAP)
     return (read_rgba(path)[y : y + 48, x : x + 48, :3] == OUTLINE).all(-1)
 
 
-def test_the_picture_draws_the_points_around_the_object(scene, tmp_path, capsys):
+def test_the_image_draws_the_points_around_the_object(scene, tmp_path, capsys):
     path, subject = tmp_path / "points.png", tmp_path / "run"
     assert main(arguments(scene, subject, train__iterations=2, train__prune_weight=0)) == 0
     assert main(["info", str(subject), "--picture", str(path)]) == 0

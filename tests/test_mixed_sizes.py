@@ -1,4 +1,4 @@
-"""Scenes whose photographs differ in size: every command takes them."""
+"""Scenes whose images differ in size: every command takes them."""
 
 import json
 
@@ -17,7 +17,7 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import load_scene, scene_frames
 from pp_cl.scene.readers.transforms import write_scene
-from pp_cl.session.memory import Room
+from pp_cl.session.memory import MemoryPlan
 
 SIZES = ((48, 48), (37, 29), (24, 40))
 
@@ -82,7 +82,7 @@ def test_it_is_rendered_shown_and_exported(trained, tmp_path):
         assert main(words) == 0
 
 
-def test_a_film_of_different_sizes_is_refused(trained):
+def test_a_video_of_different_sizes_is_refused(trained):
     told = failure("render", trained, "--path", "test", "--format", "mp4")
     assert "--path test: its images differ in size" in told
     assert not (trained / "render").exists()
@@ -99,6 +99,6 @@ def test_memory_is_planned_for_the_largest(dev, scene):
     frames = scene_frames(scene)
     orders = frames, frames[::-1], [max(frames, key=lambda one: one.camera.width)] * len(frames)
     mixed, turned, largest = (
-        Room(config, net, order).need_of(hull.grid, len(hull.ids), (2, 6)) for order in orders
+        MemoryPlan(config, net, order).need_of(hull.grid, len(hull.ids), (2, 6)) for order in orders
     )
     assert mixed == turned and 0.9 * largest.device < mixed.device <= largest.device

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pp_cl.files.picture import Picture
+from pp_cl.files.rendered_view import RenderedView
 
 NOTEBOOK = Path(__file__).parents[1] / "docs" / "tour.ipynb"
 
 
 @pytest.mark.slow
-def test_the_notebook_makes_a_film_and_a_page(tmp_path, monkeypatch):
+def test_the_notebook_makes_a_video_and_a_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
     sources = ["".join(c["source"]) for c in cells if c["cell_type"] == "code"]
@@ -26,7 +26,7 @@ def test_the_notebook_makes_a_film_and_a_page(tmp_path, monkeypatch):
             shown.append(eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names))  # noqa: S307
         else:
             exec(compile(ast.Module([last], []), str(NOTEBOOK), "exec"), names)  # noqa: S102
-    assert isinstance(shown[0], Picture) and set(shown[1]) == {"psnr", "ssim"}
-    with Image.open(tmp_path / "runs/tour/film.gif") as film:
-        assert film.n_frames == 24 and film.size == (200, 200)
+    assert isinstance(shown[0], RenderedView) and set(shown[1]) == {"psnr", "ssim"}
+    with Image.open(tmp_path / "runs/tour/video.gif") as video:
+        assert video.n_frames == 24 and video.size == (200, 200)
     assert (tmp_path / "runs/tour/view.html").stat().st_size > 1e5

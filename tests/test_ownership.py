@@ -15,7 +15,7 @@ from support.sweeps import jobs_of, pretend, words_of
 from pp_cl.cli import main
 from pp_studio.export import FORMATS
 
-FILM = ["render", "run", "--seconds", "0.2", "--fps", "10"]
+VIDEO = ["render", "run", "--seconds", "0.2", "--fps", "10"]
 OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
 RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--blend", "alpha"]
 # of a small window, for which splats are fitted faster
@@ -25,7 +25,7 @@ EXPORT = {
 }
 # what writes by a mechanism of its own: a run, an evaluation, a file, a folder, a page, a table
 ONE_EACH = (
-    *("train", "eval", "eval elsewhere", "film elsewhere", "frames", "export html"),
+    *("train", "eval", "eval elsewhere", "video elsewhere", "frames", "export html"),
     *("export ply elsewhere", "export scene elsewhere", "info", "sweep"),
 )
 # {name: (words, BALL stands for a scene; files that the words name, which may be replaced)}
@@ -35,11 +35,11 @@ COMMANDS = {
     "eval of a split": (["eval", "run", "--save-images", "--split", "train"], ()),
     "eval elsewhere": (["eval", "run", "--save-images", "--out", "there"], ()),
     "eval in JSON": (["eval", "run", "--json", "a.json"], ("a.json",)),
-    "film": (FILM, ()),
-    "film elsewhere": ([*FILM, "--out", "a.gif"], ("a.gif",)),
-    "mp4 elsewhere": ([*FILM, "--out", "a.mp4"], ("a.mp4",)),
-    "frames": ([*FILM, "--format", "png"], ()),
-    "frames elsewhere": ([*FILM, "--format", "exr", "--out", "there"], ()),
+    "video": (VIDEO, ()),
+    "video elsewhere": ([*VIDEO, "--out", "a.gif"], ("a.gif",)),
+    "mp4 elsewhere": ([*VIDEO, "--out", "a.mp4"], ("a.mp4",)),
+    "frames": ([*VIDEO, "--format", "png"], ()),
+    "frames elsewhere": ([*VIDEO, "--format", "exr", "--out", "there"], ()),
     **{f"export {name}": (words, ()) for name, words in EXPORT.items()},
     **{
         f"export {name} elsewhere": ([*EXPORT[name], "--out", f"a{end}"], named)
@@ -100,11 +100,11 @@ def test_what_is_the_users_stays(work, scene, name, capsys):
     others = ("mine.png", "notes.txt", ".own.txt", "step_999999.png", ".lock", ".a.7.tmp")
     beside = made([folder / other for folder in folders for other in others], work)
 
-    def again(kept):
+    def again(earlier):
         status, lines = spoken(words)
         told = [line for line in lines if line.startswith("pp-cl: ")]
         assert (status, len(told)) in ((0, 0), (2, 1)), lines
-        assert {path: files(work).get(path) for path in kept} == kept
+        assert {path: files(work).get(path) for path in earlier} == earlier
 
     again(beside)
     new = [path for path, there in written.items() if before.get(path) != there]

@@ -58,7 +58,10 @@ def test_a_refined_run_is_compared_on_its_last_grid(dev, scene, mesh, tmp_path):
     changes = {"train__refine_at": "0.3,1", "points__count": 300}
     facts = run_shape(dev, RunFolder(train(scene, tmp_path / "run", **changes)), mesh, 40_000)
     hull = build_grid(dev, load_scene(scene).splits["train"], 300)
-    assert facts["grid"] == {"dims": [2 * n for n in hull.grid.dims], "edge": hull.grid.edge / 2}
+    assert facts["grid"] == {
+        "dims": [2 * n for n in hull.grid.dims],
+        "voxel_size": hull.grid.voxel_size / 2,
+    }
     assert facts["before"]["points"] == 8 * len(hull.ids) > facts["after"]["points"]
     assert facts["before"]["recall"] > 0.8
 

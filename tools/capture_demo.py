@@ -2,7 +2,7 @@
 scene agree with the true ones.
 
     python -m tools.capture_demo photographs FOLDER     # FOLDER/images and FOLDER/masks
-    python -m tools.capture_demo film FILM.mp4          # the camera moves around the object
+    python -m tools.capture_demo video VIDEO.mp4        # the camera moves around the object
     python -m tools.capture_demo turntable FOLDER       # the object turns, camera and wall stay
     python -m tools.capture_demo compare SCENE KIND     # a scene made of one of these
 """
@@ -29,7 +29,7 @@ from pp_studio.video import write_video
 WIDER = 1.6  # angle of view, so that the room is seen around the object
 ROOM = 6.0  # radius of the room, world units; the cameras are 3.4 from its middle
 TURNED, STEPS = 0.35, 72  # elevation of the turntable's camera, radians; photographs of a turn
-FILM_FRAMES, FPS, ROUNDS = 240, 24, 2
+VIDEO_FRAMES, FPS, ROUNDS = 240, 24, 2
 NOISE_CELLS, OCTAVES = 48, (1.5, 4.0, 10.0)  # cells per world unit of each layer of noise
 
 
@@ -45,13 +45,13 @@ class Alignment:
 
 def cameras(size: int, kind: str = "photographs") -> list[Camera]:
     """Where the photographs are taken, with a wider angle of view: the demo's training cameras;
-    those of a turntable, around the object that turns and fills the image; or those of a film of
+    those of a turntable, around the object that turns and fills the image; or those of a video of
     16:9.
     """
     if kind == "turntable":
         return [_around(turn, TURNED, size, size, ANGLE) for turn in np.arange(STEPS) / STEPS]
-    if kind == "film":
-        shares = np.arange(FILM_FRAMES) / FILM_FRAMES
+    if kind == "video":
+        shares = np.arange(VIDEO_FRAMES) / VIDEO_FRAMES
         return [_around(ROUNDS * s, 0.9 * s, size, size * 9 // 32 * 2) for s in shares]
     found = [frame.camera for frame in demo_frames("train", size)]
     angle = 2 * np.arctan(0.5 * size / found[0].fx)
@@ -132,7 +132,7 @@ def compare(folder: Path, kind: str) -> tuple[int, Alignment]:
 
 def main() -> int:
     """Returns the exit status."""
-    kinds = ["photographs", "film", "turntable"]
+    kinds = ["photographs", "video", "turntable"]
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("task", choices=[*kinds, "compare"])
     parser.add_argument("path", type=Path)
@@ -144,8 +144,8 @@ def main() -> int:
             count, found = compare(options.path, options.kind)
             print(f"{count} images; positions off by {found.position:.5f} world units (RMS),")
             print(f"directions by at most {found.degrees:.3f} degrees")
-        elif options.task == "film":
-            taken = photographs(open_device(), options.size, "film")
+        elif options.task == "video":
+            taken = photographs(open_device(), options.size, "video")
             write_video(options.path, (to_8bit(colours) for colours, _ in taken), FPS)
         else:
             write_photographs(open_device(), options.path, options.size, options.task)

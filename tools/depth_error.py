@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 from pp_cl import load
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.grid import Grid, smallest_edge
+from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.run import Run
@@ -32,7 +32,7 @@ class DemoSurface:
 
     def __init__(self, dev: Device):
         box = np.array(OBJECT_BOX)
-        self.grid = Grid.centred_in(box, smallest_edge(box, CELLS))
+        self.grid = Grid.centred_in(box, smallest_voxel_size(box, CELLS))
         self.field = distances(dev, self.grid)
 
     def depth(self, camera: Camera) -> np.ndarray:
@@ -45,14 +45,14 @@ class DemoSurface:
         travelled = np.full(lengths.shape, np.linalg.norm(camera.eye) - 1.5)
         for _ in range(STEPS):
             distance, inside = self._at(camera.eye + directions * travelled[..., None])
-            travelled += np.where(inside, distance, self.grid.edge)
+            travelled += np.where(inside, distance, self.grid.voxel_size)
         distance, inside = self._at(camera.eye + directions * travelled[..., None])
-        hit = inside & (np.abs(distance) < 0.2 * self.grid.edge)
+        hit = inside & (np.abs(distance) < 0.2 * self.grid.voxel_size)
         return np.where(hit, travelled / lengths, np.inf)
 
     def _at(self, points):
         """(distances, inside of the field) of world positions (..., 3)."""
-        places = (points - self.grid.origin) / self.grid.edge
+        places = (points - self.grid.origin) / self.grid.voxel_size
         inside = ((places >= 0) & (places <= np.array(self.grid.dims) - 1)).all(axis=-1)
         return map_coordinates(self.field, places.T[::-1].swapaxes(1, 2), order=1), inside
 
@@ -86,14 +86,14 @@ def depth_error(run: Run) -> DepthError:
         raise UserError(f"{run.folder}: is no run of the demo, whose depth alone is known exactly")
     surface, rows = DemoSurface(run.dev), []
     for view in run.scene("test").splits["test"]:
-        picture, k = run.render(view.camera), view.downscale
+        rendered, k = run.render(view.camera), view.downscale
         stored = view.image[..., 3].reshape(view.camera.height, k, view.camera.width, k)
         mask = stored.mean(axis=(1, 3)) > 127.5
         exact = surface.depth(view.camera)
-        seen, most = mask & np.isfinite(exact), NEAR * run.model.grid.edge
-        depths = picture.depth, picture.median_depth
+        seen, most = mask & np.isfinite(exact), NEAR * run.model.grid.voxel_size
+        depths = rendered.depth, rendered.median_depth
         shares = [near_share(depth, exact, seen, most) for depth in depths]
-        rows.append((*shares, overlap(picture.alpha > 0.5, mask)))
+        rows.append((*shares, overlap(rendered.alpha > 0.5, mask)))
     return DepthError(*np.mean(rows, axis=0).tolist())
 
 

@@ -148,7 +148,7 @@ def api() -> str:
             thing = getattr(module, one)
             first = seen.setdefault(id(thing), name)
             known = [f"- `{one}`: see {first}"]
-            lines += _entry(one, thing, told) if first == name else known
+            lines += _described(one, thing, told) if first == name else known
         lines += [""]
     return "\n".join(line.rstrip() for line in lines).rstrip()
 
@@ -167,7 +167,9 @@ def _first_sentence(text: str | None) -> str:
     return re.split(r"(?<=\.)\s", paragraph)[0]
 
 
-def _entry(name: str, thing: Any, told: Callable[[str | None], str], indent: str = "") -> list[str]:
+def _described(
+    name: str, thing: Any, told: Callable[[str | None], str], indent: str = ""
+) -> list[str]:
     """The lines of a name: a constant, a type, a function, or a class with its public methods."""
     if not (inspect.isroutine(thing) or inspect.isclass(thing)):
         if isinstance(thing, (int, str)):
@@ -187,7 +189,9 @@ def _entry(name: str, thing: Any, told: Callable[[str | None], str], indent: str
                 text = textwrap.indent(told(function.__doc__), f"{indent}    ").strip()
                 lines.append(f"{indent}  - `.{own}: {returned}`: {text}")
             elif isinstance(member, (classmethod, staticmethod)) or inspect.isfunction(member):
-                lines += _entry(f".{own}", getattr(member, "__func__", member), told, f"{indent}  ")
+                lines += _described(
+                    f".{own}", getattr(member, "__func__", member), told, f"{indent}  "
+                )
     return lines
 
 

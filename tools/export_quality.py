@@ -26,7 +26,7 @@ EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances
 
 
 def mesh_rows(run: Run) -> list[dict]:
-    """Distances of meshes to the exact surface and back, in grid edges."""
+    """Distances of meshes to the exact surface and back, in voxel sizes."""
     cameras = run.cameras("train")
     views = [(camera, run.render(camera)) for camera in cameras]
     means = [(camera, replace(p, median_depth=p.depth)) for camera, p in views]
@@ -46,7 +46,7 @@ def _opacities(run, grid):
     """(nz, ny, nx) opacities on a grid, 0 where there is no point."""
     dense = np.zeros(grid.dims[::-1], np.float32)
     positions = run.model.positions()
-    i, j, k = np.rint((positions - np.asarray(grid.origin)) / grid.edge).astype(int).T
+    i, j, k = np.rint((positions - np.asarray(grid.origin)) / grid.voxel_size).astype(int).T
     dense[k, j, i] = run.model.cloud.opacity.get()
     return dense
 
@@ -54,15 +54,15 @@ def _opacities(run, grid):
 def _measured(field, grid, exact, surface):
     """A row of the surface where a field is 0, positive outside. surface: tree of exact points."""
     vertices, faces, _, _ = marching_cubes(field, 0, gradient_direction="ascent")
-    corners = (np.asarray(grid.origin) + grid.edge * vertices[:, ::-1])[faces]
+    corners = (np.asarray(grid.origin) + grid.voxel_size * vertices[:, ::-1])[faces]
     sides = corners[:, 1:] - corners[:, :1]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     rng = np.random.default_rng(0)
     chosen = rng.choice(len(faces), SAMPLES, p=area / area.sum())
     points = (rng.dirichlet((1, 1, 1), SAMPLES)[..., None] * corners[chosen]).sum(1)
-    at = (points - np.asarray(EXACT.origin)) / EXACT.edge
-    away = np.abs(map_coordinates(exact, at[:, ::-1].T, order=1, mode="nearest")) / grid.edge
-    back = cKDTree(points).query(surface.data)[0] / grid.edge
+    at = (points - np.asarray(EXACT.origin)) / EXACT.voxel_size
+    away = np.abs(map_coordinates(exact, at[:, ::-1].T, order=1, mode="nearest")) / grid.voxel_size
+    back = cKDTree(points).query(surface.data)[0] / grid.voxel_size
     return {
         "mean": round(float(away.mean()), 2),
         "median": round(float(np.median(away)), 2),
@@ -99,8 +99,8 @@ def _drawn(run, coefficients, cameras):
     positions = run.model.positions()
     drawn = []
     for seen in observe(run, cameras, "drawing", blending=True):
-        at = basis(directions(positions[seen.shaded], seen.camera))[:, : coefficients.shape[1]]
-        colours, rest = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[seen.shaded]))
+        at = basis(directions(positions[seen.visible], seen.camera))[:, : coefficients.shape[1]]
+        colours, rest = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[seen.visible]))
         image = colours + rest[:, None]
         drawn.append(to_8bit(image.reshape(seen.camera.height, seen.camera.width, 3)))
     return drawn

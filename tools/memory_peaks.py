@@ -78,7 +78,7 @@ def peaks(name: str, scene: str) -> dict:
         training = open_training(dev, folder, config, None)
         training.run()
     host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    need, host_need = training.room.need, training.room.host_bytes
+    need, host_need = training.memory_plan.need, training.memory_plan.host_bytes
     return {
         "name": name,
         "points": need.points,

@@ -168,9 +168,9 @@ def run_program(*words: object) -> None:
         raise UserError(f"{' '.join(map(str, words[1:]))}: {done.stderr[-2000:].strip()}")
 
 
-def read_found(kept: Path, *words: object) -> dict:
+def read_found(store: Path, *words: object) -> dict:
     """What a program writes with --json."""
-    file = kept / "found"
+    file = store / "found"
     run_program(*words, "--json", file)
     return json.loads(file.read_text("utf-8"))
 
@@ -183,11 +183,11 @@ def key_of(training: Training) -> str:
     return f"{name}_{training.steps}" if training.steps else name
 
 
-def train(training: Training, kept: Path) -> dict:
+def train(training: Training, store: Path) -> dict:
     """A row of QUALITY."""
-    run, scene = kept / key_of(training), scene_of(training.scene)
+    run, scene = store / key_of(training), scene_of(training.scene)
     if training.is_captured:
-        scene, photographs = kept / f"{key_of(training)}_scene", scene
+        scene, photographs = store / f"{key_of(training)}_scene", scene
         run_program(*PP_CL, "capture", photographs, "--out", scene)
     words = ["--preset", training.preset, "--out", run]
     if training.steps:
@@ -196,8 +196,8 @@ def train(training: Training, kept: Path) -> dict:
         words += ["--downscale", training.downscale]
     run_program(*PP_CL, "train", scene, *words)
     words = ["--scene", scene_of(training.test)] if training.test else []
-    found = read_found(kept, *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
-    about = read_found(kept, *PP_CL, "info", run)
+    found = read_found(store, *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
+    about = read_found(store, *PP_CL, "info", run)
     (size,) = about["views"]["images"]
     width, height = (int(side) // about["downscale"] for side in size.split("x"))
     return {
@@ -214,7 +214,7 @@ def train(training: Training, kept: Path) -> dict:
     }
 
 
-def rasteriser(kept: Path) -> list[dict]:
+def rasteriser(store: Path) -> list[dict]:
     """Rows of RASTERISER."""
     rows = []
     for scene, points, sizes in (
@@ -222,7 +222,7 @@ def rasteriser(kept: Path) -> list[dict]:
         ("pulsar", "100000", "400,800"),
     ):
         words = ["--scene", scene, "--points", points, "--size", sizes]
-        rows += read_found(kept, *PP_CL, "bench", "raster", *words)["rows"]
+        rows += read_found(store, *PP_CL, "bench", "raster", *words)["rows"]
     return [by_stage(row) for row in rows]
 
 
@@ -231,35 +231,35 @@ def by_stage(row: dict) -> dict:
     return row | {f"{stage}_ms": row["stages_ms"].get(stage, 0) for stage in FORWARD}
 
 
-def network(kept: Path) -> list[dict]:
+def network(store: Path) -> list[dict]:
     """Rows of NETWORK: the paper's network, and that of the other presets."""
     rows = []
     for (widths, side), blocks in zip(NETWORKS, ("double", "single"), strict=True):
         words = ["--widths", widths, "--size", side, "--blocks", blocks]
-        found = read_found(kept, *PP_CL, "bench", "unet", *words)["rows"]
+        found = read_found(store, *PP_CL, "bench", "unet", *words)["rows"]
         # auto is one of the others, and which are fast depends on the device
         found = [row for row in found if row["variant"] in ("direct", "auto")]
         rows += [row | {"widths": widths, "side": side} for row in found]
     return rows
 
 
-def pytorch(kept: Path) -> list[dict]:
+def pytorch(store: Path) -> list[dict]:
     """Rows of PYTORCH: the paper's network and a narrow one, both of double blocks."""
     rows = []
     for widths, side in NETWORKS:
         for variant in ("direct", "auto"):
             words = ("--widths", widths, "--size", side, "--variant", variant)
-            found = read_found(kept, *TOOL, "tools.compare_torch", *words)
+            found = read_found(store, *TOOL, "tools.compare_torch", *words)
             times = {f"{p}_{key}": found[p][key] for p in ("forward", "train") for key in found[p]}
             rows.append(found | times | {"widths": widths})
     return rows
 
 
-def stages(kept: Path) -> dict[str, dict]:
+def stages(store: Path) -> dict[str, dict]:
     """{preset: what tools/stages.py says}."""
-    words = {name: (scene_of(LEGO), "--out", kept / run) for name, run in STEPS.items()}
+    words = {name: (scene_of(LEGO), "--out", store / run) for name, run in STEPS.items()}
     words["paper"] += ("--preset", "paper")
-    return {name: read_found(kept, *TOOL, "tools.stages", *w) for name, w in words.items()}
+    return {name: read_found(store, *TOOL, "tools.stages", *w) for name, w in words.items()}
 
 
 def by_preset(found: dict) -> list[dict]:
@@ -273,21 +273,21 @@ def by_preset(found: dict) -> list[dict]:
     return list(rows.values())
 
 
-def memory(kept: Path) -> list[dict]:
+def memory(store: Path) -> list[dict]:
     """Rows of MEMORY."""
-    return read_found(kept, *TOOL, "tools.memory_peaks")
+    return read_found(store, *TOOL, "tools.memory_peaks")
 
 
-def demo(kept: Path) -> list[dict]:
+def demo(store: Path) -> list[dict]:
     """Rows of DEMO: depth, mesh and page of the demo's runs."""
     rows = []
-    short, long = (kept / key_of(training) for training in TRAININGS[:2])
+    short, long = (store / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
-        found = read_found(kept, *TOOL, "tools.depth_error", run)
+        found = read_found(store, *TOOL, "tools.depth_error", run)
         shares = f"median {found['median']:.1%}, mean {found['mean']:.1%}"
         rows.append({"what": f"depths within 1.5 spacings, {steps} steps", "result": shares})
         rows.append({"what": f"IoU of alpha, {steps} steps", "result": f"{found['overlap']:.3f}"})
-    found = read_found(kept, *TOOL, "tools.export_quality", short)
+    found = read_found(store, *TOOL, "tools.export_quality", short)
     mesh = next(row for row in found["mesh"] if "as exported" in row["field"])
     page = next(row for row in found["page"] if "as exported" in row["what"])
     near = f"{mesh['mean']} on average, median {mesh['median']}"
@@ -356,20 +356,20 @@ def origin() -> dict[str, str]:
     }
 
 
-def begin(kept: Path, commit: str) -> None:
+def begin(store: Path, commit: str) -> None:
     """Make the folder of what is kept, empty if what is in it is of another commit."""
-    mark = kept / "commit"
+    mark = store / "commit"
     if not (mark.exists() and mark.read_text("utf-8") == commit):
-        shutil.rmtree(kept, ignore_errors=True)
-        kept.mkdir(parents=True)
+        shutil.rmtree(store, ignore_errors=True)
+        store.mkdir(parents=True)
         mark.write_text(commit, "utf-8")
 
 
-def measure(kept: Path, name: str) -> Found:
+def measure(store: Path, name: str) -> Found:
     """What a part found, now or before."""
-    file = kept / f"{name}.json"
+    file = store / f"{name}.json"
     if not file.exists():
-        write_json(file, PARTS[name](kept))
+        write_json(file, PARTS[name](store))
     return json.loads(file.read_text("utf-8"))
 
 
@@ -483,11 +483,11 @@ def plot_speed(axes: "Axes", timed: list[dict]) -> None:
     axes.minorticks_off()
 
 
-def films(kept: Path, folder: Path) -> None:
-    """Films around the demo and around a real object, for README.md."""
-    for name, run in (("demo", "demo_1500"), ("film", "ethiopian_head_6000")):
+def videos(store: Path, folder: Path) -> None:
+    """Videos around the demo and around a real object, for README.md."""
+    for name, run in (("demo", "demo_1500"), ("video", "ethiopian_head_6000")):
         look = ("--size", "320x320", "--seconds", 5, "--fps", 12, "--out", folder / f"{name}.webp")
-        run_program(*PP_CL, "render", kept / run, *look)
+        run_program(*PP_CL, "render", store / run, *look)
 
 
 def main() -> int:
@@ -496,13 +496,13 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
     parser.add_argument("--kind", default="", metavar="NAME")
     options = parser.parse_args()
-    kept = ROOT / "runs" / "-".join(filter(None, ("results", options.kind)))
+    store = ROOT / "runs" / "-".join(filter(None, ("results", options.kind)))
     try:
         about = origin()
-        begin(kept, about["commit"])
+        begin(store, about["commit"])
         for name in options.only:
-            measure(kept, name)
-        found = {name: measure(kept, name) for name in PARTS if (kept / f"{name}.json").exists()}
+            measure(store, name)
+        found = {name: measure(store, name) for name in PARTS if (store / f"{name}.json").exists()}
     except UserError as error:
         print(f"results: {error}", file=sys.stderr)
         return 2
@@ -514,7 +514,7 @@ def main() -> int:
             write_json(folder / f"{name}.json", about | contents)
     if is_whole and not options.kind:
         draw(trained(found), timed(found), ROOT / "docs")
-        films(kept, ROOT / "docs")
+        videos(store, ROOT / "docs")
     return 0
 
 

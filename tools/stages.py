@@ -19,7 +19,7 @@ from pp_cl.config import run_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.network.layers import multiplications
 from pp_cl.engine.network.unet import UNet
-from pp_cl.engine.raster.weights import listed_hits
+from pp_cl.engine.raster.weights import listed_fragments
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
@@ -30,18 +30,18 @@ UNTIMED, TIMED = 4, 15  # steps; the first ones build kernels and grow buffers
 WORD, ROW = 4, 64  # bytes of a number, and of a point's or pixel's 16 features
 
 
-def least_bytes(n: int, visible: int, hits: int, front: int, pixels: int, sh: int) -> dict:
+def least_bytes(n: int, visible: int, fragments: int, front: int, pixels: int, sh: int) -> dict:
     """{stage: bytes that it reads or writes once}.
 
-    n: points. visible: those with a hit before the early stop. hits: pairs of a point and a pixel.
-    front: hits before the early stop. sh: bytes of a point's SH coefficients.
+    n: points. visible: those with a fragment before the early stop. fragments: pairs of a point and
+    a pixel. front: fragments before the early stop. sh: bytes of a point's SH coefficients.
     """
     cloud = 5 * WORD  # id and offset
     projected = 8 * WORD  # axes, box, count, radius
     moved = 5 * WORD  # gradient; parameter and second moment, read and written
     return {
         "project": n * (cloud + WORD) + visible * projected,
-        "pairs": visible * projected + hits * 5 * WORD + pixels * WORD,
+        "pairs": visible * projected + fragments * 5 * WORD + pixels * WORD,
         "weights": front * (2 + 2 + 1 + 2 + 1) * WORD,
         "shade": visible * (sh + ROW),
         "blend": front * 2 * WORD + visible * ROW + pixels * ROW,
@@ -56,8 +56,8 @@ def least_bytes(n: int, visible: int, hits: int, front: int, pixels: int, sh: in
 def counts(result) -> dict:
     """The arguments of least_bytes() that a rendered view decides."""
     pairs, weights = result.pairs, result.weights
-    front = int(listed_hits(pairs, weights)[0].sum())
-    shown = {"visible": weights.shaded.size, "hits": pairs.total, "front": front}
+    front = int(listed_fragments(pairs, weights)[0].sum())
+    shown = {"visible": weights.visible.size, "fragments": pairs.total, "front": front}
     return shown | {"n": pairs.points, "pixels": pairs.pixels}
 
 

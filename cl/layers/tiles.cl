@@ -25,9 +25,9 @@ kernel void tiles_find(
     flags[tile] = other;
 }
 
-// One work-item per tile: reads where the hits of its pixels begin, writes 1 if any pixel has hits,
-// else 0.
-kernel void tiles_hit(
+// One work-item per tile: reads where the fragments of its pixels begin, writes 1 if any pixel has
+// fragments, else 0.
+kernel void tiles_covered(
     const int h,
     const int w,
     global const uint *pixel_offset,  // (H*W+1)
@@ -36,10 +36,10 @@ kernel void tiles_hit(
     const int tile = get_global_id(0), columns = tile_columns(w), rows = tile_columns(h);
     if (tile >= columns * rows) return;
     const int x0 = tile % columns * SIDE, y0 = tile / columns * SIDE, x1 = min(x0 + SIDE, w);
-    int hit = 0;
+    int covered = 0;
     for (int y = y0; y < min(y0 + SIDE, h); y++)
-        hit |= pixel_offset[y * w + x0] != pixel_offset[y * w + x1];
-    flags[tile] = hit;
+        covered |= pixel_offset[y * w + x0] != pixel_offset[y * w + x1];
+    flags[tile] = covered;
 }
 
 // One work-item per (LANES channels, pixel of a tile, copy): writes the pixel of the tile `to` as

@@ -30,7 +30,7 @@ kernel void sample_surface(
     const uint nz,
     const uint words,              // words per row
     global const ulong *area_end,  // (TRIANGLES) areas of the triangles up to and with this one
-    global const float4 *corners,  // (TRIANGLES, 3, 4) in units of the grid's edge from vertex 0
+    global const float4 *corners,  // (TRIANGLES, 3, 4) in units of the voxel size from vertex 0
     global uint *bits)             // (NY*NZ, WORDS)
 {
     const uint begin = get_global_id(0) * RUN;

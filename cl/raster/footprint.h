@@ -1,17 +1,17 @@
-// Footprints: which pixels points cover, their closeness d there (1 in the centre, 0 at the rim)
+// Footprints: which pixels points cover, their falloff d there (1 in the centre, 0 at the rim)
 // and their depth. Each kind of point is a header with the same three functions:
 //
-// footprints_box()  their shape, and the pixels that they may hit: the first and last along x and
-//                   y; false if none of those that are kept hits any
+// footprints_box()  their shape, and the pixels that they may cover: the first and last along x and
+//                   y; false if none of those that are kept covers any
 // footprints_rim()  what follows from place and shape for all pixels
-// footprints_hit()  whether they hit a pixel (px, py) each, with d and depth
+// footprints_cover()  whether they cover a pixel (px, py) each, with d and depth
 //
-// Beside them a header has surface_range() for depth.cl, the distance from the eye where a ray meets
-// the surface for which a point stands, and constants of blending and shading; where points learn
-// offsets, also the gradients of these for offset.cl.
+// Beside them a header has surface_range() for depth.cl, the distance from the eye where a ray
+// meets the surface for which a point stands, and constants of blending and shading; where points
+// learn offsets, also the gradients of these for offset.cl.
 //
-// Counting (project.cl) and filling (pairs.cl) must find the same hits, so no compiler may round
-// here in one way and there in another: FP_CONTRACT is OFF in what leads to a hit.
+// Counting (project.cl) and filling (pairs.cl) must find the same fragments, so no compiler may
+// round here in one way and there in another: FP_CONTRACT is OFF in what leads to a fragment.
 #ifndef PP_FOOTPRINT_H
 #define PP_FOOTPRINT_H
 
@@ -57,8 +57,8 @@ typedef struct {
 
 // How they cover a pixel each.
 typedef struct {
-    ints hit;  // lanes that hit are not 0
-    floats closeness, depth;
+    ints covers;  // lanes that cover it are not 0
+    floats falloff, depth;
 } Coverage;
 
 // Fills in `columns` and `rows`.
@@ -70,9 +70,9 @@ ALWAYS_INLINE void footprints_measure(Footprints *f) {
     }
 }
 
-// First and last pixel along one axis whose centres lie between two places, and `more` on each side,
-// before clipping to the image: -2 to size + 1. low, high: in pixels, less half of one; not bounded:
-// of the whole image.
+// First and last pixel along one axis whose centres lie between two places, and `more` on each
+// side, before clipping to the image: -2 to size + 1. low, high: in pixels, less half of one; not
+// bounded: of the whole image.
 ALWAYS_INLINE void pixels_between(
     const floats low,
     const floats high,
@@ -89,8 +89,8 @@ ALWAYS_INLINE void pixels_between(
 }
 
 // Whether circles around (u, z), u = x or y, come so near to the image along that axis that they
-// may hit a pixel. Their distance from the plane through the eye and one of its sides, of slope m,
-// is (u - m z) / sqrt(1 + m^2).
+// may cover a pixel. Their distance from the plane through the eye and one of its sides, of slope
+// m, is (u - m z) / sqrt(1 + m^2).
 ALWAYS_INLINE ints reaches_image(
     const floats u,
     const floats z,
@@ -124,8 +124,8 @@ ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
 ALWAYS_INLINE Coverage
 footprints_test(const Footprints *f, const Rim *rim, const int column, const int row) {
     const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
-    Coverage c = footprints_hit(f, rim, LANED(convert_float)(x), LANED(convert_float)(y));
-    c.hit &= x <= LANES_FROM(f->box[2]) & y <= LANES_FROM(f->box[3]);
+    Coverage c = footprints_cover(f, rim, LANED(convert_float)(x), LANED(convert_float)(y));
+    c.covers &= x <= LANES_FROM(f->box[2]) & y <= LANES_FROM(f->box[3]);
     return c;
 }
 

@@ -1,5 +1,6 @@
 // Lists of the keys of each pixel on CPUs, where an atomic addition takes as long as the rest of a
-// pair: the keys go into buckets, one for each stretch of the image, whose lists a core's cache holds.
+// pair: the keys go into buckets, one for each stretch of the image, whose lists a core's cache
+// holds.
 #include "common.h"
 
 #define RUN 128  // keys ranked at once by comparing all with all; longer lists are merged
@@ -15,7 +16,7 @@
 // One work-item per chunk: reads the pixels of its pairs, writes how many each bucket has of them.
 kernel void pairs_bucket_sizes(
     const uint n,                     // points
-    const uint p,                     // pairs for which there is room
+    const uint p,                     // capacity, in pairs
     const uint chunks,                // of the pairs
     const uint stretch,               // log2 of the pixels of a bucket
     global const uint *point_offset,  // (N+1)
@@ -35,7 +36,7 @@ kernel void pairs_bucket_sizes(
 // chunks before.
 kernel void pairs_bucket(
     const uint n,                     // points
-    const uint p,                     // pairs for which there is room
+    const uint p,                     // capacity, in pairs
     const uint chunks,                // of the pairs
     const uint stretch,               // log2 of the pixels of a bucket
     global const uint *point_offset,  // (N+1)
@@ -55,8 +56,8 @@ kernel void pairs_bucket(
         bucket_key[next[pair_pixel[pair] >> stretch]++] = point_key[pair];
 }
 
-// Minus the number of depths in [first, end) that are smaller than each of z. A function of vectors:
-// else PoCL splits them.
+// Minus the number of depths in [first, end) that are smaller than each of z. A function of
+// vectors: else PoCL splits them.
 ALWAYS_INLINE int16 smaller(const uint16 z, const uint *depth, const uint first, const uint end) {
     int16 found = 0;
     for (uint j = first; j < end; j++)
@@ -64,8 +65,8 @@ ALWAYS_INLINE int16 smaller(const uint16 z, const uint *depth, const uint first,
     return found;
 }
 
-// Sorts `count` <= RUN keys, which are ordered by pair, into `sorted`, which may be the same memory:
-// each key's place is the number of smaller depths, and of equal ones before it.
+// Sorts `count` <= RUN keys, which are ordered by pair, into `sorted`, which may be the same
+// memory: each key's place is the number of smaller depths, and of equal ones before it.
 static inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
     const uint16 lane = (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
     ulong run[RUN];

@@ -9,7 +9,7 @@
 // One work-item per pair: counts it at its pixel.
 kernel void pairs_count(
     const uint n,                       // points
-    const uint p,                       // pairs for which there is room
+    const uint p,                       // capacity, in pairs
     global const uint *point_offset,    // (N+1)
     global const uint *pair_pixel,      // (P)
     global volatile uint *pixel_count)  // (HW) accumulates
@@ -22,7 +22,7 @@ kernel void pairs_count(
 // One work-item per pair: writes its key into the list of its pixel, at the place that the count,
 // as it falls to 0, says. Bits of floats >= 0 sort like the floats.
 kernel void pairs_scatter(
-    const uint p,                       // pairs for which there is room
+    const uint p,                       // capacity, in pairs
     const uint hw,                      // pixels
     global const uint *pair_pixel,      // (P)
     global const uint *pixel_offset,    // (HW+1) first key of each pixel
@@ -38,7 +38,7 @@ kernel void pairs_scatter(
 
 // One work-item per key: writes it at its place within its run, RUN keys of its pixel.
 kernel void pairs_sort_runs(
-    const uint p,                     // pairs for which there is room
+    const uint p,                     // capacity, in pairs
     const uint hw,                    // pixels
     global const uint *pair_pixel,    // (P)
     global const uint *pixel_offset,  // (HW+1)
@@ -60,7 +60,7 @@ kernel void pairs_sort_runs(
 // the sorted runs of `width` keys that follow one another in `group` keys of its list. That place
 // is behind the smaller keys of all of the group's runs.
 kernel void pairs_merge_runs(
-    const uint p,      // pairs for which there is room
+    const uint p,      // capacity, in pairs
     const uint hw,     // pixels
     const uint width,  // keys of a run
     const uint group,  // keys of what becomes one run: a multiple of width, or no list has more

@@ -1,11 +1,11 @@
-// Pairs: every hit of a point in a pixel, written point by point, each with a key (depth << 32 |
-// pair). The keys then become lists, one for each pixel, sorted by depth, then by pair and so by
+// Pairs: every fragment of a point in a pixel, written point by point, each with a key (depth << 32
+// | pair). The keys then become lists, one for each pixel, sorted by depth, then by pair and so by
 // point: lists_by_bucket.cl on CPUs, lists_by_key.cl on GPUs.
 #include "common.h"
 #include "raster/footprint.h"
 
-// Pixels of a box that are tested before their hits are written, at most 32 (bits of a uint). With
-// fewer, writing alternates more often between the pairs of 16 points, which lie far apart.
+// Pixels of a box that are tested before their fragments are written, at most 32 (bits of a uint).
+// With fewer, writing alternates more often between the pairs of 16 points, which lie far apart.
 #define CELLS (LANES > 1 ? 32 : 1)
 
 // Reads the footprints of the points from `first` on, of which `count` exist; the others have empty
@@ -43,22 +43,22 @@ ALWAYS_INLINE Footprints footprints_load(
     return f;
 }
 
-// One work-item per LANES points: finds their hits again (project.cl counted them) and writes them as
-// pairs; does nothing where not all of them have room.
+// One work-item per LANES points: finds their fragments again (project.cl counted them) and writes
+// them as pairs; does nothing where not all of them have room.
 //
-// A compiler that rounds otherwise here than in project.cl finds one hit more or less of a point in
-// a million: one too many is left out, one that is missing becomes a pair without weight.
+// A compiler that rounds otherwise here than in project.cl finds one fragment more or less of a
+// point in a million: one too many is left out, one that is missing becomes a pair without weight.
 kernel void pairs_fill(
-    const uint n,                        // points
-    const uint p,                        // pairs for which there is room
-    global const float *camera,          // (21) camera.h
-    global const float4 *point_camera,   // (N, 4) x, y, z, t
-    global const float *point_shape,     // (N, SHAPE) footprint.h
-    global const ushort4 *point_box,     // (N, 4) first x, first y, last x, last y
-    global const uint *point_offset,     // (N+1) first pair of each point
-    global uint *pair_pixel,             // (P)
-    global uint2 *pair_point_closeness,  // (P, 2) point, bits of d in [0, 1]
-    global ulong *point_key)             // (P) depth << 32 | pair, by point
+    const uint n,                       // points
+    const uint p,                       // capacity, in pairs
+    global const float *camera,         // (21) camera.h
+    global const float4 *point_camera,  // (N, 4) x, y, z, t
+    global const float *point_shape,    // (N, SHAPE) footprint.h
+    global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
+    global const uint *point_offset,    // (N+1) first pair of each point
+    global uint *pair_pixel,            // (P)
+    global uint2 *pair_point_falloff,   // (P, 2) point, bits of d in [0, 1]
+    global ulong *point_key)            // (P) depth << 32 | pair, by point
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n || point_offset[n] > p) return;
@@ -76,14 +76,14 @@ kernel void pairs_fill(
     }
     int row = 0, column = 0;
     while (row < f.rows) {
-        // first a few pixels of all points, then what each point hit: its pairs lie together
-        float closeness[CELLS][LANES], depth[CELLS][LANES];
-        uint offset[CELLS], hits[LANES];
+        // first a few pixels of all points, then what each point covers: its pairs lie together
+        float falloff[CELLS][LANES], depth[CELLS][LANES];
+        uint offset[CELLS], fragments[LANES];
         uints found = 0;
         for (uint k = 0; k < CELLS && row < f.rows; k++) {
             const Coverage c = footprints_test(&f, &rim, column, row);
-            found |= select((uints)(0), (uints)(1u << k), c.hit);
-            LANES_INTO(closeness[k], c.closeness);
+            found |= select((uints)(0), (uints)(1u << k), c.covers);
+            LANES_INTO(falloff[k], c.falloff);
             LANES_INTO(depth[k], c.depth);
             offset[k] = row * cam.width + column;
             if (++column == f.columns) {
@@ -91,12 +91,12 @@ kernel void pairs_fill(
                 row++;
             }
         }
-        LANES_INTO(hits, found);
+        LANES_INTO(fragments, found);
         for (uint j = 0; j < count; j++)
-            for (uint left = hits[j]; left && next[j] < end[j]; left &= left - 1) {
+            for (uint left = fragments[j]; left && next[j] < end[j]; left &= left - 1) {
                 const uint k = 31 - clz(left & -left), pair = next[j]++;
                 pair_pixel[pair] = corner[j] + offset[k];
-                pair_point_closeness[pair] = (uint2)(first + j, as_uint(closeness[k][j]));
+                pair_point_falloff[pair] = (uint2)(first + j, as_uint(falloff[k][j]));
                 point_key[pair] = upsample(as_uint(depth[k][j]), pair);
             }
     }
@@ -104,7 +104,7 @@ kernel void pairs_fill(
         for (uint pair = next[j]; pair < end[j]; pair++) {
             const float depth = point_camera[first + j].w;
             pair_pixel[pair] = corner[j];
-            pair_point_closeness[pair] = (uint2)(first + j, as_uint(0.0f));
+            pair_point_falloff[pair] = (uint2)(first + j, as_uint(0.0f));
             point_key[pair] = upsample(as_uint(depth), pair);
         }
 }

@@ -1,5 +1,5 @@
 // Projection: points to camera axes, culling, the box of pixels that each may cover, and how many
-// pixels it hits.
+// pixels it covers.
 #include "common.h"
 #include "camera.h"
 #include "grid.h"
@@ -11,11 +11,11 @@
 // the eye.
 #define LEAST_COSINE 1e-6f
 
-// Points in world axes to camera axes, each with the box of pixels that it may hit; false if none
-// hits any, as it is for most points of a crop, and nothing else is known of them then. A point is
-// culled, with (0, 0, 0, -1) and no pixel, if it is too near or too far (measured at the sphere's
-// front, as in Pulsar), behind the eye, or not finite, for which every comparison is false. radius:
-// of the culling. form: as the kind of footprint has it.
+// Points in world axes to camera axes, each with the box of pixels that it may cover; false if none
+// covers any, as it is for most points of a crop, and nothing else is known of them then. A point
+// is culled, with (0, 0, 0, -1) and no pixel, if it is too near or too far (measured at the
+// sphere's front, as in Pulsar), behind the eye, or not finite, for which every comparison is
+// false. radius: of the culling. form: as the kind of footprint has it.
 ALWAYS_INLINE bool project(
     const Camera *cam,
     const floats x,
@@ -30,38 +30,38 @@ ALWAYS_INLINE bool project(
     f->z = cam->forward.x * vx + cam->forward.y * vy + cam->forward.z * vz;
     f->t = sqrt(f->x * f->x + f->y * f->y + f->z * f->z);
     const floats front = f->t - radius;
-    const ints kept =
+    const ints drawn =
         (front >= cam->near) & (front <= cam->far) & (f->t > 0.0f) & (f->z >= LEAST_COSINE * f->t);
     ints first[2], last[2];
-    if (!footprints_box(cam, form, kept, f, first, last)) return false;
+    if (!footprints_box(cam, form, drawn, f, first, last)) return false;
     const ints x0 = max(first[0], (ints)(0)), x1 = min(last[0], (ints)(cam->width - 1));
     const ints y0 = max(first[1], (ints)(0)), y1 = min(last[1], (ints)(cam->height - 1));
-    const ints visible = kept & (x1 >= x0) & (y1 >= y0);
-    f->x = select((floats)(0.0f), f->x, kept);
-    f->y = select((floats)(0.0f), f->y, kept);
-    f->z = select((floats)(0.0f), f->z, kept);
-    f->t = select((floats)(-1.0f), f->t, kept);
+    const ints in_image = drawn & (x1 >= x0) & (y1 >= y0);
+    f->x = select((floats)(0.0f), f->x, drawn);
+    f->y = select((floats)(0.0f), f->y, drawn);
+    f->z = select((floats)(0.0f), f->z, drawn);
+    f->t = select((floats)(-1.0f), f->t, drawn);
     // no pixel: last before first
-    LANES_INTO(f->box[0], select((ints)(1), x0, visible));
-    LANES_INTO(f->box[1], select((ints)(1), y0, visible));
-    LANES_INTO(f->box[2], select((ints)(0), x1, visible));
-    LANES_INTO(f->box[3], select((ints)(0), y1, visible));
+    LANES_INTO(f->box[0], select((ints)(1), x0, in_image));
+    LANES_INTO(f->box[1], select((ints)(1), y0, in_image));
+    LANES_INTO(f->box[2], select((ints)(0), x1, in_image));
+    LANES_INTO(f->box[3], select((ints)(0), y1, in_image));
     footprints_measure(f);
     return true;
 }
 
-// The number of pixels that each point hits, by testing all pixels of its box.
-ALWAYS_INLINE ints count_hits(const Camera *cam, const Footprints *f) {
+// The number of pixels that each point covers, by testing all pixels of its box.
+ALWAYS_INLINE ints count_fragments(const Camera *cam, const Footprints *f) {
     const Rim rim = footprints_rim(cam, f);
-    ints hits = 0;
+    ints fragments = 0;
     for (int row = 0; row < f->rows; row++)
         for (int column = 0; column < f->columns; column++)
-            hits += footprints_test(f, &rim, column, row).hit & 1;
-    return hits;
+            fragments += footprints_test(f, &rim, column, row).covers & 1;
+    return fragments;
 }
 
 // Projects `count` points and writes them from `first` on: positions in camera axes, shapes, boxes
-// and numbers of hits; of points of which none hits a pixel, only these numbers.
+// and numbers of fragments; of points of which none covers a pixel, only these numbers.
 ALWAYS_INLINE void project_points(
     const Camera *cam,
     const floats x,
@@ -82,33 +82,34 @@ ALWAYS_INLINE void project_points(
         return;
     }
     float place[4][LANES], shape[SHAPE][LANES];
-    int hits[LANES];
+    int fragments[LANES];
     LANES_INTO(place[0], f.x);
     LANES_INTO(place[1], f.y);
     LANES_INTO(place[2], f.z);
     LANES_INTO(place[3], f.t);
     GPU_UNROLLED_FOR (uint k = 0; k < SHAPE; k++)
         LANES_INTO(shape[k], f.shape[k]);
-    LANES_INTO(hits, count_hits(cam, &f));
+    LANES_INTO(fragments, count_fragments(cam, &f));
     for (uint j = 0; j < count; j++) {
         const uint i = first + j;
         point_camera[i] = (float4)(place[0][j], place[1][j], place[2][j], place[3][j]);
         GPU_UNROLLED_FOR (uint k = 0; k < SHAPE; k++)
             point_shape[SHAPE * i + k] = shape[k][j];
         point_box[i] = (ushort4)(f.box[0][j], f.box[1][j], f.box[2][j], f.box[3][j]);
-        point_count[i] = hits[j];
+        point_count[i] = fragments[j];
     }
 }
 
-// Whether all points of a brick miss the image, wherever they are in their cells. id: of one of them.
-// radius: of a point without offsets.
+// Whether all points of a brick miss the image, wherever they are in their cells. id: of one of
+// them. radius: of a point without offsets.
 ALWAYS_INLINE bool
 brick_misses(const Camera *cam, global const float *grid, const uint id, const float radius) {
-    const float half_side = 0.5f * (BRICK - 1), edge = grid[3];
+    const float half_side = 0.5f * (BRICK - 1), voxel_size = grid[3];
     const uint first = id >> 3 * BRICK_BITS << 3 * BRICK_BITS;
     const float3 corner = (float3)(grid[0], grid[1], grid[2]) - cam->eye;
-    const float3 centre = corner + edge * (convert_float3(grid_vertex(grid, first)) + half_side);
-    const float reach = 1.7321f * edge * (half_side + MOST_OFFSET);  // to a corner
+    const float3 centre =
+        corner + voxel_size * (convert_float3(grid_vertex(grid, first)) + half_side);
+    const float reach = 1.7321f * voxel_size * (half_side + MOST_OFFSET);  // to a corner
     const float pixels = LEAST_RADIUS * (length(centre) + reach) / least_focal(cam);
     const floats wide = reach + fmax(LARGEST(radius), pixels);
     const floats x = dot(cam->right, centre), y = dot(cam->down, centre);
@@ -128,7 +129,7 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
 }
 
 // One work-item per LANES points: reads their grid indices and offsets, writes their numbers of
-// hits and, if any is above 0, their camera-space positions and distances, shapes and boxes.
+// fragments and, if any is above 0, their camera-space positions and distances, shapes and boxes.
 kernel void project_grid(
     const uint n,                      // points
     global const float *camera,        // (21) camera.h

@@ -29,43 +29,43 @@
 #define LOAD_FLOAT(index, array) load_part(array, index)
 #define LOAD_HALF(index, array) load_half_part(array, index)
 
-// One work-item per part of a shaded point: reads its coefficients and where it is, writes its
+// One work-item per part of a visible point: reads its coefficients and where it is, writes its
 // features.
 kernel void shade_forward(
-    const uint s,                       // shaded points
-    global const uint *shaded,          // (S) their indices
+    const uint s,                       // visible points
+    global const uint *visible,         // (S) their indices
     global const float *camera,         // (21) camera.h
     global const float4 *point_camera,  // (N, 4) x, y, z, distance
     global const float16 *sh_0,         // (N, 1, 16)
     global const float16 *sh_1,         // (?, ?, 16) (N, 3, 16), not read at degree 0
     global const float16 *sh_2a,        // (?, ?, 16) (N, 3, 16), not read below degree 2
     global const float16 *sh_2b,        // (?, ?, 16) (N, 2, 16), not read below degree 2
-    global float16 *shaded_features)    // (?, 16) a row for each
+    global float16 *visible_features)   // (?, 16) a row for each
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
-    const uint i = shaded[g];
-    SH_READ_AHEAD(shaded[min(g + POINTS_AHEAD, s - 1)], 1)
+    const uint i = visible[g];
+    SH_READ_AHEAD(visible[min(g + POINTS_AHEAD, s - 1)], 1)
     SHADE(LOAD_FLOAT, i, features)
-    store_part(features, shaded_features, g);
+    store_part(features, visible_features, g);
 }
 
 // The same from coefficients of 16 bits.
 kernel void shade_forward_half(
-    const uint s,                       // shaded points
-    global const uint *shaded,          // (S) their indices
+    const uint s,                       // visible points
+    global const uint *visible,         // (S) their indices
     global const float *camera,         // (21) camera.h
     global const float4 *point_camera,  // (N, 4) x, y, z, distance
     global const half *sh_0,            // (N, 1, 16)
     global const half *sh_1,            // (?, ?, 16) (N, 3, 16), not read at degree 0
     global const half *sh_2a,           // (?, ?, 16) (N, 3, 16), not read below degree 2
     global const half *sh_2b,           // (?, ?, 16) (N, 2, 16), not read below degree 2
-    global float16 *shaded_features)    // (?, 16) a row for each
+    global float16 *visible_features)   // (?, 16) a row for each
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
-    const uint i = shaded[g];
-    SH_READ_AHEAD(shaded[min(g + POINTS_AHEAD, s - 1)], CHANNELS)
+    const uint i = visible[g];
+    SH_READ_AHEAD(visible[min(g + POINTS_AHEAD, s - 1)], CHANNELS)
     SHADE(LOAD_HALF, i, features)
-    store_part(features, shaded_features, g);
+    store_part(features, visible_features, g);
 }

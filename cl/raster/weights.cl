@@ -1,35 +1,36 @@
-// What follows for the points from the blend weights of their hits: each one's highest weight, by
-// which it is pruned.
+// What follows for the points from the blend weights of their fragments: each one's highest weight,
+// by which it is pruned.
 #include "common.h"
 
 // One work-item per visible point: clears its pairs, of which the pixels then write those that they
 // do not drop.
 kernel void clear_pairs(
     const uint s,                     // visible points
-    global const uint *shaded,        // (S) their indices
+    global const uint *visible,       // (S) their indices
     global const uint *point_offset,  // (N+1)
     global float2 *pair_gradient)     // (P, 2)
 {
     const uint g = get_global_id(0);
     if (g >= s) return;
-    for (uint pair = point_offset[shaded[g]]; pair < point_offset[shaded[g] + 1]; pair++)
+    for (uint pair = point_offset[visible[g]]; pair < point_offset[visible[g] + 1]; pair++)
         pair_gradient[pair] = 0.0f;
 }
 
-// One work-item per pixel: writes the weights of its `tracked` nearest hits by pair.
+// One work-item per pixel: writes the weights of its `tracked` nearest fragments by pair.
 kernel void list_weights(
-    const uint hw,                    // pixels
-    const uint tracked,               // hits of a pixel that count
-    global const uint *pixel_offset,  // (HW+1)
-    global const ulong *pair_key,     // (P) depth << 32 | pair
-    global const ulong *pixel_entry,  // (P) weight << 32 | point; no point: the list ends
-    global float2 *pair_gradient)     // (P, 2) b, 0; cleared before
+    const uint hw,                           // pixels
+    const uint tracked,                      // fragments of a pixel that count
+    global const uint *pixel_offset,         // (HW+1)
+    global const ulong *pair_key,            // (P) depth << 32 | pair
+    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
+    global float2 *pair_gradient)            // (P, 2) b, 0; cleared before
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
     const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
-    for (uint i = begin; i < begin + min(count, tracked) && (uint)pixel_entry[i] != NONE; i++) {
-        const float b = as_float((uint)(pixel_entry[i] >> 32));
+    for (uint i = begin; i < begin + min(count, tracked) && (uint)pixel_weight_point[i] != NONE;
+         i++) {
+        const float b = as_float((uint)(pixel_weight_point[i] >> 32));
         pair_gradient[(uint)pair_key[i]] = (float2)(b, 0.0f);
     }
 }
@@ -37,20 +38,20 @@ kernel void list_weights(
 // One work-item per point with a pair: sums the weights of its pairs, keeps the sum if it is the
 // highest so far, and counts the view if the sum is at least `least`.
 kernel void record_weights(
-    const uint n,                         // points
-    const float least,                    // weight of a point that counts as seen
-    global const uint *point_offset,      // (N+1)
-    global const uchar *point_is_shaded,  // (N) 1: not all of its pairs are dropped
-    global const float2 *pair_gradient,   // (P, 2) b first; read of visible points
-    global float *max_weight,             // (N) read and written
-    global float *times_seen)             // (N) accumulates
+    const uint n,                          // points
+    const float least,                     // weight of a point that counts as seen
+    global const uint *point_offset,       // (N+1)
+    global const uchar *point_is_visible,  // (N) 1: not all of its pairs are dropped
+    global const float2 *pair_gradient,    // (P, 2) b first; read of visible points
+    global float *max_weight,              // (N) read and written
+    global float *times_seen)              // (N) accumulates
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
     const uint begin = point_offset[i], end = point_offset[i + 1];
     if (begin == end) return;
     float sum = 0.0f;
-    if (point_is_shaded[i]) {
+    if (point_is_visible[i]) {
         for (uint pair = begin; pair < end; pair++)
             sum += pair_gradient[pair].x;
         if (sum > max_weight[i] || isnan(sum)) max_weight[i] = sum;  // fmax() would hide a NaN

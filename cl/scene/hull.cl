@@ -87,10 +87,10 @@ kernel void carve(
             alive |= tally[b] >> 16 <= forgiven;
         }
     }
-    uint kept = 0;
+    uint in_hull = 0;
     for (uint b = 0; b < 32; b++) {
         const uint seen = tally[b] & 0xffff, rejected = tally[b] >> 16;
-        kept |= (uint)(seen >= least && views * rejected <= forgiven * seen) << b;
+        in_hull |= (uint)(seen >= least && views * rejected <= forgiven * seen) << b;
     }
-    bits[row * words + word] = kept;
+    bits[row * words + word] = in_hull;
 }

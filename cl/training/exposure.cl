@@ -1,6 +1,6 @@
-// Gains of the photographs, one a view and channel: what exposure and white balance multiplied them
-// by. They are the least squares between what was rendered and the photograph over the last steps
-// that saw a view, and the loss compares the rendering with the photograph divided by them. They
+// Gains of the images, one a view and channel: what exposure and white balance multiplied them
+// by. They are the least squares between what was rendered and the image over the last steps
+// that saw a view, and the loss compares the rendering with the image divided by them. They
 // concern the object's part of a colour over white, c - (1 - a).
 #include "group.h"
 
@@ -8,32 +8,32 @@
 #define MOST 8.0f  // gain: three stops
 #endif
 
-// One work-item per target pixel: writes the photograph divided by its view's gains.
+// One work-item per target pixel: writes the image divided by its view's gains.
 kernel void exposure_divide(
     const uint hw,  // pixels of the target
     const uint view,
-    global const float4 *exposure,   // (VIEWS, 3, 4) the gain behind three others
-    global const float *photograph,  // (H, W, 3)
-    global const float *alpha,       // (H, W)
-    global float *target)            // (H, W, 3)
+    global const float4 *exposure,  // (VIEWS, 3, 4) the gain behind three others
+    global const float *image,      // (H, W, 3)
+    global const float *alpha,      // (H, W)
+    global float *target)           // (H, W, 3)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
     global const float4 *channels = exposure + 3 * view;
     const float3 gain = (float3)(channels[0].w, channels[1].w, channels[2].w);
     const float white = 1.0f - alpha[q];
-    vstore3((vload3(q, photograph) - white) / gain + white, q, target);
+    vstore3((vload3(q, image) - white) / gain + white, q, target);
 }
 
-// GROUP work-items per row: write its sums of rendering times photograph, of the rendering squared
-// and of the photograph squared.
+// GROUP work-items per row: write its sums of rendering times image, of the rendering squared
+// and of the image squared.
 kernel void exposure_products(
-    const uint h,  // photograph
+    const uint h,  // image
     const uint w,
     const uint pw,                   // width of the prediction
-    const uint corner,               // first value of the prediction under the photograph
+    const uint corner,               // first value of the prediction under the image
     global const float *prediction,  // (PH, PW, 3)
-    global const float *photograph,  // (H, W, 3)
+    global const float *image,       // (H, W, 3)
     global const float *alpha,       // (H, W)
     global float4 *row_products)     // (3, H, 4) the last unused
 {
@@ -44,7 +44,7 @@ kernel void exposure_products(
     for (uint x = MEMBER; x < w; x += GROUP) {
         const float a = alpha[y * w + x], white = 1.0f - a;
         const float3 p = vload3(x, prediction + corner + 3 * (size_t)pw * y) - white;
-        const float3 t = vload3((size_t)y * w + x, photograph) - white;
+        const float3 t = vload3((size_t)y * w + x, image) - white;
         pt.xyz += a * p * t;
         pp.xyz += a * p * p;
         tt.xyz += a * t * t;
@@ -66,7 +66,7 @@ kernel void exposure_fit(
     const uint views,
     const uint view,
     const uint h,                      // rows
-    const float kept,                  // of the sums before
+    const float decay,                 // of the sums before
     const float prior,                 // of a gain of 1, as a sum of squares
     global const float *row_products,  // (3, H, 4)
     global float4 *exposure)           // (VIEWS, 3, 4) the sums of three products, and the gain
@@ -81,7 +81,7 @@ kernel void exposure_fit(
     for (uint v = 0; v < views; v++) {
         global float4 *channel = exposure + 3 * v + c;
         float4 known = *channel;
-        if (v == view) known.xyz = kept * known.xyz + products;
+        if (v == view) known.xyz = decay * known.xyz + products;
         const float gain = (known.x + prior) / (known.y + prior);
         known.w = BOUNDED(gain, 1.0f / MOST, MOST);
         sum += log(known.w);

@@ -9,8 +9,9 @@
 // pixel, so a step of one pixel is a step of 3 values.
 //
 // The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
-// slopes; slopes summed along x; along y, with the gradient; sums. Scratch rows are BLOCKS vectors
-// of LANES values long, MARGIN more than 3W values need, so that no tap along x needs a test.
+// derivatives; derivatives summed along x; along y, with the gradient; sums. Scratch rows are
+// BLOCKS vectors of LANES values long, MARGIN more than 3W values need, so that no tap along x
+// needs a test.
 #include "group.h"
 #include "lanes.h"
 
@@ -75,7 +76,7 @@ static inline floats blur_along_x(global const floats *row, const int i, const i
 }
 
 // One work-item per LANES values of a row of windows, shifted right by MARGIN: finishes the moments
-// along x, writes what the windows give to the loss and its slopes: dL/dp of a pixel is the
+// along x, writes what the windows give to the loss and its derivatives: dL/dp of a pixel is the
 // window-weighted sum of [0] + [1] d + [2] s.
 kernel void loss_similarity(
     const uint v,                  // rows of windows
@@ -83,12 +84,12 @@ kernel void loss_similarity(
     const uint blocks,             // vectors in a scratch row
     const float weight,            // of 1 - SSIM
     global const float *moments,   // (V, 4, BLOCKS, LANES)
-    global float *slopes,          // (V, 3, BLOCKS, LANES) 0 outside the windows
+    global float *derivatives,     // (V, 3, BLOCKS, LANES) 0 outside the windows
     global float4 *partial_terms)  // (ROWS, BLOCKS, 4) rows 0 to V - 1
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b >= blocks || y >= v) return;
-    floats slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
+    floats derivative_0 = 0.0f, derivative_d = 0.0f, derivative_s = 0.0f;
     float dissimilarity = 0.0f;
     if (b >= MARGIN) {
         const int i = LANES * (b - MARGIN);
@@ -110,51 +111,52 @@ kernel void loss_similarity(
         const floats dL_dvar_d = weight * scale * (1.0f - a) / Q * (1.0f - 0.5f * b);
         const floats dL_dvar_s = weight * scale * (1.0f - a) / Q * (-0.5f * b);
         const floats dL_dm = weight * scale * (1.0f - b) / P * ((2.0f - a) * m_d - a * mean_s);
-        slope_0 = select((floats)0.0f, dL_dm - 2.0f * (m_d * dL_dvar_d + m_s * dL_dvar_s), inside);
-        slope_d = select((floats)0.0f, 2.0f * dL_dvar_d, inside);
-        slope_s = select((floats)0.0f, 2.0f * dL_dvar_s, inside);
+        derivative_0 =
+            select((floats)0.0f, dL_dm - 2.0f * (m_d * dL_dvar_d + m_s * dL_dvar_s), inside);
+        derivative_d = select((floats)0.0f, 2.0f * dL_dvar_d, inside);
+        derivative_s = select((floats)0.0f, 2.0f * dL_dvar_s, inside);
     }
-    global floats *row = (global floats *)slopes + 3 * (size_t)blocks * y + b;
-    row[0] = slope_0;
-    row[blocks] = slope_d;
-    row[2 * blocks] = slope_s;
+    global floats *row = (global floats *)derivatives + 3 * (size_t)blocks * y + b;
+    row[0] = derivative_0;
+    row[blocks] = derivative_d;
+    row[2 * blocks] = derivative_s;
     partial_terms[(size_t)blocks * y + b] =
         (float4)(weight * dissimilarity, 0.0f, dissimilarity, 0.0f);
 }
 
-// One work-item per LANES values of a row of windows: sums the slopes of the 11 windows of the row
-// that see each value.
-kernel void loss_row_slopes(
-    const uint v,                // rows of windows
-    const uint blocks,           // vectors in a scratch row
-    global const float *slopes,  // (V, 3, BLOCKS, LANES)
-    global float *row_slopes)    // (V, 3, BLOCKS, LANES) without the last MARGIN blocks
+// One work-item per LANES values of a row of windows: sums the derivatives of the 11 windows of the
+// row that see each value.
+kernel void loss_row_derivatives(
+    const uint v,                     // rows of windows
+    const uint blocks,                // vectors in a scratch row
+    global const float *derivatives,  // (V, 3, BLOCKS, LANES)
+    global float *row_derivatives)    // (V, 3, BLOCKS, LANES) without the last MARGIN blocks
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b + MARGIN >= blocks || y >= v) return;
     for (int f = 0; f < 3; f++) {
         const size_t row = ((size_t)y * 3 + f) * blocks;
-        ((global floats *)row_slopes)[row + b] =
-            blur_along_x((global const floats *)slopes + row, LANES * (b + MARGIN), -3);
+        ((global floats *)row_derivatives)[row + b] =
+            blur_along_x((global const floats *)derivatives + row, LANES * (b + MARGIN), -3);
     }
 }
 
-// One work-item per LANES values of a target row: sums the slopes of the 11 rows of windows that
-// see it, writes dL/dp and what the values give to the loss. Leaves the gradient outside the target
-// as it is.
+// One work-item per LANES values of a target row: sums the derivatives of the 11 rows of windows
+// that see it, writes dL/dp and what the values give to the loss. Leaves the gradient outside the
+// target as it is.
 kernel void loss_gradient(
-    const uint v,                    // rows of windows, 0 where there is no SSIM
-    const uint h,                    // height of the target
-    const uint w,                    // width of the target
-    const uint pw,                   // width of the prediction
-    const uint corner,               // first value of the prediction under the target
-    const uint blocks,               // vectors in a scratch row
-    const float beta,                // of smooth L1
-    global const float *prediction,  // (PH, PW, 3)
-    global const float *target,      // (H, W, 3)
-    global const float *row_slopes,  // (V, 3, BLOCKS, LANES)
-    global float *grad_prediction,   // (PH, PW, 3)
-    global float4 *partial_terms)    // (ROWS, BLOCKS, 4) rows V to V + H - 1
+    const uint v,                         // rows of windows, 0 where there is no SSIM
+    const uint h,                         // height of the target
+    const uint w,                         // width of the target
+    const uint pw,                        // width of the prediction
+    const uint corner,                    // first value of the prediction under the target
+    const uint blocks,                    // vectors in a scratch row
+    const float beta,                     // of smooth L1
+    global const float *prediction,       // (PH, PW, 3)
+    global const float *target,           // (H, W, 3)
+    global const float *row_derivatives,  // (V, 3, BLOCKS, LANES)
+    global float *grad_prediction,        // (PH, PW, 3)
+    global float4 *partial_terms)         // (ROWS, BLOCKS, 4) rows V to V + H - 1
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b >= blocks || y >= h) return;
@@ -165,20 +167,21 @@ kernel void loss_gradient(
         const floats p = load_lanes(prediction + at, count);
         const floats t = load_lanes(target + 3 * (size_t)w * y + LANES * b, count);
         const floats d = p - t, s = p + t - SUM_SHIFT;
-        floats slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
+        floats derivative_0 = 0.0f, derivative_d = 0.0f, derivative_s = 0.0f;
         for (int k = max(0, y - (int)v + 1); k < TAPS && k <= y; k++) {
             global const floats *row =
-                (global const floats *)row_slopes + 3 * (size_t)blocks * (y - k) + b;
-            slope_0 += WINDOW[k] * row[0];
-            slope_d += WINDOW[k] * row[blocks];
-            slope_s += WINDOW[k] * row[2 * blocks];
+                (global const floats *)row_derivatives + 3 * (size_t)blocks * (y - k) + b;
+            derivative_0 += WINDOW[k] * row[0];
+            derivative_d += WINDOW[k] * row[blocks];
+            derivative_s += WINDOW[k] * row[2 * blocks];
         }
         const float scale = 1.0f / (3.0f * h * w);
-        const floats slope =
+        const floats derivative =
             beta > 0.0f ? BOUNDED(d / beta, (floats)(-1.0f), (floats)(1.0f)) : sign(d);
         store_lanes(
-            scale * slope + slope_0 + slope_d * d + slope_s * s, grad_prediction + at, count);
-        smooth = scale * SUM_LANES(slope * (d - 0.5f * beta * slope));
+            scale * derivative + derivative_0 + derivative_d * d + derivative_s * s,
+            grad_prediction + at, count);
+        smooth = scale * SUM_LANES(derivative * (d - 0.5f * beta * derivative));
         absolute = scale * SUM_LANES(fabs(d));
         squared = scale * SUM_LANES(d * d);
     }
@@ -202,8 +205,8 @@ kernel void loss_sum(
     if (MEMBER == 0) sums[row] = sum;
 }
 
-// GROUP work-items: write a further term, the scaled sum of the values, and ADD it, weighted, to the
-// loss.
+// GROUP work-items: write a further term, the scaled sum of the values, and ADD it, weighted, to
+// the loss.
 kernel void loss_add(
     const uint n,
     const uint term,  // which of the terms it is

@@ -1,5 +1,5 @@
 // The mask term of the loss: weight * mean of (a - m)^2 of the rendered alpha a = 1 - T and the
-// photograph's alpha m. Where a < m it counts `shortfall` times, which rises from 0 to 1 in the
+// image's alpha m. Where a < m it counts `shortfall` times, which rises from 0 to 1 in the
 // course of a training: at first it would hold the points of the hull that lie in front of the
 // surface. Nothing is learned of pixels that are ignored.
 #include "group.h"
@@ -39,8 +39,8 @@ kernel void mask_gradient(
     if (MEMBER == 0) row_term[y] = sum;
 }
 
-// One work-item per target pixel: where it is ignored, the target becomes what was rendered, of which
-// the loss is 0, and its alpha -1.
+// One work-item per target pixel: where it is ignored, the target becomes what was rendered, of
+// which the loss is 0, and its alpha -1.
 kernel void ignore_target(
     const uint w,  // target
     const uint h,

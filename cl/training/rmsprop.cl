@@ -1,11 +1,11 @@
-// The optimiser of the points: RMSprop (Tieleman & Hinton 2012), that is Adam without a first moment
-// (beta1 = 0), with Adam's bias correction folded into rates and eps on the host.
+// The optimiser of the points: RMSprop (Tieleman & Hinton 2012), that is Adam without a first
+// moment (beta1 = 0), with Adam's bias correction folded into rates and eps on the host.
 //
-// The gradient of coefficient k of the SH is Y_k(direction) G, G being that of the point's features,
-// and is never stored. The squares of the harmonics of a degree add up to the same in all directions
-// (Unsoeld 1927), so all coefficients of a feature share one second moment v, an average of
-// G^2 / (4 pi), which is the mean of Y_k^2 G^2 over the directions. They move by
-// rate Y_k G / (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike.
+// The gradient of coefficient k of the SH is Y_k(direction) G, G being that of the point's
+// features, and is never stored. The squares of the harmonics of a degree add up to the same in all
+// directions (Unsoeld 1927), so all coefficients of a feature share one second moment v, an average
+// of G^2 / (4 pi), which is the mean of Y_k^2 G^2 over the directions. They move by rate Y_k G /
+// (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike.
 //
 // A point without a gradient stays where it is; the decay of its second moments waits until it has
 // one.
@@ -60,26 +60,26 @@ kernel void rmsprop_move(
     const float point_eps,  // of offset and opacity, as the next two
     const float rate_offset,
     const float rate_opacity,
-    global const uint *shaded,                   // (S) their indices
-    global const float *camera,                  // (21) camera.h
-    global const float4 *point_camera,           // (N, 4) x, y, z, distance
-    global const float16 *grad_shaded_features,  // (?, 16) G, a row for each visible point
-    global const float *grad_offset,             // (?, OFFSETS) alike, unread without MOVES_OFFSET
-    global const float *grad_opacity,            // (?) alike
-    global uint *last_step,                      // (N) of each point's last gradient, 0: none
-    global float16 *v,                           // (N, 16)
-    global float *v_offset,                      // (N, OFFSETS)
-    global float *v_opacity,                     // (N)
-    global float *offset,                        // (N, OFFSETS) cloud.h
-    global float *opacity,                       // (N)
-    global float16 *sh_0,                        // (N, 1, 16)
-    global float16 *sh_1,                        // (?, ?, 16) (N, 3, 16), untouched at degree 0
-    global float16 *sh_2a,                       // (?, ?, 16) (N, 3, 16), untouched below degree 2
-    global float16 *sh_2b)                       // (?, ?, 16) (N, 2, 16), untouched below degree 2
+    global const uint *visible,                   // (S) their indices
+    global const float *camera,                   // (21) camera.h
+    global const float4 *point_camera,            // (N, 4) x, y, z, distance
+    global const float16 *grad_visible_features,  // (?, 16) G, a row for each visible point
+    global const float *grad_offset,              // (?, OFFSETS) alike, unread without MOVES_OFFSET
+    global const float *grad_opacity,             // (?) alike
+    global uint *last_step,                       // (N) of each point's last gradient, 0: none
+    global float16 *v,                            // (N, 16)
+    global float *v_offset,                       // (N, OFFSETS)
+    global float *v_opacity,                      // (N)
+    global float *offset,                         // (N, OFFSETS) cloud.h
+    global float *opacity,                        // (N)
+    global float16 *sh_0,                         // (N, 1, 16)
+    global float16 *sh_1,                         // (?, ?, 16) (N, 3, 16), untouched at degree 0
+    global float16 *sh_2a,                        // (?, ?, 16) (N, 3, 16), untouched below degree 2
+    global float16 *sh_2b)                        // (?, ?, 16) (N, 2, 16), untouched below degree 2
 {
     const uint row = get_global_id(0) / ROW_PARTS;
-    const size_t g = min(row, s - 1), i = shaded[g];
-    const size_t soon = shaded[min(row + POINTS_AHEAD, s - 1)];
+    const size_t g = min(row, s - 1), i = visible[g];
+    const size_t soon = visible[min(row + POINTS_AHEAD, s - 1)];
     READ_AHEAD(v + soon);
     SH_READ_AHEAD(soon, 1)
     const uint last = last_step[i];
@@ -89,7 +89,7 @@ kernel void rmsprop_move(
     const Offsets o = MOVES_OFFSET ? OFFSETS_AT(grad_offset, g) : (Offsets)(0.0f);
     const float a = grad_opacity[g];
     // a NaN is a gradient
-    if (row >= s || !(any(grad_shaded_features[g] != 0.0f) || any(o != 0.0f) || a != 0.0f)) return;
+    if (row >= s || !(any(grad_visible_features[g] != 0.0f) || any(o != 0.0f) || a != 0.0f)) return;
     const float decay = exp2((step - last) * LOG_BETA2);
     if (ROW_PART == 0) {
         last_step[i] = step;
@@ -104,7 +104,7 @@ kernel void rmsprop_move(
             OFFSETS_AT(offset, i) = BOUNDED(shifted, -most, most);
         }
     }
-    const floats G = load_part(grad_shaded_features, g);
+    const floats G = load_part(grad_visible_features, g);
     const floats moment = decay * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
     store_part(moment, v, i);
     const floats scaled = G / (sqrt(moment) + eps);

@@ -1,4 +1,4 @@
-// The target of a rendering: a stored photograph, reduced by area and composited over white.
+// The target of a rendering: a stored image, reduced by area and composited over white.
 #include "common.h"
 
 // One work-item per target pixel: reads its block of downscale x downscale stored pixels, writes
@@ -49,14 +49,14 @@ static inline void lagrange(const float t, float weights[5]) {
     weights[4] = t * a * (t + 2.0f) / 24.0f;
 }
 
-// The same between the pixels of a photograph that is not reduced: one work-item per target pixel
+// The same between the pixels of an image that is not reduced: one work-item per target pixel
 // reads the 5 x 5 pixels around it, those at the image's edge for what lies beyond.
 kernel void target_between(
     const int width,
     const int height,
     const float across,  // pixels by which the target lies further right, at most half a one
     const float down,
-    const int left,  // photograph's column and row of target pixel (0, 0)
+    const int left,  // image's column and row of target pixel (0, 0)
     const int top,
     const int image_width,
     const int image_height,

@@ -4,9 +4,10 @@ Errors are against float64 (reference/network.py), of an image of at most CHECK_
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +40,7 @@ CHECK_SIDE = 33  # several tiles of any variant, and parts of some; float64 take
 RESULTS = {"forward": slice(0, 1), "weights": slice(1, 2), "input": slice(3, None)}
 
 
+@dataclass
 class Layer:
     """A convolution with its input.
 
@@ -47,18 +49,11 @@ class Layer:
     input is masked by the input's own.
     """
 
-    def __init__(
-        self,
-        parts: Sequence[np.ndarray],
-        weight: np.ndarray,
-        bias: np.ndarray,
-        grad_out: np.ndarray,
-        *,
-        relu: bool = False,
-    ):
-        self.parts, self.weight, self.bias = tuple(parts), weight, bias
-        self.grad_out, self.relu = grad_out, relu
-        self.x = np.concatenate(self.parts, 2)
+    parts: Sequence[np.ndarray]
+    weight: np.ndarray
+    bias: np.ndarray
+    grad_out: np.ndarray
+    relu: bool = False
 
     @classmethod
     def random(
@@ -83,11 +78,12 @@ class Layer:
         """Float64 [output, gradients of the weights and the bias as the device lays them out,
         gradient of each part].
         """
-        out = reference.convolution(self.x, self.weight, self.bias)
+        x = np.concatenate(self.parts, 2)
+        out = reference.convolution(x, self.weight, self.bias)
         grad_x = reference.convolution(self.grad_out, reference.flipped(self.weight))
-        grad_x *= self.x > 0 if self.relu else 1
+        grad_x *= x > 0 if self.relu else 1
         k = self.weight.shape[2]
-        grad_weight = reference.convolution_backward_weights(self.x, self.grad_out, k)
+        grad_weight = reference.convolution_backward_weights(x, self.grad_out, k)
         firsts = np.cumsum([part.shape[2] for part in self.parts])[:-1]
         return [
             np.maximum(out, 0) if self.relu else out,
@@ -97,11 +93,7 @@ class Layer:
         ]
 
     def computed(
-        self,
-        dev: Device,
-        variant: str,
-        blocking: Blocking,
-        tiles: Tiles | None = None,
+        self, dev: Device, variant: str, blocking: Blocking, tiles: Tiles | None = None
     ) -> list[np.ndarray]:
         """What `expected` lists, by a variant. tiles: of output and gradients."""
         uploaded = UploadedLayer(dev, self)
@@ -139,41 +131,34 @@ class UploadedLayer:
         return run
 
     def compute(
-        self,
-        variant: str,
-        blocking: Blocking,
-        direction: str,
-        tiles: Tiles | None,
+        self, variant: str, blocking: Blocking, direction: str, tiles: Tiles | None
     ) -> None:
-        """Compute a direction by a variant, as the network does in each step of a training."""
+        """Compute a direction by a variant, as the network does in each step of a training, with
+        the weights laid out anew.
+        """
         dev, parts, grad_out, kernels = self.dev, self.parts, self.grad_out, VARIANTS[variant]
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
-        shape = ConvShape(direction, self.weight.shape[1], channels, co, (height, width))
         tiles = tiles or all_tiles(dev, height, width)
-        if direction == "forward":
-            conv = self._conv(blocking, variant, shape)
-            kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
-        elif direction == "weights":
-            conv = self._conv(blocking, variant, shape)
-            count = kernels.backward_weights(conv, parts, grad_out, tiles=tiles)
-            sum_parts(dev, [(conv, count)], conv.work, self.grad_weight, self.grad_bias)
-        else:
-            for i, (part, grad) in enumerate(zip(parts, self.grad_parts, strict=True)):
-                conv = self._conv(blocking, variant, replace(shape, source=i))
-                mask = part if self.relu else None
+        sources: Iterable[Any] = range(len(parts)) if direction == "input" else [None]
+        for source in sources:
+            k = self.weight.shape[1]
+            shape = ConvShape(direction, k, channels, co, (height, width), source)
+            conv = Conv(dev, blocking, variant, shape, self.weight, self.bias)
+            if needed := work_shape(variant, shape):
+                n = math.prod(needed)
+                shared = dev.scratch("bench: weights and parts of their gradients", n)
+                conv.work = shared[:n].reshape(needed)
+                lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
+            if direction == "forward":
+                kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
+            elif direction == "weights":
+                count = kernels.backward_weights(conv, parts, grad_out, tiles=tiles)
+                sum_parts(dev, [(conv, count)], conv.work, self.grad_weight, self.grad_bias)
+            else:
+                mask = parts[source] if self.relu else None
+                grad = self.grad_parts[source]
                 kernels.backward_input(conv, grad_out, grad, mask=mask, tiles=tiles)
-
-    def _conv(self, blocking, variant, shape):
-        """A direction of the convolution, its weights laid out anew."""
-        conv = Conv(self.dev, blocking, variant, shape, self.weight, self.bias)
-        needed = work_shape(variant, shape)
-        if needed:
-            n = math.prod(needed)
-            shared = self.dev.scratch("bench: weights and parts of their gradients", n)
-            conv.work = shared[:n].reshape(needed)
-            lay_out(self.dev, [conv], self.weight.reshape(-1), conv.work)
-        return conv
 
 
 def layer_errors(layer: Layer, computed: list[np.ndarray], direction: str) -> tuple[float, float]:
@@ -187,11 +172,7 @@ def layer_errors(layer: Layer, computed: list[np.ndarray], direction: str) -> tu
 
 
 def bench_conv(
-    dev: Device,
-    size: int,
-    widths: tuple[int, int, int],
-    *,
-    blocks: str = "double",
+    dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
     """Rows of every distinct convolution of the network at size x size, by direction and variant.
 

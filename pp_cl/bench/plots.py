@@ -1,4 +1,4 @@
-"""The picture of the benches; matplotlib is an extra."""
+"""The plot of the benches; matplotlib is an extra."""
 
 from pathlib import Path
 from typing import Any

@@ -7,9 +7,10 @@ float64, of CHECKED_POINTS points in CHECKED_SIDE x CHECKED_SIDE pixels, some hu
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -38,62 +39,23 @@ CHANNELS = 16
 HIGHER_SH = 0.1
 
 
-class BenchScene:
-    """Points in view of a camera, and the float64 features of its pixels.
-
-    positions: (N, 3), world. opacity: (N,) float32. size: side of the image in pixels. grad: (H, W,
-    16) device array, dL/dfeatures. forward(blend) rasterises in the stages FORWARD (Device.stage),
-    backward(blend, its result) in others; exact_features() are (N, 16).
-    """
-
-    FORWARD: tuple[str, ...]
-    footprint: str
-    depth_range: tuple[float, float]
-    camera: Camera
-    positions: np.ndarray
-    opacity: np.ndarray
-    forward: Callable[[str], RenderResult]
-    exact_features: Callable[[], np.ndarray]
-
-    def __init__(self, dev: Device, size: int, rng: np.random.Generator):
-        self.dev, self.size = dev, size
-        self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
-
-    def error(self, blend: str, features: np.ndarray) -> float:
-        """Largest difference of an image's (H, W, 16) features from float64, over the range of the
-        points' features and the background, 1. Pixels where float32's rounding may decide over a
-        hit are left out. Every point meets every pixel: for small scenes.
-        """
-        geometry = dense.geometry(
-            self.camera, self.positions, RADIUS, self.footprint, depth_range=self.depth_range
-        )
-        clear = (geometry["margin"] >= ROUNDING * self.camera.fx).all(axis=0)
-        point_features = self.exact_features()
-        exact = dense.blend_by_rule(blend, geometry, self.opacity, GAMMA)
-        expected = dense.features(exact, point_features)
-        span = np.maximum(point_features.max(0), 1) - np.minimum(point_features.min(0), 1)
-        difference = np.abs(features.reshape(expected.shape) - expected) / span
-        return float(difference[clear].max(initial=0))
-
-
-class GridScene(BenchScene):
+class GridScene:
     """About n discs of the paper's radius on a grid inside the unit ball, seen from a distance of 4
-    under 40 degrees, by the renderer.
+    under 40 degrees, by the renderer, in an image of size x size pixels.
 
-    Opacities are uniform in [0.7, 1]: in a trained model few are lower. The camera looks along no
-    axis of the grid.
+    positions: (N, 3), world. opacity: (N,) float32, uniform in [0.7, 1]: in a trained model few are
+    lower. The camera looks along no axis of the grid.
     """
 
-    FORWARD = ("project", "pairs", "weights", "shade", "blend")
     footprint, depth_range = "disc", (2.0, 6.0)
 
     def __init__(self, dev: Device, n: int, size: int):
         rng = np.random.default_rng(0)
-        super().__init__(dev, size, rng)
-        edge = (4 / 3 * np.pi / n) ** (1 / 3)
-        side = int(2 / edge) + 2
-        grid = Grid((-edge * (side - 1) / 2,) * 3, edge, (side,) * 3)
-        squares = (grid.origin[0] + edge * np.arange(side)) ** 2
+        self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
+        voxel_size = (4 / 3 * np.pi / n) ** (1 / 3)
+        side = int(2 / voxel_size) + 2
+        grid = Grid((-voxel_size * (side - 1) / 2,) * 3, voxel_size, (side,) * 3)
+        squares = (grid.origin[0] + voxel_size * np.arange(side)) ** 2
         inside = squares[:, None, None] + squares[:, None] + squares < 1
         ids = np.flatnonzero(inside).astype(np.uint32)
         self.positions, n = grid.positions(ids), len(ids)
@@ -128,25 +90,22 @@ class GridScene(BenchScene):
         return dense.shade(self.positions, self.camera.eye, coefficients)
 
 
-class PulsarScene(BenchScene):
-    """Spheres of radius 0.0015, uniform in a cube of side 1 at a depth of 1 to 2: Pulsar's own
-    benchmark.
-
-    Focal length and sensor are equal, near is 0.6, far 2.5, opacities are 1. Stage `spheres`:
-    gradients of positions and radii.
+class PulsarScene:
+    """What a GridScene has, of n spheres, uniform in a cube of side 1 at a depth of 1 to 2, as in
+    Pulsar's own benchmark. Focal length and sensor are equal, opacities are 1.
     """
 
-    FORWARD = ("project", "pairs", "weights", "blend")
     footprint, depth_range = "sphere", (0.6, 2.5)
 
     def __init__(self, dev: Device, n: int, size: int):
         rng = np.random.default_rng(0)
-        super().__init__(dev, size, rng)
+        self.dev, self.size = dev, (size, size)
+        self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
         self.camera = Camera(np.eye(3, 4), size, size, size / 2, size / 2, size, size)
         self.opacity = np.ones(n, np.float32)
         self.positions = rng.random((n, 3), np.float32) + np.array([-0.5, -0.5, 1], np.float32)
         self.point_features = rng.random((n, CHANNELS), np.float32)
-        self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
+        self.buffers, self.capacity = {blend: Buffers(dev) for blend in BLENDS}, 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload(np.full(n, RADIUS), np.float32)
         self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
@@ -155,32 +114,28 @@ class PulsarScene(BenchScene):
 
     def forward(self, blend: str) -> RenderResult:
         """Project, find pairs, weigh and blend."""
-        dev, b, camera, size = self.dev, self.buffers[blend], self.camera_buffer, (self.size,) * 2
+        dev, b, camera, size = self.dev, self.buffers[blend], self.camera_buffer, self.size
         with dev.stage("project"):
             points = project_spheres(
-                dev,
-                b,
-                self.footprint,
-                camera,
-                self.point_positions,
-                point_radius=self.point_radius,
+                dev, b, self.footprint, camera, self.point_positions, point_radius=self.point_radius
             )
         with dev.stage("pairs"):
-            pairs = find_all_pairs(dev, b, points, size, self.room)
-            self.room = pairs.capacity
+            pairs = find_all_pairs(dev, b, points, size, self.capacity)
+            self.capacity = pairs.capacity
         with dev.stage("weights"):
-            weights = blend_weights(
-                dev, b, pairs, camera, self.point_opacity, blend=blend, gamma=GAMMA
-            )
+            opacity = self.point_opacity
+            weights = blend_weights(dev, b, pairs, camera, opacity, blend=blend, gamma=GAMMA)
         with dev.stage("blend"):
-            features = gather_rows(dev, self.device_features, weights.shaded)
+            features = gather_rows(dev, self.device_features, weights.visible)
             blend_forward(dev, pairs, weights, features, self.features)
         result = RenderResult(dev, self.camera, (0, 0), size, points, pairs, weights, None)
-        result.shaded_features, result.features = features, self.features
+        result.visible_features, result.features = features, self.features
         return result
 
     def backward(self, blend: str, result: RenderResult) -> None:
-        """Stages `backward` and `spheres`."""
+        """Stages `backward` and `spheres`: gradients of features and opacities, then of positions
+        and radii.
+        """
         dev, opacity = self.dev, self.point_opacity
         view = result.points, result.pairs, result.weights
         with dev.stage("backward"):
@@ -189,7 +144,7 @@ class PulsarScene(BenchScene):
                 self.buffers[blend],
                 *view,
                 opacity=opacity,
-                shaded_features=result.shaded_features,
+                visible_features=result.visible_features,
                 features=result.features,
                 grad_features=self.grad,
             )
@@ -201,7 +156,25 @@ class PulsarScene(BenchScene):
         return self.point_features.astype(np.float64)
 
 
-SCENES = {"grid": GridScene, "pulsar": PulsarScene}
+Scene = GridScene | PulsarScene
+SCENES: dict[str, type[Scene]] = {"grid": GridScene, "pulsar": PulsarScene}
+
+
+def features_error(scene: Scene, blend: str, features: np.ndarray) -> float:
+    """Largest difference of an image's (H, W, 16) features from float64, over the range of the
+    points' features and the background, 1. Pixels where float32's rounding may decide over a
+    fragment are left out. Every point meets every pixel: for small scenes.
+    """
+    geometry = dense.geometry(
+        scene.camera, scene.positions, RADIUS, scene.footprint, depth_range=scene.depth_range
+    )
+    clear = (geometry["margin"] >= ROUNDING * scene.camera.fx).all(axis=0)
+    point_features = scene.exact_features()
+    exact = dense.blend_by_rule(blend, geometry, scene.opacity, GAMMA)
+    expected = dense.features(exact, point_features)
+    span = np.maximum(point_features.max(0), 1) - np.minimum(point_features.min(0), 1)
+    difference = np.abs(features.reshape(expected.shape) - expected) / span
+    return float(difference[clear].max(initial=0))
 
 
 def bench_raster(
@@ -209,50 +182,38 @@ def bench_raster(
 ) -> Iterator[dict]:
     """Yield a row for every number of points, side and blend. name: a key of SCENES."""
     small = SCENES[name](dev, CHECKED_POINTS, CHECKED_SIDE)
-    errors = {blend: small.error(blend, small.forward(blend).features.get()) for blend in blends}
-    for n in points:
-        for size in sizes:
-            before = dev.reset_peak()
-            scene = SCENES[name](dev, n, size)
-            stages_ms, whole_ms = _time(dev, scene, blends)
-            for blend in blends:
-                result, stages, times = scene.forward(blend), stages_ms[blend], whole_ms[blend]
-                forward = sum(ms for stage, ms in stages.items() if stage in scene.FORWARD)
-                yield {
-                    "scene": name,
-                    "points": len(scene.positions),
-                    "size": size,
-                    "gamma": GAMMA,
-                    "blend": blend,
-                    "pairs": result.pairs.total,
-                    "shaded": int(result.weights.shaded.size),
-                    "forward_ms": forward,
-                    "backward_ms": sum(stages.values()) - forward,
-                    "ms": float(np.median(times)),
-                    "ms_range": [min(times), max(times)],
-                    "stages_ms": stages,
-                    "peak_device_bytes": dev.peak_bytes - before,
-                    "max_err": errors[blend],
-                }
+    errors = {b: features_error(small, b, small.forward(b).features.get()) for b in blends}
+    for n, size in product(points, sizes):
+        before = dev.reset_peak()
+        scene = SCENES[name](dev, n, size)
+        seconds: dict[str, list[dict]] = {blend: [] for blend in blends}  # of the stages of passes
 
-
-def _time(dev, scene, blends):
-    """({blend: {stage: median milliseconds}}, {blend: all its milliseconds}), in turn."""
-    seconds = {blend: defaultdict(list) for blend in blends}
-
-    def runner(blend):
-        def run():
+        def run(blend, scene=scene, seconds=seconds):
             with dev.timed_stages() as stages:
                 scene.backward(blend, scene.forward(blend))
-            for name, values in stages.items():
-                seconds[blend][name] += values
+            seconds[blend].append(stages)
 
-        return run
-
-    times = interleave({blend: runner(blend) for blend in blends})
-    # the first pass, which builds programs, does not count
-    medians = {
-        blend: {name: float(np.median(values[1:])) * 1e3 for name, values in stages.items()}
-        for blend, stages in seconds.items()
-    }
-    return medians, times
+        for blend, times in interleave({b: partial(run, b) for b in blends}).items():
+            passes = seconds[blend][1:]  # the first one builds programs
+            stages = {
+                stage: float(np.median([sum(taken[stage]) for taken in passes])) * 1e3
+                for stage in passes[0]
+            }
+            backward = sum(stages.get(stage, 0) for stage in ("backward", "spheres"))
+            result = scene.forward(blend)
+            yield {
+                "scene": name,
+                "points": len(scene.positions),
+                "size": size,
+                "gamma": GAMMA,
+                "blend": blend,
+                "pairs": result.pairs.total,
+                "visible": int(result.weights.visible.size),
+                "forward_ms": sum(stages.values()) - backward,
+                "backward_ms": backward,
+                "ms": float(np.median(times)),
+                "ms_range": [min(times), max(times)],
+                "stages_ms": stages,
+                "peak_device_bytes": dev.peak_bytes - before,
+                "max_err": errors[blend],
+            }

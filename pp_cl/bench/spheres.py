@@ -9,7 +9,7 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes
-from pp_cl.engine.raster.pairs import Pairs, find_pairs, room_needed
+from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs
 from pp_cl.engine.raster.project import ProjectedPoints, projection_program, projection_table
 from pp_cl.engine.raster.weights import BlendWeights
 
@@ -50,15 +50,15 @@ def project_spheres(
 
 
 def find_all_pairs(
-    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], room: int = 1
+    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], capacity: int = 1
 ) -> Pairs:
-    """The hits in an image of size (height, width), with room for all, tried first with `room`.
-    Waits for the device. Raises UserError as room_needed() does.
+    """The fragments in an image of size (height, width), with a capacity for all, tried first with
+    `capacity`. Waits for the device. Raises UserError as capacity_needed() does.
     """
     while True:
-        pairs = find_pairs(dev, b, points, size, room)
-        room = room_needed(pairs)
-        if room == pairs.capacity:
+        pairs = find_pairs(dev, b, points, size, capacity)
+        capacity = capacity_needed(pairs)
+        if capacity == pairs.capacity:
             return pairs
         del pairs  # else its arrays would stay beside the larger ones
 
@@ -83,16 +83,16 @@ def spheres_backward(
         "spheres_backward",
         n,
         n=n,
-        # alpha depends on the order of the hits alone
+        # alpha depends on the order of the fragments alone
         gamma=math.inf if weights.blend == "alpha" else gamma,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         point_shape=points.point_shape,
         opacity=opacity,
-        point_is_shaded=weights.point_is_shaded,
+        point_is_visible=weights.point_is_visible,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
-        pair_point_closeness=pairs.pair_point_closeness,
+        pair_point_falloff=pairs.pair_point_falloff,
         pair_gradient=pair_gradient,
         grad_positions=grad_positions,
         grad_radius=grad_radius,

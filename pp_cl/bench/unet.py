@@ -22,11 +22,7 @@ CHECK_SIZE = 128  # float64 takes seconds for each variant of the paper's networ
 
 
 def bench_unet(
-    dev: Device,
-    size: int,
-    widths: tuple[int, int, int],
-    *,
-    blocks: str = "double",
+    dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
     """Rows of the whole network at size x size, as shipped and by every variant: forward, and train
     = forward and backward to the input and the weights.
@@ -62,10 +58,7 @@ def bench_unet(
 
 
 def make_network(
-    dev: Device,
-    widths: tuple[int, int, int],
-    variant: str = AUTO,
-    blocks: str = "double",
+    dev: Device, widths: tuple[int, int, int], variant: str = AUTO, blocks: str = "double"
 ) -> UNet:
     """A network by a variant; the parameters do not depend on it. blocks: as UNet takes them.
 

@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--size",
         type=shared.several(shared.integer(4, 4096, 4)),
-        metavar="S",
-        help="side of the image in pixels, a multiple of 4 (256; raster: 200,400,800)",
+        metavar="S,...",
+        help="sides of the image in pixels, multiples of 4 (256; raster: 200,400,800)",
     )
     add(
         "--widths",
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--points",
         type=shared.several(shared.integer(8, 2**27)),
         metavar="N,...",
-        help="raster: numbers of points (10 thousand to 4 million); train: one (4 million)",
+        help="raster: numbers of points (10 thousand to 4 million); train: of the hull (4 million)",
     )
     add(
         "--blend",
@@ -126,20 +126,17 @@ def _prepared(name, options):
         sizes = options.size or [200, 400, 800]
         return lambda dev: bench_raster(dev, scene, points, sizes, blends=blends)
     if name == "train":
-        given = [("network.widths", widths, "--widths")]
-        if options.points:
-            given.append(("points.count", _one(options, "points"), "--points"))
-        config = configure(preset("paper"), options.scene or "demo", given)
-        return lambda dev: bench_step(dev, config)
-    size = _one(options, "size") if options.size else 256
-    bench = bench_conv if name == "conv" else bench_unet
-    return lambda dev: bench(dev, size, widths, blocks=options.blocks or "double")
-
-
-def _one(options, name):
-    """The number of an option that only bench raster takes several of."""
-    numbers = getattr(options, name)
-    if len(numbers) > 1:
-        text = ",".join(map(str, numbers))
-        raise UserError(f"--{name} {text}: write one number for bench {options.what}")
-    return numbers[0]
+        configs = [
+            configure(
+                preset("paper"),
+                options.scene or "demo",
+                [("network.widths", widths, "--widths"), ("points.count", count, "--points")],
+            )
+            for count in options.points or [preset("paper").points.count]
+        ]
+        return lambda dev: chain.from_iterable(bench_step(dev, config) for config in configs)
+    sizes, bench = options.size or [256], bench_conv if name == "conv" else bench_unet
+    blocks = options.blocks or "double"
+    return lambda dev: chain.from_iterable(
+        bench(dev, size, widths, blocks=blocks) for size in sizes
+    )

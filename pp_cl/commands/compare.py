@@ -90,7 +90,7 @@ def _shape(options):
 def _rows(facts):
     grid = facts["grid"]
     lines = [
-        f"grid      {'x'.join(map(str, grid['dims']))}, voxel size {grid['edge']:.6g}",
+        f"grid      {'x'.join(map(str, grid['dims']))}, voxel size {grid['voxel_size']:.6g}",
         f"surface   {facts['surface']} vertices, by {facts['samples']} samples",
     ]
     if "before" in facts:

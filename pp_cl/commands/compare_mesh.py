@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from pp_cl.checkpoint import opened_run
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.grid import Grid, smallest_edge
+from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
@@ -22,12 +22,13 @@ from pp_cl.settings import Config
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 
 
-def mesh_shape(dev: Device, mesh: Mesh, edge: float | None, samples: int) -> dict[str, Any]:
-    """{"grid": {"dims", "edge"}, "surface": vertices nearest to the mesh} for a grid of this edge
-    around the mesh; None: the finest that points may have. Raises UserError as sample_surface does.
+def mesh_shape(dev: Device, mesh: Mesh, voxel_size: float | None, samples: int) -> dict[str, Any]:
+    """{"grid": {"dims", "voxel_size"}, "surface": vertices nearest to the mesh} for a grid of this
+    voxel size around the mesh; None: the finest that points may have. Raises UserError as
+    sample_surface does.
     """
     box = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
-    chosen = edge or smallest_edge(box, CELL_CAP)
+    chosen = voxel_size or smallest_voxel_size(box, CELL_CAP)
     surface = _sampled(dev, mesh, Grid.centred_in(box, chosen), samples)
     return _facts(surface.grid, surface, samples)
 
@@ -39,7 +40,7 @@ def _sampled(dev, mesh, grid, samples):
 
 
 def _facts(grid, surface, samples):
-    facts = {"grid": {"dims": list(grid.dims), "edge": grid.edge}}
+    facts = {"grid": {"dims": list(grid.dims), "voxel_size": grid.voxel_size}}
     return facts | {"samples": samples, "surface": surface.count}
 
 

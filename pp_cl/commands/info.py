@@ -3,7 +3,7 @@
 import argparse
 
 from pp_cl.commands import options as shared
-from pp_cl.errors import listing
+from pp_cl.errors import few_names
 from pp_cl.presets import PRESETS
 
 HELP = "describe a run or a scene; --picture draws its points over photographs"
@@ -30,13 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the facts, write the picture. Raises UserError for options that do not fit."""
-    from pp_cl.commands.info_facts import describe_scene, run_facts, run_picture
+    """Print the facts, write the image. Raises UserError for options that do not fit."""
+    from pp_cl.commands.info_facts import describe_scene, run_facts, run_sheet
     from pp_cl.config import nearby_run
     from pp_cl.drivers import open_device
     from pp_cl.files.image import write_png
     from pp_cl.run import find_run
-    from pp_cl.scene.outline import picture
+    from pp_cl.scene.outline import outline_sheet
 
     folder, image = find_run(options.subject), None
     is_misspelt = not folder.path.exists() and nearby_run(folder.path)
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
         shared.refuse(options, (*MASKS, "set", "preset"), "only of a scene")
         facts = run_facts(folder, options.scene)
         if options.picture:
-            image = run_picture(open_device(options.device), folder, options.scene)
+            image = run_sheet(open_device(options.device), folder, options.scene)
         rows = _run_rows(facts)
     else:
         shared.refuse(options, ("scene",), "only of a run")
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
         preset_name = options.preset or "tiny"
         facts, views, hull, found = describe_scene(dev, options.subject, preset_name, given)
         if options.picture:
-            image = picture(dev, views, hull, found)
+            image = outline_sheet(dev, views, hull, found)
         rows = _scene_rows(facts)
     lines = [f"{name:12s}{text}" for name, text in rows]
     if image is not None:
@@ -138,14 +138,16 @@ def _scene_rows(facts):
     if facts["box"]:
         rows.append(("given box", " to ".join(map(_vector, facts["box"]))))
     if dropped:
-        rows.append(("dropped", f"{listing(dropped)} (pp_cl.json)"))
+        rows.append(("dropped", f"{few_names(dropped)} (pp_cl.json)"))
     hull = facts["hull"]
     if hull is None:
         return [*rows, ("hull", f"none: {facts['problem']}")]
     capped = " (capped)" * hull["capped"]
     rows.append(("hull", f"{hull['points']} points{capped}, {_grid_text(hull)}"))
     if times := hull["refinements"]:
-        pixels = " and ".join(f"{hull['edge_pixels'] / 2**n:.2f}" for n in range(1, times + 1))
+        pixels = " and ".join(
+            f"{hull['voxel_size_pixels'] / 2**n:.2f}" for n in range(1, times + 1)
+        )
         rows.append(("", f"to be refined to {pixels} pixels"))
     if masks["forgiven"]:
         many = f"up to {masks['forgiven']} masks may reject a point"
@@ -162,8 +164,8 @@ def _bytes(count):
 
 
 def _grid_text(grid):
-    dims, edge = "x".join(map(str, grid["dims"])), f"voxel size {grid['edge']:.6g}"
-    return f"{dims}, {edge} ({grid['edge_pixels']:.2f} pixels)"
+    dims, voxel_size = "x".join(map(str, grid["dims"])), f"voxel size {grid['voxel_size']:.6g}"
+    return f"{dims}, {voxel_size} ({grid['voxel_size_pixels']:.2f} pixels)"
 
 
 def _range(values, form):

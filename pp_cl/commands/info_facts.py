@@ -21,9 +21,9 @@ from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.gaze import looked_at, up_of
 from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
-from pp_cl.scene.identity import kept_views
+from pp_cl.scene.identity import unpacked_views
 from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits
-from pp_cl.scene.outline import SHOWN_VIEWS, picture
+from pp_cl.scene.outline import SHOWN_VIEWS, outline_sheet
 from pp_cl.session.start import first_hull
 
 Facts = dict[str, Any]
@@ -65,21 +65,21 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         header, forms = stored.header, stored.forms
     sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
     facts["network"]["parameters"] = sum(sizes)
-    photographs, grid = kept_views(header["views"]), header["grid"]
-    cameras = [one.camera.downscaled(config.scene.downscale) for one in photographs]
+    image_files, grid = unpacked_views(header["views"]), header["grid"]
+    cameras = [one.camera.downscaled(config.scene.downscale) for one in image_files]
     return facts | {
         "step": header["step"],
         "finished": header["finished"],
         "notes": header.get("notes", []),
-        "views": {"count": len(photographs), "images": _image_sizes(photographs)},
+        "views": {"count": len(image_files), "images": _image_sizes(image_files)},
         "points": {"initial": header["initial_points"], "left": forms["points.ids"].shape[0]},
-        "grid": grid | {"edge_pixels": spacing_pixels(Grid.of_header(grid), cameras)},
+        "grid": grid | {"voxel_size_pixels": spacing_pixels(Grid.of_header(grid), cameras)},
     }
 
 
-def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
-    """picture() of the points that a run has left, over renderings where its scene is missing.
-    Raises UserError as run_facts does, and for a scene that is broken.
+def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
+    """outline_sheet() of the points that a run has left, over renderings where its scene is
+    missing. Raises UserError as run_facts does, and for a scene that is broken.
     """
     run = load_run(dev, folder.path, scene=scene)
     path = run.config.scene.path
@@ -88,11 +88,11 @@ def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.
         views = open_scene(dev, run.config, ("train",), SHOWN_VIEWS).splits["train"]
     else:
         warnings.warn(
-            f"{path}: is not there; the picture shows the run's renderings in place of photographs",
+            f"{path}: is not there; the image shows the run's renderings in place of images",
             stacklevel=2,
         )
-        views = run.rendered(evenly(run.photographs("train"), SHOWN_VIEWS), opaque=True)
-    return picture(dev, views, points)
+        views = run.rendered(evenly(run.image_files("train"), SHOWN_VIEWS), opaque=True)
+    return outline_sheet(dev, views, points)
 
 
 def _files(folder):
@@ -104,9 +104,9 @@ def _files(folder):
     return {name: size for name, size in sizes.items() if not name.startswith(".")}
 
 
-def _image_sizes(photographs):
+def _image_sizes(image_files):
     """{WxH: how many images have it}."""
-    return dict(Counter(f"{p.camera.width}x{p.camera.height}" for p in photographs))
+    return dict(Counter(f"{p.camera.width}x{p.camera.height}" for p in image_files))
 
 
 def describe_scene(
@@ -161,8 +161,8 @@ def describe_scene(
             "points": len(hull.ids),
             "capped": hull.capped,
             "dims": list(hull.grid.dims),
-            "edge": hull.grid.edge,
-            "edge_pixels": spacing_pixels(hull.grid, cameras),
+            "voxel_size": hull.grid.voxel_size,
+            "voxel_size_pixels": spacing_pixels(hull.grid, cameras),
             "refinements": sum(0 < share < 1 for share in shares),
             "box": hull.grid.box.tolist(),
         }

@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--config",
         metavar="FILE",
-        help="begin with the settings of a config.json, all but those of its scene and what its"
-        " images decided; options come on top",
+        help="begin with the settings of a config.json, all but those of its scene and the"
+        " automatic ones; options come on top",
     )
     shared.add_short(parser, SHORT)
     add(
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> None:
         print(_extended_line(training))
     if training.hull and (told := _left_out_line(config.train)):
         print(told)
-    print(memory_line(training.room), flush=True)
+    print(memory_line(training.memory_plan), flush=True)
     seconds = _run(training, options)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
@@ -114,7 +114,7 @@ def _first_line(training):
     )
     return (
         f"hull: {points} points on a {'x'.join(map(str, grid.dims))} grid, voxel size"
-        f" {grid.edge:.6g} ({spacing:.2f} pixels{finer}), depth {near:.3f} to {far:.3f}"
+        f" {grid.voxel_size:.6g} ({spacing:.2f} pixels{finer}), depth {near:.3f} to {far:.3f}"
         f" ({hull.seconds:.1f} s)"
         f"{capped if hull.capped else ''}"
     )
@@ -154,10 +154,10 @@ def _images_line(training, chosen):
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
     k = view.downscale
     jitter = f"{k}x{k} offsets" if k > 1 else "at most an eighth of a pixel"
-    kept = f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter {jitter}"
+    reduced = f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter {jitter}"
     return (
         f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
-        f"{kept if view.shrunk > 1 else ''}"
+        f"{reduced if view.shrunk > 1 else ''}"
     )
 
 
@@ -192,9 +192,9 @@ def _run(training, options):
         try:
             seconds = training.run(on_step, lambda: bool(caught))
         except KeyboardInterrupt:
-            kept = "goes on from" if folder.checkpoint.exists() else "starts over, there is no"
+            resumes = "goes on from" if folder.checkpoint.exists() else "starts over, there is no"
             raise Stopped(
-                f"stopped at once; the same command {kept} {folder.checkpoint}",
+                f"stopped at once; the same command {resumes} {folder.checkpoint}",
                 128 + signal.SIGINT,
             ) from None
     if trainer.step < training.config.train.iterations:

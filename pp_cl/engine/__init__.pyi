@@ -1,7 +1,7 @@
 from .camera import Camera as Camera
 from .device.device import Device as Device
 from .grid import Grid as Grid
-from .grid import smallest_edge as smallest_edge
+from .grid import smallest_voxel_size as smallest_voxel_size
 from .model import Model as Model
 from .network.means import Means as Means
 from .network.unet import UNet as UNet

@@ -13,7 +13,7 @@ class Camera:
     """A pinhole camera with OpenCV axes: x right, y down, z forward.
 
     pose: (3, 4) float64 camera-to-world, orthonormal rotation. fx, fy, cx, cy: pixels; the centre
-    of pixel (x, y) is (x + 0.5, y + 0.5). samples: pixels of a viewer's picture, each way, whose
+    of pixel (x, y) is (x + 0.5, y + 0.5). samples: pixels of a viewer's rendering, each way, whose
     mean a pixel is, for Gaussians alone. The depth range is the model's, not the camera's.
     """
 

@@ -23,8 +23,8 @@ HALF_OF_NEIGHBOURS = [step for step in product((0, 1, -1), repeat=3) if step[::-
 class Grid:
     """A regular grid.
 
-    origin: world position of vertex (0, 0, 0). edge: spacing, world units. dims: number of vertices
-    along x, y and z.
+    origin: world position of vertex (0, 0, 0). voxel_size: distance of neighbouring vertices, world
+    units. dims: number of vertices along x, y and z.
 
     Ids number the vertices brick by brick of 8x8x8, bricks and the vertices in each x first, so
     that points in the order of their ids lie near one another in all directions: 16 of them meet
@@ -32,27 +32,27 @@ class Grid:
     """
 
     origin: tuple[float, ...]
-    edge: float
+    voxel_size: float
     dims: tuple[int, ...]
 
     @classmethod
-    def centred_in(cls, box: np.ndarray, edge: float) -> "Grid":
-        """The largest grid of this edge that fits into a (2, 3) box, centred in it."""
-        steps = np.maximum(box[1] - box[0], 0) // edge
-        origin = box.mean(0) - edge * steps / 2
-        return cls(tuple(float(x) for x in origin), edge, tuple(int(n) + 1 for n in steps))
+    def centred_in(cls, box: np.ndarray, voxel_size: float) -> "Grid":
+        """The largest grid of this voxel size that fits into a (2, 3) box, centred in it."""
+        steps = np.maximum(box[1] - box[0], 0) // voxel_size
+        origin = box.mean(0) - voxel_size * steps / 2
+        return cls(tuple(float(x) for x in origin), voxel_size, tuple(int(n) + 1 for n in steps))
 
     @classmethod
     def of_header(cls, stored: dict[str, Any]) -> "Grid":
         """The grid of what header() gave."""
         origin = tuple(map(float, stored["origin"]))  # JSON may hold integers beyond 64 bits
-        return cls(origin, float(stored["edge"]), tuple(stored["dims"]))
+        return cls(origin, float(stored["voxel_size"]), tuple(stored["dims"]))
 
     def header(self) -> dict[str, Any]:
-        """JSON-able: {"origin", "edge", "dims"}."""
+        """JSON-able: {"origin", "voxel_size", "dims"}."""
         return {
             "origin": [float(x) for x in self.origin],
-            "edge": float(self.edge),
+            "voxel_size": float(self.voxel_size),
             "dims": [int(n) for n in self.dims],
         }
 
@@ -60,13 +60,13 @@ class Grid:
         """The grid of half the spacing that has eight vertices around each of this one's: vertex
         (i, j, k) is in the middle of (2 i, 2 j, 2 k) to (2 i + 1, 2 j + 1, 2 k + 1).
         """
-        origin = tuple(x - self.edge / 4 for x in self.origin)
-        return Grid(origin, self.edge / 2, tuple(2 * n for n in self.dims))
+        origin = tuple(x - self.voxel_size / 4 for x in self.origin)
+        return Grid(origin, self.voxel_size / 2, tuple(2 * n for n in self.dims))
 
     def coarsened(self) -> "Grid":
         """The grid whose refined() this is."""
-        origin = tuple(x + self.edge / 2 for x in self.origin)
-        return Grid(origin, 2 * self.edge, tuple(n // 2 for n in self.dims))
+        origin = tuple(x + self.voxel_size / 2 for x in self.origin)
+        return Grid(origin, 2 * self.voxel_size, tuple(n // 2 for n in self.dims))
 
     def children(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(ids of refined(), ascending, the place in `ids` of each one's parent), (8 N) uint32
@@ -83,45 +83,49 @@ class Grid:
     @property
     def centre(self) -> np.ndarray:
         """(3,) float64 world position of the middle of the vertices."""
-        return np.asarray(self.origin) + self.edge * (np.asarray(self.dims) - 1) / 2
+        return np.asarray(self.origin) + self.voxel_size * (np.asarray(self.dims) - 1) / 2
 
     @property
     def box(self) -> np.ndarray:
         """(2, 3) float64: the first and the last vertex."""
         low = np.asarray(self.origin)
-        return np.stack([low, low + self.edge * (np.asarray(self.dims) - 1)])
+        return np.stack([low, low + self.voxel_size * (np.asarray(self.dims) - 1)])
 
     @property
     def diagonal(self) -> float:
-        """From the first to the last vertex, world units; an edge where there is one vertex."""
-        return float(np.linalg.norm(np.ptp(self.box, axis=0))) or self.edge
+        """From the first to the last vertex, world units; the voxel size where there is one
+        vertex.
+        """
+        return float(np.linalg.norm(np.ptp(self.box, axis=0))) or self.voxel_size
 
     def moved(self, by: ArrayLike) -> "Grid":
         """The grid moved by (3,) world units."""
         return replace(self, origin=tuple(float(x) for x in np.add(self.origin, by)))
 
     def rounded(self) -> "Grid":
-        """The grid with an edge that float32 holds, and an origin of whole units of its last bit.
-        So float64 holds each vertex and the centre exactly, up to 2^28 edges from the world's
+        """The grid with a voxel size that float32 holds, and an origin of whole units of its last
+        bit. So float64 holds each vertex and the centre exactly, up to 2^28 voxels from the world's
         origin, and moves by whole units change nothing else.
         """
-        unit = 2.0 ** (math.frexp(self.edge)[1] - FLOAT32_BITS)
+        unit = 2.0 ** (math.frexp(self.voxel_size)[1] - FLOAT32_BITS)
         origin = tuple(float(x) for x in unit * np.rint(np.divide(self.origin, unit)))
-        return replace(self, origin=origin, edge=float(unit * np.rint(self.edge / unit)))
+        return replace(
+            self, origin=origin, voxel_size=float(unit * np.rint(self.voxel_size / unit))
+        )
 
     def packed(self, centre: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
         """(8,) float32, the layout of cl/grid.h. centre: as Camera.packed has it."""
         origin = np.subtract(self.origin, centre)
-        return np.array([*origin, self.edge, *self.dims, 0], np.float32)
+        return np.array([*origin, self.voxel_size, *self.dims, 0], np.float32)
 
     def positions(self, ids: ArrayLike) -> np.ndarray:
         """(N, 3) float64 world positions of the vertices with ids (N,)."""
-        return np.asarray(self.origin) + self.edge * self.coordinates(ids)
+        return np.asarray(self.origin) + self.voxel_size * self.coordinates(ids)
 
     def lattice(self) -> np.ndarray:
         """(nz ny nx, 3) float64: the world positions of all vertices, x first."""
         places = np.moveaxis(np.indices(self.dims[::-1]), 0, -1)[..., ::-1].reshape(-1, 3)
-        return np.asarray(self.origin) + self.edge * places
+        return np.asarray(self.origin) + self.voxel_size * places
 
     @property
     def id_count(self) -> int:
@@ -153,10 +157,10 @@ class Grid:
 
     def in_large_parts(self, ids: np.ndarray, least: int) -> np.ndarray:
         """(N,) bool: which of the vertices with ids (N,), ascending, are in a connected part
-        (edges, diagonals) of at least `least`; where there is none, those in the largest. It takes
+        (sides, diagonals) of at least `least`; where there is none, those in the largest. It takes
         the memory of the vertices, not of the box around them.
         """
-        ids, place, edges = np.asarray(ids, np.int64), self.coordinates(ids), []
+        ids, place, found_pairs = np.asarray(ids, np.int64), self.coordinates(ids), []
         for step in HALF_OF_NEIGHBOURS:
             there = place + step
             inside = np.flatnonzero(((there >= 0) & (there < self.dims)).all(1))
@@ -164,8 +168,8 @@ class Grid:
             found = np.searchsorted(ids, wanted)
             found[found == len(ids)] = 0
             known = ids[found] == wanted
-            edges.append(np.stack([inside[known], found[known]]).astype(np.int32))
-        one, other = np.concatenate(edges, 1)
+            found_pairs.append(np.stack([inside[known], found[known]]).astype(np.int32))
+        one, other = np.concatenate(found_pairs, 1)
         graph = coo_array((np.ones(len(one), bool), (one, other)), (len(ids), len(ids)))
         part = connected_components(graph, directed=False)[1]
         size = np.bincount(part)
@@ -177,18 +181,22 @@ class Grid:
         """
         intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
         offset = np.asarray(self.origin) - camera.eye
-        return intrinsics @ camera.pose[:, :3].T @ np.column_stack([self.edge * np.eye(3), offset])
+        return (
+            intrinsics
+            @ camera.pose[:, :3].T
+            @ np.column_stack([self.voxel_size * np.eye(3), offset])
+        )
 
 
-def smallest_edge(box: np.ndarray, cells: int) -> float:
-    """Edge, within 0.1 %, of the finest grid over a (2, 3) box with at most `cells` vertices; 1
-    where the box is one place.
+def smallest_voxel_size(box: np.ndarray, cells: int) -> float:
+    """Voxel size, within 0.1 %, of the finest grid over a (2, 3) box with at most `cells` vertices;
+    1 where the box is one place.
     """
     size = box[1] - box[0]
     if not size.any():
         return 1.0
     size = np.maximum(size, 1e-6 * size.max())  # a box may be flat
-    edge = (size.prod() / cells) ** (1 / 3)
-    while (excess := np.prod(size // edge + 1) / cells) > 1:
-        edge *= max(excess ** (1 / 3), 1.001)
-    return float(edge)
+    voxel_size = (size.prod() / cells) ** (1 / 3)
+    while (excess := np.prod(size // voxel_size + 1) / cells) > 1:
+        voxel_size *= max(excess ** (1 / 3), 1.001)
+    return float(voxel_size)

@@ -45,7 +45,7 @@ class Model:
     def positions(self) -> np.ndarray:
         """(N, 3) float64 world positions of the points."""
         vertices = self.grid.positions(self.dev.download(self.cloud.ids))
-        return vertices + self.grid.edge * self.dev.download(self.cloud.offset)[:, :3]
+        return vertices + self.grid.voxel_size * self.dev.download(self.cloud.offset)[:, :3]
 
     def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
         """(21,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the

@@ -1,5 +1,5 @@
-"""The renderer: from a model and a camera to an image, and back to gradients. This is the
-one place that writes the order of the stages.
+"""The renderer: from a model and a camera to an image, and back to gradients. This is the one place
+that writes the order of the stages.
 
 project -> pairs -> blend weights -> shade the visible points -> blend their features -> U-Net
 """
@@ -14,9 +14,9 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.device.buffers import Buffers, Reading, Table, grown
+from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.tiles import tiles_hit
+from pp_cl.engine.layers.tiles import tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
     BlendGradients,
@@ -25,7 +25,7 @@ from pp_cl.engine.raster.blend import (
     blend_forward,
     shade_forward,
 )
-from pp_cl.engine.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
+from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs, pairs_table
 from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid, projection_table
 from pp_cl.engine.raster.weights import (
     ALL,
@@ -43,10 +43,12 @@ MOST_SIDE = 2**16 - 1  # pixels of an image: the boxes of points have 16 bits
 PAPER_DEPTH_RANGE = 4.0
 
 
-def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, float]) -> float:
-    """The radius in world units of points whose offset is 0. edge: of the grid, world units."""
+def point_radius(
+    settings: RasterConfig, voxel_size: float, depth_range: tuple[float, float]
+) -> float:
+    """The radius in world units of points whose offset is 0. voxel_size: world units."""
     if settings.footprint in MOVED:
-        return settings.radius * edge
+        return settings.radius * voxel_size
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
 
@@ -61,16 +63,16 @@ def view_table(
     until: Literal["weights", "image"] = "image",
     training: bool = False,
 ) -> Table:
-    """The buffers of Renderer for a view of n points with so many pixels, hits and visible points.
-    until, training: of forward(); with record_weights() if it ends at the weights, with backward()
-    in a training.
+    """The buffers of Renderer for a view of n points with so many pixels, fragments and visible
+    points. until, training: of forward(); with record_weights() if it ends at the weights, with
+    backward() in a training.
     """
     table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs)
     table |= weights_table(n, pixels, pairs if training else 1)
     table["features"] = (pixels, 16), np.float32
     if until == "weights":
         return table | {"pair_gradient": ((pairs, 2), np.float32)}
-    table["shaded_features"] = (visible, 16), np.float32
+    table["visible_features"] = (visible, 16), np.float32
     if training:
         table |= blend_backward_table(visible, pixels, pairs, settings.blend, settings.footprint)
     return table
@@ -83,11 +85,11 @@ class RenderResult:
 
     camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
     offset: (left, top) of the view in it. points: the N points as the padded camera sees them.
-    tiles: (rows, columns) bool, the 4x4 tiles of the padded image that have hits; None where the
-    network computes all. shaded_features: float32, one row of 16 for each point of weights.shaded,
-    then room for more. features: (H, W, 16) float32, blended from them. image: (H, W, 3) float32,
-    unclamped. computed_fraction: share of the network's multiplications that was done; the others
-    would have seen only background.
+    tile_mask: (rows, columns) bool, the 4x4 tiles of the padded image that have fragments; None
+    where the network computes all. visible_features: float32, one row of 16 for each point of
+    weights.visible, then room for more. features: (H, W, 16) float32, blended from them. image: (H,
+    W, 3) float32, unclamped. computed_fraction: share of the network's multiplications that was
+    done; the others would have seen only background.
     """
 
     dev: Device
@@ -97,8 +99,8 @@ class RenderResult:
     points: ProjectedPoints
     pairs: Pairs
     weights: BlendWeights
-    tiles: Reading[np.ndarray] | None
-    shaded_features: Array = field(init=False)
+    tile_mask: Pending[np.ndarray] | None
+    visible_features: Array = field(init=False)
     features: Array = field(init=False)
     image: Array = field(init=False)
     computed_fraction: float = 1.0
@@ -129,13 +131,13 @@ class Renderer:
         # crops. Of each: capacities of the arrays of pairs and of visible points, which grow with
         # the views.
         self._by_pair = False
-        self._room, self._shaded_room = [1, 1], [1, 1]
+        self._capacity, self._visible_capacity = [1, 1], [1, 1]
         self.release()
 
     @property
     def point_radius(self) -> float:
         """The radius in world units of points whose offset is 0."""
-        return point_radius(self.settings, self.model.grid.edge, self.model.depth_range)
+        return point_radius(self.settings, self.model.grid.voxel_size, self.model.depth_range)
 
     def release(self) -> None:
         """Free the buffers; the next view makes them anew."""
@@ -187,36 +189,40 @@ class Renderer:
                 cloud_offset=cloud.offset,
                 radius=self.point_radius,
             )
-        pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop, training)
-        result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)
+        pairs, weights, tile_mask = self._pairs_and_weights(
+            points, size, gamma, early_stop, training
+        )
+        result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tile_mask)
         if until == "weights":
             return result
         with dev.stage("shade"):
-            shaded = weights.shaded
-            room = self._shaded_room[by_pair] = grown(self._shaded_room[by_pair], shaded.size)
-            b.require({"shaded_features": ((min(room, cloud.count), 16), np.float32)})
-            shade_forward(dev, points, shaded, cloud.sh, shaded_features=b.shaded_features)
+            visible = weights.visible
+            capacity = self._visible_capacity[by_pair] = grown(
+                self._visible_capacity[by_pair], visible.size
+            )
+            b.require({"visible_features": ((min(capacity, cloud.count), 16), np.float32)})
+            shade_forward(dev, points, visible, cloud.sh, visible_features=b.visible_features)
         with dev.stage("blend"):
-            blend_forward(dev, pairs, weights, b.shaded_features, b.features)
-        result.shaded_features, result.features = b.shaded_features, b.features
+            blend_forward(dev, pairs, weights, b.visible_features, b.features)
+        result.visible_features, result.features = b.visible_features, b.features
         if until == "features":
             return result
         with dev.stage("network"):
             plan: Any = None
             if net.is_planned(size):
-                plan = net.plan_tiles(size, tiles.get(), gradient_tiles())
+                plan = net.plan_tiles(size, tile_mask.get(), gradient_tiles())
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(b.features, training, plan)
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training):
-        """(Pairs, BlendWeights, RenderResult.tiles). Both stages are enqueued before the number
-        of pairs is known, and run again with more room if it was too small.
+        """(Pairs, BlendWeights, RenderResult.tile_mask). Both stages are enqueued before the number
+        of pairs is known, and run again with more capacity if it was too small.
         """
         settings, by_pair = self.settings, self._by_pair
         while True:
             with self.dev.stage("pairs"):
-                pairs = find_pairs(self.dev, self._buffers, points, size, self._room[by_pair])
+                pairs = find_pairs(self.dev, self._buffers, points, size, self._capacity[by_pair])
             with self.dev.stage("weights"):
                 weights = blend_weights(
                     self.dev,
@@ -228,15 +234,15 @@ class Renderer:
                     gamma=gamma,
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
-                    slopes=training,
+                    derivatives=training,
                 )
-            tiles = None
+            tile_mask = None
             if self.model.net.is_planned(size):
-                tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
-            (tiles or weights.shaded_list).get()  # the host's one wait for the device
-            self._room[by_pair] = room_needed(pairs)
-            if self._room[by_pair] == pairs.capacity:
-                return pairs, weights, tiles
+                tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
+            (tile_mask or weights.visible_list).get()  # the host's one wait for the device
+            self._capacity[by_pair] = capacity_needed(pairs)
+            if self._capacity[by_pair] == pairs.capacity:
+                return pairs, weights, tile_mask
             del pairs, weights  # else their arrays would stay beside the larger ones
 
     def backward(self, result: RenderResult, grad_image: Array, **options: Any) -> BlendGradients:
@@ -253,17 +259,17 @@ class Renderer:
         grad_features: Array,
         *,
         grad_alpha: Array | None = None,
-        spread_weight: float = 0.0,
+        distortion_weight: float = 0.0,
         with_offsets: bool = False,
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
-        alpha compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with
-        this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
+        alpha compositing also from dL/dalpha (H * W,), and of the distortion loss of each pixel
+        with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
         points are composited by alpha, there are none of offsets.
 
         result: of the last forward(training=True). The gradients of the SH coefficients are those
-        of the shaded features times the basis functions in the view's direction; the optimiser
-        multiplies them as it moves each coefficient, and never stores them.
+        of the visible points' features times the basis functions in the view's direction; the
+        optimiser multiplies them as it moves each coefficient, and never stores them.
         """
         settings = self.settings
         moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
@@ -275,23 +281,24 @@ class Renderer:
                 result.pairs,
                 result.weights,
                 opacity=self.model.cloud.opacity,
-                shaded_features=result.shaded_features,
+                visible_features=result.visible_features,
                 features=result.features,
                 grad_features=grad_features,
                 grad_alpha=grad_alpha,
-                spread_weight=spread_weight,
-                edge=self.model.grid.edge if moves else 0.0,
+                distortion_weight=distortion_weight,
+                voxel_size=self.model.grid.voxel_size if moves else 0.0,
             )
 
     def blend(self, result: RenderResult, features: np.ndarray) -> np.ndarray:
-        """(H, W, 16) float32: features (S, 16) of the visible points result.weights.shaded, blended
-        by the weights of a view, without its padding. They take the place of result.features.
+        """(H, W, 16) float32: features (S, 16) of the visible points result.weights.visible,
+        blended by the weights of a view, without its padding. They take the place of
+        result.features.
 
         result: of the last forward(training=True).
         """
-        self.dev.write(result.shaded_features[: len(features)], features)
+        self.dev.write(result.visible_features[: len(features)], features)
         blend_forward(
-            self.dev, result.pairs, result.weights, result.shaded_features, result.features
+            self.dev, result.pairs, result.weights, result.visible_features, result.features
         )
         return result.cropped(self.dev.download(result.features))
 
@@ -303,7 +310,7 @@ class Renderer:
         result.cropped(padded)[:] = pixels
         result.weights = replace(result.weights, tracked=ALL)
         gradients = self.backward_features(result, self.dev.upload(padded))
-        return self.dev.download(gradients.shaded_features[: result.weights.shaded.size])
+        return self.dev.download(gradients.visible_features[: result.weights.visible.size])
 
     def record_weights(
         self,

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, DeviceRows, Reading
+from pp_cl.engine.device.buffers import Buffers, DeviceRows, Pending
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.model import Model
 from pp_cl.engine.render import Renderer, RenderResult
@@ -62,7 +62,7 @@ class Trainer:
         self._composited = config.raster.blend == "alpha"
         self._target = Target(dev)
         self._buffers = Buffers(dev)
-        self._terms: Reading[dict[str, float]] | None = None  # of the loss of the last step
+        self._terms: Pending[dict[str, float]] | None = None  # of the loss of the last step
         self._smoother: Smoother | None = None  # made when it is due, anew when the points change
         self._refine_steps = refine_steps(train)
         self.crops = Crops(views, train, self.refinements_to_come)
@@ -80,7 +80,7 @@ class Trainer:
 
     @property
     def is_exposed(self) -> bool:
-        """Whether photographs are divided by gains."""
+        """Whether images are divided by gains."""
         return self.exposure is not None and self.exposure.is_applied
 
     @property
@@ -90,7 +90,7 @@ class Trainer:
 
     # ---- a step ----------------------------------------------------------------------------------
 
-    def train_step(self) -> Reading[dict[str, float]]:
+    def train_step(self) -> Pending[dict[str, float]]:
         """Enqueue one step, which the device may not have finished on return; returns the terms of
         its loss. Raises Diverged if a term of the previous step is not finite.
         """
@@ -98,36 +98,38 @@ class Trainer:
         rates = Rates.at(self.step, config.network, train)
         crop = self.crops.draw(self.step)
         with self.dev.stage("target"):
-            photograph, alpha = self._target.crop(crop.view, crop.box, crop.jitter)
-            target = photograph
+            image, alpha = self._target.crop(crop.view, crop.box, crop.jitter)
+            target = image
             if self.exposure and self.exposure.is_applied:
-                target = self.exposure.target(crop.view_index, photograph, alpha)
+                target = self.exposure.target(crop.view_index, image, alpha)
             says_nothing = crop.view.ignored_crop(crop.box, crop.jitter)
             padded, *corner = crop.camera.padded(self.model.net.multiple)
             size = padded.height, padded.width
-            tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
+            find_gradient_tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
             ignored = None if says_nothing is None else self._sent(says_nothing)
 
         rendered = self.renderer.forward(
-            crop.camera, self.gamma, training=True, gradient_tiles=tiles
+            crop.camera, self.gamma, training=True, gradient_tiles=find_gradient_tiles
         )
         with self.dev.stage("loss"):
             if self.exposure:
                 offset = rendered.offset
-                self.exposure.fit(crop.view_index, rendered.image, photograph, alpha, offset)
+                self.exposure.fit(crop.view_index, rendered.image, image, alpha, offset)
             grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
-        # the spread is a mean over the pixels, as a share of the grid's diagonal
+        # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * self.model.grid.diagonal
-        spread_weight = self._rising(train.spread_weight if self._composited else 0.0)
+        distortion_weight = self._rising(train.distortion_weight if self._composited else 0.0)
         gradients = self.renderer.backward(
             rendered,
             grad_image,
             grad_alpha=grad_alpha,
-            spread_weight=spread_weight / all_depths,
+            distortion_weight=distortion_weight / all_depths,
             with_offsets=rates.offset > 0,
         )
-        if spread_weight > 0:
-            self.loss.add("spread", gradients.pixel_spread, spread_weight, 1 / all_depths)
+        if distortion_weight > 0:
+            self.loss.add(
+                "distortion", gradients.pixel_distortion, distortion_weight, 1 / all_depths
+            )
 
         with self.dev.stage("update"):
             self.optimiser.update(
@@ -135,7 +137,7 @@ class Trainer:
                 rates,
                 gradients,
                 points=rendered.points,
-                shaded=rendered.weights.shaded,
+                visible=rendered.weights.visible,
                 sh_eps=train.sh_eps / target.size,
             )
         with self.dev.stage("max weights"):
@@ -159,8 +161,8 @@ class Trainer:
         alpha: Array,
         ignored: Array | None,
     ) -> tuple[Array, Array | None]:
-        """(dL/dimage, dL/dalpha or None) of all terms but the spread; their values go to self.loss,
-        which stays on the device. ignored: (H, W) uint8, 1 where a pixel of the crop is.
+        """(dL/dimage, dL/dalpha or None) of all terms but the distortion loss; their values go to
+        self.loss, which stays on the device. ignored: (H, W) uint8, 1 where a pixel of the crop is.
         """
         train, image, offset, grad_alpha = self.config.train, rendered.image, rendered.offset, None
         if ignored is not None:
@@ -202,8 +204,8 @@ class Trainer:
         step.
         """
         train, step = self.config.train, self.step
-        is_open = self.exposure is not None and not self.exposure.is_applied
-        if is_open and step == decided_at(self.begun, len(self.views)):
+        is_undecided = self.exposure is not None and not self.exposure.is_applied
+        if is_undecided and step == decided_at(self.begun, len(self.views)):
             self.exposure = self.exposure.decided()
         if train.sh_smoothing > 0 and step % SMOOTHING_EVERY == 0:
             with self.dev.stage("smoothing"):

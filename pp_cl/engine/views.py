@@ -1,4 +1,4 @@
-"""Views: photographs with their cameras, listed by a scene, loaded, and reduced."""
+"""Views: images with their cameras, listed by a scene, loaded, and reduced."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,18 +25,18 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A photograph, which is used reduced: its pixels are the means of blocks of
-    downscale x downscale stored pixels.
+    """An image, which is used reduced: its pixels are the means of blocks of downscale x downscale
+    stored pixels.
 
     name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
     image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
     in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
     None for one that the program makes itself. shrunk: how many times the stored image was reduced
-    while it was read from its file (shrink()). unshrunk_camera: of the file's image, where
-    that is another one. is_masked: a mask of its own says so where the object fills the image.
-    ignored: (H, W) bool, the pixels that say nothing, neither for the hull nor for the loss; the
-    image is 0 there. None: there are none.
+    while it was read from its file (shrink()). unshrunk_camera: of the file's image, where that is
+    another one. is_masked: a mask of its own says so where the object fills the image. ignored: (H,
+    W) bool, the pixels that say nothing, neither for the hull nor for the loss; the image is 0
+    there. None: there are none.
     """
 
     name: str
@@ -101,12 +101,12 @@ class View:
         return truth if ignored is None else np.where(ignored[..., None], image, truth)
 
     def moved(self, by: ArrayLike) -> "View":
-        """The same photograph, its camera moved by (3,) world units."""
+        """The same image, its camera moved by (3,) world units."""
         unshrunk = self.unshrunk_camera and self.unshrunk_camera.moved(by)
         return replace(self, stored_camera=self.stored_camera.moved(by), unshrunk_camera=unshrunk)
 
     def reduced(self, downscale: int) -> "View":
-        """The same photograph reduced `downscale` times from its stored resolution.
+        """The same image reduced `downscale` times from its stored resolution.
 
         Raises UserError unless that is a whole number that leaves at least MIN_SIDE pixels each
         way.
@@ -116,7 +116,7 @@ class View:
         return replace(self, downscale=downscale)
 
     def near_size(self, side: int) -> "View":
-        """The same photograph reduced to about `side` pixels, as fitting_downscale() has it."""
+        """The same image reduced to about `side` pixels, as fitting_downscale() has it."""
         size = self.stored_camera.width, self.stored_camera.height
         return replace(self, downscale=fitting_downscale(size, side))
 
@@ -146,7 +146,7 @@ class View:
 
 
 def check_downscale(name: str, camera: Camera, downscale: int) -> None:
-    """Raise UserError unless the photograph `name` of a camera can be reduced `downscale` times: a
+    """Raise UserError unless the image `name` of a camera can be reduced `downscale` times: a
     whole number that leaves at least MIN_SIDE pixels each way.
     """
     width, height = camera.width, camera.height

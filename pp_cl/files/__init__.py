@@ -1,4 +1,4 @@
-"""Reads and writes files: checkpoints, images, films, the folder of a run; written atomically and
+"""Reads and writes files: checkpoints, images, videos, the folder of a run; written atomically and
 checked when read.
 """
 

@@ -14,7 +14,7 @@ from .atomic import remove_ours as remove_ours
 from .atomic import write_json as write_json
 from .atomic import write_text as write_text
 from .exr import write_exr as write_exr
-from .image import image_files as image_files
+from .image import image_paths as image_paths
 from .image import in_srgb as in_srgb
 from .image import is_deep_png as is_deep_png
 from .image import read_mask as read_mask

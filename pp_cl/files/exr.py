@@ -121,7 +121,7 @@ def _wanted(path, header, chunk):
         for colours in COLOURS
         if all(layer + name in channels for name in colours)
     ]
-    whole = [entry for entry in found if entry[0] == ""] or found
+    whole = [one for one in found if one[0] == ""] or found
     if len(whole) != 1:
         raise UserError(
             f"{path}: has {'no' if not whole else 'several'} images among its channels"

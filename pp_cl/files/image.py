@@ -211,7 +211,7 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
         file.write(encoded.getbuffer())
 
 
-def image_files(names: list[str]) -> list[PurePosixPath]:
+def image_paths(names: list[str]) -> list[PurePosixPath]:
     """Relative paths of PNG files for views of these names: the folders in which they differ stay,
     those that all of them share go.
     """

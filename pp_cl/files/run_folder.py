@@ -16,7 +16,7 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import check_ours, own, remove_ours, told, write_text
 from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
-MASKS_PICTURE = "masks.png"
+MASKS_SHEET = "masks.png"
 MOST_OWNER = 1000  # bytes of the line that names the owner
 MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
 MOST_LOG = 2**25  # bytes of a log: 80,000 rows
@@ -27,9 +27,7 @@ MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews: paths in it, which need not
-    exist.
-    """
+    """path: the folder; config, checkpoint, log, previews: paths in it, which need not exist."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
@@ -115,21 +113,21 @@ class RunFolder:
             with suppress(OSError):
                 lock.release()
 
-    def check_pictures(self, step: int) -> None:
-        """Raise UserError for a picture that training from this step on would replace, or create()
+    def check_sheets(self, step: int) -> None:
+        """Raise UserError for an image that training from this step on would replace, or create()
         remove, and that no training has written as it is now.
         """
         begun = "" if step == 0 else f"step_{step:06d}.png"
         previews = [one for one in self.previews.glob("step_*.png") if one.name > begun]
-        check_ours([self.path / MASKS_PICTURE] * (step == 0) + previews)
+        check_ours([self.path / MASKS_SHEET] * (step == 0) + previews)
 
     def create(self, config_json: str) -> None:
-        """Make the folders, remove what a killed process left unfinished, and pictures that belong
+        """Make the folders, remove what a killed process left unfinished, and images that belong
         to no checkpoint; write config.json, which makes the folder one of a run, before the rest.
         """
         own(self.path)
         if not self.checkpoint.exists():
-            remove_ours([self.path / MASKS_PICTURE, *self.previews.glob("step_*.png")])
+            remove_ours([self.path / MASKS_SHEET, *self.previews.glob("step_*.png")])
         self.configure(config_json)
         self.previews.mkdir(exist_ok=True)
 
@@ -183,18 +181,18 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
         numbers = [row["step"], row["seconds"], row.get("loss", 0), row.get("psnr", 0)]
         is_row = type(numbers[0]) is int and all(type(n) in (int, float) for n in numbers)
         is_row = is_row and min(numbers[:2]) >= 0 and type(row.get("device", "")) is str
-        return row if is_row and _is_kept(row) else None
+        return row if is_row and _is_loggable(row) else None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
 
-def _is_kept(value, levels=MOST_LEVELS):
+def _is_loggable(value, levels=MOST_LEVELS):
     """Whether a value of JSON may be written again: no number in it is huge, infinite included, and
     it is not nested deeply.
     """
     if isinstance(value, (list, dict)):
         inside = value.values() if isinstance(value, dict) else value
-        return levels > 0 and all(_is_kept(part, levels - 1) for part in inside)
+        return levels > 0 and all(_is_loggable(part, levels - 1) for part in inside)
     return not isinstance(value, (int, float)) or abs(value) < MOST_NUMBER
 
 

@@ -1,6 +1,4 @@
-"""Contact sheets: many images in one picture, predictions beside the truth or photographs of a
-scene.
-"""
+"""Contact sheets: many images in one image, predictions beside the truth or images of a scene."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,17 +8,17 @@ from PIL import Image, ImageDraw
 
 from pp_cl.files.image import to_8bit, write_png
 
-ERROR_GAIN = 4
+ERROR_SCALE = 4
 GAP = 2  # pixels between the images
 HEADER = 14  # pixels for the captions
-CAPTIONS = ("prediction", "truth", f"error x{ERROR_GAIN}")
+CAPTIONS = ("prediction", "truth", f"error x{ERROR_SCALE}")
 LINE, INK = (200, 200, 200), (60, 60, 60)
 
 
 def contact_sheet(
     images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
 ) -> np.ndarray:
-    """(H, W, 3) uint8 picture of uint8 images, (H, W, 3) or (H, W, 4), row by row under their
+    """(H, W, 3) uint8 image of uint8 images, (H, W, 3) or (H, W, 4), row by row under their
     captions, each in a cell as large as the largest; what is transparent, or beside a smaller
     image, shows white. There are no more columns than images.
     """
@@ -47,7 +45,7 @@ def write_comparison(
     """Write a PNG file of float (H, W, 3) images in [0, 1]: a row of prediction, truth and error
     for each view, whose sizes may differ.
 
-    The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as
+    The error is the absolute difference, mean of the channels, ERROR_SCALE times; white is none, as
     around the object.
     """
     pairs = zip(predictions, truths, strict=True)
@@ -57,4 +55,4 @@ def write_comparison(
 
 def _error(prediction, truth):
     error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
-    return np.repeat(1 - ERROR_GAIN * error, 3, axis=2)
+    return np.repeat(1 - ERROR_SCALE * error, 3, axis=2)

@@ -14,7 +14,8 @@ from pp_cl.errors import UserError, shown
 
 MOST_REASON = 120  # characters
 MOST_VALUES = 2**22  # of a JSON file: 100,000 cameras of 40; with its text they take 1 GiB at most
-# bytes of a zip's directory: each entry takes about ten times its part of it as zipfile keeps it
+# bytes of a zip's directory: each file in it takes about ten times its part of it as zipfile keeps
+# it
 MOST_DIRECTORY = 2**24
 MOST_PIXELS = 2 * 89_478_485  # of an image; Pillow refuses more. The largest sensors have 151 M
 

@@ -60,8 +60,8 @@ def _download(url, target, _):
 
 
 def parse_weights(content: bytes) -> dict[str, np.ndarray]:
-    """load_weights()'s arrays from the bytes of MEMBER: for each convolution its kernel
-    (3, 3, CI, CO) and bias, then the heads. Nothing that a pickle asks for is executed.
+    """load_weights()'s arrays from the bytes of MEMBER: for each convolution its kernel (3, 3, CI,
+    CO) and bias, then the heads. Nothing that a pickle asks for is executed.
     """
     arrays = [
         np.frombuffer(argument, "<f4")

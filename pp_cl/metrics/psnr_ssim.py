@@ -48,7 +48,7 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 def exposed_alike(truth: np.ndarray, prediction: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """(H, W, 3) the truth, the object in it divided by the gain of each channel that brings the
-    prediction nearest to it: as the photograph would be at the exposure that was learned.
+    prediction nearest to it: as the image would be at the exposure that was learned.
 
     truth, prediction: (H, W, 3) in [0, 1], over white. alpha: (H, W) of the truth.
     """

@@ -59,7 +59,7 @@ def read_mesh(path: Path | str) -> Mesh:
 class Surface:
     """The vertices of a grid that are nearest to some point of a mesh.
 
-    grid: around the mesh and the grid asked for, of the same edge and in step with it. bits:
+    grid: around the mesh and the grid asked for, of the same voxel size and in step with it. bits:
     (ny nz, words) uint32, the set: bit b of word w in a row is vertex 32 w + b. count: of its
     vertices.
     """
@@ -70,7 +70,9 @@ class Surface:
 
     def holds(self, grid: Grid, ids: np.ndarray) -> np.ndarray:
         """(N,) bool: which vertices of the grid asked for, by their ids (N,), are among them."""
-        steps = np.rint(np.subtract(grid.origin, self.grid.origin) / grid.edge).astype(np.int64)
+        steps = np.rint(np.subtract(grid.origin, self.grid.origin) / grid.voxel_size).astype(
+            np.int64
+        )
         i, j, k = (grid.coordinates(ids) + steps).T
         words = self.bits[k * self.grid.dims[1] + j, i // 32]
         return (words >> (i % 32).astype(np.uint32) & 1).astype(bool)
@@ -139,8 +141,8 @@ def _grid_around(mesh, grid):
     of the other's. Raises UserError.
     """
     origin = np.asarray(grid.origin)
-    low = np.floor((mesh.vertices.min(0) - origin) / grid.edge)
-    high = np.ceil((mesh.vertices.max(0) - origin) / grid.edge)
+    low = np.floor((mesh.vertices.min(0) - origin) / grid.voxel_size)
+    high = np.ceil((mesh.vertices.max(0) - origin) / grid.voxel_size)
     low, high = np.minimum(low, 0), np.maximum(high, np.asarray(grid.dims) - 1)
     dims = tuple(int(n) for n in high - low + 1)
     if math.prod(dims) > MOST_VERTICES:
@@ -148,17 +150,17 @@ def _grid_around(mesh, grid):
             f"the mesh reaches over {dims[0]}x{dims[1]}x{dims[2]} vertices of the grid, more than"
             f" {MOST_VERTICES}: is it in the world of the scene?"
         )
-    return Grid(tuple(float(x) for x in origin + low * grid.edge), grid.edge, dims)
+    return Grid(tuple(float(x) for x in origin + low * grid.voxel_size), grid.voxel_size, dims)
 
 
 def _triangles(mesh, grid):
     """(area_end (F,) uint64, corners (F, 3, 4) float32) of the triangles that have an area."""
-    corners = (mesh.vertices[mesh.faces] - np.asarray(grid.origin)) / grid.edge
+    corners = (mesh.vertices[mesh.faces] - np.asarray(grid.origin)) / grid.voxel_size
     sides = corners[:, 1:] - corners[:, :1]
     areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    kept = areas > 0
-    if not kept.any():
+    has_area = areas > 0
+    if not has_area.any():
         raise UserError("the mesh has no triangle with an area")
-    share = np.cumsum(areas[kept]) / areas[kept].sum()
+    share = np.cumsum(areas[has_area]) / areas[has_area].sum()
     area_end = np.minimum(share * WHOLE_AREA, WHOLE_AREA).astype(np.uint64)
-    return area_end, np.pad(corners[kept], ((0, 0), (0, 0), (0, 1))).astype(np.float32)
+    return area_end, np.pad(corners[has_area], ((0, 0), (0, 0), (0, 1))).astype(np.float32)

@@ -24,7 +24,7 @@ def pixel_width(camera: Any, t: np.ndarray) -> np.ndarray:
     return t / min(camera.fx, camera.fy)
 
 
-def kept(
+def drawn(
     camera: Any,
     positions: np.ndarray,
     radius: np.ndarray | float,
@@ -52,9 +52,9 @@ def surface_depth(
     camera: Any, geometry: Arrays, radius: np.ndarray | float, kind: str
 ) -> np.ndarray:
     """(N, HW): where a pixel's ray meets the point, along the camera's axis; of a soft point the
-    front of its ball, by the closeness. geometry, radius (N,) and kind: as geometry() has them.
+    front of its ball, by the falloff. geometry, radius (N,) and kind: as geometry() has them.
     """
-    ranges, d = geometry["depth"], np.maximum(geometry["closeness"], 0)
+    ranges, d = geometry["depth"], np.maximum(geometry["falloff"], 0)
     if kind == "soft":
         radius = np.broadcast_to(np.asarray(radius, np.float64), len(ranges))
         ranges = ranges - radius[:, None] * np.sqrt(d * (2 - d))
@@ -70,16 +70,16 @@ def geometry(
     covariance: np.ndarray | None = None,
     depth_range: tuple[float, float] = DEPTH_RANGE,
 ) -> Arrays:
-    """Dict of (N, HW) arrays: hit, closeness, depth, z = normalised depth, and margin = distance of
-    the hit test from its edge, in pixels.
+    """Dict of (N, HW) arrays: fragment, falloff, depth, z = normalised depth, and margin = distance
+    of the test of coverage from its border, in pixels.
 
     radius: (N,) world units. covariance: (N, 3, 3) of Gaussians, world units squared; None: round
-    ones. Points that are left out hit nothing. Pulsar's box, part of the sphere's rule, is
+    ones. Points that are left out cover nothing. Pulsar's box, part of the sphere's rule, is
     included.
     """
     radius = np.broadcast_to(np.asarray(radius, np.float64), (len(positions),))
     c, r = camera_space(camera, positions), rays(camera)
-    ok = kept(camera, positions, radius, depth_range)
+    ok = drawn(camera, positions, radius, depth_range)
     c = np.where(ok[:, None], c, [0.0, 0.0, 1.0])
     t = np.linalg.norm(c, axis=1)[:, None]
     round_ones = radius[:, None, None] ** 2 * np.eye(3)
@@ -90,32 +90,32 @@ def geometry(
             camera, c, round_ones if covariance is None else covariance
         )
         deviations = np.sqrt(np.einsum("nqi,nij,nqj->nq", away, inverse, away).clip(0))
-        hit = deviations < DEVIATIONS
-        closeness = peak[:, None] * np.exp(-0.5 * deviations**2)
-        depth = np.broadcast_to(c[:, 2:], hit.shape)
+        fragment = deviations < DEVIATIONS
+        falloff = peak[:, None] * np.exp(-0.5 * deviations**2)
+        depth = np.broadcast_to(c[:, 2:], fragment.shape)
         with np.errstate(divide="ignore"):
             margin = np.linalg.norm(away, axis=2) * np.abs(1 - DEVIATIONS / deviations)
     elif kind != "sphere":
         reach, ahead = np.maximum(radius, least), np.maximum(c @ r.T, 0)
         rho = np.linalg.norm(c[:, None] - ahead[..., None] * r[None], axis=2)
-        hit = (rho < reach) & (ahead > 0)
-        closeness = 1 - rho / reach if kind == "soft" else np.ones_like(rho)
+        fragment = (rho < reach) & (ahead > 0)
+        falloff = 1 - rho / reach if kind == "soft" else np.ones_like(rho)
         depth = np.broadcast_to(t, rho.shape)
         margin = np.abs(rho - reach) / width
     else:
         rho = np.linalg.norm(c[:, None] - t[..., None] * r[None], axis=2)
         through = rho < least
-        hit = (rho <= radius) | through
-        closeness = np.where(through & (radius < width), 1.0, np.clip(1 - rho / radius, 0, 1))
+        fragment = (rho <= radius) | through
+        falloff = np.where(through & (radius < width), 1.0, np.clip(1 - rho / radius, 0, 1))
         along = np.minimum(c @ r.T, t)
         across = np.linalg.norm(c[:, None] - along[..., None] * r[None], axis=2)
         depth = along - np.sqrt(np.maximum(radius**2 - across**2, 0))
         margin = np.minimum(np.abs(rho - radius), np.abs(rho - least)) / width
-        hit &= pulsar_box(camera, c, radius[:, 0])
+        fragment &= pulsar_box(camera, c, radius[:, 0])
     near, far = depth_range
     return {
-        "hit": hit & ok[:, None],
-        "closeness": closeness,
+        "fragment": fragment & ok[:, None],
+        "falloff": falloff,
         "depth": depth,
         "z": 1 - (depth - near) / (far - near),
         "margin": margin,
@@ -124,7 +124,7 @@ def geometry(
 
 
 def gaussians(
-    camera: Any, vertices: np.ndarray, edge: float, offset: np.ndarray, radius: float
+    camera: Any, vertices: np.ndarray, voxel_size: float, offset: np.ndarray, radius: float
 ) -> Arrays:
     """geometry() of Gaussians in the cells of a grid. vertices: (N, 3) world. offset: (N, 9) or
     more, as cl/cloud.h has it. radius: of one without offsets, world units.
@@ -132,7 +132,7 @@ def gaussians(
     lower = np.zeros((len(offset), 3, 3))
     lower[:, range(3), range(3)] = radius * np.exp(offset[:, 3:6])
     lower[:, [1, 2, 2], [0, 0, 1]] = radius * offset[:, 6:9]
-    positions = vertices + edge * offset[:, :3]
+    positions = vertices + voxel_size * offset[:, :3]
     covariance = lower @ lower.transpose(0, 2, 1)
     return geometry(camera, positions, radius, "gaussian", covariance=covariance)
 
@@ -141,7 +141,7 @@ def screen_gaussians(
     camera: Any, c: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((N, HW, 2) from the centres of Gaussians to those of the pixels, (N, 2, 2) inverse of their
-    covariances on the screen, (N,) closeness in the centre). c: (N, 3) in camera axes. covariance:
+    covariances on the screen, (N,) falloff in the centre). c: (N, 3) in camera axes. covariance:
     (N, 3, 3) in world axes.
     """
     (x, y, z), focal = c.T, (camera.fx, camera.fy)
@@ -181,10 +181,10 @@ def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:
 
 
 def order(geometry_: Arrays) -> np.ndarray:
-    """(N, HW) int: each hit's place in its pixel by (depth, index), from 0; other entries are
+    """(N, HW) int: each fragment's place in its pixel by (depth, index), from 0; other numbers are
     meaningless.
     """
-    depth = np.where(geometry_["hit"], geometry_["depth"], np.inf)
+    depth = np.where(geometry_["fragment"], geometry_["depth"], np.inf)
     ranks = np.empty(depth.shape, np.int64)
     np.put_along_axis(
         ranks, np.argsort(depth, axis=0, kind="stable"), np.arange(len(depth))[:, None], axis=0
@@ -194,15 +194,15 @@ def order(geometry_: Arrays) -> np.ndarray:
 
 def blend(geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.0) -> Arrays:
     """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; by_opacity (N, HW), what the
-    logarithm's derivative by o is times b; z (N, HW); background (HW,) b_0; hit (N, HW) used.
+    logarithm's derivative by o is times b; z (N, HW); background (HW,) b_0; fragment (N, HW) used.
     """
-    hit, d, z = geometry_["hit"], geometry_["closeness"], geometry_["z"]
+    fragment, d, z = geometry_["fragment"], geometry_["falloff"], geometry_["z"]
     o = np.asarray(opacity, np.float64)[:, None]
     if stop > 0:
-        hit = hit & ~_stopped(geometry_, o, gamma, stop)
-    with np.errstate(divide="ignore", invalid="ignore"):  # outside the hits
-        log_weight = np.where(hit, np.log(o * d) + o * z / gamma, -np.inf)
-        log_share = np.where(hit, np.log(d) + o * z / gamma, -np.inf)
+        fragment = fragment & ~_stopped(geometry_, o, gamma, stop)
+    with np.errstate(divide="ignore", invalid="ignore"):  # outside the fragments
+        log_weight = np.where(fragment, np.log(o * d) + o * z / gamma, -np.inf)
+        log_share = np.where(fragment, np.log(d) + o * z / gamma, -np.inf)
     m = np.maximum(EPS / gamma, log_weight.max(axis=0, initial=-np.inf))
     total = m + np.log(np.exp(EPS / gamma - m) + np.exp(log_weight - m).sum(axis=0))
     share = np.exp(log_share - total)
@@ -211,17 +211,17 @@ def blend(geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.
         "share": share,
         "by_opacity": share * (1 + o * z / gamma),
         "z": z,
-        "hit": hit,
+        "fragment": fragment,
         "background": np.exp(EPS / gamma - total),
     }
 
 
 def _stopped(geometry_, o, gamma, stop):
-    """(N, HW) bool: hits behind the early stop of their pixel."""
-    hit, d, z = geometry_["hit"], geometry_["closeness"], geometry_["z"]
-    result, ranks = np.zeros_like(hit), order(geometry_)
-    for q in np.flatnonzero(hit.any(axis=0)):
-        points = np.flatnonzero(hit[:, q])
+    """(N, HW) bool: fragments behind the early stop of their pixel."""
+    fragment, d, z = geometry_["fragment"], geometry_["falloff"], geometry_["z"]
+    result, ranks = np.zeros_like(fragment), order(geometry_)
+    for q in np.flatnonzero(fragment.any(axis=0)):
+        points = np.flatnonzero(fragment[:, q])
         points = points[np.argsort(ranks[points, q])]
         log_total = EPS / gamma
         for place, i in enumerate(points):
@@ -244,26 +244,27 @@ def features(blend_: Arrays, point_features: np.ndarray) -> np.ndarray:
 
 def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
     """Dict of front-to-back compositing: alpha (N, HW); weight (N, HW) b; through (N, HW) T in
-    front of a hit; background (HW,) what is left; hit (N, HW) used: those where T >= least.
+    front of a fragment; background (HW,) what is left; fragment (N, HW) used: those where T >=
+    least.
     """
-    hit, ranks = geometry_["hit"], order(geometry_)
+    fragment, ranks = geometry_["fragment"], order(geometry_)
     least_alpha, most_alpha = geometry_["limits"]
-    alpha_ = np.asarray(opacity, np.float64)[:, None] * geometry_["closeness"]
+    alpha_ = np.asarray(opacity, np.float64)[:, None] * geometry_["falloff"]
     shows = alpha_ >= least_alpha
     alpha_ = np.where(shows, np.minimum(alpha_, most_alpha), 0)
-    factors = np.ones((len(hit) + 1, hit.shape[1]))  # by the places of the hits, from 1
-    np.put_along_axis(factors, ranks + 1, np.where(hit, 1 - alpha_, 1), axis=0)
+    factors = np.ones((len(fragment) + 1, fragment.shape[1]))  # by places, from 1
+    np.put_along_axis(factors, ranks + 1, np.where(fragment, 1 - alpha_, 1), axis=0)
     passed = np.cumprod(factors, axis=0)  # T in front of each
     through = np.take_along_axis(passed, ranks, axis=0)
-    used = hit & ~(through < least)
+    used = fragment & ~(through < least)
     through = np.where(used, through, 0)
     return {
         "alpha": alpha_,
         "shows": shows,
         "weight": through * alpha_,
         "through": through,
-        "background": passed[used.sum(axis=0), np.arange(hit.shape[1])],
-        "hit": used,
+        "background": passed[used.sum(axis=0), np.arange(fragment.shape[1])],
+        "fragment": used,
     }
 
 
@@ -277,17 +278,17 @@ def blend_by_rule(
 
 
 def distances(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
-    """(N, HW) sum_j b_j |z_i - z_j| of the hits that are used; 0 elsewhere."""
-    depth, weight, hit = geometry_["depth"], blend_["weight"], blend_["hit"]
-    found = np.zeros(hit.shape)
-    for q in np.flatnonzero(hit.any(axis=0)):
-        z = depth[hit[:, q], q]
-        found[hit[:, q], q] = np.abs(z[:, None] - z) @ weight[hit[:, q], q]
+    """(N, HW) sum_j b_j |z_i - z_j| of the fragments that are used; 0 elsewhere."""
+    depth, weight, fragment = geometry_["depth"], blend_["weight"], blend_["fragment"]
+    found = np.zeros(fragment.shape)
+    for q in np.flatnonzero(fragment.any(axis=0)):
+        z = depth[fragment[:, q], q]
+        found[fragment[:, q], q] = np.abs(z[:, None] - z) @ weight[fragment[:, q], q]
     return found
 
 
-def spread(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
-    """(HW,) sum_ij b_i b_j |z_i - z_j| of the hits that are used (Mip-NeRF 360, Eq. 15)."""
+def distortion(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
+    """(HW,) sum_ij b_i b_j |z_i - z_j| of the fragments that are used (Mip-NeRF 360, Eq. 15)."""
     return (blend_["weight"] * distances(geometry_, blend_)).sum(axis=0)
 
 
@@ -298,41 +299,43 @@ def gradients(
     grad_features: np.ndarray,
     *,
     max_tracked: int = 0,
-    spread_weight: float = 0.0,
+    distortion_weight: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the tracked() hits. spread_weight:
-    of the pixels' spread, which is added to the loss; of alpha() alone.
+    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the tracked() fragments.
+    distortion_weight: of the pixels' distortion loss, which is added; of alpha() alone.
     """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
     if "through" in blend_:
-        if spread_weight:
-            own += 2 * spread_weight * distances(geometry_, blend_)
-        slope = _alpha_slope(blend_, own, G.sum(axis=1), ranks) * geometry_["closeness"]
+        if distortion_weight:
+            own += 2 * distortion_weight * distances(geometry_, blend_)
+        derivative = _alpha_derivative(blend_, own, G.sum(axis=1), ranks) * geometry_["falloff"]
     else:
-        slope = blend_["by_opacity"] * (own - (G * features(blend_, f)).sum(axis=1))
+        derivative = blend_["by_opacity"] * (own - (G * features(blend_, f)).sum(axis=1))
     used = tracked(geometry_, blend_, max_tracked)
-    return np.where(used, blend_["weight"], 0) @ G, np.where(used, slope, 0).sum(axis=1)
+    return np.where(used, blend_["weight"], 0) @ G, np.where(used, derivative, 0).sum(axis=1)
 
 
 def tracked(geometry_: Arrays, blend_: Arrays, max_tracked: int) -> np.ndarray:
-    """(N, HW) bool: the max_tracked nearest hits of each pixel that are used, 0: all."""
-    return blend_["hit"] & (order(geometry_) < max_tracked) if max_tracked else blend_["hit"]
+    """(N, HW) bool: the max_tracked nearest fragments of each pixel that are used, 0: all."""
+    return (
+        blend_["fragment"] & (order(geometry_) < max_tracked) if max_tracked else blend_["fragment"]
+    )
 
 
-def _alpha_slope(blend_, own, background, ranks):
-    """(N, HW) dL/dalpha of the hits that are used. own: G times a point's features. background:
-    (HW,), G times those behind all hits.
+def _alpha_derivative(blend_, own, background, ranks):
+    """(N, HW) dL/dalpha of the fragments that are used. own: G times a point's features.
+    background: (HW,), G times those behind all fragments.
     """
-    slope = np.zeros_like(own)
-    for q in np.flatnonzero(blend_["hit"].any(axis=0)):
-        points = np.flatnonzero(blend_["hit"][:, q])
-        rest = background[q]  # G times what is composited behind a hit
+    derivative = np.zeros_like(own)
+    for q in np.flatnonzero(blend_["fragment"].any(axis=0)):
+        points = np.flatnonzero(blend_["fragment"][:, q])
+        rest = background[q]  # G times what is composited behind a fragment
         for i in points[np.argsort(-ranks[points, q])]:
             if blend_["shows"][i, q]:
-                slope[i, q] = blend_["through"][i, q] * (own[i, q] - rest)
+                derivative[i, q] = blend_["through"][i, q] * (own[i, q] - rest)
             rest += blend_["alpha"][i, q] * (own[i, q] - rest)
-    return slope
+    return derivative
 
 
 def sh_basis(directions: np.ndarray) -> np.ndarray:

@@ -24,13 +24,13 @@ def windowed(image: np.ndarray) -> np.ndarray:
     )
 
 
-def unwindowed(slopes: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+def unwindowed(derivatives: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """The adjoint of windowed."""
     h, w, _ = shape
     image = np.zeros(shape)
     for j in range(11):
         for i in range(11):
-            image[j : h - 10 + j, i : w - 10 + i] += WINDOW[j, i] * slopes
+            image[j : h - 10 + j, i : w - 10 + i] += WINDOW[j, i] * derivatives
     return image
 
 

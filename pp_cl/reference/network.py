@@ -32,14 +32,11 @@ def convolution_backward_weights(x: np.ndarray, grad_out: np.ndarray, k: int) ->
     return gradient
 
 
-def _padding(k):
-    return (k // 2, k // 2), (k // 2, k // 2), (0, 0)
-
-
 def _taps(x, k):
     """Yields (ky, kx, (H W, CI) float64: what each pixel sees through that tap)."""
     height, width, channels = x.shape
-    padded = np.pad(np.asarray(x, np.float64), _padding(k))
+    around = (k // 2, k // 2)
+    padded = np.pad(np.asarray(x, np.float64), (around, around, (0, 0)))
     for ky in range(k):
         for kx in range(k):
             yield ky, kx, padded[ky : ky + height, kx : kx + width].reshape(-1, channels)
@@ -54,8 +51,8 @@ def gate(x: np.ndarray) -> np.ndarray:
 def gate_backward(x: np.ndarray, grad_out: np.ndarray) -> np.ndarray:
     """(H, W, 2 C) gradient of the input of gate(), given that of its output (H, W, C)."""
     features, gates = np.split(x, 2, 2)
-    slope = np.exp(np.minimum(features, 0))
-    grad_features = grad_out * slope * _sigmoid(gates)
+    derivative = np.exp(np.minimum(features, 0))
+    grad_features = grad_out * derivative * _sigmoid(gates)
     grad_gates = grad_out * _elu(features) * _sigmoid(gates) * _sigmoid(-gates)
     return np.concatenate([grad_features, grad_gates], 2)
 

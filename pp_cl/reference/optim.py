@@ -29,26 +29,22 @@ class Adam:
 class RmsProp:
     """The step of cl/training/rmsprop.cl, written out for all points in every step.
 
-    basis: (N, count), harmonics of the coefficients sh, (N, count, 16). most: of an offset;
-    most_sh: of coefficients above degree 0. offset: (N, 4), of Gaussians (N, 16). opacity: (N,). v:
-    {"sh": (N, 16), "offset", "opacity"}.
+    values: {"sh": (N, count, 16), "offset": (N, 4), of Gaussians (N, 16), "opacity": (N,)}. basis:
+    (N, count), harmonics of the coefficients. most: of an offset; most_sh: of coefficients above
+    degree 0. v: {"sh": (N, 16), "offset", "opacity"}.
     """
 
     def __init__(
         self,
+        values: dict[str, np.ndarray],
         basis: np.ndarray,
         most: float,
         most_sh: float = np.inf,
-        *,
-        sh: np.ndarray,
-        offset: np.ndarray,
-        opacity: np.ndarray,
     ):
         self.basis, self.most, self.most_sh, self.t = basis, most, most_sh, 0
-        self.sh, self.offset = np.array(sh, np.float64), np.array(offset, np.float64)
-        self.opacity = np.array(opacity, np.float64)
-        self.v = {name: np.zeros_like(getattr(self, name)) for name in ("offset", "opacity")}
-        self.v["sh"] = np.zeros((len(sh), 16))
+        self.values = {name: np.array(array, np.float64) for name, array in values.items()}
+        self.v = {name: np.zeros_like(array) for name, array in self.values.items()}
+        self.v["sh"] = np.zeros((len(basis), 16))
 
     def step(
         self, t: int, gradients: dict[str, np.ndarray], rates: dict, eps: dict[str, float]
@@ -65,11 +61,12 @@ class RmsProp:
             moves[name] = grad / (np.sqrt(v / (1 - BETA2**t)) + eps[name])
         self.t = t
         by_basis = np.asarray(rates["sh"])[: self.basis.shape[1]] * self.basis
-        self.sh -= by_basis[:, :, None] * moves["sh"][:, None, :]
-        self.sh[:, 1:] = np.clip(self.sh[:, 1:], -self.most_sh, self.most_sh)
-        shifted = self.offset - rates["offset"] * moves["offset"]
-        self.offset = np.clip(shifted, -self.most, self.most)
-        self.opacity = np.clip(self.opacity - rates["opacity"] * moves["opacity"], 0, 1)
+        sh = self.values["sh"]
+        sh -= by_basis[:, :, None] * moves["sh"][:, None, :]
+        sh[:, 1:] = np.clip(sh[:, 1:], -self.most_sh, self.most_sh)
+        for name, (least, most) in {"offset": (-self.most, self.most), "opacity": (0, 1)}.items():
+            moved = self.values[name] - rates[name] * moves[name]
+            self.values[name] = np.clip(moved, least, most)
 
 
 def basis(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:

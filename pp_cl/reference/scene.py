@@ -26,10 +26,10 @@ def dilated_mask(alpha: np.ndarray, threshold: int, margin: int) -> np.ndarray:
     return np.asarray(sliding_window_view(padded, (side, side)).any((2, 3)))
 
 
-def kept(
+def in_hull(
     views: Sequence[Any], positions: np.ndarray, threshold: int, *, least: int, forgiven: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((N,) bool kept: seen by `least` views and rejected by no larger share of them than
+    """((N,) bool in the hull: seen by `least` views and rejected by no larger share of them than
     `forgiven` of all, (N,) pixels to the nearest pixel border of any view that has the position
     before it).
     """
@@ -60,15 +60,15 @@ def kept(
     return (seen >= least) & (rejecting * len(views) <= forgiven * seen), border
 
 
-def undistorted(image: np.ndarray, camera: Any, distortion: Any, factor: int = 1) -> np.ndarray:
-    """(H // factor, W // factor, 4) float64, of 255 levels: a photograph (H, W, 4) uint8, read by
+def undistorted(image: np.ndarray, camera: Any, lens: Any, factor: int = 1) -> np.ndarray:
+    """(H // factor, W // factor, 4) float64, of 255 levels: an image (H, W, 4) uint8, read by
     cubic splines where the lens puts the pixels of a pinhole camera, on premultiplied colour, then
     reduced by area.
     """
     height, width = (side // factor for side in image.shape[:2])
     x = (np.arange(factor * width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(factor * height) + 0.5 - camera.cy) / camera.fy
-    x, y = distortion.apply(*np.meshgrid(x, y))
+    x, y = lens.apply(*np.meshgrid(x, y))
     places = [camera.fy * y + camera.cy - 0.5, camera.fx * x + camera.cx - 0.5]
     alpha = image[..., 3:] / 255.0
     planes = np.concatenate([image[..., :3] / 255.0 * alpha, alpha], axis=2)

@@ -1,4 +1,4 @@
-"""Scenes: photographs with cameras and masks, and the visual hull where the points start."""
+"""Scenes: images with cameras and masks, and the visual hull where the points start."""
 
 import lazy_loader
 

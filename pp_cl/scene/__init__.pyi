@@ -1,6 +1,4 @@
 from .agreement import disagreements as disagreements
-from .distortion import Distortion as Distortion
-from .distortion import undistort as undistort
 from .edits import EDITS as EDITS
 from .edits import Edits as Edits
 from .edits import read_edits as read_edits
@@ -11,8 +9,10 @@ from .gaze import up_of as up_of
 from .hull import Hull as Hull
 from .hull import agreeing as agreeing
 from .hull import build_grid as build_grid
-from .image_file import Photograph as Photograph
+from .image_file import ImageFile as ImageFile
 from .image_file import shrink as shrink
+from .lens import LensDistortion as LensDistortion
+from .lens import undistort as undistort
 from .load import Scene as Scene
 from .load import check_folder as check_folder
 from .load import load_scene as load_scene

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pp_cl.engine.grid import Grid, smallest_edge
+from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.engine.views import MASK_THRESHOLD, View
-from pp_cl.errors import listing
+from pp_cl.errors import few_names
 
 # pp-cl warns about a view that alone rejects more than this share of the object, and several times
 # the usual share: each view carves a little that no other does, more so where there are few. Lego's
@@ -59,12 +59,12 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
     names = [views[i].name for i in np.argsort(-objections, kind="stable") if objections[i] > 0]
     if agreeing >= 0.75 * len(views) and names:
         return (
-            f"{listing(names)}: the mask rejects every place that the other views agree on: check"
+            f"{few_names(names)}: the mask rejects every place that the other views agree on: check"
             " its alpha and its camera"
         )
     return (
-        f"{listing([view.name for view in views])}: the masks leave no point, at most {agreeing} of"
-        f" {len(views)} meet in one place:"
+        f"{few_names([view.name for view in views])}: the masks leave no point, at most"
+        f" {agreeing} of {len(views)} meet in one place:"
         " check the masks and the camera poses (camera-to-world; in transforms files x right, y"
         " up, z backward)"
     )
@@ -74,7 +74,7 @@ def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray
     """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its lattice() fall onto
     each view's mask, and which into its image beside the mask), neither where it is ignored.
     """
-    grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
+    grid = Grid.centred_in(box, smallest_voxel_size(box, PROBED_CELLS))
     vertices = grid.lattice()
     on_mask, beside = [], []
     for view in views:

@@ -12,7 +12,7 @@ from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.views import View, evenly
 from pp_cl.errors import UserError
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 
 SPLITS = ("train", "test")
 SIZE = 400  # pixels
@@ -36,7 +36,7 @@ def demo_views(dev: Device, split: str, most: int | None = None, size: int = SIZ
     ]
 
 
-def demo_frames(split: str, size: int = SIZE) -> list[Photograph]:
+def demo_frames(split: str, size: int = SIZE) -> list[ImageFile]:
     """A split's views, without their images. Raises UserError for a split that there is not."""
     if split not in SPLITS:
         raise UserError(f"demo has no split {split}; its splits are {', '.join(SPLITS)}")
@@ -47,7 +47,7 @@ def demo_frames(split: str, size: int = SIZE) -> list[Photograph]:
         turns = (np.arange(TEST_VIEWS) + 0.5) / TEST_VIEWS * 2 * math.pi
         angles = [(turn, math.radians(25 + 20 * math.sin(2 * turn))) for turn in turns]
     cameras = [_camera(*angle, size) for angle in angles]
-    return [Photograph(f"{split}/r_{i}.png", camera) for i, camera in enumerate(cameras)]
+    return [ImageFile(f"{split}/r_{i}.png", camera) for i, camera in enumerate(cameras)]
 
 
 def render(dev: Device, camera: Camera) -> np.ndarray:
@@ -76,12 +76,12 @@ def demo_mesh(dev: Device, resolution: int = 256) -> tuple[np.ndarray, np.ndarra
     from skimage.measure import marching_cubes  # takes long to import
 
     low, high = np.array(OBJECT_BOX)
-    edge = (high - low).max() / (resolution - 1)
-    dims = tuple(int(n) for n in np.ceil((high - low) / edge - 1e-6) + 1)
+    voxel_size = (high - low).max() / (resolution - 1)
+    dims = tuple(int(n) for n in np.ceil((high - low) / voxel_size - 1e-6) + 1)
     vertices, faces, _, _ = marching_cubes(
-        distances(dev, Grid(tuple(low), edge, dims)), 0, gradient_direction="ascent"
+        distances(dev, Grid(tuple(low), voxel_size, dims)), 0, gradient_direction="ascent"
     )
-    return (low + edge * vertices[:, ::-1]).astype(np.float32), faces
+    return (low + voxel_size * vertices[:, ::-1]).astype(np.float32), faces
 
 
 def distances(dev: Device, grid: Grid) -> np.ndarray:

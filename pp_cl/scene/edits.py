@@ -17,7 +17,7 @@ EDITS = "pp_cl.json"
 
 class Edits(NamedTuple):
     """box: (2, 3) lower and upper corner in world units, None where the user has given none.
-    dropped: names of photographs, as a scene lists them. axes: how the matrices of its cameras are
+    dropped: names of images, as a scene lists them. axes: how the matrices of its cameras are
     to be read, out of AXES; None where the user has not said so.
     """
 
@@ -39,7 +39,7 @@ def read_edits(folder: Path) -> Edits:
         raise fail_at(file, "axes")(f"is {quoted(axes, 40)}; must be one of {', '.join(AXES)}")
     dropped = found.get("dropped", [])
     if not isinstance(dropped, list) or not all(type(name) is str for name in dropped):
-        raise fail_at(file, "dropped")("must be a list of names of photographs; correct it")
+        raise fail_at(file, "dropped")("must be a list of names of images; correct it")
     corners = found.get("box")
     box = None if corners is None else checked_box(corners, fail_at(file, "box"))
     return Edits(box, frozenset(dropped), axes)
@@ -52,10 +52,10 @@ def write_edits(folder: Path, edits: Edits) -> None:
     file, box = folder / EDITS, None
     if edits.box is not None:
         box = checked_box(np.array(edits.box).tolist(), fail_at(file, "box")).tolist()
-    kept = {"box": box, "dropped": sorted(edits.dropped), "axes": edits.axes}
-    kept = {key: value for key, value in kept.items() if value}
-    if kept:
-        write_json(file, kept)
+    facts = {"box": box, "dropped": sorted(edits.dropped), "axes": edits.axes}
+    facts = {key: value for key, value in facts.items() if value}
+    if facts:
+        write_json(file, facts)
         return
     try:
         file.unlink(missing_ok=True)

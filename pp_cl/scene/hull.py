@@ -11,7 +11,7 @@ from skimage.morphology import closing, dilation, disk
 
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.grid import Grid, smallest_edge
+from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import explain_empty_hull
@@ -31,10 +31,11 @@ LEAST_SEEING = 3  # images that see a vertex: what lies behind the object is in 
 # the hull: masks moved by 6 % of the image have 0.05 to 0.13 there, right ones 0.03 at most.
 MOST_BESIDE, TIMES_USUAL = 0.05, 3.0
 MOST_LEFT_OUT = 1 / 8  # of the views
-# The mean share beside the hull for which masks are forgiven, one more until it is less or this
-# share of them is: rendered masks have 0, those of photographs 0.0001 to 0.016. What the hull lacks
-# is lost, and what it has too much training prunes: mary_rose's sound views gain 1.4 dB by 12
-# masks of 60 in place of 4.
+# A mask is wrong by the share of it that lies beside the hull: 0 for rendered masks, 0.0001 to
+# 0.016 for those of photographs. Where the mean share is larger than MOST_MISSED, a vertex stays
+# though some masks reject it: as few masks as bring the mean below, but at most MOST_FORGIVEN of
+# them. What the hull lacks is lost, while training prunes what it has too much: mary_rose's sound
+# views gain 1.4 dB where 12 of 60 masks may reject, in place of 4.
 MOST_MISSED, MOST_FORGIVEN = 0.0002, 1 / 4
 COMPARED_POINTS, COMPARED_SIZE = 60_000, 128  # pixels of the images in which this is looked up
 VERTEX_WORK = 10  # multiply-adds that project a vertex into a view, and find its pixel
@@ -58,8 +59,8 @@ class Carver:
     """Masks and cameras of the stored images, on the device, to carve any grid with.
 
     Masks are widened by a pixel, which keeps vertices that touch the silhouette, and by one of the
-    reduced image: by so much are poses and masks of photographs wrong. least: images that must see
-    a vertex.
+    reduced image: by so much are poses and masks of images wrong. least: images that must see a
+    vertex.
     """
 
     def __init__(self, dev: Device, views: Sequence[View]):
@@ -148,12 +149,11 @@ def build_grid(
     views: of any sizes; their stored images and cameras are used. box: (2, 3), which holds all
     vertices; None: what the masks allow, and where no view has one what all cameras see. A vertex
     is inside if LEAST_SEEING images see it and it lies in the mask of each one that does, widened
-    as Carver has it, but for `forgiven` of all views (agreeing()).
-    The search starts from the box that the masks allow and rescales the edge from the measured
-    count, until the count is `points` to 1.02 points. At CELL_CAP vertices of the grid, or after
-    8 rounds, the best carving is taken: the smallest with enough points, else the largest. Raises
-    UserError for an impossible `points`, masks or poses that leave no vertex, cameras that make no
-    scene.
+    as Carver has it, but for `forgiven` of all views (agreeing()). The search starts from the box
+    that the masks allow and rescales the voxel size from the measured count, until the count is
+    `points` to 1.02 points. At CELL_CAP vertices of the grid, or after 8 rounds, the best carving
+    is taken: the smallest with enough points, else the largest. Raises UserError for an impossible
+    `points`, masks or poses that leave no vertex, cameras that make no scene.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
@@ -200,25 +200,25 @@ def _search(dev, views, points, box, forgiven, limit):
     """The Hull of build_grid() in a box. limit: (2, 3) that it may not leave, or None."""
     carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
 
-    def carve(edge):
-        grid = Grid.centred_in(box, edge).rounded()
+    def carve(voxel_size):
+        grid = Grid.centred_in(box, voxel_size).rounded()
         return _tight(grid, carver.carve(grid, forgiven))
 
-    best = last = carve(smallest_edge(box, min(COARSE_CELLS, CELL_CAP)))
+    best = last = carve(smallest_voxel_size(box, min(COARSE_CELLS, CELL_CAP)))
     capped, rounds, count = False, 0, last.total
     if not count:
         raise UserError(explain_empty_hull(views, box))
     while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
-        if count:  # the next carving searches an edge around
-            box = last.grid.box + last.grid.edge * np.array([[-1], [1]])
+        if count:  # the next carving searches a voxel around
+            box = last.grid.box + last.grid.voxel_size * np.array([[-1], [1]])
         if limit is not None:
             box = np.stack([np.maximum(box[0], limit[0]), np.minimum(box[1], limit[1])])
-        wanted = last.grid.edge * (max(count, 0.5) / (AIM * points)) ** (1 / 3)
-        edge = max(wanted, smallest_edge(box, CELL_CAP))
-        capped = edge > wanted
-        if capped and edge > 0.99 * last.grid.edge:
+        wanted = last.grid.voxel_size * (max(count, 0.5) / (AIM * points)) ** (1 / 3)
+        voxel_size = max(wanted, smallest_voxel_size(box, CELL_CAP))
+        capped = voxel_size > wanted
+        if capped and voxel_size > 0.99 * last.grid.voxel_size:
             break  # the box shrinks no more
-        last = carve(edge)
+        last = carve(voxel_size)
         count, rounds = last.total, rounds + 1
         best = min(best, last, key=lambda c: (c.total < points, abs(c.total - points)))
     return Hull(best.grid, best.grid.ids_of(best.inside), capped and best.total < points)
@@ -243,8 +243,8 @@ def _tight(grid, inside):
         return _Carving(grid, inside, 0)
     low = np.array([places[0] for places in used])
     part = inside[tuple(slice(places[0], places[-1] + 1) for places in reversed(used))]
-    origin = np.asarray(grid.origin) + grid.edge * low
-    tight = Grid(tuple(float(x) for x in origin), grid.edge, part.shape[::-1])
+    origin = np.asarray(grid.origin) + grid.voxel_size * low
+    tight = Grid(tuple(float(x) for x in origin), grid.voxel_size, part.shape[::-1])
     return _Carving(tight, part, int(np.count_nonzero(part)))
 
 
@@ -252,27 +252,27 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
     """(near, far) for all views, as Euclidean distances in world units (docs/scenes.md).
 
     The hull lies between them for every view: near is the distance to the ball around it,
-    DEPTH_MARGIN times enlarged, but at least half the distance to its box and one grid edge. A
+    DEPTH_MARGIN times enlarged, but at least half the distance to its box and one voxel size. A
     range stated by the dataset is kept, but widened to the ball itself, since points outside of it
     would be missing.
     """
     stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
-    half = grid.edge * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
+    half = grid.voxel_size * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
     offsets = np.stack([view.camera.eye for view in views]) - grid.centre
     from_centre = np.linalg.norm(offsets, axis=1)
     from_box = np.linalg.norm(np.maximum(np.abs(offsets) - half, 0), axis=1)
     radius = (1 if stated else DEPTH_MARGIN) * np.linalg.norm(half)
-    near = max(from_centre.min() - radius, from_box.min() / 2, grid.edge)
+    near = max(from_centre.min() - radius, from_box.min() / 2, grid.voxel_size)
     ranges = np.array([(near, from_centre.max() + radius), *stated])
     return float(ranges[:, 0].min()), float(ranges[:, 1].max())
 
 
 def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
-    """Grid edge in pixels of the cameras' images, at the middle of the grid, mean over the
+    """Voxel size in pixels of the cameras' images, at the middle of the grid, mean over the
     cameras.
     """
     distances = [np.linalg.norm(camera.eye - grid.centre) for camera in cameras]
-    pixels = [c.fx * grid.edge / d for c, d in zip(cameras, distances, strict=True)]
+    pixels = [c.fx * grid.voxel_size / d for c, d in zip(cameras, distances, strict=True)]
     return float(np.mean(pixels))
 
 
@@ -312,25 +312,25 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
     most = int(MOST_LEFT_OUT * len(views))
     elsewhere = looking_elsewhere(views)
     left_out = {view.name: 1.0 for view in elsewhere if len(elsewhere) <= most}
-    kept, forgiven = [view for view in views if view.name not in left_out], most // 2
+    left, forgiven = [view for view in views if view.name not in left_out], most // 2
     try:
-        if _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
-            return Agreement(kept, left_out, 0)
+        if _shares_beside(dev, left, box, 0).max() <= MOST_BESIDE / 2:
+            return Agreement(left, left_out, 0)
     except UserError:  # no place is in all masks
         forgiven = most
     while len(left_out) < most:
-        shares = _shares_beside(dev, kept, box, forgiven)
+        shares = _shares_beside(dev, left, box, forgiven)
         worst = int(shares.argmax())
         if shares[worst] <= max(MOST_BESIDE, TIMES_USUAL * np.median(shares)):
             break
-        left_out[kept.pop(worst).name] = float(shares[worst])
+        left_out[left.pop(worst).name] = float(shares[worst])
     # the more masks are forgiven, the less of them lies beside the hull
     least = bisect_left(
-        range(int(MOST_FORGIVEN * len(kept))),
+        range(int(MOST_FORGIVEN * len(left))),
         True,
-        key=lambda forgiven: _shares_beside(dev, kept, box, forgiven).mean() <= MOST_MISSED,
+        key=lambda forgiven: _shares_beside(dev, left, box, forgiven).mean() <= MOST_MISSED,
     )
-    return Agreement(kept, left_out, least)
+    return Agreement(left, left_out, least)
 
 
 def _shares_beside(dev, views, box, forgiven):

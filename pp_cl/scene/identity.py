@@ -1,5 +1,5 @@
 """The names, cameras and pixel digests of the training views in a checkpoint: to render without the
-scene, and to check that a training resumes with the same photographs.
+scene, and to check that a training resumes with the same images.
 """
 
 from collections.abc import Sequence
@@ -9,32 +9,32 @@ import numpy as np
 
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.views import View
-from pp_cl.errors import listing
-from pp_cl.scene.image_file import Photograph
+from pp_cl.errors import few_names
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import MOST, numbers
 
-POSE, LENS, RANGE = 12, 6, 2  # numbers of a kept view; it may have no depth range
+POSE, LENS, RANGE = 12, 6, 2  # numbers of a stored view; it may have no depth range
 CLOSE = 1e-6  # world units or pixels: cameras are the same, as another processor rounds them
 MOST_SIDE = 2**24  # what float32 holds as whole numbers
 
 
 def identity(views: Sequence[View]) -> dict[str, Any]:
     """{"pixels": {name: digest} of the views, None where the program makes them, "views": for
-    kept_views()}: what the header of a checkpoint holds of its training views.
+    unpacked_views()}: what the header of a checkpoint holds of its training views.
     """
     made = any(view.digest is None for view in views)
     pixels = None if made else {view.name: view.digest for view in views}
-    kept = [[view.name, kept_camera(view.file_camera, view.depth_range)] for view in views]
-    return {"pixels": pixels, "views": kept}
+    packed = [[view.name, packed_camera(view.file_camera, view.depth_range)] for view in views]
+    return {"pixels": pixels, "views": packed}
 
 
-def kept_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> list[float]:
+def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> list[float]:
     """The numbers of a camera and its depth range, which JSON keeps to the bit."""
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
     return [float(number) for number in (*camera.pose.ravel(), *lens, *(depth_range or ()))]
 
 
-def kept_views(views: Any) -> list[Photograph]:
+def unpacked_views(views: Any) -> list[ImageFile]:
     """The training views that identity() has kept. Raises ValueError or TypeError for what it never
     makes.
     """
@@ -56,22 +56,22 @@ def _unpacked(name, stored):
     if not np.allclose(pose[:, :3].T @ pose[:, :3], np.eye(3), rtol=0, atol=1e-4):
         raise ValueError("a camera whose axes are not orthonormal")
     camera = Camera(pose, fx, fy, cx, cy, int(width), int(height))
-    return Photograph(name, camera, tuple(near_far) or None)
+    return ImageFile(name, camera, tuple(near_far) or None)
 
 
 def difference(
-    header: dict[str, Any], listed: Sequence[Photograph], views: Sequence[View] = ()
+    header: dict[str, Any], listed: Sequence[ImageFile], views: Sequence[View] = ()
 ) -> str:
     """How the training views of a checkpoint's header differ from those that a scene lists, in
     words; "" where all of them are listed, with the same cameras. The scene may list more.
 
     views: those whose pixels are compared, where the header has their digests.
     """
-    cameras = {one.name: kept_camera(one.camera) for one in listed}
-    for name, kept in header["views"]:
+    cameras = {one.name: packed_camera(one.camera) for one in listed}
+    for name, packed in header["views"]:
         now = cameras.get(name)
-        if now is None or not np.allclose(now, kept[: POSE + LENS], rtol=0, atol=CLOSE):
+        if now is None or not np.allclose(now, packed[: POSE + LENS], rtol=0, atol=CLOSE):
             return "its training views have other names or cameras"
     known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]
-    return f"{listing(changed)}: other pixels, or another mask" if changed else ""
+    return f"{few_names(changed)}: other pixels, or another mask" if changed else ""

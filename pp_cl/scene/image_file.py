@@ -14,54 +14,53 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.errors import Unusable
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.distortion import Distortion, undistort
+from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.scene.masks import OPAQUE, MaskRule, cut_out, read_mask_of_size
 
-# Of a scene's photographs in memory, as RGBA; more than this is reduced while it is read. A fixed
+# Of a scene's images in memory, as RGBA; more than this is reduced while it is read. A fixed
 # number, not what happens to be free: the same command gives the same bits on every machine.
-KEPT_BYTES = 2**29
-STRAIGHT = Distortion()  # of a lens without distortion
+MOST_IMAGE_BYTES = 2**29
+STRAIGHT = LensDistortion()  # of a lens without distortion
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """A photograph that a scene lists, before its pixels are read.
+class ImageFile:
+    """An image that a scene lists, before its pixels are read.
 
     name: path of the image relative to the scene's folder. camera: of the stored image, freed of
     distortion. depth_range: (near, far), Euclidean distances in world units, if the format states
     one. mask: path of its mask relative to the scene's folder, white where the object is; None: the
-    image's own alpha. distortion: of the image as it lies in the file. ignore: path of an image
-    that is white where this one says nothing; if ignores_black, it is black there.
+    image's own alpha. lens: of the image as it lies in the file. ignore: path of an image that is
+    white where this one says nothing; if ignores_black, it is black there.
     """
 
     name: str
     camera: Camera
     depth_range: tuple[float, float] | None = None
     mask: str | None = None
-    distortion: Distortion = field(default_factory=Distortion)
+    lens: LensDistortion = field(default_factory=LensDistortion)
     ignore: str | None = None
     ignores_black: bool = False
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], downscale: int) -> int:
-    """How many times to reduce photographs of these (width, height), in pixels, while they are
-    read, where a training reduces them `downscale` times: the least divisor of it with which they
-    take KEPT_BYTES at most, else all of it.
+    """How many times to reduce images of these (width, height), in pixels, while they are read,
+    where a training reduces them `downscale` times: the least divisor of it with which they take
+    MOST_IMAGE_BYTES at most, else all of it.
     """
     divisors = (f for f in range(1, downscale + 1) if downscale % f == 0)
-    return next((f for f in divisors if kept_bytes(sizes, f) <= KEPT_BYTES), downscale)
+    return next((f for f in divisors if image_bytes(sizes, f) <= MOST_IMAGE_BYTES), downscale)
 
 
-def kept_bytes(sizes: Sequence[tuple[int, int]], factor: int) -> int:
-    """Bytes of the images that photographs of these (width, height) become."""
+def image_bytes(sizes: Sequence[tuple[int, int]], factor: int) -> int:
+    """Bytes of images of these (width, height), reduced `factor` times."""
     return sum(4 * (width // factor) * (height // factor) for width, height in sizes)
 
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:
-    """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): means of blocks of
-    factor x factor pixels on premultiplied colour, rounded. Rows and columns that fill no block are
-    cut off.
+    """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): means of blocks of factor x
+    factor pixels on premultiplied colour, rounded. Rows and columns that fill no block are cut off.
     """
     if factor == 1:
         return image
@@ -80,59 +79,59 @@ def shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def read_view(
-    folder: Path, photograph: Photograph, rule: MaskRule, dev: Device | None, factor: int = 1
+    folder: Path, image_file: ImageFile, rule: MaskRule, dev: Device | None, factor: int = 1
 ) -> View:
-    """The View of a photograph of the scene in a folder, with its mask, free of distortion and
+    """The View of an image of the scene in a folder, with its mask, free of distortion and
     reduced `factor` times. dev: removes distortion; None where there is none.
 
     Raises Unusable where the image or a mask cannot be used.
     """
-    camera = photograph.camera
+    camera = image_file.camera
 
     def used(image):
-        if photograph.distortion:
-            return undistort(dev, image, camera, photograph.distortion, factor)
+        if image_file.lens:
+            return undistort(dev, image, camera, image_file.lens, factor)
         return shrink(image, factor)
 
     size, ignored = (camera.width, camera.height), None
-    if photograph.ignore:
-        mask = read_mask_of_size(folder / photograph.ignore, size) > OPAQUE // 2
-        mask = np.where(mask != photograph.ignores_black, np.uint8(OPAQUE), np.uint8(0))
+    if image_file.ignore:
+        mask = read_mask_of_size(folder / image_file.ignore, size) > OPAQUE // 2
+        mask = np.where(mask != image_file.ignores_black, np.uint8(OPAQUE), np.uint8(0))
         ignored = used(np.dstack([mask] * 4))[..., 3] > MASK_THRESHOLD
-    image = read_rgba(folder / photograph.name, size)
-    if photograph.mask:
-        image[..., 3] = read_mask_of_size(folder / photograph.mask, image.shape[1::-1])
+    image = read_rgba(folder / image_file.name, size)
+    if image_file.mask:
+        image[..., 3] = read_mask_of_size(folder / image_file.mask, image.shape[1::-1])
     elif rule.source in ("box", "none"):
         image[..., 3] = OPAQUE
-    digest = pixel_digest(image, photograph.distortion, ignored)
+    digest = pixel_digest(image, image_file.lens, ignored)
     image = used(image)
     if rule.is_by_colour:
-        image = cut_out(image, photograph.name, rule.tolerance)
+        image = cut_out(image, image_file.name, rule.tolerance)
     if ignored is not None:
         image = np.where(ignored[..., None], np.uint8(0), image)
     if image[..., 3].max() <= MASK_THRESHOLD:
-        text = f"{folder / photograph.name}: its mask is empty; correct it, or remove the image"
+        text = f"{folder / image_file.name}: its mask is empty; correct it, or remove the image"
         raise Unusable(text, "an empty mask")
     return View(
-        photograph.name,
+        image_file.name,
         camera.downscaled(factor) if factor > 1 else camera,
         image,
-        photograph.depth_range,
+        image_file.depth_range,
         digest=digest,
         shrunk=factor,
         unshrunk_camera=camera if factor > 1 else None,
-        is_masked=photograph.mask is not None,
+        is_masked=image_file.mask is not None,
         ignored=ignored,
     )
 
 
 def pixel_digest(
-    image: np.ndarray, distortion: Distortion = STRAIGHT, ignored: np.ndarray | None = None
+    image: np.ndarray, lens: LensDistortion = STRAIGHT, ignored: np.ndarray | None = None
 ) -> str:
     """Hex digest of the pixels of a uint8 image, its mask among them, of the distortion that is
     removed from it, and of which pixels are ignored.
     """
     digest = hashlib.sha256(np.ascontiguousarray(image).data)
-    digest.update(repr(distortion).encode() if distortion else b"")
+    digest.update(repr(lens).encode() if lens else b"")
     digest.update(b"" if ignored is None else np.packbits(ignored).data)
     return digest.hexdigest()[:DIGITS]

@@ -1,5 +1,5 @@
-"""Scenes: photographs of one object with cameras and masks, from a folder in any format that
-READERS knows, or made by the program.
+"""Scenes: images of one object with cameras and masks, from a folder in any format that READERS
+knows, or made by the program.
 """
 
 import math
@@ -19,11 +19,10 @@ from tqdm import tqdm
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, border, check_downscale, evenly
-from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, listing, quoted
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, quoted
 from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
-from pp_cl.scene.distortion import BAND_BYTES
 from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.found import (
     IGNORE_FOLDERS,
@@ -33,7 +32,8 @@ from pp_cl.scene.found import (
     folder_named,
     usable,
 )
-from pp_cl.scene.image_file import Photograph, read_view, shrink_factor
+from pp_cl.scene.image_file import ImageFile, read_view, shrink_factor
+from pp_cl.scene.lens import BAND_BYTES
 from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, read_mask_of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import read_json
@@ -44,7 +44,7 @@ DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
 # holds such files, splits(folder) names its splits, read_split(folder, split, left_out) gives a
-# list of Photograph of one of them without reading pixels and adds the views that cannot be used to
+# list of ImageFile of one of them without reading pixels and adds the views that cannot be used to
 # left_out, and box(folder), which only some have, gives the box that the files state around the
 # object. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
@@ -53,7 +53,7 @@ READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 # mask; a mask by colour of the reduced image, in float64
 DECODED, CUT_OUT = 18, 160
 BAND_COPIES = 2  # BAND_BYTES of a spline's coefficients, and the pixels before and after
-READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
+READING_BYTES = 3 * 2**28  # of the images that are read side by side
 
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
 
@@ -62,15 +62,15 @@ BESIDE = 0.5  # of what is transparent, that a mask which is not of the object h
 WRONG = "what the scene's files say of it is wrong"  # of a view whose error is no Unusable
 OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
 LEAST_VIEWS = 8  # for training that are left where some are left out
-NEARBY = 100  # entries of a folder without a scene in which one is looked for
+NEARBY = 100  # files of a folder without a scene in which one is looked for
 
 
-class Listing(NamedTuple):
-    """The photographs of a split, without their pixels. left_out: the names of those that cannot be
-    used, and why. done: (name of a photograph, what was done to use it).
+class SplitFiles(NamedTuple):
+    """The images of a split, without their pixels. left_out: the names of those that cannot be
+    used, and why. done: (name of an image, what was done to use it).
     """
 
-    photographs: list[Photograph]
+    image_files: list[ImageFile]
     left_out: LeftOut
     done: list[tuple[str, str]]
 
@@ -95,7 +95,7 @@ def open_scene(
     config: Config,
     splits: tuple[str, ...],
     most: int | None = None,
-    listed: Mapping[str, Listing] | None = None,
+    listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
     `demo` is rendered on the device.
@@ -118,7 +118,7 @@ def open_scene(
         )
     if views and not masked and most is None and config.scene.mask_from != "box":
         warnings.warn(
-            f"{path}: no photograph has a mask: points fill the box that all cameras see;"
+            f"{path}: no image has a mask: points fill the box that all cameras see;"
             " --mask-from color cuts out a uniform background, --masks FOLDER takes masks,"
             " --mask-from box says that it is meant",
             stacklevel=2,
@@ -164,61 +164,59 @@ def scene_splits(path: Path | str) -> list[str]:
 # Listing a split ----------------------------------------------------------------------------------
 
 
-def scene_frames(
-    path: str | Path, split: str = "train", *, edited: bool = True
-) -> list[Photograph]:
-    """list_split()'s photographs; what it left out and did becomes warnings."""
+def scene_frames(path: str | Path, split: str = "train", *, edited: bool = True) -> list[ImageFile]:
+    """list_split()'s image_files; what it left out and did becomes warnings."""
     found = list_split(path, split, edited=edited)
     _tell(Path(path), _lines(split, *found))
-    return found.photographs
+    return found.image_files
 
 
-def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> Listing:
-    """The photographs of a split, without their pixels; edited: but for those that the user has
+def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> SplitFiles:
+    """The images of a split, without their pixels; edited: but for those that the user has
     dropped. Raises UserError where there are none, where too few are left, and for cameras in other
     axes than the format's.
     """
     if path == DEMO:
-        return Listing(demo.demo_frames(split), [], [])
+        return SplitFiles(demo.demo_frames(split), [], [])
     folder, reader = Path(path), find_reader(path)
     present = reader.splits(folder)
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
     left_out: LeftOut = []
-    photographs = reader.read_split(folder, split, left_out)
+    image_files = reader.read_split(folder, split, left_out)
     edits = read_edits(folder)
     if edited:
-        photographs = [one for one in photographs if one.name not in edits.dropped]
+        image_files = [one for one in image_files if one.name not in edits.dropped]
     if edits.axes:
-        photographs = [replace(o, camera=read_as(o.camera, edits.axes)) for o in photographs]
-    elif axes := other_axes([one.camera for one in photographs]):
+        image_files = [replace(o, camera=read_as(o.camera, edits.axes)) for o in image_files]
+    elif axes := other_axes([one.camera for one in image_files]):
         raise UserError(
             f"{folder}: its cameras do not look at one place; they would if their matrices were of"
             f' the kind "{axes}". If so, write {{"axes": "{axes}"}} into {folder / EDITS}; if they'
             f' are right, {{"axes": "{STATED}"}}'
         )
-    if not photographs and not left_out:
+    if not image_files and not left_out:
         lacks = f"; {EDITS} drops some" if edited and edits.dropped else ""
-        raise UserError(f"{folder}: split {split} has no photographs{lacks}; add some")
+        raise UserError(f"{folder}: split {split} has no images{lacks}; add some")
 
-    def checked(photograph):
-        check_lens(folder / photograph.name, photograph)
-        return photograph
+    def checked(image_file):
+        check_lens(folder / image_file.name, image_file)
+        return image_file
 
-    photographs = list(usable(photographs, checked, lambda one: one.name, left_out))
-    _check_left(photographs, left_out, LEAST_VIEWS if split == "train" else 1)
-    photographs, done = _masked(folder, reader, photographs, split)
-    photographs = _ignoring(folder, IGNORE_FOLDERS, photographs, split)
+    image_files = list(usable(image_files, checked, lambda one: one.name, left_out))
+    _check_left(image_files, left_out, LEAST_VIEWS if split == "train" else 1)
+    image_files, done = _masked(folder, reader, image_files, split)
+    image_files = _ignoring(folder, IGNORE_FOLDERS, image_files, split)
     ignored = "pixels are ignored where the masks in ignore are white"
-    done += [(one.name, ignored) for one in photographs if one.ignore and not one.ignores_black]
-    return Listing(photographs, left_out, done)
+    done += [(one.name, ignored) for one in image_files if one.ignore and not one.ignores_black]
+    return SplitFiles(image_files, left_out, done)
 
 
-def check_lens(file: Path, photograph: Photograph) -> None:
-    """Raise Unusable naming the file of a photograph whose camera shows nothing in float32, or
+def check_lens(file: Path, image_file: ImageFile) -> None:
+    """Raise Unusable naming the file of an image whose camera shows nothing in float32, or
     whose distortion folds.
     """
-    camera = photograph.camera
+    camera = image_file.camera
     for what, values, least in (
         ("focal lengths", (camera.fx, camera.fy), LEAST_FOCAL),
         ("a principal point", (camera.cx, camera.cy), -MOST_FOCAL),
@@ -229,7 +227,7 @@ def check_lens(file: Path, photograph: Photograph) -> None:
                 f" which must be {least:g} to {MOST_FOCAL:g}; correct the scene's file of cameras",
                 BROKEN_CAMERA,
             )
-    if photograph.distortion.folds(camera):
+    if image_file.lens.folds(camera):
         raise Unusable(
             f"{file}: its distortion coefficients fold the image over; correct them, or undistort"
             " the images with the program that found them",
@@ -245,75 +243,75 @@ def _check_left(left, left_out, least):
         raise left_out[0][1]
 
 
-def _masked(folder, reader, photographs, split):
-    """(The photographs, with the masks of a folder of masks where the format names none; what was
+def _masked(folder, reader, image_files, split):
+    """(The images, with the masks of a folder of masks where the format names none; what was
     done). Images of a transforms.json have their own alpha, if they have one. Where masks are of
     the object, what a transforms.json names besides says where images are of use, as nerfstudio
     takes it.
     """
-    named, done = [one for one in photographs if one.mask], []
+    named, done = [one for one in image_files if one.mask], []
     if named:
         if reader is not transforms or not _are_besides(folder, named[0]):
-            return photographs, done
+            return image_files, done
         what = "masks that frames name are taken for where images are of use"
         done = [(one.name, what) for one in named]
-        photographs = [
-            replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in photographs
+        image_files = [
+            replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in image_files
         ]
     place = folder_named(folder, MASK_FOLDERS)
-    if place and reader is transforms and _are_cut_out(folder, photographs):
-        return photographs, done
-    masks = _masks_in(folder, photographs, split, MASK_FOLDERS)
+    if place and reader is transforms and _are_cut_out(folder, image_files):
+        return image_files, done
+    masks = _masks_in(folder, image_files, split, MASK_FOLDERS)
     if masks and reader is transforms:
         what = f"masks are taken from {folder / place}, which no frame names"
         done += [(name, what) for name in masks]
-    return [replace(one, mask=masks.get(one.name)) for one in photographs], done
+    return [replace(one, mask=masks.get(one.name)) for one in image_files], done
 
 
-def _are_cut_out(folder, photographs):
+def _are_cut_out(folder, image_files):
     """Whether the first image that can be read has transparent pixels."""
-    for one in photographs:
+    for one in image_files:
         with suppress(Unusable):
             return is_transparent(folder / one.name)
     return False
 
 
-def _masks_in(folder, photographs, split, places):
-    """{photograph: its mask} of those that have one in one of the places in a folder. Raises
-    UserError where a place has none for any training photograph.
+def _masks_in(folder, image_files, split, places):
+    """{name: its mask} of those that have one in one of the places in a folder. Raises
+    UserError where a place has none for any training image.
     """
     try:
-        return find_masks(folder, [one.name for one in photographs], places) or {}
+        return find_masks(folder, [one.name for one in image_files], places) or {}
     except UserError:
         if split == "train":
             raise
         return {}
 
 
-def _are_besides(folder, photograph):
+def _are_besides(folder, image_file):
     """Whether an image has alpha of which the mask that its frame names is no part, or the scene
     has a folder of masks in which that mask does not lie.
     """
-    place, image = folder_named(folder, MASK_FOLDERS), folder / photograph.name
-    if place and not photograph.mask.startswith(f"{place}/"):
+    place, image = folder_named(folder, MASK_FOLDERS), folder / image_file.name
+    if place and not image_file.mask.startswith(f"{place}/"):
         return True
     with suppress(UserError):
         if is_transparent(image):
             outside = read_rgba(image)[..., 3] < OPAQUE // 2
-            mask = read_mask_of_size(folder / photograph.mask, outside.shape[::-1])
+            mask = read_mask_of_size(folder / image_file.mask, outside.shape[::-1])
             return bool(outside.any() and (mask[outside] > OPAQUE // 2).mean() > BESIDE)
     return False
 
 
-def _ignoring(folder, places, photographs, split):
-    """The photographs, with the masks of what says nothing that lie in one of the places in a
+def _ignoring(folder, places, image_files, split):
+    """The images, with the masks of what says nothing that lie in one of the places in a
     folder.
     """
-    masks = _masks_in(folder, photographs, split, places)
+    masks = _masks_in(folder, image_files, split, places)
     files = {name: str(folder.absolute() / mask) for name, mask in masks.items()}
     return [
         replace(one, ignore=files[one.name], ignores_black=False) if one.name in files else one
-        for one in photographs
+        for one in image_files
     ]
 
 
@@ -322,9 +320,9 @@ def _lines(split, used, left_out, done):
     count = len(used) + len(left_out)
     gone = _by_kind((name, getattr(error, "why", WRONG)) for name, error in left_out)
     return [
-        f"{split}: {len(names)} of {count} views left out: {why} ({listing(names)})"
+        f"{split}: {len(names)} of {count} views left out: {why} ({few_names(names)})"
         for why, names in gone.items()
-    ] + [f"{split}: {what} ({listing(names)})" for what, names in _by_kind(done).items()]
+    ] + [f"{split}: {what} ({few_names(names)})" for what, names in _by_kind(done).items()]
 
 
 def _by_kind(pairs):
@@ -368,9 +366,9 @@ def find_reader(path: str | Path) -> ModuleType:
 def check_folder(folder: Path) -> None:
     """Raise UserError where a scene's folder is missing, no folder, or cannot be read."""
     if folder.is_file():
-        is_film = (mimetypes.guess_type(folder.name)[0] or "").startswith("video/")
+        is_video = (mimetypes.guess_type(folder.name)[0] or "").startswith("video/")
         mend = f"a scene is a folder, maybe {folder.absolute().parent}"
-        mend = f"`pp-cl capture {folder} --out SCENE` makes a scene of it" if is_film else mend
+        mend = f"`pp-cl capture {folder} --out SCENE` makes a scene of it" if is_video else mend
         raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
@@ -388,22 +386,22 @@ def _reader_of(folder):
 
 def _found_instead(folder):
     """What is in a folder without a scene, and where one is, in words."""
-    inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     for near in (*folder.absolute().parents[:2], *filter(Path.is_dir, inside[:NEARBY])):
         if _is_readable(near) and (reader := _reader_of(near)):
             return f"; {near} is one ({reader.FILES}); give that"
-    for file in (entry for entry in inside if entry.suffix.lower() == ".json"):
+    for file in (path for path in inside if path.suffix.lower() == ".json"):
         with suppress(UserError):
             if isinstance(data := read_json(file), dict) and "frames" in data:
                 return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
-    found = listing([quoted(entry.name, 40) for entry in inside]) or "nothing"
+    found = few_names([quoted(path.name, 40) for path in inside]) or "nothing"
     return (
         f": {found}, but no file of cameras that is known, such as transforms.json or sparse/0;"
         " `pp-cl capture` makes one of photographs"
     )
 
 
-# Reading images -----------------------------------------------------------------------------------
+# Pending images -----------------------------------------------------------------------------------
 
 
 def load_scene(
@@ -414,7 +412,7 @@ def load_scene(
     *,
     dev: Device | None = None,
     downscale: int | None = None,
-    listed: Mapping[str, Listing] | None = None,
+    listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
     """Scene of the given splits from a folder; a progress bar shows on a terminal.
 
@@ -433,12 +431,12 @@ def load_scene(
     for split in splits:
         found = (listed or {}).get(split) or list_split(folder, split)
         lines += _lines(split, *found)
-        chosen[split] = _by_rule(masks, evenly(found.photographs, most), split)
-    photographs = [one for some in chosen.values() for one in some]
-    _check_alike(folder, photographs, downscale)
-    if dev is None and any(one.distortion for one in photographs):
+        chosen[split] = _by_rule(masks, evenly(found.image_files, most), split)
+    image_files = [one for some in chosen.values() for one in some]
+    _check_alike(folder, image_files, downscale)
+    if dev is None and any(one.lens for one in image_files):
         raise UserError(f"{folder}: its images have distortion, which only a device removes")
-    factor = shrink_factor([(p.camera.width, p.camera.height) for p in photographs], downscale or 1)
+    factor = shrink_factor([(p.camera.width, p.camera.height) for p in image_files], downscale or 1)
     left_out: dict[str, LeftOut] = {split: [] for split in chosen}
     views = {
         split: _read_views(folder, some, masks, dev, factor, left_out[split])
@@ -461,26 +459,24 @@ def _reduced(splits, downscale):
     return {split: [view.reduced(downscale) for view in views] for split, views in splits.items()}
 
 
-def _by_rule(rule, photographs, split):
-    """The photographs, with the masks of the rule's folders, and none where its masks are no
-    files.
-    """
+def _by_rule(rule, image_files, split):
+    """The images, with the masks of the rule's folders, and none where its masks are no files."""
     if rule.folder:
         own = Path(rule.folder).absolute()
-        masks = _masks_in(own, photographs, split, ["."])
+        masks = _masks_in(own, image_files, split, ["."])
         files = {name: str(own / mask) for name, mask in masks.items()}
-        photographs = [replace(one, mask=files.get(one.name)) for one in photographs]
+        image_files = [replace(one, mask=files.get(one.name)) for one in image_files]
     elif rule.source != "given":
-        photographs = [replace(one, mask=None) for one in photographs]
+        image_files = [replace(one, mask=None) for one in image_files]
     if rule.ignore:
-        photographs = _ignoring(Path(rule.ignore), ["."], photographs, split)
-    return photographs
+        image_files = _ignoring(Path(rule.ignore), ["."], image_files, split)
+    return image_files
 
 
-def _check_alike(folder, photographs, downscale):
-    """Raise UserError if only some photographs have a depth range, or one cannot be reduced."""
-    first = photographs[0]
-    for one in photographs:
+def _check_alike(folder, image_files, downscale):
+    """Raise UserError if only some images have a depth range, or one cannot be reduced."""
+    first = image_files[0]
+    for one in image_files:
         if (one.depth_range is None) != (first.depth_range is None):
             raise UserError(
                 f"{folder}: near and far are given for only one of {first.name} and {one.name}; "
@@ -490,21 +486,21 @@ def _check_alike(folder, photographs, downscale):
             check_downscale(one.name, one.camera, downscale)
 
 
-def _read_views(folder, photographs, masks, dev, factor, left_out):
-    """The views of the photographs that can be used, several read at a time."""
+def _read_views(folder, image_files, masks, dev, factor, left_out):
+    """The views of the images that can be used, several read at a time."""
 
-    def read(photograph):
+    def read(image_file):
         try:
-            return read_view(folder, photograph, masks, dev, factor)
+            return read_view(folder, image_file, masks, dev, factor)
         except UserError as error:
             return error
 
-    with ThreadPoolExecutor(reading(photographs, masks, factor)[0]) as pool:
-        reads, count = pool.map(read, photographs), len(photographs)
+    with ThreadPoolExecutor(reading_cost(image_files, masks, factor)[0]) as pool:
+        reads, count = pool.map(read, image_files), len(image_files)
         found = list(tqdm(reads, "reading images", count, unit="image", leave=False, disable=None))
-    for photograph, error in zip(photographs, found, strict=True):
+    for image_file, error in zip(image_files, found, strict=True):
         if isinstance(error, UserError):
-            left_out.append((photograph.name, error))
+            left_out.append((image_file.name, error))
     return [view for view in found if isinstance(view, View)]
 
 
@@ -525,16 +521,16 @@ def _all_masked(folder, views, dev, left_out):
     return masked, []
 
 
-def reading(
-    photographs: Sequence[Photograph], masks: MaskRule = AS_GIVEN, factor: int = 1
+def reading_cost(
+    image_files: Sequence[ImageFile], masks: MaskRule = AS_GIVEN, factor: int = 1
 ) -> tuple[int, int]:
-    """(how many photographs are read side by side, bytes that this takes beside the images that
+    """(how many images are read side by side, bytes that this takes beside the images that
     stay): as many as there are cores, but no more than READING_BYTES hold. factor: how many times
     they are reduced meanwhile.
     """
     per_pixel = DECODED + (CUT_OUT / factor**2 if masks.is_by_colour else 0)
-    pixels = max(one.camera.width * one.camera.height for one in photographs)
+    pixels = max(one.camera.width * one.camera.height for one in image_files)
     most = math.ceil(per_pixel * pixels)
-    workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(photographs)))
-    is_bent = any(one.distortion for one in photographs)
+    workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(image_files)))
+    is_bent = any(one.lens for one in image_files)
     return workers, workers * most + (BAND_COPIES * BAND_BYTES if is_bent else 0)

@@ -1,4 +1,4 @@
-"""The mask of a photograph: from a file, from its alpha, from a uniform background, or none."""
+"""The mask of an image: from a file, from its alpha, from a uniform background, or none."""
 
 import warnings
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class MaskRule:
     """How a scene's masks are made: the settings scene.mask_from, scene.masks and
     scene.mask_tolerance.
 
-    source: given, alpha, color, box or none. folder: of masks named like the photographs, before
+    source: given, alpha, color, box or none. folder: of masks named like the images, before
     everything else; "" for none. tolerance: of color, in CIELAB's units. ignore: folder of masks
     of what says nothing, before those of the scene; "" for none.
     """
@@ -49,7 +49,7 @@ AS_GIVEN = MaskRule()
 
 
 def named_mask(folder: Path, *names: str) -> Path:
-    """The mask of a photograph in a folder, by one of the names of the photograph: a path or a name
+    """The mask of an image in a folder, by one of the names of the image: a path or a name
     alone. Raises UserError.
     """
     for name in names:
@@ -87,7 +87,7 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
     further than `tolerance` from it, a distance in CIELAB. Places of that colour which the object
     encloses are opaque, since nothing tells a hole from a spot; with_holes: but for the smallest
     they are holes. Pixels at the edge are a mixture of the background and of the nearest colour
-    within the object. Raises Unusable naming the photograph where its border is of several colours.
+    within the object. Raises Unusable naming the image where its border is of several colours.
     """
     colour = image[..., :3] / 255.0
     behind = np.median(border(colour), axis=0)
@@ -120,8 +120,8 @@ def _regions(places, with_holes):
     enough for holes.
     """
     regions = label(places, connectivity=1)
-    kept = border(regions)
+    chosen = border(regions)
     if with_holes:
         large = np.flatnonzero(np.bincount(regions.ravel()) > HOLE * regions.size)
-        kept = np.append(kept, large)
-    return places & np.isin(regions, np.unique(kept[kept > 0]))
+        chosen = np.append(chosen, large)
+    return places & np.isin(regions, np.unique(chosen[chosen > 0]))

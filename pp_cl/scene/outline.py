@@ -1,4 +1,4 @@
-"""Pictures for checking a scene: the outline of the points drawn over photographs, and where masks
+"""Contact sheets for checking a scene: the outline of the points drawn over images, and where masks
 disagree.
 """
 
@@ -19,7 +19,7 @@ from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.hull import Hull, silhouette
 from pp_cl.scene.image_file import shrink
 
-SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
+SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # images of the sheet, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
 MASK_OUTLINE = (0, 150, 255)
 REJECTED = np.array([127, 60, 0], np.uint8)  # added to what a mask should have held
@@ -30,13 +30,13 @@ def outline(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
     return find_boundaries(silhouette(grid, ids, camera), mode="thick")
 
 
-def picture(
+def outline_sheet(
     dev: Device,
     views: Sequence[View],
     points: Hull | None,
     disagreeing: Sequence[Disagreement] = (),
 ) -> np.ndarray:
-    """uint8 (H, W, 3) contact sheet of up to 12 photographs over white, spread evenly over the
+    """uint8 (H, W, 3) contact sheet of up to 12 images over white, spread evenly over the
     views, with the outlines of the mask and, over it, of the points drawn over them.
 
     disagreeing: their views come first, tinted where they reject what the others agree on.

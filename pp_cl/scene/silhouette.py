@@ -1,6 +1,4 @@
-"""Photographs without a mask among others that have one: what the others' visual hull tells of
-them.
-"""
+"""Images without a mask among others that have one: what the others' visual hull tells of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -33,25 +33,23 @@ from pp_cl.selftest.points import (
     PairedGaussians,
     PairedPoints,
     blend_on_axis,
-    depth_at,
     make_camera,
     make_points,
     some_ids,
 )
 
-# alpha: a closeness is off by 1e-6, as the places are (project); the product of some ten 1 - alpha
+# alpha: a falloff is off by 1e-6, as the places are (project); the product of some ten 1 - alpha
 # of them by as many times that. softmax: exponents o z / gamma of up to 100 are off by 100 EPS
 WEIGHT = {"alpha": 1e-5, "softmax": 2e-5}
 GRADIENT = 2e-5  # alpha: T, and what is composited behind, each off by its WEIGHT
 # softmax: dL/do = share (1 + o z / gamma) s, two factors that are each off by its WEIGHT
 OPACITY = {"alpha": GRADIENT, "softmax": 5e-5}
 MANY = 1e-4  # a sum of 20000 terms one by one: each rounds all those before it
-NEAREST = 1e-4  # e^100 of a depth near 1: its rounding, and that of the place, times 100
 UNIT = 2.0**-24  # a float's rounding
 ROUNDINGS = 4  # of an exponent, and in a row of a product of 16 terms
 LEAST = 2.0**-126  # the least float that every device has
 STEP = 1e-6
-DIFFERENCES = 2e-3  # depths and closeness are steep at the rim, where that step is no small one
+DIFFERENCES = 2e-3  # depths and falloff are steep at the rim, where that step is no small one
 
 
 def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -61,9 +59,9 @@ def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Ite
         yield absolute(blended.weight, blended.blend["weight"], WEIGHT[rule])
         expected = dense.features(blended.blend, blended.point_features)
         yield relative(blended.features, expected, WEIGHT[rule])
-        empty = ~blended.geometry["hit"].any(axis=0)
+        empty = ~blended.geometry["fragment"].any(axis=0)
         yield exact(blended.features[empty], np.ones((empty.sum(), 16)))
-        yield exact(weights.shaded.get(), blended.scene.seen)
+        yield exact(weights.visible.get(), blended.scene.seen)
         if rule == "alpha":
             transmittance: Any = weights.transmittance
             background = blended.blend["background"]
@@ -77,7 +75,7 @@ def _backward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> It
         gradients, expected = blended.gradients(), blended.reference_gradients(tracked)
         yield relative(gradients["features"], expected[0], GRADIENT)
         yield relative(gradients["opacity"], expected[1], OPACITY[rule])
-        unseen = ~blended.geometry["hit"].any(axis=1)
+        unseen = ~blended.geometry["fragment"].any(axis=1)
         yield exact(gradients["opacity"][unseen], np.zeros(unseen.sum()))
 
 
@@ -100,14 +98,14 @@ def _early_stop(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Ch
     for stop in (0.001, 0.05, 0.5):
         options: dict[str, Any] = {"gamma": 0.02, "radius": 0.4, "rule": rule, "early_stop": stop}
         blended = Blended(dev, rng, 500, **options)
-        hit, kept = blended.geometry["hit"], blended.blend["hit"]
-        yield exact(blended.dropped, hit & ~kept)
-        yield exact(blended.scene.weights.shaded.get(), np.flatnonzero(kept.any(axis=1)))
+        fragment, used = blended.geometry["fragment"], blended.blend["fragment"]
+        yield exact(blended.dropped, fragment & ~used)
+        yield exact(blended.scene.weights.visible.get(), np.flatnonzero(used.any(axis=1)))
         yield from _check_blended(blended)
 
 
 def _zero_opacity(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The picture is the background; every opacity has a gradient by which it can come back."""
+    """The image is the background; every opacity has a gradient by which it can come back."""
     for gamma, stop in ((0.1, 0.0), (0.01, 0.0), (1e-5, 0.0), (0.1, 1e-3)):
         options: dict[str, Any] = {"rule": rule, "early_stop": stop}
         scene, weight = blend_on_axis(dev, [0.9, 0.5, 0.2], [0.0] * 3, gamma, **options)
@@ -115,7 +113,7 @@ def _zero_opacity(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[
         yield exact(scene.features.get(), np.ones((1, 1, 16)))
         gradients = scene.gradients(np.ones((1, 1, 16)))
         # d G.(f - bg), of a softmax exp(-M) / D with D = 1: a handful of roundings
-        expected = scene.geometry()["closeness"][:, 0] * (1 - 16)
+        expected = scene.geometry()["falloff"][:, 0] * (1 - 16)
         if rule == "softmax":
             expected *= np.exp(-1e-6 / gamma)
         yield relative(gradients["opacity"], expected, 1e-5)
@@ -129,13 +127,13 @@ def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     positions[-1], radius[-1] = 0, 0.01
     opacity, features = rng.uniform(0, 1, n).astype(np.float32), rng.normal(size=(n, 16))
     scene = PairedPoints(dev, camera, positions, radius, kind="sphere")
-    hit, grad = scene.hits(), rng.normal(size=(camera.width * camera.height, 16))
+    fragment, grad = scene.fragments(), rng.normal(size=(camera.width * camera.height, 16))
     for rule in BLENDS:
         scene.blend(opacity, gamma, features, rule=rule)
         gradients = scene.sphere_gradients(grad)
 
         def loss(positions, radius, rule=rule):
-            geometry = dense.geometry(camera, positions, radius, "sphere") | {"hit": hit}
+            geometry = dense.geometry(camera, positions, radius, "sphere") | {"fragment": fragment}
             blend = dense.blend_by_rule(rule, geometry, opacity, gamma)
             return (dense.features(blend, features) * grad).sum()
 
@@ -147,8 +145,8 @@ def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Gradients of offsets, against finite differences of what the closeness changes."""
-    camera, n, edge = make_camera(), 40, 0.3
+    """Gradients of offsets, against finite differences of what the falloff changes."""
+    camera, n, voxel_size = make_camera(), 40, 0.3
     positions, opacity = make_points(rng, n), rng.uniform(0, 1, n).astype(np.float32)
     features = rng.normal(size=(n, 16))
     grad = rng.normal(size=(camera.width * camera.height, 16))
@@ -156,16 +154,16 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0)):
         scene = PairedPoints(dev, camera, positions, radius)
         scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
-        gradients = scene.gradients(grad, edge=edge)["offset"]
+        gradients = scene.gradients(grad, voxel_size=voxel_size)["offset"]
         exact_geometry = scene.geometry()
-        used = dense.alpha(exact_geometry, opacity, stop)["hit"]
-        start = dense.geometry(camera, positions, radius, "soft")["closeness"]
+        used = dense.alpha(exact_geometry, opacity, stop)["fragment"]
+        start = dense.geometry(camera, positions, radius, "soft")["falloff"]
 
         def loss(offset, i, radius=radius, exact_geometry=exact_geometry, used=used, start=start):
-            place, wide = positions[i] + edge * offset[:3], radius * np.exp(offset[3])
-            closeness = start.copy()
-            closeness[i] = dense.geometry(camera, place[None], wide, "soft")["closeness"][0]
-            moved = exact_geometry | {"hit": used, "closeness": closeness}
+            place, wide = positions[i] + voxel_size * offset[:3], radius * np.exp(offset[3])
+            falloff = start.copy()
+            falloff[i] = dense.geometry(camera, place[None], wide, "soft")["falloff"][0]
+            moved = exact_geometry | {"fragment": used, "falloff": falloff}
             return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
 
         numeric = [numeric_gradient(partial(loss, i=i), np.zeros(4), STEP) for i in range(n)]
@@ -173,8 +171,8 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _gaussians(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Of all shapes: their pictures, and the gradients of places and shapes, against finite
-    differences of what the closeness changes; features that were clamped to 0 have none. 1e-3: far
+    """Of all shapes: their images, and the gradients of places and shapes, against finite
+    differences of what the falloff changes; features that were clamped to 0 have none. 1e-3: far
     below a pixel.
     """
     for n, radius, stop in ((33, 0.1, 0.0), (17, 0.1, 0.05), (17, 1e-3, 0.0), (1, 0.2, 0.0)):
@@ -191,21 +189,21 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
     features = np.maximum(rng.normal(size=(n, 16)), 0)
     grad = rng.normal(size=(camera.width * camera.height, 16))
     scene = PairedGaussians(dev, camera, grid, ids, np.pad(learned, ((0, 0), (0, 7))), radius)
-    picture = scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
-    found, measured = scene.gradients(grad, edge=grid.edge), scene.geometry()
-    blend, hit = dense.alpha(measured, opacity, stop), measured["hit"]
-    yield relative(picture.reshape(-1, 16), dense.features(blend, features), WEIGHT["alpha"])
+    image = scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
+    found, measured = scene.gradients(grad, voxel_size=grid.voxel_size), scene.geometry()
+    blend, fragment = dense.alpha(measured, opacity, stop), measured["fragment"]
+    yield relative(image.reshape(-1, 16), dense.features(blend, features), WEIGHT["alpha"])
     expected = np.where(features > 0, blend["weight"] @ grad, 0)
     yield relative(found["features"], expected, WEIGHT["alpha"])
     vertices = grid.positions(ids)
-    expected = dense.gaussians(camera, vertices, grid.edge, learned, radius)["closeness"]
-    yield absolute(measured["closeness"][hit], expected[hit], WEIGHT["alpha"])
+    expected = dense.gaussians(camera, vertices, grid.voxel_size, learned, radius)["falloff"]
+    yield absolute(measured["falloff"][fragment], expected[fragment], WEIGHT["alpha"])
 
     def loss(offset, i):
-        moved = dense.gaussians(camera, vertices[i : i + 1], grid.edge, offset[None], radius)
-        closeness = expected.copy()
-        closeness[i] = moved["closeness"][0]
-        geometry = measured | {"hit": blend["hit"], "closeness": closeness}
+        moved = dense.gaussians(camera, vertices[i : i + 1], grid.voxel_size, offset[None], radius)
+        falloff = expected.copy()
+        falloff[i] = moved["falloff"][0]
+        geometry = measured | {"fragment": blend["fragment"], "falloff": falloff}
         return (dense.features(dense.alpha(geometry, opacity), features) * grad).sum()
 
     rows = enumerate(learned)
@@ -233,16 +231,16 @@ def _opacity_bound(blended: Blended) -> np.ndarray:
     blend, inverse = blended.blend, 1 / blended.gamma
     mean = dense.features(blend, features)
     size = np.abs(features) @ np.abs(grad).T + np.abs(mean * grad).sum(axis=1)
-    gain = np.abs(features @ grad.T - (mean * grad).sum(axis=1))
-    gain += (blend["weight"] * gain).sum(axis=0)  # what an exponent's rounding moves the mean by
+    dL_db = np.abs(features @ grad.T - (mean * grad).sum(axis=1))
+    dL_db += (blend["weight"] * dL_db).sum(axis=0)  # what an exponent's rounding moves the mean by
     factor = 1 + blended.opacity[:, None] * np.abs(blend["z"]) * inverse
-    rounded = blend["share"] * (size + (1 + inverse) * gain) * UNIT * ROUNDINGS
+    rounded = blend["share"] * (size + (1 + inverse) * dL_db) * UNIT * ROUNDINGS
     underflow = LEAST * size
-    return np.where(blend["hit"], factor * (rounded + underflow), 0).sum(axis=1)
+    return np.where(blend["fragment"], factor * (rounded + underflow), 0).sum(axis=1)
 
 
 def _sharp(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Where one hit has nearly all of the weight, dL/do is a rounding of 0 times 1/gamma."""
+    """Where one fragment has nearly all of the weight, dL/do is a rounding of 0 times 1/gamma."""
     for kind in FOOTPRINTS:
         for gamma in (1e-3, 1e-5):
             blended = Blended(dev, rng, kind=kind, gamma=gamma)
@@ -250,42 +248,22 @@ def _sharp(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             yield allowed(blended.gradients()["opacity"], expected, _opacity_bound(blended))
 
 
-def _nearest(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """exp(z / gamma) = e^100 at z = 1 is above the largest float."""
-    radius = 2.0**-10
-    places = np.stack([np.zeros(3), np.zeros(3), depth_at([1.0, 0.99, 0.5]) + radius], -1)
-    features = PairedPoints(dev, AXIS, places, radius, kind="sphere").blend(
-        [1, 1, 1], 0.01, np.eye(3, 16)
-    )
-    e = np.exp([0.0, -1.0, -50.0])
-    yield each(features[0, 0, :3], e / e.sum(), NEAREST, floor=1e-3)
-
-
-def _equal_depths_softmax(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Shared equally; tracked in the order of the indices."""
-    for gamma in (0.1, 0.01, 1e-5):
-        for count in (2, 3, 16, 17, 100):
-            _, weight = blend_on_axis(dev, [0.7] * count, [1.0] * count, gamma)
-            yield exact(weight, np.full_like(weight, weight[0]))
-            # at gamma = 0.1 the background keeps up to e^-7 / 2, less than 1e-3
-            yield absolute(weight.sum(), 1, 1e-2 if gamma == 0.1 else 1e-5)
-    scene, _ = blend_on_axis(dev, [0.7] * 5, [1.0] * 5, 0.1, max_tracked=2)
-    tracked = scene.gradients(np.ones((1, 1, 16)))["features"].any(axis=1)
-    yield exact(tracked, [True, True, False, False, False])
-
-
-def _many_hits(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _many_fragments(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """20000 in a pixel: a transmittance falls below the smallest number, and nothing is NaN."""
     z, opacity = rng.uniform(0.1, 0.99, 20_000), rng.uniform(0, 1, 20_000).astype(np.float32)
-    for gamma in (0.1, 0.01):
-        scene, weight = blend_on_axis(dev, z, opacity, gamma)
-        blend = dense.blend(scene.geometry(), opacity, gamma)
+    for gamma, stop in ((0.1, 0.0), (0.01, 1e-3 if rule == "alpha" else 0.0)):
+        scene, weight = blend_on_axis(dev, z, opacity, gamma, rule=rule, early_stop=stop)
+        blend = dense.blend_by_rule(rule, scene.geometry(), opacity, gamma, stop)
         yield relative(weight, blend["weight"][:, 0], MANY)
+        if rule == "alpha":  # down to 1e-30, some hundred factors of half EPS each
+            yield each(weight, blend["weight"][:, 0], MANY, floor=1e-26)
         expected = dense.features(blend, np.resize(np.eye(16), (20_000, 16)))
         yield relative(scene.features.get().reshape(1, 16), expected, MANY)
+        yield finite(*scene.gradients(rng.normal(size=(1, 1, 16))).values())
 
 
 def _rims(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """A sphere hit on the very rim, where d = 0; one through whose centre the ray goes; one beyond
+    """A sphere met on the very rim, where d = 0; one through whose centre the ray goes; one beyond
     far, which the early stop spares.
     """
     ones = np.ones((1, 1, 16))
@@ -342,64 +320,18 @@ def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]
         yield relative(gradients["features"][:, :15], expected[0][:, :15], GRADIENT)
 
 
-def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Of hits of all weights, of those before an early stop, and of the tracked ones."""
+def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Of fragments of all weights, of those before an early stop, and of the tracked ones."""
     for n, tracked, stop in ((257, 0, 0), (257, 0, 0.05), (257, 3, 0), (33, 0, 0), (31, 0, 0)):
         options: dict[str, Any] = {"max_tracked": tracked, "early_stop": stop}
         blended = Blended(dev, rng, n, rule="alpha", **options)
         blended.grad[:] = 0
-        expected = blended.reference_gradients(tracked, spread_weight=3.0)[1]
-        gradients = blended.gradients(spread_weight=3.0)
+        expected = blended.reference_gradients(tracked, distortion_weight=3.0)[1]
+        gradients = blended.gradients(distortion_weight=3.0)
         yield relative(gradients["opacity"], expected, GRADIENT)
         yield exact(gradients["features"], np.zeros((n, 16)))
-        spread = dense.spread(blended.geometry, blended.blend)
-        yield relative(blended.scene.backward.pixel_spread.get(), spread, GRADIENT)
-
-
-def _opaque(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """alpha = 1: no weight behind it, no division by 1 - alpha, a gradient by which it can fade."""
-    scene, weight = _composited(dev, [0.5, 1.0, 1.0, 0.3])
-    yield absolute(weight, [0.5, 0.5, 0, 0], 1e-7)  # a rounding
-    gradients = scene.gradients(np.arange(16.0).reshape(1, 1, 16))
-    yield absolute(gradients["opacity"], [-1, -0.5, 0, 0], WEIGHT["alpha"])
-
-
-def _composited(dev, opacity, **options):
-    """Hits one behind another in a single pixel."""
-    z = np.linspace(0.9, 0.1, len(opacity))
-    return blend_on_axis(dev, z, opacity, 0.1, rule="alpha", **options)
-
-
-def _equal_depths_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Ordered, and tracked, by index."""
-    for count in (5, 17, 100):
-        given = [0.7] * count, [0.5] * count
-        scene, weight = blend_on_axis(dev, *given, 0.1, rule="alpha", max_tracked=2)
-        yield each(weight, 0.5 ** np.arange(1, count + 1), WEIGHT["alpha"])
-        tracked = scene.gradients(np.ones((1, 1, 16)))["features"].any(axis=1)
-        yield exact(tracked, np.arange(count) < 2)
-
-
-def _underflow(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """20000 hits: the transmittance falls below the smallest number, with nothing not finite."""
-    z, opacity = rng.uniform(0.1, 0.99, 20_000), rng.uniform(0, 1, 20_000).astype(np.float32)
-    order = np.argsort(-z)
-    through = np.concatenate([[1], np.cumprod(1 - opacity[order].astype(np.float64))[:-1]])
-    for least in (0.0, 1e-3):
-        scene, weight = blend_on_axis(dev, z, opacity, 0.1, rule="alpha", early_stop=least)
-        expected = np.zeros(len(z))
-        expected[order] = np.where(through >= least, through * opacity[order], 0)
-        # down to 1e-30, some hundred factors of half EPS each
-        yield each(weight, expected, 1e-4, floor=1e-26)
-        yield finite(*scene.gradients(rng.normal(size=(1, 1, 16))).values())
-
-
-def _faint(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """A thousand hits of 1e-3 let exp(-1) through: a thousand roundings that mostly cancel."""
-    scene, weight = _composited(dev, np.full(1000, 1e-3))
-    yield absolute(1 - weight.sum(), (1 - 1e-3) ** 1000, 1e-5)
-    gradient = scene.gradients(np.ones((1, 1, 16)))["opacity"]
-    yield exact(gradient < 0, np.ones(1000, bool))
+        distortion = dense.distortion(blended.geometry, blended.blend)
+        yield relative(blended.scene.backward.pixel_distortion.get(), distortion, GRADIENT)
 
 
 def _of_both(what, function):
@@ -417,20 +349,14 @@ CASES = (
     *_of_both("awkward sizes", _sizes),
     *_of_both("early stop", _early_stop),
     *_of_both("opacities of 0", _zero_opacity),
+    *_of_both("20000 fragments in a pixel", _many_fragments),
     Case("softmax: gradients of spheres", _spheres),
     Case("softmax: gamma of 1e-5", _smallest_gamma),
     Case("softmax: dL/do at small gammas", _sharp),
-    Case("softmax: nearest possible point", _nearest),
-    Case("softmax: equal depths", _equal_depths_softmax),
-    Case("softmax: 20000 hits in a pixel", _many_hits),
     Case("softmax: rims and centres of spheres", _rims),
     Case("softmax: an empty view", _empty),
     Case("alpha: gradient of alpha", _gradient_of_alpha),
-    Case("alpha: spread", _spread),
+    Case("alpha: distortion loss", _distortion),
     Case("alpha: offsets of points", _offsets),
     Case("alpha: shapes of Gaussians", _gaussians),
-    Case("alpha: opacities of 1", _opaque),
-    Case("alpha: equal depths", _equal_depths_alpha),
-    Case("alpha: transmittance that underflows", _underflow),
-    Case("alpha: faint hits", _faint),
 )

@@ -42,9 +42,9 @@ def _compact(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Every bit is kept, those of NaN among them."""
     for n in SIZES:
         source = rng.integers(0, 2**32, (n, 3, 16), dtype=np.uint32)
-        kept = np.flatnonzero(rng.random(n) < 0.6) if n > 1 else np.zeros(1, int)
-        rows = compact_rows(dev, dev.upload(source.view(np.float32)), dev.upload(kept, np.uint32))
-        yield exact(rows.get().view(np.uint32), source[kept])
+        chosen = np.flatnonzero(rng.random(n) < 0.6) if n > 1 else np.zeros(1, int)
+        rows = compact_rows(dev, dev.upload(source.view(np.float32)), dev.upload(chosen, np.uint32))
+        yield exact(rows.get().view(np.uint32), source[chosen])
         some = rng.integers(0, n, 3 * n)
         gathered = gather_rows(dev, dev.upload(source), dev.upload(some, np.uint32))
         yield exact(gathered.get(), source[some])

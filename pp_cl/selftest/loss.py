@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.training.exposure import KEPT, PRIOR, Exposure
+from pp_cl.engine.training.exposure import DECAY, PRIOR, Exposure
 from pp_cl.engine.training.loss import FURTHER, Loss, MaskLoss, ignore_gradient, ignore_target
 from pp_cl.reference import loss as reference_loss
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
@@ -125,7 +125,7 @@ def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The gains of three views, of which one is seen twice and one never, and photographs that are
+    """The gains of three views, of which one is seen twice and one never, and images that are
     divided by them.
     """
     known, left, top = np.zeros((3, 3, 3)), 3, 1
@@ -134,20 +134,18 @@ def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         alpha = rng.random((side, 29))
         prediction = rng.random((side + 3, 36, 3))
         inside = prediction[top : top + side, left : left + 29] - (1 - alpha[..., None])
-        photograph = rng.uniform(0.5, 1.5, 3) * inside + (1 - alpha[..., None])
-        shown_as, shot, mask = (
-            dev.upload(image, np.float32) for image in (prediction, photograph, alpha)
-        )
+        image = rng.uniform(0.5, 1.5, 3) * inside + (1 - alpha[..., None])
+        shown_as, shot, mask = (dev.upload(one, np.float32) for one in (prediction, image, alpha))
         target = exposure.target(view, shot, mask).get()
         gains = exposure.state.get()[:, :, 3].astype(np.float64)
-        expected = (photograph - (1 - alpha[..., None])) / gains[view] + (1 - alpha[..., None])
+        expected = (image - (1 - alpha[..., None])) / gains[view] + (1 - alpha[..., None])
         yield relative(target, expected, 8 * EPS)
         exposure.fit(view, shown_as, shot, mask, (left, top))
         weighted = alpha[..., None] * inside
-        shown = photograph - 1 + alpha[..., None]
+        shown = image - 1 + alpha[..., None]
         sums = [(weighted * shown).sum((0, 1)), (weighted * inside).sum((0, 1))]
         sums.append((alpha[..., None] * shown**2).sum((0, 1)))
-        known[view] = KEPT * known[view] + np.stack(sums, axis=1)
+        known[view] = DECAY * known[view] + np.stack(sums, axis=1)
         pull = PRIOR * alpha.size
         gains = (known[..., 0] + pull) / (known[..., 1] + pull)
         gains /= np.exp(np.log(gains).mean(axis=0))

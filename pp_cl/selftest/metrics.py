@@ -17,15 +17,6 @@ BOX = np.array([(x, y, z) for x in (-0.39, 0.39) for y in (-0.29, 0.29) for z in
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
 
-def _input(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    for w in SIZES:
-        image = rng.uniform(0, 1, (31, w, 3)).astype(np.float32)
-        x, n = dev.empty(image.shape), 31 * w
-        lpips_program(dev).launch("lpips_input", n, n=n, image=dev.upload(image), x=x)
-        # four roundings of values of up to 2.4
-        yield relative(x.get(), lpips.scaled_input(image.astype(np.float64)), 1e-6)
-
-
 def _distance(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Features whose lengths differ a millionfold; none; equal ones."""
     for n in SIZES:
@@ -68,7 +59,6 @@ def _box(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 CASES = (
-    Case("metrics: input of LPIPS", _input),
     Case("metrics: distance of LPIPS", _distance),
     Case("metrics: LPIPS", _lpips),
     Case("metrics: vertices on a box", _box),

@@ -17,7 +17,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import BlendGradients, blend_backward, blend_forward
 from pp_cl.engine.raster.project import project_grid
-from pp_cl.engine.raster.weights import blend_weights, listed_hits
+from pp_cl.engine.raster.weights import blend_weights, listed_fragments
 from pp_cl.reference import dense
 
 Gradients = dict[str, np.ndarray]
@@ -94,37 +94,34 @@ class PairedPoints:
         """(?,) the points with a pair, ascending."""
         return np.flatnonzero(np.diff(self.pairs.point_offset.get()))
 
-    def _counts(self):
-        return np.diff(self.pairs.point_offset.get().astype(np.int64))
-
     def pair_points(self) -> np.ndarray:
         """(P,) the point of each pair, from the offsets alone."""
-        return np.repeat(np.arange(self.n), self._counts())
+        counts = np.diff(self.pairs.point_offset.get().astype(np.int64))
+        return np.repeat(np.arange(self.n), counts)
 
     def dense(self, pair_values: np.ndarray, missing: float = 0.0) -> np.ndarray:
         """(N, HW) of values by pair: (P, ...) on the host."""
         total = self.pairs.total
-        matrix = np.full(
-            (self.n, self.camera.width * self.camera.height), missing, pair_values.dtype
-        )
+        pixels = self.camera.width * self.camera.height
+        matrix = np.full((self.n, pixels), missing, pair_values.dtype)
         matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
         return matrix
 
     def geometry(self) -> dict[str, np.ndarray]:
-        """dense.geometry with the device's hits, and at these its closeness and depth: at the rim
-        of a footprint a closeness is rounding, and a softmax may make it half a pixel.
+        """dense.geometry with the device's fragments, and at these its falloff and depth: at the
+        rim of a footprint a falloff is rounding, and a softmax may make it half a pixel.
         """
-        total, hit = self.pairs.total, self.hits()
-        closeness = self.pairs.pair_point_closeness.get()[:total, 1].view(np.float32)
+        total, fragment = self.pairs.total, self.fragments()
+        falloff = self.pairs.pair_point_falloff.get()[:total, 1].view(np.float32)
         keys, depth = self.pairs.pair_key.get()[:total], np.empty(total, np.float32)
         depth[keys & 0xFFFFFFFF] = (keys >> 32).astype(np.uint32).view(np.float32)
         geometry = self._exact()
-        for name, measured in (("closeness", closeness), ("depth", depth)):
-            geometry[name] = np.where(hit, self.dense(measured), geometry[name])
+        for name, measured in (("falloff", falloff), ("depth", depth)):
+            geometry[name] = np.where(fragment, self.dense(measured), geometry[name])
         near, far = self.depth_range
-        return geometry | {"hit": hit, "z": 1 - (geometry["depth"] - near) / (far - near)}
+        return geometry | {"fragment": fragment, "z": 1 - (geometry["depth"] - near) / (far - near)}
 
-    def hits(self) -> np.ndarray:
+    def fragments(self) -> np.ndarray:
         """(N, HW) bool."""
         return self.dense(np.ones(max(1, self.pairs.total), bool), False)
 
@@ -149,26 +146,26 @@ class PairedPoints:
             gamma=gamma,
             **drops,
         )
-        shaded = self.weights.shaded.get()
-        rows = np.full((len(shaded) + 1, 16), np.nan)  # as if there was room for one more
-        rows[:-1] = np.asarray(point_features)[shaded]
-        self.shaded_features = self.dev.upload(rows, np.float32)
+        visible = self.weights.visible.get()
+        rows = np.full((len(visible) + 1, 16), np.nan)  # as if there was room for one more
+        rows[:-1] = np.asarray(point_features)[visible]
+        self.visible_features = self.dev.upload(rows, np.float32)
         self.features = self.dev.empty((*self.shape, 16))
-        blend_forward(self.dev, self.pairs, self.weights, self.shaded_features, self.features)
+        blend_forward(self.dev, self.pairs, self.weights, self.visible_features, self.features)
         return self.features.get()
 
     def weight(self) -> np.ndarray:
-        """(N, HW) the blend weights, 0 where a hit was dropped."""
-        kept, _, weights = listed_hits(self.pairs, self.weights)
+        """(N, HW) the blend weights, 0 where a fragment was dropped."""
+        is_listed, _, weights = listed_fragments(self.pairs, self.weights)
         by_pair = np.zeros(self.pairs.total, np.float32)
-        by_pair[self._listed()[kept]] = weights
+        by_pair[self._listed()[is_listed]] = weights
         return self.dense(by_pair)
 
     def dropped(self) -> np.ndarray:
-        """(N, HW) bool: the hits behind an early stop."""
-        kept, _, _ = listed_hits(self.pairs, self.weights)
+        """(N, HW) bool: the fragments behind an early stop."""
+        is_listed, _, _ = listed_fragments(self.pairs, self.weights)
         by_pair = np.empty(self.pairs.total, bool)
-        by_pair[self._listed()] = ~kept
+        by_pair[self._listed()] = ~is_listed
         return self.dense(by_pair, False)
 
     def _listed(self):
@@ -179,14 +176,14 @@ class PairedPoints:
         self,
         grad_features: np.ndarray,
         grad_alpha: np.ndarray | None = None,
-        spread_weight: float = 0.0,
-        edge: float = 0.0,
+        distortion_weight: float = 0.0,
+        voxel_size: float = 0.0,
     ) -> Gradients:
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
-        sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend(); on a grid of
-        an edge also "offset", (N, 4).
+        sum(alpha * grad_alpha) and the pixels' distortion loss times its weight, after blend(); on
+        a grid of a voxel size also "offset", (N, 4).
         """
-        alphas = None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32)
+        grad_features = np.reshape(grad_features, (*self.shape, 16))
         found = self.backward = blend_backward(
             self.dev,
             self.buffers,
@@ -194,15 +191,21 @@ class PairedPoints:
             self.pairs,
             self.weights,
             opacity=self.opacity,
-            shaded_features=self.shaded_features,
+            visible_features=self.visible_features,
             features=self.features,
-            grad_features=self._uploaded(grad_features),
-            grad_alpha=alphas,
-            spread_weight=spread_weight,
-            edge=edge,
+            grad_features=self.dev.upload(grad_features, np.float32),
+            grad_alpha=None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32),
+            distortion_weight=distortion_weight,
+            voxel_size=voxel_size,
         )
-        rows = {"features": found.shaded_features, "opacity": found.opacity, "offset": found.offset}
-        return {name: self._of_points(array) for name, array in rows.items() if array is not None}
+        rows = {"features": found.visible_features, "opacity": found.opacity}
+        if found.offset is not None:
+            rows["offset"] = found.offset
+        visible, gradients = self.weights.visible.get(), {}
+        for name, array in rows.items():  # of the visible points; those of all others are 0
+            gradients[name] = np.zeros((self.n, *array.shape[1:]), np.float32)
+            gradients[name][visible] = array.get()[: len(visible)]
+        return gradients
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
@@ -217,18 +220,6 @@ class PairedPoints:
             gamma=self.gamma,
         )
         return gradients | {"positions": positions.get(), "radius": radius.get()}
-
-    def _of_points(self, rows):
-        """(N, ...): those of the visible points, 0 for all others."""
-        shaded, of_points = (
-            self.weights.shaded.get(),
-            np.zeros((self.n, *rows.shape[1:]), np.float32),
-        )
-        of_points[shaded] = rows.get()[: len(shaded)]
-        return of_points
-
-    def _uploaded(self, grad_features):
-        return self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
 
 
 class PairedGaussians(PairedPoints):
@@ -245,7 +236,9 @@ class PairedGaussians(PairedPoints):
         offset: np.ndarray,
         radius: float,
     ):
-        exact = partial(dense.gaussians, camera, grid.positions(ids), grid.edge, offset, radius)
+        exact = partial(
+            dense.gaussians, camera, grid.positions(ids), grid.voxel_size, offset, radius
+        )
         self._begin(dev, camera, len(ids), exact, dense.DEPTH_RANGE)
         self._pair(
             project_grid(
@@ -285,8 +278,8 @@ def blend_on_axis(
 
 
 class Blended:
-    """A random scene blended by the kernels and in float64, both with the kernels' hits, closeness
-    and depth.
+    """A random scene blended by the kernels and in float64, both with the kernels' fragments,
+    falloff and depth.
     """
 
     def __init__(
@@ -321,12 +314,14 @@ class Blended:
         self.weight = self.scene.weight()
         self.dropped = self.scene.dropped()
 
-    def gradients(self, spread_weight: float = 0.0) -> Gradients:
-        """The kernels' gradients of sum(features * grad) and the spread times its weight."""
-        return self.scene.gradients(self.grad, spread_weight=spread_weight)
+    def gradients(self, distortion_weight: float = 0.0) -> Gradients:
+        """The kernels' gradients of sum(features * grad) and the distortion loss times its
+        weight.
+        """
+        return self.scene.gradients(self.grad, distortion_weight=distortion_weight)
 
     def reference_gradients(
-        self, max_tracked: int = 0, spread_weight: float = 0.0
+        self, max_tracked: int = 0, distortion_weight: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """The same in float64: (features, opacity)."""
         return dense.gradients(
@@ -335,5 +330,5 @@ class Blended:
             self.point_features,
             self.grad,
             max_tracked=max_tracked,
-            spread_weight=spread_weight,
+            distortion_weight=distortion_weight,
         )

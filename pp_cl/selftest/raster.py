@@ -17,15 +17,13 @@ from pp_cl.engine.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
 from pp_cl.engine.raster.weights import BLENDS, list_weights, record_weights
 from pp_cl.reference import dense
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
+from pp_cl.selftest.case import SIZES, Case, Check, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import (
     AXIS,
-    AXIS_RADIUS,
     FAR,
     Blended,
     PairedPoints,
     blend_on_axis,
-    depth_at,
     make_camera,
     make_points,
     some_ids,
@@ -34,21 +32,21 @@ from pp_cl.selftest.points import (
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 PLACED = 1e-6  # a rotation of a difference: 8 roundings of half EPS, and the camera's own two
 BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
-CLOSENESS = 1e-4  # that band's: of a radius of at least 0.75 pixels
+FALLOFF = 1e-4  # that band's: of a radius of at least 0.75 pixels
 RIM = 1e-3  # the depth of a sphere is steep at its rim
 SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
 
 
 def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Points in the cells of a grid; spheres of which the depth range culls some, by their front.
-    Where points are is known of those that hit a pixel, and all hit one that lie in the image.
+    Where points are is known of those that cover a pixel, and all cover one that lie in the image.
     """
     camera, depth_range = make_camera(), (3.5, 4.8)
     for n in SIZES:
         ids = some_ids(rng, GRID, n)
         ids[-1] = GRID.ids(np.array(GRID.dims) - 1)
         offset = rng.uniform(-0.5, 0.5, (n, 4)).astype(np.float32)
-        positions = GRID.positions(ids) + GRID.edge * offset[:, :3]
+        positions = GRID.positions(ids) + GRID.voxel_size * offset[:, :3]
         points = project_grid(
             dev,
             Buffers(dev),
@@ -59,25 +57,25 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             cloud_offset=dev.upload(offset),
             radius=0.01,
         )
-        place, hit = dense.camera_space(camera, positions), points.point_count.get() > 0
-        yield exact(hit | ~_inside(camera, place), np.ones(n, bool))
-        radius = 0.01 * np.exp(offset[hit, 3])
-        yield relative(points.point_shape.get()[hit, 0], radius, PLACED)
-        yield relative(points.point_camera.get()[hit, :3], place[hit], PLACED)
+        place, covers = dense.camera_space(camera, positions), points.point_count.get() > 0
+        yield exact(covers | ~_inside(camera, place), np.ones(n, bool))
+        radius = 0.01 * np.exp(offset[covers, 3])
+        yield relative(points.point_shape.get()[covers, 0], radius, PLACED)
+        yield relative(points.point_camera.get()[covers, :3], place[covers], PLACED)
         yield relative(
-            points.point_camera.get()[hit, 3], np.linalg.norm(place[hit], axis=1), PLACED
+            points.point_camera.get()[covers, 3], np.linalg.norm(place[covers], axis=1), PLACED
         )
 
         positions, radius = make_points(rng, n), rng.uniform(0.01, 0.3, n)
         spheres = PairedPoints(dev, camera, positions, radius, depth_range=depth_range)
-        placed, hit = spheres.projected.point_camera.get(), np.isin(np.arange(n), spheres.seen)
-        place, kept = (
+        placed, covers = spheres.projected.point_camera.get(), np.isin(np.arange(n), spheres.seen)
+        place, drawn = (
             dense.camera_space(camera, positions),
-            dense.kept(camera, positions, radius, depth_range),
+            dense.drawn(camera, positions, radius, depth_range),
         )
-        yield exact(hit[~kept], np.zeros((~kept).sum(), bool))
-        yield exact(hit | ~(kept & _inside(camera, place)), np.ones(n, bool))
-        yield relative(placed[hit, :3], place[hit], PLACED)
+        yield exact(covers[~drawn], np.zeros((~drawn).sum(), bool))
+        yield exact(covers | ~(drawn & _inside(camera, place)), np.ones(n, bool))
+        yield relative(placed[covers, :3], place[covers], PLACED)
 
 
 def _inside(camera, place):
@@ -88,30 +86,27 @@ def _inside(camera, place):
     return (z > 0) & inside
 
 
-def _not_finite(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Positions that are NaN, infinite or too large are left out and reach nothing."""
+def _left_out(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Points behind the eye, on its plane and at it, and positions that are NaN, infinite or too
+    large, reach nothing.
+    """
+    positions = [[0, 0, 3.0], [0.001, 0, 4.0], [0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9]]
     for bad in (np.nan, np.inf, -np.inf, 3e38, -3e38):
-        positions = np.array([[0, 0, 3.0], [0, 0, 3.0], [0.001, 0, 4.0]])
-        positions[1, rng.integers(3)] = bad
-        scene = PairedPoints(dev, AXIS, positions, 0.1, kind="sphere")
-        yield exact(scene.seen, [0, 2])
-        features = scene.blend(np.ones(3), 0.01, np.ones((3, 16)) * 2)
-        ones = np.ones((1, 1, 16))
-        gradients = scene.sphere_gradients(ones)
-        yield finite(features, *gradients.values())
-        yield exact([g[1].any() for g in gradients.values()], [False] * 4)
-
-
-def _behind(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Points behind the eye, on its plane and at the eye are left out."""
-    positions = np.array([[0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9], [0, 0, 3.0]])
+        positions += [[bad, 0, 3.0], [0, bad, 3.0], [0, 0, bad]]
+    n, ones = len(positions), np.ones((1, 1, 16))
     for kind in FOOTPRINTS:
-        scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
-        yield exact(scene.seen, [4])
+        scene = PairedPoints(
+            dev, AXIS, np.array(positions), 0.01, kind=kind, depth_range=(1e-3, FAR)
+        )
+        yield exact(scene.seen, [0, 1])
+        features = scene.blend(np.ones(n), 0.01, np.full((n, 16), 2))
+        found = scene.sphere_gradients(ones) if kind == "sphere" else scene.gradients(ones)
+        yield finite(features, *found.values())
+        yield exact([gradient[2:].any() for gradient in found.values()], [False] * len(found))
 
 
 def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Which pixels a point hits, how close to its centre, at which depth, in which order."""
+    """Which pixels a point covers, how close to its centre, at which depth, in which order."""
     camera = replace(make_camera(33, 31), fy=26.0)
     for n in SIZES:
         positions, radius = make_points(rng, n), (10.0 ** rng.uniform(-3, 0, n)).astype(np.float32)
@@ -121,25 +116,23 @@ def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _check_pairs(scene, expected):
     """tests/engine/raster/test_pairs.py says more of each."""
-    pairs, total, hits = scene.pairs, scene.pairs.total, scene.hits()
+    pairs, fragments, measured = scene.pairs, scene.fragments(), scene.geometry()
     clear = expected["margin"] > BAND
-    yield exact(hits[clear], expected["hit"][clear])
-    yield exact(hits.sum(), total)
-    points, pixels = scene.pair_points(), pairs.pair_pixel.get()[:total].astype(np.int64)
-    source = pairs.pair_point_closeness.get()[:total]
-    yield exact(source[:, 0], points)
-    closeness = source[:, 1].view(np.float32)
-    yield relative(closeness, expected["closeness"][points, pixels], CLOSENESS)
-    counts, keys = np.diff(pairs.pixel_offset.get().astype(np.int64)), pairs.pair_key.get()[:total]
-    yield exact(counts, hits.sum(axis=0))
-    pair = (keys & 0xFFFFFFFF).astype(np.int64)
-    depth = (keys >> 32).astype(np.uint32).view(np.float32)
-    yield exact(np.sort(pair), np.arange(total))
-    yield exact(pixels[pair], np.repeat(np.arange(len(counts)), counts))
-    yield relative(depth, expected["depth"][points[pair], pixels[pair]], RIM)
-    inner = pixels[pair][1:] == pixels[pair][:-1]
+    yield exact(fragments[clear], expected["fragment"][clear])
+    yield exact(fragments.sum(), pairs.total)
+    yield relative(measured["falloff"][fragments], expected["falloff"][fragments], FALLOFF)
+    yield relative(measured["depth"][fragments], expected["depth"][fragments], RIM)
+    yield exact(pairs.pair_point_falloff.get()[: pairs.total, 0], scene.pair_points())
+    counts = np.diff(pairs.pixel_offset.get().astype(np.int64))
+    yield exact(counts, fragments.sum(axis=0))
+    keys = pairs.pair_key.get()[: pairs.total]
+    pair = keys & 0xFFFFFFFF
+    yield exact(np.sort(pair), np.arange(pairs.total))
+    pixels = pairs.pair_pixel.get()[pair]
+    yield exact(pixels, np.repeat(np.arange(len(counts)), counts))
+    inner = pixels[1:] == pixels[:-1]
     yield exact((keys[1:] > keys[:-1])[inner], np.ones(inner.sum(), bool))
-    yield exact(scene.seen, np.flatnonzero(hits.any(axis=1)))
+    yield exact(scene.seen, np.flatnonzero(fragments.any(axis=1)))
 
 
 def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -163,32 +156,32 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         scene = PairedPoints(dev, camera, positions, 0.1)
         seen, sh = scene.seen[::2], [rng.normal(size=(n, b.count, 16)) for b in sh_blocks(degree)]
 
-        def shaded(sh, points=scene.projected, seen=seen):
+        def shade(sh, points=scene.projected, seen=seen):
             features = dev.upload(np.full((len(seen) + 3, 16), 7.0), np.float32)
             shade_forward(
                 dev,
                 points,
                 dev.upload(seen, np.uint32),
                 [dev.upload(block) for block in sh],
-                shaded_features=features,
+                visible_features=features,
             )
             return features.get()
 
-        features = shaded([block.astype(np.float32) for block in sh])
+        features = shade([block.astype(np.float32) for block in sh])
         expected = dense.shade(positions, camera.eye, np.concatenate(sh, axis=1))
         # nine products of a direction's squares: 5 roundings each, of values of up to 4
         yield relative(features[:-3], expected[seen], 1e-5)
         yield exact(features[-3:], np.full((3, 16), 7))
         gaussians = replace(scene.projected, footprint="gaussian")
-        clamped = shaded([block.astype(np.float32) for block in sh], gaussians)
+        clamped = shade([block.astype(np.float32) for block in sh], gaussians)
         yield exact(clamped[:-3], np.maximum(features[:-3], 0))
         sh[0][:, 0, :4] = 0, -6e-8, 65504, 1e-5  # denormal halves and the largest
         half = [block.astype(np.float16) for block in sh]
-        yield exact(shaded(half), shaded([block.astype(np.float32) for block in half]))
+        yield exact(shade(half), shade([block.astype(np.float32) for block in half]))
 
 
 def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Alpha, mean and median depth by the blend weights; those of three points by hand."""
+    """Alpha, mean and median depth by the blend weights; nothing of opacities of 0."""
     for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
         blended = Blended(
             dev, rng, n, gamma=0.02, radius=0.4, rule=rule, early_stop=1e-2, kind=kind
@@ -198,25 +191,15 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         weight = scene.weight().astype(np.float64)
         z = dense.surface_depth(scene.camera, blended.geometry, blended.radius, kind)
         total = weight.sum(axis=0)
-        hit = total > 0
+        covers = total > 0
         stopped = blended.dropped.any(axis=0)
         yield each(alpha, np.where(stopped, 1, np.minimum(total, 1)), SUMMED, floor=1e-2)
-        yield exact(np.isinf(depth), ~hit)
-        mean = (weight * z).sum(axis=0)[hit] / total[hit]
-        yield relative(depth[hit], mean, SUMMED)
-        yield exact(np.isinf(median), ~hit)
+        yield exact(np.isinf(depth), ~covers)
+        mean = (weight * z).sum(axis=0)[covers] / total[covers]
+        yield relative(depth[covers], mean, SUMMED)
+        yield exact(np.isinf(median), ~covers)
         low, high = _medians(blended, weight, z)
-        yield absolute(median[hit], np.clip(median, low, high)[hit], SUMMED * z.max())
-    scene, _ = blend_on_axis(dev, [0.9, 0.5, 0.1], [0.25, 1.0, 1.0], 0.1, rule="alpha")
-    alpha, depth, median = _depths(dev, scene)
-    near, far = depth_at(np.array([0.9, 0.5])) - AXIS_RADIUS
-    for actual, expected in (
-        (alpha, 1),
-        (depth, 0.25 * near + 0.75 * far),
-        # a quarter at the first, the second quarter is a third of the second's weight
-        (median, near + (far - near) / 3),
-    ):
-        yield relative(actual, [expected], 8 * EPS)
+        yield absolute(median[covers], np.clip(median, low, high)[covers], SUMMED * z.max())
     scene, _ = blend_on_axis(dev, [0.9, 0.5], [0.0, 0.0], 0.1, rule="alpha")
     yield exact(np.concatenate(_depths(dev, scene)), [0, np.inf, np.inf])
 
@@ -225,12 +208,15 @@ def _medians(blended, weight, z):
     """Two (HW,) between which the medians lie: where shares just below and above one half are
     reached. weight, z: (N, HW).
     """
-    hits, bounds = blended.geometry["hit"] & ~blended.dropped, np.zeros((2, len(weight.T)))
+    fragments, bounds = (
+        blended.geometry["fragment"] & ~blended.dropped,
+        np.zeros((2, len(weight.T))),
+    )
     for q in np.flatnonzero(weight.any(axis=0)):
         order = np.argsort(blended.geometry["depth"][:, q], kind="stable")
-        listed = order[hits[order, q]]
+        listed = order[fragments[order, q]]
         reached = np.concatenate([[0], np.cumsum(weight[listed, q])])
-        depths = z[np.concatenate([listed[:1], listed]), q]  # the first hit alone has no slope
+        depths = z[np.concatenate([listed[:1], listed]), q]  # the first fragment alone has no slope
         bounds[:, q] = np.interp(np.array([0.499999, 0.500001]) * reached[-1], reached, depths)
     return np.sort(bounds, axis=0)
 
@@ -241,8 +227,8 @@ def _depths(dev, scene):
 
 
 def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The highest weight of each point, and how often it was seen, by the tracked hits; the same
-    from the weights that the backward pass leaves.
+    """The highest weight of each point, and how often it was seen, by the tracked fragments; the
+    same from the weights that the backward pass leaves.
     """
     options: dict[str, Any] = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
@@ -250,25 +236,24 @@ def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]
     highest, scene = before.copy(), blended.scene
     listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
     record_weights(dev, scene.pairs, scene.weights, listed, highest, seen)
-    yield exact(seen.get() - np.arange(500), blended.geometry["hit"].any(axis=1))
+    yield exact(seen.get() - np.arange(500), blended.geometry["fragment"].any(axis=1))
     tracked = dense.tracked(blended.geometry, blended.blend, 2)
     weight = np.where(tracked, blended.blend["weight"], 0).sum(axis=1)
     least = float(np.sort(weight)[-30:-28].mean())  # 29 points have more
     dev.fill(seen, 0)
     record_weights(dev, scene.pairs, scene.weights, listed, highest, seen, least)
     yield exact(seen.get(), weight > least)
-    is_shaded = np.isin(scene.pair_points(), scene.weights.shaded.get())
-    weights = listed.get()[: scene.pairs.total, 0][is_shaded]
+    is_visible = np.isin(scene.pair_points(), scene.weights.visible.get())
+    weights = listed.get()[: scene.pairs.total, 0][is_visible]
     blended.gradients()
     left = scene.backward.pair_gradient.get()[: scene.pairs.total, 0]
-    yield exact(left[is_shaded], weights)
+    yield exact(left[is_visible], weights)
     yield relative(highest.get(), np.maximum(before.get(), weight), PLACED)
 
 
 CASES = (
     Case("raster: project", _project),
-    Case("raster: positions that are not finite", _not_finite),
-    Case("raster: points behind and at the eye", _behind),
+    Case("raster: points that are left out", _left_out),
     *(Case(f"raster: pairs, {kind}", partial(_pairs, kind)) for kind in FOOTPRINTS),
     Case("raster: thousands of equal depths", _equal_depths),
     Case("raster: shade", _shade),

@@ -14,24 +14,24 @@ from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.reference.scene import (
     dilated_mask,
     distance,
-    kept,
+    in_hull,
     target_between,
     target_forward,
     undistorted,
 )
 from pp_cl.scene.demo import distances
-from pp_cl.scene.distortion import Distortion, undistort
 from pp_cl.scene.hull import Carver
+from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.selftest.case import SIZES, Case, Check, absolute, exact
 
 BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
 TARGET = 5e-7  # a few roundings of a float32 in [0, 1]
 ROUNDED = 0.5 + 0.1  # levels: to 8 bits; and 2e-4 pixels, of a place in float32, in steep noise
 LENSES = (
-    Distortion(-0.15, 0.04, 0.004, -0.003, 0.01),
-    Distortion(k1=0.3),
-    Distortion(k1=0.5, k2=0.1, k4=0.4, k5=0.05, k6=-0.01),
-    Distortion(0.04, -0.02, 0.0, 0.0, 0.01, -0.004, fisheye=True),
+    LensDistortion(-0.15, 0.04, 0.004, -0.003, 0.01),
+    LensDistortion(k1=0.3),
+    LensDistortion(k1=0.5, k2=0.1, k4=0.4, k5=0.05, k6=-0.01),
+    LensDistortion(0.04, -0.02, 0.0, 0.0, 0.01, -0.004, fisheye=True),
 )
 DEMO = 2e-6  # distances of up to 2, by some ten roundings
 
@@ -71,10 +71,14 @@ def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     views = _views(rng, 0.05)
     carver = Carver(dev, views)
     for nx, forgiven in itertools.product(SIZES, (0, 1, 2)):
-        edge, ny, nz = 2 / nx, 7, 5
-        grid = Grid((-edge * nx / 2, -edge * ny / 2, -edge * nz / 2 + 0.1), edge, (nx, ny, nz))
+        voxel_size, ny, nz = 2 / nx, 7, 5
+        grid = Grid(
+            (-voxel_size * nx / 2, -voxel_size * ny / 2, -voxel_size * nz / 2 + 0.1),
+            voxel_size,
+            (nx, ny, nz),
+        )
         positions = grid.lattice()
-        expected, border = kept(
+        expected, border = in_hull(
             views, positions, MASK_THRESHOLD, least=carver.least, forgiven=forgiven
         )
         found = carver.carve(grid, forgiven).ravel()
@@ -145,6 +149,6 @@ CASES = (
     Case("scene: hull", _hull),
     Case("scene: target", _target),
     Case("scene: target between pixels", _target_between),
-    Case("scene: distortion", _distortion),
+    Case("scene: lens", _distortion),
     Case("scene: demo", _demo),
 )

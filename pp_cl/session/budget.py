@@ -10,7 +10,7 @@ from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.settings import TrainConfig
 
 PLANS = 50  # in the minutes given
-KEPT = 0.8  # share of the steps after which their number stays: soon the averages begin
+FIXED = 0.8  # share of the steps after which their number stays: soon the averages begin
 FOG = 0.35  # of the first step's time, which later ones save: a third of the steps clears it
 DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
 ENDING = 0.15  # of a step's time, for as many pixels of a training view, which the end looks at
@@ -33,7 +33,7 @@ class Budget:
         if step in refine_steps(train):
             self._times.clear()
         enough = len(self._times) >= FEWEST and seconds >= self._next
-        if not enough or step >= KEPT * train.iterations:
+        if not enough or step >= FIXED * train.iterations:
             return False
         self._next = seconds + 60 * train.minutes / PLANS
         left = 60 * train.minutes - seconds
@@ -54,7 +54,7 @@ def replan(train: TrainConfig, step: int, left: float, ending: float = 0.0) -> N
     for level, end in enumerate([*to_come, 1.0]):
         all_as_one += (end - start) * DEARER**level
         start = end
-    soonest = min([KEPT, *(share for share in shares if share not in past)])  # is not jumped over
+    soonest = min([FIXED, *(share for share in shares if share not in past)])  # is not jumped over
     left -= ending * DEARER ** len(to_come)
     planned = max(round((step + left) / all_as_one), math.ceil((step + 1) / soonest))
     train.iterations = planned

@@ -1,5 +1,5 @@
 """The memory that a training takes, within 15 % of what it will allocate: the tables of the engine,
-for the numbers of points, hits and pixels that are expected. A training that does not fit is
+for the numbers of points, fragments and pixels that are expected. A training that does not fit is
 refused before anything is allocated.
 """
 
@@ -27,16 +27,16 @@ from pp_cl.engine.training.smooth import smoothing_table
 from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import target_table
 from pp_cl.errors import UserError
-from pp_cl.scene.image_file import Photograph, kept_bytes, shrink_factor
-from pp_cl.scene.load import DEMO, mask_rule, reading
+from pp_cl.scene.image_file import ImageFile, image_bytes, shrink_factor
+from pp_cl.scene.load import DEMO, mask_rule, reading_cost
 from pp_cl.settings import Config
 
 MIB, GIB = 2**20, 2**30
 # How many times its share of an image's pixels a crop sees of the points: up to 4 times on lego,
 # where an image shows the object on a third of its pixels.
 CROP_SHARE = 4
-# The share of the points that an image shows at first, when they are fog; all where no hits are
-# dropped.
+# The share of the points that an image shows at first, when they are fog; all where no fragments
+# are dropped.
 SHOWN = 0.8
 
 
@@ -51,25 +51,27 @@ class Need(NamedTuple):
     host: int
 
 
-class Room:
+class MemoryPlan:
     """Checks that a training fits the available memory; made before the training allocates
     anything. need: what it takes, by the last check.
 
-    photographs: of the training views.
+    image_files: of the training views.
     """
 
-    def __init__(self, config: Config, net: UNet, photographs: Sequence[Photograph]):
+    def __init__(self, config: Config, net: UNet, image_files: Sequence[ImageFile]):
         self.dev, self._net = net.dev, net
         self.need: Need
         self._raster, self._train, self._points = config.raster, config.train, config.points
         self._downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
-        cameras = [one.camera for one in photographs]
+        cameras = [one.camera for one in image_files]
         self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
         sizes = [(camera.width, camera.height) for camera in cameras]
         factor = 1 if is_demo else shrink_factor(sizes, self._downscale)
-        self._images = kept_bytes(sizes, factor)
-        self._image = kept_bytes([(self._largest.width, self._largest.height)], factor)
-        self._reading = 0 if is_demo else reading(photographs, mask_rule(config), factor)[1]
+        self._images = image_bytes(sizes, factor)
+        self._image = image_bytes([(self._largest.width, self._largest.height)], factor)
+        self._reading_bytes = (
+            0 if is_demo else reading_cost(image_files, mask_rule(config), factor)[1]
+        )
         held = self.dev.bytes if self.dev.is_cpu else 0  # which `need` counts
         self._program = resident_bytes() - held + compiler_bytes(self.dev.info)
 
@@ -80,7 +82,7 @@ class Room:
 
     def check_unseen(self) -> None:
         """Raise UserError as check_points() does if even the least memory that the training can
-        take does not fit; called before the photographs are read and the hull is known.
+        take does not fit; called before the images are read and the hull is known.
         """
         self._check(self._need(self._points.count, 0.0, step=0))
 
@@ -122,11 +124,11 @@ class Room:
         # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
         # second order
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
-        radius = point_radius(self._raster, grid.edge, depth_range)
+        radius = point_radius(self._raster, grid.voxel_size, depth_range)
         return self._need(points, radius * self._largest.fx / middle * math.sqrt(growth), step)
 
     def _need(self, points, radius, step):
-        """The Need from a step on. radius: of the footprints then, pixels of the largest photograph
+        """The Need from a step on. radius: of the footprints then, pixels of the largest image
         as it is stored.
         """
         stretches = [*expected_stretches(self._train, points, step)]
@@ -143,7 +145,7 @@ class Room:
             peak.device,
             peak.points,
             max(need.largest for need in found),
-            self._images + max(host, self._reading),
+            self._images + max(host, self._reading_bytes),
         )
 
     def _need_of_stretch(self, stretch, radius):
@@ -175,7 +177,7 @@ class Room:
             self._net.table(crop, image),
             network_state_table(self._net.all_parameters.size, stretch.is_averaged),
             loss_table(self.dev, crop, crop, train.ssim_weight),
-            {"photograph": ((self._image,), np.uint8)},
+            {"image": ((self._image,), np.uint8)},
         ]
         taking_turns = [
             [of_step, target_table(crop)],
@@ -189,7 +191,7 @@ class Room:
         return Need(device, n, largest, n * REFINING_BYTES if stretch.refinements else 0)
 
     def _padded_size(self, halvings, side):
-        """(height, width) of a crop of the largest photograph, in whole multiples of what the
+        """(height, width) of a crop of the largest image, in whole multiples of what the
         network needs; side 0: of the whole image.
         """
         camera = self._largest.downscaled(self._downscale << halvings)
@@ -228,9 +230,9 @@ def _size(size):
     return f"{size / GIB:.2f} GiB" if size >= GIB else f"{size / MIB:.3g} MiB"
 
 
-def memory_line(room: Room) -> str:
+def memory_line(memory_plan: MemoryPlan) -> str:
     """The memory that the last check found to be needed, in words."""
-    need, dev = room.need, room.dev
+    need, dev = memory_plan.need, memory_plan.dev
     return (
         f"memory: about {need.device / MIB:.0f} of {dev.info['memory_bytes'] / MIB:.0f} MiB of"
         f" {dev.name} (with {need.points} points), {need.host / MIB:.0f} MiB of the host"

@@ -8,25 +8,25 @@ from pathlib import Path
 import numpy as np
 
 from pp_cl.checkpoint import opened_run
-from pp_cl.config import OPEN, RANDOM, load_config, text_of
+from pp_cl.config import AUTOMATIC, RANDOM, load_config, text_of
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.engine.views import View
-from pp_cl.errors import UserError, listing
-from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.errors import UserError, few_names
+from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import Agreement, Hull, agreeing, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import DEMO, scene_box
-from pp_cl.scene.outline import picture
-from pp_cl.session.memory import Room
+from pp_cl.scene.outline import outline_sheet
+from pp_cl.session.memory import MemoryPlan
 from pp_cl.settings import Config, NetworkConfig
 
-UNDECIDED, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
+UNSET, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 # train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
-# raster.radius where it is open, in point spacings: one pixel within these bounds; less is no
+# raster.radius where it is automatic, in point spacings: one pixel within these bounds; less is no
 # better where points lie farther apart
 LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
 COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1.7 times less points
@@ -71,14 +71,14 @@ def first_hull(
 ) -> tuple[Hull, tuple[float, float]]:
     """(the hull that a training starts from, its train.refine_at).
 
-    Where the settings leave train.refine_at open, there are as many refinements as bring points
+    Where train.refine_at is automatic, there are as many refinements as bring points
     `coarsest` pixels of the images close, and the hull has the spacing from which these lead to
     FINEST to `coarsest`.
     """
     points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
     hull = build_grid(dev, views, points, box, forgiven)
-    if shares != UNDECIDED:
+    if shares != UNSET:
         return hull, shares
     cameras = [view.camera for view in views]
     spacing = spacing_pixels(hull.grid, cameras)
@@ -92,43 +92,46 @@ def first_hull(
 
 
 def fitting_hull(
-    dev: Device, config: Config, views: list[View], room: Room
+    dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
 ) -> tuple[Agreement, Hull, tuple[float, float]]:
     """(which views' masks agree, first_hull() of them, its (near, far)); config.train.refine_at
-    becomes what it says, and an open raster.radius one pixel of the images. Where memory is too
-    small for points COARSEST pixels apart in the end, they are as close as it allows. Raises
-    UserError as Room.check_points() does, and for an open radius of footprints that are not soft.
+    becomes what it says, and an automatic raster.radius one pixel of the images. Where memory is
+    too small for points COARSEST pixels apart in the end, they are as close as it allows. Raises
+    UserError as MemoryPlan.check_points() does, and for an automatic radius of footprints that are
+    not soft.
     """
-    is_open, train, coarsest = config.train.refine_at == UNDECIDED, config.train, COARSEST
-    raster, is_radius_open = config.raster, config.raster.radius == 0
-    config.decided = [key for key, one in zip(OPEN, (is_open, is_radius_open), strict=True) if one]
-    if is_radius_open and raster.footprint != "soft":
+    is_automatic, train, coarsest = config.train.refine_at == UNSET, config.train, COARSEST
+    raster, is_radius_automatic = config.raster, config.raster.radius == 0
+    config.automatic = [
+        key for key, one in zip(AUTOMATIC, (is_automatic, is_radius_automatic), strict=True) if one
+    ]
+    if is_radius_automatic and raster.footprint != "soft":
         raise UserError(
-            f"raster.radius: is open, which raster.footprint={raster.footprint} cannot be; give it"
-            " in world units at a depth range of 4 (0.0015 in the paper)"
+            f"raster.radius: is automatic, which raster.footprint={raster.footprint}"
+            " cannot be; give it in world units at a depth range of 4 (0.0015 in the paper)"
         )
     agreement = agreeing(dev, views, scene_box(config))
     while True:
         hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
-        if is_radius_open:
+        if is_radius_automatic:
             # refining halves the spacing, and doubles the images
             pixels = spacing_pixels(hull.grid, [view.camera for view in agreement.views])
             spacing = pixels / 2 ** len(refine_steps(train))
             raster.radius = round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
         near_far = depth_range(agreement.views, hull)
         try:
-            room.check_points(hull.grid, len(hull.ids), near_far)
+            memory_plan.check_points(hull.grid, len(hull.ids), near_far)
             return agreement, hull, near_far
         except UserError:
-            if not is_open or train.refine_at == NEVER:
+            if not is_automatic or train.refine_at == NEVER:
                 raise
-        train.refine_at, coarsest = UNDECIDED, COARSER * coarsest
+        train.refine_at, coarsest = UNSET, COARSER * coarsest
 
 
-def picture_of_masks(
+def sheet_of_masks(
     dev: Device, views: list[View], hull: Hull, left_out: dict[str, float]
 ) -> np.ndarray | None:
-    """Warn of masks that disagree with the others; return their picture, None if all agree."""
+    """Warn of masks that disagree with the others; return their image, None if all agree."""
     found = disagreements(views, hull.grid.box)
     rejecting = {one.view.name: one.share for one in found if one.view.name not in left_out}
     for what, shares in (
@@ -136,8 +139,8 @@ def picture_of_masks(
         ("reject what the other views agree on", rejecting),
     ):
         if shares:
-            worst = listing([f"{name} ({share:.0%} of it)" for name, share in shares.items()])
+            worst = few_names([f"{name} ({share:.0%} of it)" for name, share in shares.items()])
             warnings.warn(
-                f"masks {what}: {worst}; see {MASKS_PICTURE} in the run's folder", stacklevel=2
+                f"masks {what}: {worst}; see {MASKS_SHEET} in the run's folder", stacklevel=2
             )
-    return picture(dev, views, hull, found) if found or left_out else None
+    return outline_sheet(dev, views, hull, found) if found or left_out else None

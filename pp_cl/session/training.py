@@ -24,21 +24,21 @@ from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_target
 from pp_cl.files.image import to_8bit, write_png
-from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
 from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import (
-    Listing,
+    SplitFiles,
     list_split,
     measured_split,
     open_scene,
 )
 from pp_cl.session.budget import Budget
-from pp_cl.session.memory import Room
-from pp_cl.session.start import NEVER, begin_network, fitting_hull, picture_of_masks
+from pp_cl.session.memory import MemoryPlan
+from pp_cl.session.start import NEVER, begin_network, fitting_hull, sheet_of_masks
 from pp_cl.settings import Config
 
 PREVIEWS = 4  # of a training, besides an early one
@@ -52,20 +52,20 @@ class HullFacts(NamedTuple):
     """What a new training says of its visual hull.
 
     capped: it has fewer points than asked for, as the grid may not be finer. seconds: time that
-    carving took. picture: of the masks that disagree with the others, None if all agree.
+    carving took. sheet: of the masks that disagree with the others, None if all agree.
     """
 
     capped: bool
     seconds: float
-    picture: np.ndarray | None
+    sheet: np.ndarray | None
 
 
 @dataclass
 class Training:
     """A training that is ready to begin or to go on.
 
-    info: what a checkpoint's header holds beside the model's. room: the available memory and the
-    plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
+    info: what a checkpoint's header holds beside the model's. memory_plan: the available memory and
+    the plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
     views on which train.eval_every measures PSNR.
     """
 
@@ -73,7 +73,7 @@ class Training:
     config: Config
     trainer: Trainer
     info: dict[str, Any]
-    room: Room
+    memory_plan: MemoryPlan
     hull: HullFacts | None
     measured: list[View]
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
@@ -98,15 +98,15 @@ class Training:
         with self.folder.owned():
             self._check_unchanged()
             self.folder.create(self.config.to_json())
-            if self.hull and self.hull.picture is not None:
-                write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
+            if self.hull and self.hull.sheet is not None:
+                write_png(self.folder.path / MASKS_SHEET, self.hull.sheet)
             self._saved = self.trainer.step
             try:
                 return self._run(on_step, is_stopped)
             except Diverged as error:
-                kept = f"{self.folder.checkpoint} of step {self._saved} is kept"
+                told = f"{self.folder.checkpoint} of step {self._saved} is kept"
                 raise UserError(
-                    f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
+                    f"{error}; {told if self._saved else 'nothing was kept'}: train into another"
                     " --out with a lower network.rate or train.sh_rate"
                 ) from None
 
@@ -131,7 +131,7 @@ class Training:
             self._expect_save()
             while trainer.step < train.iterations:
                 try:
-                    self.room.check_growth(trainer.model, trainer.step)
+                    self.memory_plan.check_growth(trainer.model, trainer.step)
                 except UserError:  # the next step would not fit the memory
                     self._save(finished=False)
                     raise
@@ -238,24 +238,24 @@ def open_training(
 
 
 def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
-    """A training in `folder` from its beginning; what is open in config (train.refine_at,
-    raster.radius) is decided.
+    """A training in `folder` from its beginning; the automatic settings in config (train.refine_at,
+    raster.radius) are chosen.
 
     Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
-    written, and for pictures in it that would be lost.
+    written, and for images in it that would be lost.
     """
     check_target(folder.config)
-    folder.check_pictures(0)
+    folder.check_sheets(0)
     net = begin_network(dev, config)
-    listing = list_split(config.scene.path)
-    room = Room(config, net, listing.photographs)
-    room.check_unseen()
-    views, info = _read_views(dev, config, listing)
+    split_files = list_split(config.scene.path)
+    memory_plan = MemoryPlan(config, net, split_files.image_files)
+    memory_plan.check_unseen()
+    views, info = _read_views(dev, config, split_files)
 
     start = time.perf_counter()
-    agreement, hull, depth_range = fitting_hull(dev, config, views, room)
+    agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
     seconds = time.perf_counter() - start
-    picture = picture_of_masks(dev, views, hull, agreement.left_out)
+    sheet = sheet_of_masks(dev, views, hull, agreement.left_out)
 
     cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
     model = Model(dev, hull.grid, depth_range, cloud, net=net)
@@ -263,8 +263,8 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     info["initial_points"] = model.cloud.count
     if agreement.left_out:
         info["left_out"] = list(agreement.left_out)
-    facts, measured = HullFacts(hull.capped, seconds, picture), _measured_views(dev, config)
-    return Training(folder, config, trainer, info, room, facts, measured)
+    facts, measured = HullFacts(hull.capped, seconds, sheet), _measured_views(dev, config)
+    return Training(folder, config, trainer, info, memory_plan, facts, measured)
 
 
 def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
@@ -276,17 +276,17 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     """
     header, arrays = stored
     check_target(folder.config)
-    folder.check_pictures(header["step"])
+    folder.check_sheets(header["step"])
     begun = header["step"] if header["finished"] else header.get("extended_from", 0)
     extended = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
 
     net = UNet.of_settings(dev, config.network)
-    listing = list_split(config.scene.path)
-    room = Room(extended, net, listing.photographs)
+    split_files = list_split(config.scene.path)
+    memory_plan = MemoryPlan(extended, net, split_files.image_files)
     grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
-    room.check_points(grid, points, header["depth_range"], header["step"])
-    views, info = _read_views(dev, config, listing)
-    mismatch = difference(header, list_split(config.scene.path, edited=False).photographs, views)
+    memory_plan.check_points(grid, points, header["depth_range"], header["step"])
+    views, info = _read_views(dev, config, split_files)
+    mismatch = difference(header, list_split(config.scene.path, edited=False).image_files, views)
     if not mismatch and {view.name for view in views} != {name for name, _ in header["views"]}:
         mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
     if mismatch:
@@ -303,12 +303,12 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
     measured = _measured_views(dev, config)
-    return Training(folder, config, trainer, info, room, None, measured)
+    return Training(folder, config, trainer, info, memory_plan, None, measured)
 
 
-def _read_views(dev: Device, config: Config, listing: Listing):
+def _read_views(dev: Device, config: Config, split_files: SplitFiles):
     """(the training views, what a checkpoint's header holds of them)."""
-    scene = open_scene(dev, config, ("train",), listed={"train": listing})
+    scene = open_scene(dev, config, ("train",), listed={"train": split_files})
     views = scene.splits["train"]
     return views, identity(views) | ({"notes": scene.notes} if scene.notes else {})
 
@@ -366,7 +366,7 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     if stored is None or is_finished(stored, config):
         now = config.scene.path
         if there.scene.path != now:
-            if stored is None or difference(stored[0], list_split(now, edited=False).photographs):
+            if stored is None or difference(stored[0], list_split(now, edited=False).image_files):
                 refuse_setting(folder, "scene.path", there.scene.path, now)
             folder.configure(configure(there, now).to_json())
     return stored

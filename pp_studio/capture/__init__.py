@@ -1,4 +1,4 @@
-"""From photographs or a film of an object to a scene: cameras, box and masks."""
+"""From photographs or a video of an object to a scene: cameras, box and masks."""
 
 # {stage: what it finds}, in their order
 STAGES = {

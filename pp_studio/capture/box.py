@@ -47,11 +47,11 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     ahead = level(eyes[0] - centre, up)
     rotation = np.stack([ahead, np.cross(up, ahead), up])  # the first camera to the side of x
     upright = (points - centre) @ rotation.T / reach
-    kept = _on_object(upright, _seen_share(cameras, points))
+    on_object = _on_object(upright, _seen_share(cameras, points))
     ball = min(_seen_radius(camera, centre) for camera in cameras) / reach
     low, high = np.outer([-ball, ball], np.ones(3))
-    if len(kept) >= LEAST_POINTS:
-        ends = np.quantile(kept, [CUT, 1 - CUT], axis=0)
+    if len(on_object) >= LEAST_POINTS:
+        ends = np.quantile(on_object, [CUT, 1 - CUT], axis=0)
         margin = MARGIN * np.linalg.norm(ends[1] - ends[0])
         low, high = (
             np.minimum(ends[0] - margin, FILLED * low),
@@ -82,13 +82,13 @@ def _on_object(points, seen):
     near = np.linalg.norm(points, axis=1) < 1
     if not near.any():
         return points[near]
-    kept = points[near & (seen >= SEEN * np.quantile(seen[near], 0.95))]
-    if len(kept) <= NEIGHBOURS:
-        return kept
-    away = cKDTree(kept).query(kept, NEIGHBOURS + 1)[0][:, -1]
-    kept = kept[away < LONELY * np.median(away)]
-    table = _table(kept)
-    return kept if table is None else kept[kept @ table[:3] > table[3] + THICK]
+    on_object = points[near & (seen >= SEEN * np.quantile(seen[near], 0.95))]
+    if len(on_object) <= NEIGHBOURS:
+        return on_object
+    away = cKDTree(on_object).query(on_object, NEIGHBOURS + 1)[0][:, -1]
+    on_object = on_object[away < LONELY * np.median(away)]
+    table = _table(on_object)
+    return on_object if table is None else on_object[on_object @ table[:3] > table[3] + THICK]
 
 
 def _table(points):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.engine import Grid, smallest_edge
+from pp_cl.engine import Grid, smallest_voxel_size
 from pp_cl.errors import UserError
 from pp_studio.capture import backdrop
 from pp_studio.capture.box import corners_of
@@ -96,7 +96,7 @@ def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
     on; None where no side does. The object is the hull of the masks as far as most windows see it,
     as beyond that hardly any mask bounds it.
     """
-    hull, _, edge = forgiving_hull(windows, box)
+    hull, _, voxel_size = forgiving_hull(windows, box)
     seen = np.bincount(np.concatenate([one.inside(hull)[0] for one in windows]), None, len(hull))
     hull = hull[seen >= MOSTLY_SEEN * len(windows)]
     if not len(hull):
@@ -106,7 +106,7 @@ def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
         _, layer = np.unique(hull[:, axis].round(6), return_inverse=True)
         least = TOUCHING * np.bincount(layer).max()
         for side, sign in ((0, -1), (1, 1)):
-            touching = (np.abs(hull[:, axis] - box[side, axis]) <= edge / 2).sum()
+            touching = (np.abs(hull[:, axis] - box[side, axis]) <= voxel_size / 2).sum()
             if touching > least and (side, axis) != (0, 2):
                 grown[side, axis] += sign * by
     return None if (grown == box).all() else grown
@@ -196,7 +196,7 @@ def forgiving_hull(
     """((N, 3) positions in the box that no more than FORGIVEN of the masks reject of the windows
     that see them, (N,) how many do, the positions' spacing).
     """
-    grid = Grid.centred_in(box, smallest_edge(box, CELLS))
+    grid = Grid.centred_in(box, smallest_voxel_size(box, CELLS))
     positions = grid.lattice()
     seen, rejected = np.zeros((2, len(positions)), np.int32)
     most, left = int(FORGIVEN * len(windows)), np.arange(len(positions))
@@ -206,20 +206,20 @@ def forgiving_hull(
         rejected[left[found]] += ~one.mask[rows, columns]
         left = left[rejected[left] <= most]
     seen, rejected = seen[left], rejected[left]
-    kept = (seen >= min(LEAST_SEEING, len(windows))) & (rejected <= FORGIVEN * seen)
-    if not kept.any():
+    in_hull = (seen >= min(LEAST_SEEING, len(windows))) & (rejected <= FORGIVEN * seen)
+    if not in_hull.any():
         raise UserError(
             "the photographs have no part of the box in common that stands out from what is behind"
             " it; give masks with --masks, or another box with --box"
         )
-    return positions[left[kept]], rejected[kept], grid.edge
+    return positions[left[in_hull]], rejected[in_hull], grid.voxel_size
 
 
-def _relabelled(one, seeds, hull, rejections, edge):
+def _relabelled(one, seeds, hull, rejections, voxel_size):
     """(H, W) uint8 of GrabCut's labels of a window from what all views agree on: what is well
     outside the hull is background, what is well within what no other view rejects is the object.
     """
-    gap = gap_of(one, hull, edge)
+    gap = gap_of(one, hull, voxel_size)
     found, rows, columns = one.inside(hull)
     agreed = found[rejections[found] == ~one.mask[rows, columns]]
     held, core = silhouette(one, hull, gap), silhouette(one, hull[agreed], gap)
@@ -231,10 +231,10 @@ def _relabelled(one, seeds, hull, rejections, edge):
     return labels
 
 
-def gap_of(one: Window, hull: np.ndarray, edge: float) -> int:
-    """Pixels between the vertices of a hull, (N, 3) with a spacing `edge`, in a window."""
+def gap_of(one: Window, hull: np.ndarray, voxel_size: float) -> int:
+    """Pixels between the vertices of a hull, (N, 3) of this voxel_size, in a window."""
     middle = np.linalg.norm(hull.mean(0) - one.camera.eye)
-    return max(1, int(np.ceil(edge * one.camera.fx / middle)))
+    return max(1, int(np.ceil(voxel_size * one.camera.fx / middle)))
 
 
 def silhouette(one: Window, hull: np.ndarray, gap: int) -> np.ndarray:
@@ -252,12 +252,12 @@ def _marked(labels, standing_out):
     return labels
 
 
-def whole_mask(one: Window, photograph: np.ndarray) -> np.ndarray:
+def whole_mask(one: Window, image: np.ndarray) -> np.ndarray:
     """(H, W) uint8 mask of the whole photograph (H, W, 3): the window's, whose border follows the
     photograph's edges (guided filter, He et al. 2010) and is soft where they are.
     """
     x0, y0, x1, y1 = one.place
-    guide = photograph[y0:y1, x0:x1].astype(np.float32) / 255
+    guide = image[y0:y1, x0:x1].astype(np.float32) / 255
     rough = cv2.resize(one.mask.astype(np.float32), (x1 - x0, y1 - y0))
     side = 2 * max(1, round(SOFT * (x1 - x0) / one.mask.shape[1])) + 1
 
@@ -269,9 +269,9 @@ def whole_mask(one: Window, photograph: np.ndarray) -> np.ndarray:
     products = [mean(guide * guide[..., c : c + 1])[band] for c in range(3)]
     variance = np.stack(products, axis=1) - colour[band][:, None] * colour[band][..., None]
     along = mean(guide * rough[..., None])[band] - colour[band] * level[band][:, None]
-    slope = np.zeros_like(guide)
-    slope[band] = np.linalg.solve(variance + FLAT * np.eye(3), along[..., None])[..., 0]
-    refined = (mean(slope) * guide).sum(2) + mean(level - (slope * colour).sum(2))
-    mask = np.zeros(photograph.shape[:2], np.uint8)
+    coefficients = np.zeros_like(guide)
+    coefficients[band] = np.linalg.solve(variance + FLAT * np.eye(3), along[..., None])[..., 0]
+    refined = (mean(coefficients) * guide).sum(2) + mean(level - (coefficients * colour).sum(2))
+    mask = np.zeros(image.shape[:2], np.uint8)
     mask[y0:y1, x0:x1] = np.clip(255 * refined + 0.5, 0, 255)
     return mask

@@ -21,7 +21,7 @@ AT_ONCE = 32  # images, between two states of the bar and where a stopped run go
 PAIRS_AT_ONCE = 200
 EXHAUSTIVE = 150  # photographs of which each is compared with each
 OVERLAP = 10  # frames before and after that one is compared with
-LOOPS = 50  # frames that are compared with each other wherever they are in the film
+LOOPS = 50  # frames that are compared with each other wherever they are in the video
 
 
 @contextmanager
@@ -91,12 +91,12 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def match(database: Path, is_film: bool) -> int:
+def match(database: Path, is_video: bool) -> int:
     """Match the features of pairs of images, where that is not done yet, and keep the pairs whose
     matches fit one motion of the camera. Returns their number.
     """
     with quiet(database) as colmap, colmap.Database.open(database) as db:
-        pairs = pairs_of(sorted(image.name for image in db.read_all_images()), is_film)
+        pairs = pairs_of(sorted(image.name for image in db.read_all_images()), is_video)
         matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=cores())
         with tempfile.TemporaryDirectory(prefix="pp-cl-") as folder:
             listed = Path(folder) / "pairs.txt"
@@ -137,12 +137,12 @@ def verification(colmap: Any) -> Any:
     return options
 
 
-def pairs_of(names: Sequence[str], is_film: bool) -> list[tuple[str, str]]:
-    """The pairs to match: all of them, or for films and many photographs those that follow each
+def pairs_of(names: Sequence[str], is_video: bool) -> list[tuple[str, str]]:
+    """The pairs to match: all of them, or for videos and many photographs those that follow each
     other, and for loops each of some with each.
     """
     count = len(names)
-    if count <= EXHAUSTIVE and not is_film:
+    if count <= EXHAUSTIVE and not is_video:
         return list(combinations(names, 2))
     near = {(i, j) for i, j in combinations(range(count), 2) if j - i <= OVERLAP}
     some = set(combinations(range(0, count, -(-count // LOOPS)), 2))

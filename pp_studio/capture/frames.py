@@ -1,5 +1,5 @@
 """The images of a scene from what a camera gives: upright copies of photographs, or the sharpest
-frames of a film; what is blurred, broken or there twice is left out.
+frames of a video; what is blurred, broken or there twice is left out.
 """
 
 import logging
@@ -33,7 +33,7 @@ ENDINGS = (
 )
 # of Pillow; JPEG opens MPO, which phones write, too
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "HEIF")
-KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
+COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
 MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769
 FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
 # there, too: pixels across and down, pixels per unit, the unit
@@ -51,8 +51,8 @@ EMPTY = 1.0  # sharpness, levels squared: noise alone has more
 NEIGHBOURS = 10  # on either side
 ALIKE = 0.15  # of the neighbours' usual difference
 SAME = 0.3  # levels of 255 by which small copies of one photograph differ at most
-FRAMES, GROUP = 120, 12  # of a film
-LOCAL = ["-protocol_whitelist", "file,pipe"]  # a film names no other machine
+FRAMES, GROUP = 120, 12  # of a video
+LOCAL = ["-protocol_whitelist", "file,pipe"]  # a video names no other machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
 HDR = ("arib-std-b67", "smpte2084")  # transfers of phones: HLG and PQ
 WHITE = 203  # candela per square metre, of BT.2408's diffuse white
@@ -66,33 +66,33 @@ TONE_MAPPED = (
 
 def take_images(source: Path, images: Path) -> dict[str, Any]:
     """Write the photographs of a folder, or the sharpest frame of each of FRAMES intervals of a
-    film, to the new folder `images`, upright, as JPEG or PNG.
+    video, to the new folder `images`, upright, as JPEG or PNG.
 
     Returns {"images": [{name, source, lens, focal, size, sharpness}], "left_out": [{source,
     reason}]}; lens is equal for photographs of one camera at one focal length; focal, in pixels, is
     None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
     """
     with atomic_folder(images) as unfinished:
-        is_film = not source.is_dir()
-        taken = _frames(source, unfinished) if is_film else _photographs(source, unfinished)
+        is_video = not source.is_dir()
+        taken = _frames(source, unfinished) if is_video else _photographs(source, unfinished)
         found = list(taken)
         _leave_out(found)
         for one in found:
             if "reason" in one and "name" in one:
                 (unfinished / one["name"]).unlink()
-        kept = [one for one in found if "reason" not in one]
+        usable = [one for one in found if "reason" not in one]
         left_out = [one for one in found if "reason" in one]
-        if len(kept) < LEAST:
+        if len(usable) < LEAST:
             why = [f"{one['source']} {one['reason']}" for one in left_out[:3]]
             raise UserError(
-                f"{source}: {len(kept)} of {len(found)} images can be used, at least {LEAST} are"
+                f"{source}: {len(usable)} of {len(found)} images can be used, at least {LEAST} are"
                 f" needed ({'; '.join(why) or 'nothing is wrong with them'}); take 30 or more all"
                 " around the object"
             )
-    for one in kept:
+    for one in usable:
         del one["small"]
     reasons = [{"source": one["source"], "reason": one["reason"]} for one in left_out]
-    return {"images": kept, "left_out": reasons}
+    return {"images": usable, "left_out": reasons}
 
 
 # Photographs --------------------------------------------------------------------------------------
@@ -160,14 +160,14 @@ def _take(folder, file, target):
             image.load()
             turned = ImageOps.exif_transpose(image)
             upright = in_srgb(file, turned)
-            is_kept = image.format in KEPT and upright is turned
-            is_kept = is_kept and image.mode in ("RGB", "RGBA", "L")
-            is_kept = (
-                is_kept
+            is_copied = image.format in COPIED and upright is turned
+            is_copied = is_copied and image.mode in ("RGB", "RGBA", "L")
+            is_copied = (
+                is_copied
                 and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
                 and not is_deep_png(file)
             )
-            content = opened.seek(0) or opened.read() if is_kept else None
+            content = opened.seek(0) or opened.read() if is_copied else None
             lens, exif = _lens(image.getexif())
             # folders are of a round each, or of a camera
             facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
@@ -178,10 +178,10 @@ def _take(folder, file, target):
         return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
     facts |= _look(upright)
     has_alpha = upright.has_transparency_data
-    suffix = KEPT[image.format] if is_kept else ".png" if has_alpha else ".jpg"
+    suffix = COPIED[image.format] if is_copied else ".png" if has_alpha else ".jpg"
     facts["name"] = target.name + suffix
     with atomic_file(target.with_name(facts["name"])) as copy:
-        if is_kept:
+        if is_copied:
             copy.write(content)
         elif has_alpha:
             upright.convert("RGBA").save(copy, "PNG")
@@ -194,12 +194,12 @@ def _lens(exif):
     """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a focal
     length): the rest may be broken, or longer than a JPEG has room for.
     """
-    exposure, kept = exif.get_ifd(EXIF), Image.Exif()
-    kept.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
+    exposure, copied = exif.get_ifd(EXIF), Image.Exif()
+    copied.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
     wanted = (FOCAL, FOCAL_35, *SENSOR)
-    kept.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
+    copied.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
     lens = [exif.get(MAKE), exif.get(MODEL), exposure.get(FOCAL), exposure.get(FOCAL_35)]
-    return " ".join(shown(str(part), 40) for part in lens), kept.tobytes()
+    return " ".join(shown(str(part), 40) for part in lens), copied.tobytes()
 
 
 def _focal_of_larger(exposure, size):
@@ -217,64 +217,64 @@ def _focal_of_larger(exposure, size):
     return focal if is_told and POSSIBLE[0] < focal / max(size) < POSSIBLE[1] else None
 
 
-# Films --------------------------------------------------------------------------------------------
+# Videos -------------------------------------------------------------------------------------------
 
 
-def _frames(film, images):
+def _frames(video, images):
     """The facts of the sharpest frame of each interval, written to `images`."""
-    chosen, is_hdr = _sharpest(film)
+    chosen, is_hdr = _sharpest(video)
     equal = [f"eq(n,{number})" for number in chosen]
     # in groups, since ffmpeg sums no more than a hundred
     some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
     wanted = "+".join(f"({one})" for one in some)
-    frames = _decoded(film, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
-    next(frames)  # what is said of the film
+    frames = _decoded(video, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
+    next(frames)  # what is said of the video
     bar = tqdm(chosen, "frames", unit="image", leave=False, disable=None)
     for number, frame in zip(bar, frames, strict=False):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
         with atomic_file(images / name) as file:
             image.save(file, "JPEG", **QUALITY)
-        facts = {"name": name, "source": f"frame {number}", "lens": "film", "focal": None}
+        facts = {"name": name, "source": f"frame {number}", "lens": "video", "focal": None}
         yield _look(image) | facts
 
 
-def _sharpest(film):
-    """(the number of the sharpest frame of each of FRAMES intervals, whether the film is HDR)."""
-    frames = _decoded(film, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
+def _sharpest(video):
+    """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR)."""
+    frames = _decoded(video, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
     meta = next(frames)
     # an estimate, for the bar alone: what browsers record states no length
     total = round(meta["duration"] * meta["fps"]) or None
     bar = tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
     sharpness = [_look(Image.fromarray(frame[..., 0]))["sharpness"] for frame in bar]
     if not sharpness:
-        raise UserError(f"{film}: holds no frames; give another video")
+        raise UserError(f"{video}: holds no frames; give another video")
     count = len(sharpness)
     intervals = groupby(range(count), lambda number: number * FRAMES // max(count, FRAMES))
     is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)
     return [max(numbers, key=sharpness.__getitem__) for _, numbers in intervals], is_hdr
 
 
-def _decoded(film: Path, filters: str, pixels: str, channels: int) -> Iterator[Any]:
-    """What ffmpeg says of the film, then its frames after the filters, (H, W, channels) uint8."""
-    # which tells of a film that is shown turned, as phones make them
+def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[Any]:
+    """What ffmpeg says of the video, then its frames after the filters, (H, W, channels) uint8."""
+    # which tells of a video that is shown turned, as phones make them
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
-    reading = needed("imageio_ffmpeg").read_frames(
-        film,
+    decoded = needed("imageio_ffmpeg").read_frames(
+        video,
         pixels,
         bits_per_pixel=8 * channels,
         input_params=LOCAL,
         output_params=["-vf", filters, *EACH_ONCE],
     )
     try:
-        yield (meta := next(reading))
-        for content in reading:
+        yield (meta := next(decoded))
+        for content in decoded:
             yield np.frombuffer(content, np.uint8).reshape(*meta["size"][::-1], channels)
     except (OSError, RuntimeError, ValueError, IndexError, KeyError, StopIteration) as error:
         # ffmpeg's last line that says what is wrong, without its banner
         lines = [line for line in str(error).splitlines() if "rror" in line or "nvalid" in line]
         said = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
         raise UserError(
-            f"{film}: cannot be read as a video ({shown(said, 100)}); give an MP4, MOV or WebM,"
+            f"{video}: cannot be read as a video ({shown(said, 100)}); give an MP4, MOV or WebM,"
             " or a folder of photographs"
         ) from None
 

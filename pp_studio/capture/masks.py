@@ -16,11 +16,11 @@ from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
 from pp_cl.engine import View, evenly, fitting_downscale
-from pp_cl.errors import UserError, listing, shown
+from pp_cl.errors import UserError, few_names, shown
 from pp_cl.files import contact_sheet, read_mask, read_rgba, write_png
 from pp_cl.scene import (
+    ImageFile,
     MaskRule,
-    Photograph,
     cut_out,
     disagreements,
     named_mask,
@@ -48,7 +48,7 @@ UNIFORM = 0.9  # of a photograph's border, and of the photographs, that show the
 SPOT = 0.5  # of a region that a mask encloses, behind which others see the object
 ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
 CHECKED_SIDE = 200  # pixels of the masks that are compared
-SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of a picture, and their longer side in pixels
+SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of an image, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
 SECONDS = 600  # that a program may take for a mask
 
@@ -60,7 +60,7 @@ def mask_file(scene: Path, name: str) -> Path:
 
 def write_masks(
     scene: Path,
-    photographs: Sequence[Photograph],
+    image_files: Sequence[ImageFile],
     box: np.ndarray,
     points: np.ndarray,
     seen: Sequence[np.ndarray],
@@ -88,22 +88,22 @@ def write_masks(
     """
     words = None if command is None else program_words(command)
     (scene / "masks").mkdir(exist_ok=True)
-    left = _without_mask(scene, photographs)
-    how = {"kept": len(photographs) - len(left)}
-    shown = [i for i, one in enumerate(photographs) if place_of(one, box)]
-    shown = shown or list(range(len(photographs)))  # which window() refuses
-    beside = {one.name for one in photographs} - {photographs[i].name for i in shown}
+    left = _without_mask(scene, image_files)
+    how = {"kept": len(image_files) - len(left)}
+    shown = [i for i, one in enumerate(image_files) if place_of(one, box)]
+    shown = shown or list(range(len(image_files)))  # which window() refuses
+    beside = {one.name for one in image_files} - {image_files[i].name for i in shown}
     for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
         source, mask = _found(scene, one, given, sources or {}, fitted, words)
-        if mask is None and one.name in beside:  # as films have, where they begin or end
+        if mask is None and one.name in beside:  # as videos have, where they begin or end
             source = "empty, as the object is outside"
             mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
         if mask is not None:
             write_png(mask_file(scene, one.name), mask)
             how[source] = how.get(source, 0) + 1
-    if _without_mask(scene, photographs):
+    if _without_mask(scene, image_files):
         inside = ((points > box[0]) & (points < box[1])).all(1)
-        in_view, seen = [photographs[i] for i in shown], [seen[i] for i in shown]
+        in_view, seen = [image_files[i] for i in shown], [seen[i] for i in shown]
         bar = tqdm(in_view, "reading images", unit="image", leave=False, disable=None)
         windows = [_window(scene, one, box) for one in bar]
         of_object = [points[some[inside[some]]] for some in seen]
@@ -112,28 +112,28 @@ def write_masks(
             box, found = _cut(scene, in_view, windows, box, points, inside, seen, turns, grows)
             how |= found
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
-    wrong = _contradicting(scene, photographs, box)
+    wrong = _contradicting(scene, image_files, box)
     if wrong:
         shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
-        counts += f"; {len(wrong)} contradict the others: {listing(shares)}"
+        counts += f"; {len(wrong)} contradict the others: {few_names(shares)}"
     return counts, list(wrong), box
 
 
-def _without_mask(scene, photographs):
-    return [one for one in photographs if not mask_file(scene, one.name).is_file()]
+def _without_mask(scene, image_files):
+    return [one for one in image_files if not mask_file(scene, one.name).is_file()]
 
 
-def _found(scene, photograph, given, sources, fitted, words):
+def _found(scene, image_file, given, sources, fitted, words):
     """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
     if it has not.
     """
-    file, size = scene / photograph.name, (photograph.camera.width, photograph.camera.height)
+    file, size = scene / image_file.name, (image_file.camera.width, image_file.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)
-        return "given", fitted(photograph.name, read_mask_of_size(mask, size))
+        return "given", fitted(image_file.name, read_mask_of_size(mask, size))
     if words is not None:
         return "by the program", _of_program(words, file, size[::-1])
-    if not photograph.name.lower().endswith(OPAQUE):
+    if not image_file.name.lower().endswith(OPAQUE):
         alpha = read_rgba(file)[..., 3]
         if (alpha < 255).any():
             return "of their alpha", alpha
@@ -176,23 +176,23 @@ def program_words(command: str) -> list[str]:
     return words
 
 
-def _kept(scene, photograph):
+def _written_mask(scene, image_file):
     """(H, W) uint8: the mask of a photograph in the scene, which a user may have written. Raises
     UserError for one of another shape.
     """
-    file = mask_file(scene, photograph.name)
-    return read_mask_of_size(file, (photograph.camera.width, photograph.camera.height))
+    file = mask_file(scene, image_file.name)
+    return read_mask_of_size(file, (image_file.camera.width, image_file.camera.height))
 
 
-def _window(scene, photograph, box):
+def _window(scene, image_file, box):
     """The Window of a photograph, with its mask if that is written."""
-    found = window(read_rgba(scene / photograph.name)[..., :3], photograph, box)
-    if mask_file(scene, photograph.name).is_file():
-        found.mask = found.reduced(_kept(scene, photograph)) > 127
+    found = window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
+    if mask_file(scene, image_file.name).is_file():
+        found.mask = found.reduced(_written_mask(scene, image_file)) > 127
     return found
 
 
-def _uniform(scene, photographs, windows, box, points):
+def _uniform(scene, image_files, windows, box, points):
     """Write the masks of photographs before a uniform background, where nearly all of those without
     a mask are. points: (M, 3) of the object that each shows. Returns {what: how many}.
     """
@@ -206,7 +206,7 @@ def _uniform(scene, photographs, windows, box, points):
         windows[i].mask = mask
     spots = _spots(windows, found, box) if with_holes and found else {}
     for i in tqdm(found, "masks", unit="image", leave=False, disable=None):
-        name, one = photographs[i].name, windows[i]
+        name, one = image_files[i].name, windows[i]
         mask, one.mask = uniform_mask(read_rgba(scene / name), name, with_holes), None
         if mask is None:
             continue
@@ -223,12 +223,12 @@ def _spots(windows, numbers, box):
     """{number of a window: (H, W) bool, the regions in the background's colour that its mask
     encloses, but behind which the other views see the object}.
     """
-    hull, _, edge = forgiving_hull([one for one in windows if one.mask is not None], box)
+    hull, _, voxel_size = forgiving_hull([one for one in windows if one.mask is not None], box)
     found = {}
     for i in numbers:
         one = windows[i]
         regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
-        held = silhouette(one, hull, gap_of(one, hull, edge))
+        held = silhouette(one, hull, gap_of(one, hull, voxel_size))
         is_spot = np.bincount(regions.ravel(), held.ravel()) > SPOT * np.bincount(regions.ravel())
         is_spot[0] = False
         found[i] = dilated(is_spot[regions], 1)
@@ -276,7 +276,7 @@ def _before_uniform(window, points, with_holes):
     return mask if held >= ON_MASK else None
 
 
-def _cut(scene, photographs, windows, box, points, inside, seen, turns, grows):
+def _cut(scene, image_files, windows, box, points, inside, seen, turns, grows):
     """Cut out what has no mask, and write it. Returns the box, and {what: how many}."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
     for growth in range(1 + GROWTHS):
@@ -285,28 +285,28 @@ def _cut(scene, photographs, windows, box, points, inside, seen, turns, grows):
         if larger is None:
             break
         box = larger
-        windows = [_window(scene, one, box) for one in photographs]
+        windows = [_window(scene, one, box) for one in image_files]
     for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
-        name = photographs[i].name
+        name = image_files[i].name
         mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
         write_png(mask_file(scene, name), mask)
     return box, {"cut out": len(left)}
 
 
-def picture(
-    scene: Path, photographs: Sequence[Photograph], first: Sequence[str] = ()
+def outline_sheet(
+    scene: Path, image_files: Sequence[ImageFile], first: Sequence[str] = ()
 ) -> np.ndarray:
     """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks drawn
     over them. first: names of those that come first; the others are spread evenly.
     """
-    wrong = [one for one in photographs if one.name in first][:SHOWN_VIEWS]
-    others = [one for one in photographs if one.name not in first]
+    wrong = [one for one in image_files if one.name in first][:SHOWN_VIEWS]
+    others = [one for one in image_files if one.name not in first]
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
     for one in chosen:
-        photograph, mask = read_rgba(scene / one.name), _kept(scene, one)
+        whole, mask = read_rgba(scene / one.name), _written_mask(scene, one)
         factor = fitting_downscale(mask.shape, SHOWN_SIZE)
-        image = shrink(photograph, factor)[..., :3]
+        image = shrink(whole, factor)[..., :3]
         held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
         image[~held] //= 2
         image[find_boundaries(held, mode="thick")] = OUTLINE
@@ -314,11 +314,11 @@ def picture(
     return contact_sheet(images, [Path(one.name).name for one in chosen])
 
 
-def _contradicting(scene, photographs, box):
+def _contradicting(scene, image_files, box):
     """{name: share of the object that its mask alone rejects} of those that contradict others."""
     views = []
-    for one in photographs:
-        mask = _kept(scene, one)
+    for one in image_files:
+        mask = _written_mask(scene, one)
         factor = fitting_downscale(mask.shape, CHECKED_SIDE)
         image = shrink(np.dstack([mask] * 4), factor)
         views.append(View(one.name, one.camera.downscaled(factor), image))

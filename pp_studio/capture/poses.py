@@ -11,7 +11,7 @@ from tqdm import tqdm
 from pp_cl import Camera
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_folder
-from pp_cl.scene import Distortion, Photograph
+from pp_cl.scene import ImageFile, LensDistortion
 from pp_studio.capture.features import cores, forget_focal_lengths, quiet
 from pp_studio.capture.packages import needed
 
@@ -145,7 +145,7 @@ def _most_matches(database):
     return best
 
 
-def photographs(model: Any) -> list[Photograph]:
+def image_files(model: Any) -> list[ImageFile]:
     """The images of pycolmap's model that have a place, in the order of their names, as a scene
     lists them that has them in its folder `images`.
     """
@@ -157,7 +157,7 @@ def photographs(model: Any) -> list[Photograph]:
         focal, cx, cy, k1 = lens.params  # of features.LENS
         world = image.cam_from_world().inverse().matrix()
         camera = Camera(np.array(world), focal, focal, cx, cy, lens.width, lens.height)
-        found.append(Photograph(f"images/{image.name}", camera, distortion=Distortion(k1)))
+        found.append(ImageFile(f"images/{image.name}", camera, lens=LensDistortion(k1)))
     return found
 
 
@@ -165,11 +165,11 @@ def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
     """((N, 3) points of pycolmap's model that at least so many images show, for each of
     photographs() the indices of those in it).
     """
-    kept = [number for number, one in model.points3D.items() if one.track.length() >= least]
-    index = {number: k for k, number in enumerate(kept)}
+    chosen = [number for number, one in model.points3D.items() if one.track.length() >= least]
+    index = {number: k for k, number in enumerate(chosen)}
     shown = [
         np.array([index[p.point3D_id] for p in image.points2D if p.point3D_id in index], int)
         for image in sorted(model.images.values(), key=lambda image: image.name)
         if image.has_pose
     ]
-    return np.array([model.points3D[number].xyz for number in kept]), shown
+    return np.array([model.points3D[number].xyz for number in chosen]), shown

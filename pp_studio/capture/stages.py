@@ -1,5 +1,5 @@
-"""The stages from photographs or a film to a scene, each of which is done once: what it found lies
-in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes on after these.
+"""The stages from photographs or a video to a scene, each of which is done once: what it found lies
+in SCENE/capture/STAGE.json, an image of it in STAGE.png; the same command goes on after these.
 """
 
 import shutil
@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 
 from pp_cl import open_device
 from pp_cl.engine import evenly, fitting_downscale
-from pp_cl.errors import UserError, listing
+from pp_cl.errors import UserError, few_names
 from pp_cl.files import (
     atomic_folder,
     atomic_path,
@@ -31,7 +31,7 @@ from pp_cl.files import (
     write_png,
 )
 from pp_cl.scene import (
-    Distortion,
+    LensDistortion,
     frame_keys,
     named_mask,
     read_edits,
@@ -44,12 +44,12 @@ from pp_studio.capture.packages import isolated, needed
 
 SCENE_FILE = "transforms.json"
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
-SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
+SHOWN_WIDTH = 1000  # pixels of the images of points and cameras
 # decimals of what the scene states: the last digits depend on how COLMAP's threads share a sum
 DECIMALS = 9
 # stages that keep what was done when they are stopped
 RESUMED = ("features", "matches", "images", "masks")
-# what each stage leaves beside its JSON and its picture, in the scene's folder
+# what each stage leaves beside its JSON and its image, in the scene's folder
 LEFT = {
     "frames": ("capture/frames",),
     "features": ("capture/inside", *(f"capture/database.db{end}" for end in ("", "-shm", "-wal"))),
@@ -84,12 +84,12 @@ class Capture:
         self.frames = self.work / "frames"
         self.database, self.model = self.work / "database.db", self.work / "model"
         self.turns = self.work / "turns"
-        self.kept = self.work / "options.json"
+        self.options_file = self.work / "options.json"
         self.options: dict[str, Any] = {}
 
     @property
     def source(self) -> Path:
-        """The photographs or the film."""
+        """The photographs or the video."""
         return Path(self.options["source"])
 
     def run(self, begin: str | None = None, *, replace_masks: bool = False) -> None:
@@ -123,8 +123,8 @@ class Capture:
                     remove_ours(files[stage])
                     for name in {*CHANGING} & {*LEFT[stage]}:
                         (self.scene / name).unlink(missing_ok=True)
-            if changed or not self.kept.exists():
-                write_json(self.kept, self.options)
+            if changed or not self.options_file.exists():
+                write_json(self.options_file, self.options)
             for stage in done:
                 new = self._new() if stage == "frames" else ""
                 self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
@@ -147,7 +147,7 @@ class Capture:
         files = frames.listed(self.source) if self.source.is_dir() else []
         names = [file.relative_to(self.source).as_posix() for file in files]
         new = [name for name in names if name not in known]
-        return f"; {listing(new)} came later: --from frames takes all of them again" if new else ""
+        return f"; {few_names(new)} came later: --from frames takes all of them anew" if new else ""
 
     @contextmanager
     def _locked(self):
@@ -164,13 +164,13 @@ class Capture:
         """Fill in the options of this capture; returns the names of those that have changed."""
         before = {name: value for name, (_, value) in OPTIONS.items()}
         self.options = before | self.given
-        if not self.kept.exists():
+        if not self.options_file.exists():
             return []
-        before = read_json(self.kept)
+        before = read_json(self.options_file)
         if not isinstance(before, dict) or before.keys() != OPTIONS.keys():
             raise UserError(
-                f"{self.kept}: does not have the options {', '.join(OPTIONS)}; delete it, and give"
-                " them again"
+                f"{self.options_file}: does not have the options {', '.join(OPTIONS)}; delete it,"
+                " and give them again"
             )
         self.options = before | self.given
         changed = [name for name in OPTIONS if self.options[name] != before[name]]
@@ -180,7 +180,7 @@ class Capture:
                     f"{self.scene}: was made from {before['source']}; choose another --out, or"
                     " begin again with --from frames"
                 )
-            write_json(self.kept, before | {"source": self.options["source"]})
+            write_json(self.options_file, before | {"source": self.options["source"]})
             changed.remove("source")
         return changed
 
@@ -216,8 +216,8 @@ class Capture:
         if given is not None and self.source.is_dir() and not {"frames", "poses"} & {*left}:
             unplaced = self._found("poses")["unplaced"]
             for one in self._found("frames")["images"]:
-                is_kept = masks.mask_file(self.scene, one["name"]) in mended
-                if one["name"] not in unplaced and not is_kept:
+                is_mended = masks.mask_file(self.scene, one["name"]) in mended
+                if one["name"] not in unplaced and not is_mended:
                     named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
@@ -238,8 +238,8 @@ class Capture:
         there = [path for path in named if path.is_file()]
         return sorted(set(there) - set(ours(there)))
 
-    def _show(self, stage, picture):
-        write_png(self._file(stage).with_suffix(".png"), picture)
+    def _show(self, stage, image):
+        write_png(self._file(stage).with_suffix(".png"), image)
 
     def _found(self, stage):
         return read_json(self._file(stage))
@@ -294,8 +294,8 @@ class Capture:
         return folder if any(folder.iterdir()) else None
 
     def _matches(self):
-        is_film = not self.source.is_dir()
-        pairs = isolated(self.work, features.match, self.database, is_film)
+        is_video = not self.source.is_dir()
+        pairs = isolated(self.work, features.match, self.database, is_video)
         turntable = self.options["turntable"]
         turns = isolated(self.work, still.remove_still, self.database, self.turns, turntable)
         line = f"{pairs} pairs of images"
@@ -320,20 +320,20 @@ class Capture:
 
     def _images(self):
         model = needed("pycolmap").Reconstruction(self.model)
-        taken = poses.photographs(model)
+        taken = poses.image_files(model)
         made = pinhole.write_images(self._dev, self.frames, self.images, taken)
-        kept = f", {len(taken) - made} of them before" if made < len(taken) else ""
-        return {"line": f"{len(taken)} without distortion{kept}"}
+        earlier = f", {len(taken) - made} of them before" if made < len(taken) else ""
+        return {"line": f"{len(taken)} without distortion{earlier}"}
 
     def _box(self):
         model = needed("pycolmap").Reconstruction(self.model)
-        cameras = [one.camera for one in poses.photographs(model)]
+        cameras = [one.camera for one in poses.image_files(model)]
         world = box.find_world(cameras, poses.points(model)[0])
         corners = self.options["box"]
         chosen = world.box if corners is None else np.sort(np.reshape(corners, (2, 3)), axis=0)
         size = " x ".join(f"{side:.2f}" for side in np.ptp(chosen, axis=0))
         _move(model, world.scale, world.rotation, world.shift)
-        eyes = [one.camera.eye for one in poses.photographs(model)]
+        eyes = [one.camera.eye for one in poses.image_files(model)]
         distance = np.median(np.linalg.norm(eyes, axis=1))
         self._show("box", _seen_from_outside(model, chosen))
         return {
@@ -349,10 +349,10 @@ class Capture:
         corners, edits = before, read_edits(self.scene)
         given, dropped = self.options["masks"], edits.dropped
         is_given = self.options["box"] is not None or edits.box is not None
-        taken = {one.name: one for one in poses.photographs(model)}
-        photographs = [replace(one, distortion=Distortion()) for one in taken.values()]
+        taken = {one.name: one for one in poses.image_files(model)}
+        image_files = [replace(one, lens=LensDistortion()) for one in taken.values()]
         points, seen = poses.points(model, FOLLOWED)
-        kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
+        used = [i for i, one in enumerate(image_files) if one.name not in dropped]
         files = self._found("frames")["images"] if self.source.is_dir() else []
         sources = {one["name"]: one["source"] for one in files}
 
@@ -362,7 +362,7 @@ class Capture:
         def write(chosen):
             return masks.write_masks(
                 self.scene,
-                [photographs[i] for i in chosen],
+                [image_files[i] for i in chosen],
                 corners,
                 points,
                 [seen[i] for i in chosen],
@@ -374,10 +374,10 @@ class Capture:
                 grows=not is_given,
             )
 
-        line, wrong, corners = write(kept)
+        line, wrong, corners = write(used)
         if dropped:  # they have had no say in the others
-            write(range(len(photographs)))
-        self._show("masks", masks.picture(self.scene, photographs, wrong))
+            write(range(len(image_files)))
+        self._show("masks", masks.outline_sheet(self.scene, image_files, wrong))
         if (corners == before).all():
             return {"line": line}
         size = " x ".join(f"{side:.2f}" for side in np.ptp(corners, axis=0))
@@ -385,7 +385,7 @@ class Capture:
 
     def _scene(self):
         model, corners = self._world()
-        found = poses.photographs(model)
+        found = poses.image_files(model)
         places = [
             {
                 "file_path": one.name,
@@ -444,12 +444,12 @@ def _move(model, scale, rotation, shift):
 
 
 def _seen_from_outside(model, box):
-    """The picture of a model's points and cameras, and a box (2, 3), from two sides."""
-    cameras = [one.camera for one in poses.photographs(model)]
+    """The image of a model's points and cameras, and a box (2, 3), from two sides."""
+    cameras = [one.camera for one in poses.image_files(model)]
     colours = np.array([point.color for point in model.points3D.values()])
     return overview(cameras, box, poses.points(model)[0], colours, SHOWN_WIDTH)
 
 
 def _left_out(lines: Sequence[str], what: str) -> str:
     """`; 3 left out: A, B and 1 more`, empty without lines."""
-    return f"; {len(lines)} {what}: {listing(lines)}" if lines else ""
+    return f"; {len(lines)} {what}: {few_names(lines)}" if lines else ""

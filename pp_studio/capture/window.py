@@ -7,7 +7,7 @@ import numpy as np
 
 from pp_cl import Camera
 from pp_cl.errors import UserError
-from pp_cl.scene import Photograph
+from pp_cl.scene import ImageFile
 from pp_studio.capture.box import corners_of
 from pp_studio.capture.packages import needed
 
@@ -68,11 +68,11 @@ class Window:
         return shown
 
 
-def place_of(photograph: Photograph, box: np.ndarray) -> tuple[int, int, int, int] | None:
+def place_of(image_file: ImageFile, box: np.ndarray) -> tuple[int, int, int, int] | None:
     """(x0, y0, x1, y1) around the projected box (2, 3) in a photograph; None where it is
     outside.
     """
-    camera = photograph.camera
+    camera = image_file.camera
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y, depth = camera.project(corners_of(box))
     if depth.min() <= 0:  # the box is around the camera
@@ -83,22 +83,22 @@ def place_of(photograph: Photograph, box: np.ndarray) -> tuple[int, int, int, in
     return x0, y0, x1, y1
 
 
-def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window:
+def window(image: np.ndarray, image_file: ImageFile, box: np.ndarray) -> Window:
     """The Window of a photograph, (H, W, 3) uint8. Raises UserError where it does not show the box
     (2, 3).
     """
-    place = place_of(photograph, box)
+    place = place_of(image_file, box)
     if place is None:
-        raise UserError(f"{photograph.name}: the object's box is outside; give another with --box")
+        raise UserError(f"{image_file.name}: the object's box is outside; give another with --box")
     x0, y0, x1, y1 = place
     scale = min(1, CUT_SIDE / max(x1 - x0, y1 - y0))
     width, height = (max(2, round(scale * n)) for n in (x1 - x0, y1 - y0))
     sx, sy = width / (x1 - x0), height / (y1 - y0)
-    camera = photograph.camera.crop(x0, y0, width, height)
+    camera = image_file.camera.crop(x0, y0, width, height)
     camera = replace(
         camera, fx=sx * camera.fx, fy=sy * camera.fy, cx=sx * camera.cx, cy=sy * camera.cy
     )
-    found = Window(photograph.name, image, camera, place)
+    found = Window(image_file.name, image, camera, place)
     return replace(found, image=found.reduced(image))
 
 

@@ -1,4 +1,4 @@
-"""`pp-cl capture`: a scene from photographs or a film, with cameras, box and masks."""
+"""`pp-cl capture`: a scene from photographs or a video, with cameras, box and masks."""
 
 import argparse
 from typing import Any

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--window",
         type=shared.integer(16, 16384),
         metavar="PIXELS",
-        help="splats: fit the Gaussians for pictures of so many pixels on the longer side"
+        help="splats: fit the Gaussians for renderings of so many pixels on the longer side"
         f" ({WINDOW})",
     )
     add(

@@ -15,8 +15,8 @@ HELP = "photos, a video or a scene to a page, a video and a splat, in one folder
 EPILOG = """FOLDER then holds
   index.html           the result: the model to turn, views beside their photographs, the figures
   model.html           the model alone, on one page
-  film.mp4, splat.ply  once around the object; 3D Gaussians for other viewers
-  thumbnail.png        a picture of it
+  video.mp4, splat.ply once around the object; 3D Gaussians for other viewers
+  thumbnail.png        an image of it
   scene, run           what was captured of photographs; the training, which all other commands take
 Its parts are capture, train, eval, render and export. The same command goes on where it stopped."""
 MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
@@ -73,11 +73,11 @@ def run(options: argparse.Namespace) -> None:
     _step("train", scene, "--out", str(folder), *preset, *masks, *device)
     split = _held_out(scene)
     _step("eval", str(folder), "--split", split, *device)
-    film = _film()
-    for name, file, words in (("render", film, []), ("export", SPLAT, ["--format", "splat"])):
+    video = _video()
+    for name, file, words in (("render", video, []), ("export", SPLAT, ["--format", "splat"])):
         if not _is_newer(out / file, folder.checkpoint):
             _step(name, str(folder), "--out", str(out / file), *words, *device)
-    write_result(load(folder.path, options.device), split, out, film, told)
+    write_result(load(folder.path, options.device), split, out, video, told)
     print(f"wrote {out / INDEX}: open it in a browser; `pp-cl view {folder}` shows the exact model")
 
 
@@ -119,16 +119,16 @@ def _captured(scene: Path) -> list[str]:
     return [f"{name}: {read_json(scene / 'capture' / f'{name}.json')['line']}" for name in stages]
 
 
-def _film():
-    """The name of the film: of a format that can be written here."""
-    from pp_studio.export.result import FILMS
+def _video():
+    """The name of the video: of a format that can be written here."""
+    from pp_studio.export.result import VIDEOS
     from pp_studio.video import check_video
 
     try:
-        check_video(FILMS[0].partition(".")[2])
+        check_video(VIDEOS[0].partition(".")[2])
     except UserError:
-        return FILMS[1]
-    return FILMS[0]
+        return VIDEOS[1]
+    return VIDEOS[0]
 
 
 def _held_out(scene):

@@ -1,4 +1,4 @@
-"""`pp-cl render`: renders a run along a path of cameras, as a film or as frames."""
+"""`pp-cl render`: renders a run along a path of cameras, as a video or as frames."""
 
 import argparse
 import math
@@ -16,7 +16,7 @@ EPILOG = """paths:
   SPLIT       the cameras of a split of the scene: train, val, test
   FILE        nerfstudio's camera_path.json, a transforms.json, or cameras.json of 3D Gaussian
               Splatting and brush, in the world of the scene"""
-FILMS, IMAGES = ("mp4", "webm", "webp", "gif"), ("png", "exr")
+VIDEOS, IMAGES = ("mp4", "webm", "webp", "gif"), ("png", "exr")
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "transparent": None}
 MADE = ("orbit", "spiral")  # paths that the program makes
 SECONDS, FPS = 4, 30
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--format",
-        choices=(*FILMS, *IMAGES),
+        choices=(*VIDEOS, *IMAGES),
         help="a video (mp4, webm, webp, gif) or frames (png, exr); by --out, else mp4",
     )
     add("--size", type=shared.size, metavar="WxH", help="pixels (default: those of the training)")
@@ -93,28 +93,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Render the frames that are missing, and make a film of them where one is asked for."""
+    """Render the frames that are missing, and make a video of them where one is asked for."""
     from tqdm import tqdm
 
     from pp_cl import load
     from pp_cl.files import own
-    from pp_studio.export.film import render_film, render_frames
+    from pp_studio.export.render_video import render_frames, render_video
     from pp_studio.video import check_video
 
     kind = _format(options)
     style, count = _style(options, kind), _frame_count(options, kind)
-    if kind in FILMS:
+    if kind in VIDEOS:
         check_video(kind)
     run = load(options.run_folder, options.device, scene=options.scene)
     cameras = _cameras(run, options.path, count, size=options.size, fov=options.fov)
     sizes = {(camera.width, camera.height) for camera in cameras}
-    if kind in FILMS and len(sizes) > 1:
+    if kind in VIDEOS and len(sizes) > 1:
         raise UserError(
             f"--path {options.path}: its images differ in size, which no video does; give --size"
             " WxH, or --format png"
         )
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
-    if kind in FILMS and not options.out:
+    if kind in VIDEOS and not options.out:
         own(out.parent, [out], "move it away, or choose another --out")
     seconds = []
     with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
@@ -124,8 +124,8 @@ def run(options: argparse.Namespace) -> None:
             if took is not None:
                 seconds.append(took)
 
-        if kind in FILMS:
-            render_film(run, cameras, out, options.fps, style, on_frame)
+        if kind in VIDEOS:
+            render_video(run, cameras, out, options.fps, style, on_frame)
         else:
             render_frames(run, cameras, out, style, on_frame)
     made = f"{len(seconds)} of {len(cameras)} frames"
@@ -136,20 +136,20 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _format(options):
-    """Of FILMS or IMAGES, as the name of --out and --format say."""
+    """Of VIDEOS or IMAGES, as the name of --out and --format say."""
     suffix = Path(options.out).suffix[1:].lower() if options.out else ""
-    if suffix in FILMS and options.format not in (None, suffix):
+    if suffix in VIDEOS and options.format not in (None, suffix):
         raise UserError(
             f"--out {options.out}: is a video by its name, --format {options.format} is another;"
             " leave one of them out"
         )
-    if options.out and suffix not in FILMS and options.format in FILMS:
+    if options.out and suffix not in VIDEOS and options.format in VIDEOS:
         raise UserError(
             f"--out {options.out}: --format {options.format} is a video; name it"
             f" {options.out}.{options.format}"
         )
-    if suffix in FILMS or not options.out:
-        return suffix or options.format or FILMS[0]
+    if suffix in VIDEOS or not options.out:
+        return suffix or options.format or VIDEOS[0]
     if (mimetypes.guess_type(options.out)[0] or "").startswith(("video/", "image/")):
         raise UserError(
             f"--out {options.out}: videos end in .mp4, .webm, .webp or .gif, frames go into a"
@@ -162,12 +162,12 @@ def _default(run, path, sizes, kind):
     """Where a path is written that has no --out. sizes: {(width, height)} of its images."""
     name = Path(path).stem if Path(path).suffix else path
     name += "_{}x{}".format(*sizes.pop()) if len(sizes) == 1 else ""
-    return run.folder.path / "render" / (f"{name}.{kind}" if kind in FILMS else name)
+    return run.folder.path / "render" / (f"{name}.{kind}" if kind in VIDEOS else name)
 
 
 def _style(options, kind):
-    """film.Style of the options."""
-    from pp_studio.export.film import Style
+    """render_video.Style of the options."""
+    from pp_studio.export.render_video import Style
 
     if options.background and kind == "exr":
         raise UserError("--background: OpenEXR keeps alpha in its place; leave it out")
@@ -214,7 +214,7 @@ def _cameras(run, path, count, *, size, fov):
         return [shaped(camera) for camera in read_cameras(Path(path), size)]
     if path not in MADE:
         return [shaped(camera) for camera in run.cameras(path)]
-    photographs = run.cameras("train")
-    around, first = Surroundings(photographs, run.model.positions()), shaped(photographs[0])
+    training = run.cameras("train")
+    around, first = Surroundings(training, run.model.positions()), shaped(training[0])
     make = around.orbit if path == "orbit" else around.spiral
     return make(first, count)

@@ -1,6 +1,6 @@
-"""Exports a run to other programs: films, point clouds, meshes, a web page, rendered views."""
+"""Exports a run to other programs: videos, point clouds, meshes, a web page, rendered views."""
 
-# Pixels on the longer side of the pictures for which splats are fitted: of a viewer's window
+# Pixels on the longer side of the renderings for which splats are fitted: of a viewer's window
 WINDOW = 800
 SCENE, VIEWER = AXES = "scene", "viewer"
 # {format of coordinates: whose axes they have, unless others are asked for}

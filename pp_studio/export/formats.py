@@ -13,7 +13,7 @@ import numpy as np
 from pp_cl import Run
 from pp_cl.engine import View
 from pp_cl.errors import UserError, require
-from pp_cl.files import check_file, check_new_folder, check_ours, image_files, own, write_text
+from pp_cl.files import check_file, check_new_folder, check_ours, image_paths, own, write_text
 from pp_cl.scene import write_scene
 from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
 from pp_studio.export.gltf import gltf_colours, write_glb
@@ -78,7 +78,7 @@ def export_run(
         turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
 
     def placed(positions):
-        return metres * in_world(positions @ turn.T, run.model.grid.edge)
+        return metres * in_world(positions @ turn.T, run.model.grid.voxel_size)
 
     if name == "mesh":
         mesh = coloured_mesh(run, within)
@@ -142,16 +142,16 @@ def renderings(run: Run) -> dict[str, list[View]]:
     rendering of it as straight RGBA; where the run's scene has no test views, or none that can be
     read, those are left out with a warning that says why.
     """
-    splits = {"train": run.photographs("train")}
+    splits = {"train": run.image_files("train")}
     try:
-        splits["test"] = run.photographs("test")
+        splits["test"] = run.image_files("test")
     except UserError as error:
         warnings.warn(f"no test views are exported: {error}", stacklevel=2)
     return {split: _rendered(run, split, listed) for split, listed in splits.items()}
 
 
-def _rendered(run, split, photographs):
+def _rendered(run, split, listed):
     """The views of a split, named after their files in its folder."""
-    files = image_files([one.name for one in photographs])
-    views = run.rendered(photographs, opaque=False)
+    files = image_paths([one.name for one in listed])
+    views = run.rendered(listed, opaque=False)
     return [replace(v, name=f"{split}/{file}") for v, file in zip(views, files, strict=True)]

@@ -1,4 +1,4 @@
-"""Gaussians of three axes fitted to a run's photographs, and where these are few to its renderings
+"""Gaussians of three axes fitted to a run's images, and where these are few to its renderings
 of as many views between them, as viewers of 3D Gaussian splatting draw them: without a network,
 each widened by a third of a pixel^2, and colours below 0 taken for black.
 
@@ -21,10 +21,10 @@ from pp_studio.camera_path import between
 from pp_studio.export.harmonics import fit_harmonics
 
 STEPS = 7000
-# Of the steps of windows larger than the images, those that draw pictures as large as these, each
+# Of the steps of windows larger than the images, those that draw renderings as large as these, each
 # pixel as if it were the mean of a viewer's: nearly right, and they see as much more of an image.
 COARSE = 0.7
-# Photographs that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
+# Images that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
 # to the 57 of ethiopian_head.
 ENOUGH = 200
 CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of what is drawn, of an image
@@ -65,15 +65,15 @@ class LargeCrops(Crops):
 
 def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     """(the points that training views show, as Gaussians, the deviation of one without offsets):
-    fitted to pictures of about `window` pixels on the longer side. Of the features of their SH,
+    fitted to renderings of about `window` pixels on the longer side. Of the features of their SH,
     which are 3D Gaussian splatting's, the first three are sRGB colour.
     """
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud, net = _cloud(run, coefficients), Means(dev)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)
-    views = _photographs(run)
+    views = _fitted_views(run)
     if len(views) < ENOUGH:
-        listed = run.photographs("train")
+        listed = run.image_files("train")
         cameras = between([one.camera for one in listed])
         more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
@@ -95,7 +95,7 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
         trainer.train_step()
     trainer.check()
     trainer.finish()
-    return cloud, config.raster.radius * run.model.grid.edge
+    return cloud, config.raster.radius * run.model.grid.voxel_size
 
 
 def triangles(offset: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ def triangles(offset: np.ndarray) -> np.ndarray:
     return lower
 
 
-def _photographs(run):
+def _fitted_views(run):
     """The run's training views, none if their exposures differ, or with a warning if they are not
     there.
     """
@@ -139,17 +139,17 @@ def _cloud(run, coefficients):
 
 
 def _config(given: Config, scale: int) -> Config:
-    """What the trainer follows here, for pictures of about `scale` times the images each way."""
+    """What the trainer follows here, for renderings of about `scale` times the images each way."""
     config = copy.deepcopy(given)
     raster, train = config.raster, config.train
     raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
     raster.radius *= DEVIATION
     train.iterations = STEPS
     train.crop, train.refine_at, train.ema = CROP, (), True
-    train.mask_weight = train.spread_weight = train.sh_smoothing = 0.0
+    train.mask_weight = train.distortion_weight = train.sh_smoothing = 0.0
     train.exposure, train.ssim_weight = "off", 0.0
     # Colours, which begin nearly right, would diverge with their default rates, seventeen times
-    # these and more; shapes have the longest way. In pictures as large as the images colours must
+    # these and more; shapes have the longest way. In renderings as large as the images colours must
     # be fast, since they sharpen what viewers widen; in larger ones slower colours and faster
     # opacities are better (0.4 dB on lego by the colours alone).
     train.rate_steps = 0
@@ -157,6 +157,6 @@ def _config(given: Config, scale: int) -> Config:
         train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (7.6e-3, 2.3e-3)
     else:
         train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
-        train.prune_weight = 0.0  # points are judged in images, where larger pictures show more
+        train.prune_weight = 0.0  # points are judged in images, where larger renderings show more
     train.offset_rate = (4e-2, 4e-3)
     return config

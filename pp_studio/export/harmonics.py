@@ -43,14 +43,14 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
     positions = run.model.positions()
 
     def functions(seen):
-        return basis(directions(positions[seen.shaded], seen.camera))[:, :count]
+        return basis(directions(positions[seen.visible], seen.camera))[:, :count]
 
     b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
     for camera in progress(cameras, "colours"):
-        picture = run.render(camera)
-        colours = np.float32(picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
+        rendered = run.render(camera)
+        colours = np.float32(rendered.colour - (1 - rendered.alpha)[..., None]).reshape(-1, 3)
         seen = look(run, camera, blending=True)
-        at, rows = functions(seen), seen.shaded
+        at, rows = functions(seen), seen.visible
         weights = seen.gathered(np.ones_like(colours))[:, :1]
         b[rows] += at[:, :, None] * seen.gathered(colours)[:, None]
         blocks[rows] += (weights * at)[:, :, None] * at[:, None]
@@ -64,7 +64,7 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
         coefficients = flat.reshape(b.shape)
         result = ridge[..., None] * coefficients
         for seen in observe(run, cameras, "harmonics", blending=True):
-            at, rows = functions(seen), seen.shaded
+            at, rows = functions(seen), seen.visible
             colours, _ = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[rows]))
             result[rows] += at[:, :, None] * seen.gathered(colours)[:, None]
         return result.ravel()

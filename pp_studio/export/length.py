@@ -44,39 +44,39 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
     """
     points = [surface_point(run, text) for text in (first, second)]
     apart = float(np.linalg.norm(points[0] - points[1]))
-    if apart < run.model.grid.edge:
+    if apart < run.model.grid.voxel_size:
         raise UserError(f"--length {first} {second}: show the same place; name two far apart")
     found = float(metres) / apart
     if not SMALLEST <= found <= LARGEST:
         raise UserError(f"--length {metres:g}: a unit of the scene would be {found:g} m")
-    kept = {"metres_per_unit": found, "between": [first, second], "metres": float(metres)}
-    write_json(run.folder.path / FILE, kept)
+    facts = {"metres_per_unit": found, "between": [first, second], "metres": float(metres)}
+    write_json(run.folder.path / FILE, facts)
     return found
 
 
-def _straight(run, photograph, x, y):
-    """The pixel that shows without distortion what (x, y) shows of the photograph; (x, y) itself
+def _straight(run, image_file, x, y):
+    """The pixel that shows without distortion what (x, y) shows of the image; (x, y) itself
     where the scene, which knows the lens, is not there.
     """
     try:
         listed = scene_frames(run.config.scene.path, edited=False)
     except UserError:
         return x, y
-    lens = next((one.distortion for one in listed if one.name == photograph.name), None)
+    lens = next((one.lens for one in listed if one.name == image_file.name), None)
     if not lens:
         return x, y
-    camera = photograph.camera
+    camera = image_file.camera
     there = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
     found = root(lambda place: np.subtract(lens.apply(*place), there), there)
-    if not found.success:  # NaN is beyond every photograph
+    if not found.success:  # NaN is beyond every image
         return np.nan, np.nan
     return found.x[0] * camera.fx + camera.cx, found.x[1] * camera.fy + camera.cy
 
 
 def surface_point(run: Run, text: str) -> np.ndarray:
-    """(3,) world: what a pixel of a training photograph shows of the object. text: PHOTO:X,Y, the
-    photograph's path in the scene or the end of it, and pixels from its upper left corner. Raises
-    UserError where there is no such photograph or pixel, or no object in it.
+    """(3,) world: what a pixel of a training image shows of the object. text: PHOTO:X,Y, the
+    image's path in the scene or the end of it, and pixels from its upper left corner. Raises
+    UserError where there is no such image or pixel, or no object in it.
     """
     found = re.fullmatch(r"(.+):([0-9.]+),([0-9.]+)", text)
     try:
@@ -85,32 +85,32 @@ def surface_point(run: Run, text: str) -> np.ndarray:
         raise UserError(
             f"--length {shown(text)}: write PHOTO:X,Y, for example a.jpg:812,430"
         ) from None
-    photographs = run.photographs("train")
-    matches = [one for one in photographs if one.name == name or one.name.endswith(f"/{name}")]
+    image_files = run.image_files("train")
+    matches = [one for one in image_files if one.name == name or one.name.endswith(f"/{name}")]
     if len(matches) != 1:
-        names = [one.name for one in photographs]
+        names = [one.name for one in image_files]
         near = suggestion(name, names).strip() or f"name one such as {names[0]}"
         raise UserError(
             f"--length {shown(text)}: "
             + (
                 f"{name} is in several folders; write more of its path"
                 if matches
-                else f"no training photograph of that name; {near}"
+                else f"no training image of that name; {near}"
             )
         )
     stored = matches[0].camera
     if not (x < stored.width and y < stored.height):
         raise UserError(
-            f"--length {shown(text)}: the photograph has {stored.width}x{stored.height} pixels"
+            f"--length {shown(text)}: the image has {stored.width}x{stored.height} pixels"
         )
     x, y = _straight(run, matches[0], x, y)
     if not (0 <= x < stored.width and 0 <= y < stored.height):
-        raise UserError(f"--length {shown(text)}: lies beyond what is left of the photograph")
+        raise UserError(f"--length {shown(text)}: lies beyond what is left of the image")
     camera = stored.downscaled(run.config.scene.downscale)
-    picture = run.render(camera)
+    rendered = run.render(camera)
     column = min(int(x * camera.fx / stored.fx), camera.width - 1)
     row = min(int(y * camera.fy / stored.fy), camera.height - 1)
-    if not picture.alpha[row, column] > OPAQUE:
+    if not rendered.alpha[row, column] > OPAQUE:
         raise UserError(f"--length {shown(text)}: the model shows no object there")
     along = np.array([(x - stored.cx) / stored.fx, (y - stored.cy) / stored.fy, 1.0])
-    return stored.eye + picture.median_depth[row, column] * stored.pose[:, :3] @ along
+    return stored.eye + rendered.median_depth[row, column] * stored.pose[:, :3] @ along

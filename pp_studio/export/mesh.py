@@ -51,15 +51,15 @@ def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.nda
     if outside.min() >= 0:
         raise UserError(f"{run.folder}: the training views show no surface; train it longer")
     vertices, faces, _, _ = marching_cubes(outside, 0, gradient_direction="ascent")
-    positions = np.asarray(grid.origin) + grid.edge * (vertices[:, ::-1] - 1)
+    positions = np.asarray(grid.origin) + grid.voxel_size * (vertices[:, ::-1] - 1)
     faces = faces[inside(positions, box)[faces].all(1)]
     if not len(faces):
         raise UserError(
-            f"--box: holds no whole face of the mesh, whose sides are about {grid.edge:.3g};"
+            f"--box: holds no whole face of the mesh, whose sides are about {grid.voxel_size:.3g};"
             " make it larger"
         )
     used, faces = np.unique(faces, return_inverse=True)
-    return in_world(positions[used], grid.edge), faces.reshape(-1, 3).astype(np.int32)
+    return in_world(positions[used], grid.voxel_size), faces.reshape(-1, 3).astype(np.int32)
 
 
 def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
@@ -67,14 +67,16 @@ def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
     squared distance.
     """
     vertices, faces = surface(run, box)
-    return Mesh(vertices, faces, _colours(vertices, coloured_points(run), run.model.grid.edge))
+    return Mesh(
+        vertices, faces, _colours(vertices, coloured_points(run), run.model.grid.voxel_size)
+    )
 
 
-def _colours(vertices, points: ColouredPoints, edge):
+def _colours(vertices, points: ColouredPoints, voxel_size):
     """(V, 3) uint8."""
     count = min(NEIGHBOURS, len(points.rows))
     distance, near = cKDTree(points.positions).query(vertices, list(range(1, count + 1)))
-    weight = points.weight[near] / (distance**2 + edge**2)
+    weight = points.weight[near] / (distance**2 + voxel_size**2)
     mean = (weight[..., None] * points.colours[near]).sum(1) / weight.sum(1, keepdims=True)
     return np.rint(mean).astype(np.uint8)
 

@@ -35,9 +35,9 @@ class Observation:
         return weights.get()
 
     @cached_property
-    def shaded(self) -> np.ndarray:
+    def visible(self) -> np.ndarray:
         """(S,) indices of the visible points, ascending."""
-        return self.view.weights.shaded.get()
+        return self.view.weights.visible.get()
 
     def blended(self, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """((HW, 3), (HW,)) float32: colours (S, 3) blended by the weights, and what the weights of

@@ -129,9 +129,9 @@ out vec4 result;
 void main() {
   vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
   vec3 ray = normalize(vec3((pixel - focal.zw) / focal.xy, 1.0));
-  float closeness = 1.0 - length(centre - t * ray) / reach;
-  if (closeness <= 0.0) discard;
-  float alpha = colour.a * closeness;
+  float falloff = 1.0 - length(centre - t * ray) / reach;
+  if (falloff <= 0.0) discard;
+  float alpha = colour.a * falloff;
   result = vec4(colour.rgb * alpha, alpha);
 }`;
 const COPY_VERTEX = `#version 300 es

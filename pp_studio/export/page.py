@@ -52,11 +52,11 @@ def lattice(grid: Grid) -> tuple[np.ndarray, float]:
     """(origin (3,), unit), in the world: places in the cells of a grid are kept as whole units from
     there, as small as 16 bits allow.
     """
-    return np.array(grid.origin) - grid.edge / 2, grid.edge / (PLACES // max(grid.dims))
+    return np.array(grid.origin) - grid.voxel_size / 2, grid.voxel_size / (PLACES // max(grid.dims))
 
 
 def page_text(run: Run, still: str = "", title: str = "") -> str:
-    """The page. still: the file of a picture that stands for it where it is linked to, if any.
+    """The page. still: the file of an image that stands for it where it is linked to, if any.
     title: instead of the name of the run's folder. Raises UserError as check_drawable does.
     """
     check_drawable(run)
@@ -76,7 +76,7 @@ def page_text(run: Run, still: str = "", title: str = "") -> str:
 
 
 def card(still: str) -> str:
-    """What programs that show links read of a page's picture."""
+    """What programs that show links read of a page's image."""
     large = '<meta name="twitter:card" content="summary_large_image">'
     return f'<meta property="og:image" content="{still}">\n{large}' if still else ""
 
@@ -145,7 +145,7 @@ def _header(run, low, span):
         "stride": POINT.itemsize,
         "origin": origin.tolist(),
         "unit": unit,
-        "radius": float(run.config.raster.radius * grid.edge),
+        "radius": float(run.config.raster.radius * grid.voxel_size),
         "nearest": run.nearest,
         "centre": centre.tolist(),
         # of the finest camera, in world units at the distance of the centre

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import plyfile
 
-from pp_cl import Camera, Picture, Run
+from pp_cl import Camera, RenderedView, Run
 from pp_cl.engine import PointCloud
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file, to_8bit
@@ -25,7 +25,7 @@ COMMENTS = (
     "features are the input of the run's network, no colours",
 )
 COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
-FINEST = 1e-3  # of the grid's edge: how far rounding to float32 may move a point in a file
+FINEST = 1e-3  # of the voxel size: how far rounding to float32 may move a point in a file
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def coloured_points(
     No colour is invented for points that no training view shows: they are left out. box: (2, 3)
     that holds the points, or None. Raises UserError where no point is left.
     """
-    cloud, edge = run.model.cloud, run.model.grid.edge
+    cloud, voxel_size = run.model.cloud, run.model.grid.voxel_size
     positions = run.model.positions()
     colours, best = np.zeros((cloud.count, 3), np.uint8), np.zeros(cloud.count, np.float32)
     for seen in observe(run, run.cameras("train"), "colours"):
@@ -71,7 +71,7 @@ def coloured_points(
     rows = rows[inside(positions[rows], box)]
     return ColouredPoints(
         rows,
-        in_world(positions[rows], edge),
+        in_world(positions[rows], voxel_size),
         colours[rows],
         best[rows],
         cloud.opacity.get()[rows],
@@ -93,20 +93,20 @@ def inside(positions: np.ndarray, box: np.ndarray | None) -> np.ndarray:
     return found
 
 
-def in_world(positions: np.ndarray, edge: float) -> np.ndarray:
+def in_world(positions: np.ndarray, voxel_size: float) -> np.ndarray:
     """(N, 3) float64 world positions as files keep them: float32, which every program reads, or
-    float64 where the world's origin is so far that float32 moves them. edge: of the grid.
+    float64 where the world's origin is so far that float32 moves them. voxel_size: of the grid.
     """
     resolution = np.spacing(np.float32(np.abs(positions).max(initial=0)))
-    return positions if resolution > FINEST * edge else positions.astype(np.float32)
+    return positions if resolution > FINEST * voxel_size else positions.astype(np.float32)
 
 
-def _colours(picture: Picture, camera: Camera, positions):
+def _colours(rendered: RenderedView, camera: Camera, positions):
     """(M, 3) uint8: a point whose centre is just outside the image takes the nearest pixel."""
     column, row, _ = camera.project(positions)  # a seen point has a depth above 0
     column = column.clip(0, camera.width - 1).astype(np.int64)
     row = row.clip(0, camera.height - 1).astype(np.int64)
-    return to_8bit(picture.rgba()[row, column, :3])
+    return to_8bit(rendered.rgba()[row, column, :3])
 
 
 def write_ply(

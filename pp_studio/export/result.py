@@ -15,12 +15,12 @@ from pp_studio.export.page import card, filled, page_text, still
 
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS = "thumbnail.png", "views.png"
-FILMS = ("film.mp4", "film.webp")
+VIDEOS = ("video.mp4", "video.webp")
 LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
 WHAT = {
     MODEL: "the model alone, one page that needs no network",
     SPLAT: "3D Gaussians, for SuperSplat, Blender and other viewers",
-    STILL: "a picture of it",
+    STILL: "an image of it",
 }
 
 
@@ -28,15 +28,15 @@ def begin_result(folder: Path) -> None:
     """Make the folder. Raises UserError where it holds other files, or one in the place of a file
     of the result that is not the program's.
     """
-    files = [folder / name for name in (INDEX, MODEL, SPLAT, STILL, VIEWS, *FILMS)]
+    files = [folder / name for name in (INDEX, MODEL, SPLAT, STILL, VIEWS, *VIDEOS)]
     own(folder, files, "move it away, or choose another --out", alone=True)
 
 
-def write_result(run: Run, split: str, folder: Path, film: str, told: Sequence[str] = ()) -> None:
-    """Write index.html, the model's page and the pictures that it shows, beside the film and the
+def write_result(run: Run, split: str, folder: Path, video: str, told: Sequence[str] = ()) -> None:
+    """Write index.html, the model's page and the images that it shows, beside the video and the
     splats that are there already.
 
-    split: whose evaluation is shown. film: the file's name. told: what is to be known of the
+    split: whose evaluation is shown. video: the file's name. told: what is to be known of the
     photographs, a line each.
     """
     measured = run.folder.evaluation(split)
@@ -46,12 +46,12 @@ def write_result(run: Run, split: str, folder: Path, film: str, told: Sequence[s
     write_png(folder / STILL, still(run))
     title = name_of(folder)
     write_text(folder / MODEL, page_text(run, title=title))
-    names = (MODEL, film, SPLAT, STILL)
+    names = (MODEL, video, SPLAT, STILL)
     views = "that the training has not seen" if split != "train" else "of the training"
     parts = {
         "title": html.escape(title),
         "card": card(STILL),
-        "film": _player(film),
+        "video": _player(video),
         "views": f"Views {views}: rendered, photographed, and four times their difference.",
         "figures": "\n".join(_row(*row) for row in _figures(run, found)),
         "notes": _notes([*told, *_left_out(run)]),

@@ -47,7 +47,7 @@ SPLAT = np.dtype(
 def splats(
     run: Run, turn: np.ndarray, window: int, box: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of SPLAT, (3,) origin): the run as Gaussians, fitted to pictures of `window`
+    """((M,) records of SPLAT, (3,) origin): the run as Gaussians, fitted to renderings of `window`
     pixels, in the world of its scene turned by (3, 3), those in a box (2, 3) or all. Positions are
     relative to the origin, which is 0 unless float32 is too coarse there. harmonics: in the order
     and with the signs of 3D Gaussian splatting, of colours less 0.5; opacity: after the sigmoid;
@@ -59,11 +59,11 @@ def splats(
     cloud, deviation = fit_gaussians(run, window)
     opacity, offset = cloud.opacity.get().clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
-    positions = grid.positions(cloud.ids.get()[rows]) + grid.edge * offset[rows, :3]
+    positions = grid.positions(cloud.ids.get()[rows]) + grid.voxel_size * offset[rows, :3]
     held = inside(positions, box)
     rows, positions = rows[held], positions[held] @ turn.T
     coefficients = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
-    near = in_world(positions, grid.edge).dtype == np.float32
+    near = in_world(positions, grid.voxel_size).dtype == np.float32
     origin = np.zeros(3) if near else np.rint(positions.mean(0))
     table = np.zeros(len(rows), SPLAT)
     table["position"] = positions - origin
@@ -126,11 +126,11 @@ def write_splat_spz(path: Path, table: np.ndarray) -> None:
         format="ply",
     )
     # places are numbers of 24 bits with a sign
-    room = 23 - math.ceil(math.log2(np.abs(place).max(initial=1e-6) * 1.001))
+    bits_left = 23 - math.ceil(math.log2(np.abs(place).max(initial=1e-6) * 1.001))
     widest = table["deviations"].max(axis=1)
     wanted = math.ceil(math.log2(STEPS_OF_PLACE / widest.min(initial=1)))
     with atomic_path(path) as temporary:
-        write_spz(temporary, data, fractional_bits=max(0, min(room, wanted)))
+        write_spz(temporary, data, fractional_bits=max(0, min(bits_left, wanted)))
         with temporary.open("r+b") as file:  # gzip's time of writing, the one byte that differs
             file.seek(4)
             file.write(bytes(4))

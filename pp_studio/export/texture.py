@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from pp_cl import Camera, Picture, Run
+from pp_cl import Camera, RenderedView, Run
 from pp_cl.errors import require
 from pp_cl.files import atomic_file, to_8bit
 from pp_studio.export.fusion import COVERED
@@ -23,7 +23,7 @@ from pp_studio.export.observe import progress
 
 FACES = 60_000  # at most: marching cubes make more of the same surface
 SIDE = 2048  # texels
-HIDDEN = 1.5  # edges of the grid behind what a view shows: a texel there is hidden
+HIDDEN = 1.5  # voxel sizes behind what a view shows: a texel there is hidden
 LEAST_COSINE = 0.2  # between a texel's normal and the direction to an eye that sees it
 SHARPNESS = 6  # power of that cosine in a view's weight: the best views make up most of a colour
 
@@ -112,7 +112,7 @@ def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     seen, hidden = (np.zeros((len(positions), 4)) for _ in range(2))
     for camera in progress(run.cameras("train"), "texture"):
         colours, ahead, cosine = _looked_up(
-            run.render(camera), camera, positions, normals, HIDDEN * run.model.grid.edge
+            run.render(camera), camera, positions, normals, HIDDEN * run.model.grid.voxel_size
         )
         weight = np.where(ahead & (cosine > LEAST_COSINE), np.maximum(cosine, 0) ** SHARPNESS, 0)
         seen += weight[:, None] * colours
@@ -121,21 +121,21 @@ def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return total[:, :3] / np.maximum(total[:, 3:], 1e-12)
 
 
-def _looked_up(picture: Picture, camera: Camera, positions, normals, behind):
-    """(colours (T, 4), with 1 where the picture shows the object and 0 elsewhere; whether texels
+def _looked_up(rendered: RenderedView, camera: Camera, positions, normals, behind):
+    """(colours (T, 4), with 1 where the rendering shows the object and 0 elsewhere; whether texels
     are not hidden; cosines between their normals and the directions to the eye).
     """
     x, y, z = camera.project(positions)
     shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     place = np.stack([np.where(shown, y, 0.5) - 0.5, np.where(shown, x, 0.5) - 0.5])
     row, column = np.rint(place).astype(int).clip(0, [[camera.height - 1], [camera.width - 1]])
-    shown &= picture.alpha[row, column] >= COVERED
-    rgba = picture.rgba()
+    shown &= rendered.alpha[row, column] >= COVERED
+    rgba = rendered.rgba()
     channels = [map_coordinates(rgba[..., c], place, order=1, mode="nearest") for c in range(3)]
     colours = np.stack([*channels, np.ones(len(z))], 1) * shown[:, None]
     towards = camera.eye - positions
     cosine = (normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
-    return colours, shown & (z < picture.median_depth[row, column] + behind), cosine
+    return colours, shown & (z < rendered.median_depth[row, column] + behind), cosine
 
 
 def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:

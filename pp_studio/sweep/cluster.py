@@ -56,8 +56,8 @@ def run_job(job: Job, device: str | None, is_stopped: Callable[[], bool]) -> dic
     """The row of a job, trained and evaluated as far as it is not; a failed one says why. What is
     printed meanwhile is appended to the job's log.
 
-    is_stopped: asked before the first step and after each; where it is true, the training
-    ends with a checkpoint.
+    is_stopped: asked before the first step and after each; where it is true, the training ends with
+    a checkpoint.
     """
     try:
         log = open(job.log, "a", buffering=1, encoding="utf-8")  # noqa: SIM115

@@ -67,12 +67,12 @@ def markdown(rows: Sequence[Row]) -> str:
     """
     means = scene_means(rows)
     shown = [key for key in COLUMNS if any(key in row for row in means)]
-    entries = [(row["scene"], row["runs"], row["failed"], "", row) for row in means]
+    labelled = [(row["scene"], row["runs"], row["failed"], "", row) for row in means]
     if len({row["scene"] for row in means}) > 1:
         overall = overall_means(means)
-        entries += [("mean", row["scenes"], row["missing"], " scenes", row) for row in overall]
+        labelled += [("mean", row["scenes"], row["missing"], " scenes", row) for row in overall]
     lines = [["run", "number", *(COLUMNS[key][0] for key in shown)]]
-    for name, good, bad, what, row in entries:
+    for name, good, bad, what, row in labelled:
         count = f"{good} of {good + bad}{what}" if bad else f"{good}{what}"
         cells = [_cell(row, key) for key in shown]
         lines.append([f"{name} {_setting(row)}".strip().replace("|", "\\|"), count, *cells])

@@ -14,7 +14,7 @@ from pp_cl.files import linear_to_srgb, srgb_to_linear, to_8bit
 
 SHOWN = ("colour", "alpha", "depth", "normals", "fragments", "error", "photograph")
 OWN_CAMERA = SHOWN[5:]  # are shown from the nearest training view's own camera
-ERROR_GAIN = 4  # times an error is shown
+ERROR_SCALE = 4  # times an error is shown
 DARK = np.array([23, 24, 27]) / 255  # sRGB, where nothing is
 LEAST_ALPHA = 0.5  # of a pixel that has a depth to look at: those below mix edge and background
 # eleven colours of viridis, from low to high (matplotlib, CC0)
@@ -31,11 +31,11 @@ def draw(
     show: str = "colour",
     *,
     early_stop: float | None = None,
-    kept: float = 1.0,
+    share: float = 1.0,
     exposure: float = 0.0,
 ) -> tuple[np.ndarray, str]:
     """((H, W, 3) uint8, a line on what it shows). views: the run's training views, none where its
-    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. kept: share of
+    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. share: of
     the points, the most opaque ones, in (0, 1]. exposure: in stops. Raises UserError where there is
     no photograph to show, and where the model computes NaN.
     """
@@ -48,7 +48,7 @@ def draw(
     if show == "photograph":
         image = to_8bit(truth)
     else:
-        shown = most_opaque(run, kept) if kept < 1 else run
+        shown = most_opaque(run, share) if share < 1 else run
         image, scale = _rendered(shown, camera, show, early_stop, truth)
         line += scale
     if exposure:
@@ -62,23 +62,23 @@ def _rendered(run, camera, show, early_stop, truth):
     if show == "fragments":
         # the whole view, as until="weights" would change the buffers that a training goes on with
         options = {"early_stop": early_stop, "depth_range": run.depth_range(camera)}
-        hits = run.renderer.forward(camera, run.gamma, **options).fragments()
-        return colour_scale(hits, 0, hits.max(), hits > 0), f"0 to {hits.max()} fragments"
-    picture = run.render(camera, early_stop=early_stop)
-    is_known = picture.alpha >= LEAST_ALPHA
+        counts = run.renderer.forward(camera, run.gamma, **options).fragments()
+        return colour_scale(counts, 0, counts.max(), counts > 0), f"0 to {counts.max()} fragments"
+    rendered = run.render(camera, early_stop=early_stop)
+    is_known = rendered.alpha >= LEAST_ALPHA
     if show == "alpha":
-        return to_8bit(np.repeat(picture.alpha[..., None], 3, axis=2)), ""
+        return to_8bit(np.repeat(rendered.alpha[..., None], 3, axis=2)), ""
     if show == "depth":
         centre, radius = run.ball
         middle = (centre - camera.eye) @ camera.pose[:, 2]
         low, high = max(middle - radius, 0.0), max(middle + radius, 0.0)
-        return colour_scale(picture.depth, low, high, is_known), f"{low:.3g} to {high:.3g}"
+        return colour_scale(rendered.depth, low, high, is_known), f"{low:.3g} to {high:.3g}"
     if show == "normals":
-        normals = normals_from_depth(np.where(is_known, picture.depth, np.nan), camera)
+        normals = normals_from_depth(np.where(is_known, rendered.depth, np.nan), camera)
         return to_8bit(np.where(np.isnan(normals), DARK, (normals + 1) / 2)), ""
     if show == "error":
-        return to_8bit(ERROR_GAIN * np.abs(picture.colour - truth)), f", error x{ERROR_GAIN}"
-    return to_8bit(picture.colour), ""
+        return to_8bit(ERROR_SCALE * np.abs(rendered.colour - truth)), f", error x{ERROR_SCALE}"
+    return to_8bit(rendered.colour), ""
 
 
 def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:

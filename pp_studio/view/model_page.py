@@ -1,4 +1,4 @@
-"""The page of a model: pictures of it for each tab's camera, the training views as frustums,
+"""The page of a model: renderings of it for each tab's camera, the training views as frustums,
 switches, a path of cameras, and the curve of its training.
 
 viser's threads only note what tabs want; draw_next() draws it, in the thread that has the device.
@@ -25,7 +25,7 @@ from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 
 STILL = 0.2  # seconds without movement until the full resolution is drawn
 DRAFT = 4  # times fewer pixels each way while the camera moves
-MOST_PIXELS = 2**23  # of a picture
+MOST_PIXELS = 2**23  # of a rendering
 SIZES = {"half": 0.5, "as trained": 1.0, "double": 2.0}
 FPS = 30  # of a path, as `pp-cl render` has it
 MOST_ROWS = 500  # of the curve
@@ -36,7 +36,7 @@ BLUE, ORANGE, GREY = "#7fb4ff", "#ffb86b", "#a0a4ab"
 @dataclass
 class Tab:
     """A tab of a browser: its camera, with the tab's pixels; when (time.monotonic()) that or a
-    switch last changed; when the last draft was drawn, and the last picture of full size.
+    switch last changed; when the last draft was drawn, and the last rendering of full size.
     """
 
     client: Any
@@ -48,7 +48,7 @@ class Tab:
 
 class ModelPage:
     """run: may be replaced by that of another checkpoint. views: its training views, none where the
-    photographs are gone. most_pixels: of a picture. is_training: the model changes while it is
+    photographs are gone. most_pixels: of a rendering. is_training: the model changes while it is
     shown, and has no memory for a copy. woken: is set when a tab wants something.
     """
 
@@ -95,21 +95,23 @@ class ModelPage:
         self._stop = gui.add_slider(
             "Early stop", min=0.0, max=0.5, step=0.001, initial_value=early_stop
         )
-        self._kept = gui.add_slider(
+        self._share = gui.add_slider(
             "Points kept, %", min=1, max=100, step=1, initial_value=100, visible=not is_training
         )
         self._exposure = gui.add_slider(
             "Exposure, stops", min=-3.0, max=3.0, step=0.1, initial_value=0.0
         )
-        self._size = gui.add_dropdown("Picture size", tuple(SIZES), initial_value="as trained")
+        self._size = gui.add_dropdown("Image size", tuple(SIZES), initial_value="as trained")
         self._shown = gui.add_checkbox("Training views", True, hint="click one to go there")
-        trained = [(one, one.value) for one in (self._stop, self._kept, self._exposure, self._size)]
+        trained = [
+            (one, one.value) for one in (self._stop, self._share, self._exposure, self._size)
+        ]
         for handle in (self._show, self._shown, *(one for one, _ in trained)):
             handle.on_update(self._switched)
         gui.add_button("As trained").on_click(
             lambda _: [setattr(handle, "value", value) for handle, value in trained]
         )
-        gui.add_button("Save picture").on_click(self._want_file)
+        gui.add_button("Save image").on_click(self._want_file)
 
     def _add_path_and_curve(self):
         gui = self._server.gui
@@ -196,7 +198,7 @@ class ModelPage:
         """Draw what a tab waits for, that which has waited longest; whether there was anything."""
         self.woken.clear()
         if self._wanted:
-            self._send_picture(self._wanted.pop(0))
+            self._send_image(self._wanted.pop(0))
             return True
         for tab in sorted(self._tabs.values(), key=lambda tab: max(tab.drafted, tab.drawn)):
             now = time.monotonic()
@@ -218,8 +220,8 @@ class ModelPage:
         self._status.content = f"step {step} of {steps}, {points} points\n\n{line}"
 
     def _camera(self, tab):
-        """Of the picture that fills a tab, with the focal length of the training's images times the
-        size that is chosen; less where the picture would be too large.
+        """Of the rendering that fills a tab, with the focal length of the training's images times
+        the size that is chosen; less where the rendering would be too large.
         """
         camera = tab.camera
         width, height = camera.width, camera.height
@@ -232,8 +234,8 @@ class ModelPage:
 
     def _image(self, camera):
         """What draw() makes of it, as the switches say; None where it refuses, and told why."""
-        stop, kept, exposure = map(_value, (self._stop, self._kept, self._exposure))
-        options = {"early_stop": stop, "kept": kept / 100, "exposure": exposure}
+        stop, share, exposure = map(_value, (self._stop, self._share, self._exposure))
+        options = {"early_stop": stop, "share": share / 100, "exposure": exposure}
         try:
             return draw(self.run, self._views, camera, self._show.value, **options)
         except UserError as error:
@@ -241,7 +243,7 @@ class ModelPage:
             return None
 
     def _send(self, tab, is_draft):
-        """Draw the picture that a tab shows behind its frustums."""
+        """Draw the rendering that a tab shows behind its frustums."""
         start, camera = time.perf_counter(), self._camera(tab)
         if is_draft:
             most = min(camera.width, camera.height) // MIN_SIDE
@@ -255,7 +257,7 @@ class ModelPage:
                 took = f"{1e3 * (time.perf_counter() - start):.0f} ms on {self.run.dev.name}"
                 self.tell(f"{line}\n\n{image.shape[1]}x{image.shape[0]}, {took}")
 
-    def _send_picture(self, tab):
+    def _send_image(self, tab):
         """Draw what a tab shows into a file that its user keeps."""
         if found := self._image(self._camera(tab)):
             file = io.BytesIO()

@@ -14,7 +14,7 @@ from pp_studio.view.model_page import ModelPage
 from pp_studio.view.server import started
 
 POLL = 1.0  # seconds between two looks at checkpoint and log
-BREAK = 2.0  # times what a picture took, in which a training is left alone: it gets two thirds
+BREAK = 2.0  # times what a rendering took, in which a training is left alone: it gets two thirds
 RENEWED = 1.0  # seconds after which a tab that rests sees the training's model again
 
 
@@ -90,7 +90,7 @@ def logged(folder: RunFolder) -> list[dict[str, Any]]:
 
 @contextmanager
 def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
-    """Show a training until the block ends: (address, what to call after each step). Pictures are
+    """Show a training until the block ends: (address, what to call after each step). Images are
     drawn there, between two steps, and leave the bits of the training as they are: they use the
     buffers that its previews use.
     """

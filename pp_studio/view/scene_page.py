@@ -1,4 +1,4 @@
-"""The page of a scene: its cameras with their photographs, its points, its box and the views that
+"""The page of a scene: its cameras with their images, its points, its box and the views that
 are left out. What the user changes about box and views is written to the scene's folder at once.
 """
 
@@ -97,7 +97,7 @@ class ScenePage:
             gui.add_button("Set").on_click(
                 lambda _: self._change(box=[corner.value for corner in self._corners])
             )
-            self._remove = gui.add_button("Remove", hint="leave the box to the photographs")
+            self._remove = gui.add_button("Remove", hint="leave the box to the images")
             self._remove.on_click(lambda _: self._change(box=None))
         with gui.add_folder("View"):
             self._view = gui.add_dropdown("Name", names)
@@ -105,7 +105,7 @@ class ScenePage:
             self._drop = gui.add_button("Drop", hint="leave this view out, or take it back")
             self._drop.on_click(lambda _: self._change(toggled=self._view.value))
             gui.add_button("Keep all").on_click(lambda _: self._change(dropped=frozenset()))
-            self._photograph = gui.add_image(UNREADABLE)
+            self._image = gui.add_image(UNREADABLE)
 
     def _box(self):
         """((2, 3) box of the user or the format, else a suggestion; whether it is none)."""
@@ -149,7 +149,7 @@ class ScenePage:
 
     def _choose(self, _event=None):
         with self._lock:
-            self._photograph.image = self._read(self._view.value)
+            self._image.image = self._read(self._view.value)
             self._tell("")
 
     def _tell(self, line):
@@ -174,8 +174,8 @@ class ScenePage:
             end.position, handle.value = at, tuple(corner.tolist())
         chosen = self._view.value
         for name, frustum in self._frustums.items():
-            kept = CHOSEN if name == chosen else VIEW
-            frustum.color = DROPPED if name in dropped else kept
+            usual = CHOSEN if name == chosen else VIEW
+            frustum.color = DROPPED if name in dropped else usual
         self._remove.disabled = not is_given
         self._drop.label = "Take back" if chosen in dropped else "Drop"
         count, views = len(self._frustums.keys() - dropped), len(self._frustums)
@@ -190,8 +190,8 @@ class ScenePage:
         self._server.sleep_forever()
 
     def fill(self) -> None:
-        """Put the photographs into the frustums; and where the scene brings no points, show those
-        of a coarse visual hull of its masks.
+        """Put the images into the frustums; and where the scene brings no points, show those of a
+        coarse visual hull of its masks.
         """
         for name, frustum in self._frustums.items():
             frustum.image = self._read(name)

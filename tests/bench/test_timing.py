@@ -1,4 +1,4 @@
-"""Runs take turns, errors are what they say, rows become lines and a picture."""
+"""Runs take turns, errors are what they say, rows become lines and an image."""
 
 import numpy as np
 import pytest

@@ -54,8 +54,8 @@ def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypat
 def test_no_other_file_becomes_json(tmp_path):
     for name in "ab":
         write_png(tmp_path / f"{name}.png", np.zeros((16, 16, 3)))
-    pictures, before = [str(tmp_path / f"{n}.png") for n in "ab"], (tmp_path / "a.png").read_bytes()
-    for words in (["--json", *pictures], [*pictures, "--json", pictures[0]]):
+    images, before = [str(tmp_path / f"{n}.png") for n in "ab"], (tmp_path / "a.png").read_bytes()
+    for words in (["--json", *images], [*images, "--json", images[0]]):
         assert "before --json" in failure("compare", *words)
     assert (tmp_path / "a.png").read_bytes() == before
 

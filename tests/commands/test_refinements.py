@@ -8,14 +8,14 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 
-OPEN = {"points__count": 60, "train__refine_at": "0,0", "train__iterations": 30}
+AUTOMATIC = {"points__count": 60, "train__refine_at": "0,0", "train__iterations": 30}
 
 
 def test_too_little_memory_makes_the_finest_grid_coarser(tmp_path, capsys):
     """It is refined all the same: 60 points for ever are 11 pixels apart."""
     scene, told = write_ball_scene(tmp_path / "ball", size=96), []
     for name, gib in (("enough", 0), ("less", 0.03)):
-        words = arguments(scene, tmp_path / name, 1, **OPEN, train__memory_gib=gib)
+        words = arguments(scene, tmp_path / name, 1, **AUTOMATIC, train__memory_gib=gib)
         assert main(words) == 0
         hull = re.search(r"\((\S+) pixels, then (\S+)\),", capsys.readouterr().out)
         told.append([float(pixels) for pixels in hull.groups()])

@@ -150,7 +150,6 @@ REFUSED = [
         for box in ("1,2,3", "0,0,0,1,1,0", "a,0,0,1,1,1")
     ),
     ("bench raster --scene moon", "--scene"),
-    ("bench train --points 10,20", "--points"),
     ("export run --format ply --length a:1,2 b:1,2 x", "--length"),
     ("export run --format ply --length a b 1", "PHOTO:X,Y"),
     ("render run --seconds 0.001", "--seconds"),

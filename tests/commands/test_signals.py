@@ -54,8 +54,8 @@ def test_a_signal_in_the_last_step_changes_nothing(scene, whole, tmp_path, monke
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
 
 
-@pytest.mark.parametrize("at, kept", [(25, 20), (1, None)])
-def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch, at, kept):
+@pytest.mark.parametrize("at, saved", [(25, 20), (1, None)])
+def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch, at, saved):
     """Both come in a step; what is promised is the last checkpoint, where there is one."""
     train_step, file = Trainer.train_step, tmp_path / "run" / "checkpoint.npz"
 
@@ -68,8 +68,8 @@ def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch, at,
     monkeypatch.setattr(Trainer, "train_step", stepping)
     assert main(arguments(scene, tmp_path / "run")) == 130
     *_, line = capsys.readouterr().err.splitlines()
-    assert ("goes on from" if kept else "starts over") in line
-    assert load_checkpoint(file)[0]["step"] == kept if kept else not file.exists()
+    assert ("goes on from" if saved else "starts over") in line
+    assert load_checkpoint(file)[0]["step"] == saved if saved else not file.exists()
 
 
 def test_other_commands_promise_nothing(capsys, monkeypatch):

@@ -63,7 +63,7 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
     assert "preset is small there" in told
 
 
-def test_what_a_training_has_decided_is_decided_anew(tmp_path, monkeypatch):
+def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
     """Of images of another size: by a start without a checkpoint, and with --config."""
     scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
     words = arguments(scene, folder.path, train__refine_at="0,0", raster__radius=0)
@@ -71,7 +71,7 @@ def test_what_a_training_has_decided_is_decided_anew(tmp_path, monkeypatch):
         patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
         assert main(words) == 2
     stored = load_config(folder.config)
-    assert stored.decided == ["train.refine_at", "raster.radius"] and stored.raster.radius > 0
+    assert stored.automatic == ["train.refine_at", "raster.radius"] and stored.raster.radius > 0
     config = run_config(folder, scene)
     assert (config.train.refine_at, config.raster.radius) == ((0, 0), 0)
     _, given = begin_with(folder.config, [])
@@ -102,8 +102,8 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
 
     def saving(path, header, arrays):
         rows = [json.loads(line) for line in folder.log.read_text().splitlines()]
-        pictures = sorted(int(path.stem[5:]) for path in folder.previews.iterdir())
-        found[header["step"]] = rows[-1]["step"], rows[-1].get("finished"), pictures[-1:]
+        images = sorted(int(path.stem[5:]) for path in folder.previews.iterdir())
+        found[header["step"]] = rows[-1]["step"], rows[-1].get("finished"), images[-1:]
         save_checkpoint(path, header, arrays)
 
     monkeypatch.setattr("pp_cl.session.training.save_checkpoint", saving)

@@ -24,7 +24,7 @@ from pp_cl.engine.training.loss import TAPS
 
 
 def fake(platform, name, gpu=False, problem=None, index="0:0"):
-    """An entry of list_devices() that is never opened."""
+    """An item of list_devices() that is never opened."""
     kind = cl.device_type.GPU if gpu else cl.device_type.CPU
     return (
         index,
@@ -40,7 +40,9 @@ def listed(monkeypatch):
     """
     monkeypatch.setattr(drivers, "Device", lambda d: d)
     monkeypatch.delenv("PP_DEVICE", raising=False)
-    return lambda *entries: monkeypatch.setattr(drivers, "list_devices", lambda **_: list(entries))
+    return lambda *listed_devices: monkeypatch.setattr(
+        drivers, "list_devices", lambda **_: list(listed_devices)
+    )
 
 
 def test_listed_devices_are_probed(session_device):
@@ -66,14 +68,14 @@ CHOICES |= {"Intel(R) Xeon(R)": 1, "xeon": 0}
 @pytest.mark.parametrize("choice", CHOICES)
 @pytest.mark.parametrize("variable", [False, True])
 def test_choice_by_index_and_name(listed, monkeypatch, choice, variable):
-    entries = [
+    listed_devices = [
         fake("Portable Computing Language", "cpu-haswell-Intel(R) Xeon(R)"),
         fake("Intel(R) OpenCL", "Intel(R) Xeon(R)", index="1:0"),
         fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1"),
     ]
-    listed(*entries)
+    listed(*listed_devices)
     monkeypatch.setenv("PP_DEVICE", choice if variable else "0:0")  # an argument comes first
-    assert open_device(None if variable else choice) is entries[CHOICES[choice]][1]
+    assert open_device(None if variable else choice) is listed_devices[CHOICES[choice]][1]
 
 
 def test_what_cannot_be_opened_is_told_and_not_replaced(listed):

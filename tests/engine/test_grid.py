@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from pp_cl.engine.grid import MOST_IDS, Grid, smallest_edge
+from pp_cl.engine.grid import MOST_IDS, Grid, smallest_voxel_size
 
 FAR = np.array([1e6, -1e6, 1e6])
 
@@ -18,8 +18,8 @@ def grid(rng):
 
 def test_a_rounded_grid_is_the_same_to_float32(grid):
     rounded = grid.rounded()
-    assert rounded.edge == np.float32(grid.edge) and rounded.dims == grid.dims
-    unit = 2.0**-30  # of an edge of 24 bits between 2^-7 and 2^-6
+    assert rounded.voxel_size == np.float32(grid.voxel_size) and rounded.dims == grid.dims
+    unit = 2.0**-30  # of a voxel size of 24 bits between 2^-7 and 2^-6
     np.testing.assert_allclose(rounded.origin, grid.origin, rtol=0, atol=unit / 2)
     assert all((Fraction(x) / Fraction(unit)).denominator == 1 for x in rounded.origin)
     assert rounded.rounded() == rounded
@@ -34,7 +34,7 @@ def test_vertices_of_a_rounded_grid_move_exactly(grid, by):
     assert (far.packed(far.centre) == near.packed(near.centre)).all()
     assert (far.refined().centre == far.centre).all()
     exact = [
-        Fraction(x) + Fraction(near.edge) * (n - 1) / 2 - Fraction(c)
+        Fraction(x) + Fraction(near.voxel_size) * (n - 1) / 2 - Fraction(c)
         for x, n, c in zip(near.origin, near.dims, near.centre, strict=True)
     ]
     assert exact == [0, 0, 0]
@@ -44,20 +44,20 @@ def test_a_packed_grid_counts_from_the_centre(grid):
     packed = grid.packed((0.5, -0.25, 1.0))
     assert packed.dtype == np.float32
     np.testing.assert_allclose(packed[:3], np.array(grid.origin) - [0.5, -0.25, 1.0], rtol=1e-6)
-    assert packed[3:].tolist() == [np.float32(grid.edge), 45, 37, 30, 0]
+    assert packed[3:].tolist() == [np.float32(grid.voxel_size), 45, 37, 30, 0]
 
 
 @pytest.mark.parametrize("by", [0, FAR])
-def test_the_smallest_edge_depends_on_the_size_alone(by):
+def test_the_smallest_voxel_size_depends_on_the_size_alone(by):
     box = np.array([[-1.0, -2.0, 0.5], [1.0, 2.0, 0.5]])  # flat
-    edge = smallest_edge(box + by, 1000)
-    assert edge == pytest.approx(smallest_edge(box, 1000), rel=1e-9)
-    assert np.prod(np.maximum(np.ptp(box, axis=0), 0) // edge + 1) <= 1000
+    voxel_size = smallest_voxel_size(box + by, 1000)
+    assert voxel_size == pytest.approx(smallest_voxel_size(box, 1000), rel=1e-9)
+    assert np.prod(np.maximum(np.ptp(box, axis=0), 0) // voxel_size + 1) <= 1000
 
 
 def test_a_header_of_huge_integers_is_one_of_floats():
     """JSON has them without a point, and numpy would keep them as objects."""
-    grid = Grid.of_header({"origin": [10**25, 0, -1], "edge": 1, "dims": [2, 3, 4]})
+    grid = Grid.of_header({"origin": [10**25, 0, -1], "voxel_size": 1, "dims": [2, 3, 4]})
     assert grid == Grid((1e25, 0.0, -1.0), 1.0, (2, 3, 4))
     assert grid.centre.dtype == np.float64 and grid.packed(grid.centre).dtype == np.float32
 

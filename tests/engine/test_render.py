@@ -1,4 +1,4 @@
-"""The stages in their order: whole pictures and their gradients against the float64 twins chained
+"""The stages in their order: whole images and their gradients against the float64 twins chained
 together.
 """
 
@@ -22,30 +22,30 @@ GAMMA = 0.03
 
 
 def chained(model, settings, camera):
-    """Float64 (picture, function from its gradient to those of the points' features, of their
+    """Float64 (image, function from its gradient to those of the points' features, of their
     opacities and of the network) of the padded camera.
     """
     padded, _, _ = camera.padded(4)
     positions, opacity = GRID.positions(model.cloud.ids.get()), model.cloud.opacity.get()
     sh = np.concatenate([array.get() for array in model.cloud.sh], 1)
-    unit = GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / 4
+    unit = GRID.voxel_size if settings.footprint == "soft" else np.ptp(model.depth_range) / 4
     geometry = oracle_raster.geometry(padded, positions, settings.radius * unit, settings.footprint)
     blend = oracle_raster.blend_by_rule(
         settings.blend, geometry, opacity, GAMMA, settings.early_stop
     )
-    shaded = oracle_raster.shade(positions, padded.eye, sh)
-    features = oracle_raster.features(blend, shaded)
+    point_features = oracle_raster.shade(positions, padded.eye, sh)
+    features = oracle_raster.features(blend, point_features)
     parameters = plain_parameters(model.net, model.net.parameters)
     shape = (padded.height, padded.width)
     layers = model.net.layers
     outputs = network(layers, parameters, features.reshape(*shape, 16))
     active = {name: values > 0 for name, values in outputs.items()}
 
-    def backward(grad_picture):
-        grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_picture)
+    def backward(grad_image):
+        grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_image)
         grad_features = grad_net.pop("x").reshape(-1, 16)
         of_points = oracle_raster.gradients(
-            geometry, blend, shaded, grad_features, max_tracked=settings.max_tracked
+            geometry, blend, point_features, grad_features, max_tracked=settings.max_tracked
         )
         return *of_points, grad_net
 
@@ -65,30 +65,30 @@ SETTINGS = {
 @pytest.mark.parametrize("blend", BLENDS)
 @pytest.mark.parametrize("early_stop", [0.0, 0.001])
 @pytest.mark.parametrize("name", SETTINGS)
-def test_picture_and_gradients(dev, rng, name, early_stop, blend):
+def test_image_and_gradients(dev, rng, name, early_stop, blend):
     settings = RasterConfig(blend=blend, early_stop=early_stop, **SETTINGS[name])
     model, camera = make_model(dev, rng), ring_cameras(1, 30)[0].crop(3, 4, 22, 17)
     renderer = Renderer(dev, model, settings)
     result = renderer.forward(camera, GAMMA, training=True)
-    picture = result.image.get()
+    image = result.image.get()
     expected, backward = chained(model, settings, camera)
-    assert picture.shape == (20, 24, 3) and relative_error(picture, expected) < 1e-5
+    assert image.shape == (20, 24, 3) and relative_error(image, expected) < 1e-5
 
-    grad = rng.normal(size=picture.shape).astype(np.float32)
+    grad = rng.normal(size=image.shape).astype(np.float32)
     gradients = renderer.backward(result, dev.upload(grad))
-    shaded = result.weights.shaded.get()
+    visible = result.weights.visible.get()
     want_features, want_opacity, want_net = backward(grad)
     assert np.abs(want_features).max() > 0 and np.abs(want_opacity).max() > 0
-    assert not np.delete(want_features, shaded, axis=0).any()
-    assert not np.delete(want_opacity, shaded).any()
-    features, opacity = gradients.shaded_features.get(), gradients.opacity.get()
-    assert relative_error(features[: len(shaded)], want_features[shaded]) < 5e-5
-    assert relative_error(opacity[: len(shaded)], want_opacity[shaded]) < 5e-5
+    assert not np.delete(want_features, visible, axis=0).any()
+    assert not np.delete(want_opacity, visible).any()
+    features, opacity = gradients.visible_features.get(), gradients.opacity.get()
+    assert relative_error(features[: len(visible)], want_features[visible]) < 5e-5
+    assert relative_error(opacity[: len(visible)], want_opacity[visible]) < 5e-5
     for key, value in plain_parameters(model.net, model.net.gradients).items():
         assert relative_error(value, want_net[key]) < 5e-5, key
 
 
-def test_padding_does_not_move_the_picture(dev, rng):
+def test_padding_does_not_move_the_image(dev, rng):
     """A camera whose size is no multiple of 4 shows the same features as the larger one,
     cropped.
     """
@@ -111,7 +111,7 @@ def test_an_empty_view_is_the_background(dev, rng):
     np.testing.assert_array_equal(result.features.get(), np.ones((16, 16, 16), np.float32))
     assert np.isfinite(result.image.get()).all()
     renderer.backward(result, dev.upload(np.ones((16, 16, 3), np.float32)))
-    assert result.weights.shaded.size == 0
+    assert result.weights.visible.size == 0
 
 
 def test_a_call_may_see_beyond_the_models_depth_range(dev, rng):

@@ -106,9 +106,9 @@ def test_where_the_demos_network_is_taken(dev, scene, widths, is_taken):
     net = begin_network(dev, config)
     plain = UNet.of_settings(dev, config.network).parameters
     random = {name: dev.download(array) for name, array in plain.items()}
-    with np.load(DEMO_NETWORK) as kept:
+    with np.load(DEMO_NETWORK) as stored:
         for name, array in net.parameters.items():
-            expected = kept[f"net.{name}"] if is_taken else random[name]
+            expected = stored[f"net.{name}"] if is_taken else random[name]
             np.testing.assert_array_equal(dev.download(array), expected)
 
 
@@ -165,14 +165,14 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     assert losses[-1] < losses[0]
 
 
-def test_the_spread_brings_the_hits_of_a_pixel_together(scene, tmp_path):
+def test_the_distortion_loss_brings_the_fragments_of_a_pixel_together(scene, tmp_path):
     """Their mean depth and their median depth differ less."""
     apart = []
     for weight in (0, 30):
         out = tmp_path / str(weight)
-        assert main(arguments(scene, out, train__spread_weight=weight)) == 0
+        assert main(arguments(scene, out, train__distortion_weight=weight)) == 0
         run = load(out)
-        pictures = [run.render(view.camera) for view in run.scene("test").splits["test"]]
-        seen = [(p.depth[p.alpha > 0.5], p.median_depth[p.alpha > 0.5]) for p in pictures]
+        images = [run.render(view.camera) for view in run.scene("test").splits["test"]]
+        seen = [(p.depth[p.alpha > 0.5], p.median_depth[p.alpha > 0.5]) for p in images]
         apart.append(np.mean([np.abs(mean - median).mean() for mean, median in seen]))
     assert apart[1] < 0.7 * apart[0]

@@ -10,7 +10,7 @@ from support.models import drawn_alone
 
 import pp_cl.engine.network.unet
 from pp_cl.config import configure, preset
-from pp_cl.engine.device.buffers import Reading
+from pp_cl.engine.device.buffers import Pending
 from pp_cl.engine.device.device import Device, Program
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session.training import open_training
@@ -54,7 +54,7 @@ class Recorder:
         self._follow(monkeypatch, Device, "_allocate", "allocations")
         self._follow(monkeypatch, Device, "finish", "waits")
         self._follow(monkeypatch, Program, "launch", "launches")
-        self._follow(monkeypatch, Reading, "get", self._gets)
+        self._follow(monkeypatch, Pending, "get", self._gets)
 
     def _follow(self, monkeypatch, owner, name, counted):
         original = getattr(owner, name)
@@ -71,8 +71,8 @@ class Recorder:
         return "waits" if is_blocking and not on_device else "copies"
 
     @staticmethod
-    def _gets(reading):
-        event = reading._event
+    def _gets(pending):
+        event = pending._event
         there = event is None or event.command_execution_status == COMPLETE
         return "read" if there else "waits"
 

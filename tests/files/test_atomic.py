@@ -73,12 +73,12 @@ def test_a_name_that_is_no_utf_8_is_written_escaped(tmp_path):
 
 def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
     own = "pp-cl.tmp"
-    gone = [f".a.png.{DEAD}.{own}", f"x/y/.b.{DEAD}.{own}", f"x/.film.{DEAD}.{own}.mp4"]
+    gone = [f".a.png.{DEAD}.{own}", f"x/y/.b.{DEAD}.{own}", f"x/.video.{DEAD}.{own}.mp4"]
     gone.append(f".own.{os.getpid()}.{own}")  # of another process that had our number
-    kept = [f".{own}", f".a.{own}", f".a.b.{own}", f"a.{DEAD}.{own}", f".a.{DEAD}.{own}file"]
-    kept += ["x/log.jsonl", f".a.{DEAD}.tmp"]  # of another program
-    kept += [f".a.{os.getppid()}.{own}"] * (os.name == "posix")  # it is still being written
-    for name in gone + kept:
+    staying = [f".{own}", f".a.{own}", f".a.b.{own}", f"a.{DEAD}.{own}", f".a.{DEAD}.{own}file"]
+    staying += ["x/log.jsonl", f".a.{DEAD}.tmp"]  # of another program
+    staying += [f".a.{os.getppid()}.{own}"] * (os.name == "posix")  # it is still being written
+    for name in gone + staying:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("half")
     folder = tmp_path / "x" / f".page.{DEAD}.pp-cl.tmp"
@@ -86,7 +86,7 @@ def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
     (folder / "index.html").write_text("half")
     remove_leftovers(tmp_path)
     left = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
-    assert left == set(kept) and not folder.exists()
+    assert left == set(staying) and not folder.exists()
 
 
 def test_a_link_named_like_a_leftover_loses_nothing_behind_it(tmp_path):

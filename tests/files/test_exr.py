@@ -1,4 +1,4 @@
-"""OpenEXR files hold the values that went in, and are read as photographs."""
+"""OpenEXR files hold the values that went in, and are read as images."""
 
 from pathlib import Path
 
@@ -11,20 +11,20 @@ from support.scenes import write_ball_scene
 from pp_cl.errors import UserError
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_rgba
-from pp_cl.files.picture import Picture
+from pp_cl.files.rendered_view import RenderedView
 from pp_cl.files.srgb import srgb_to_linear
 from pp_cl.scene.load import load_scene
 
 
 @pytest.fixture
 def shown(rng):
-    """A picture with features and a pixel of background."""
+    """An image with features and a pixel of background."""
     alpha = rng.random((9, 4)).astype(np.float32)
     alpha[0, 0] = 0
     depth = np.where(alpha > 0, 4 * alpha, np.inf).astype(np.float32)
     colour = np.maximum(rng.random((9, 4, 3)), 1 - alpha[..., None]).astype(np.float32)
     features = rng.normal(size=(9, 4, 16)).astype(np.float32)
-    return Picture(colour, alpha, depth, depth + 1, features)
+    return RenderedView(colour, alpha, depth, depth + 1, features)
 
 
 def test_all_channels_come_back(shown, tmp_path):
@@ -122,7 +122,7 @@ def test_gray_and_one_layer(tmp_path, rng):
     assert np.abs(read_rgba(tmp_path / "layer.exr")[..., 3] - 255 * plane).max() <= 1
 
 
-def test_what_a_picture_writes_is_what_it_shows(shown, tmp_path):
+def test_what_an_image_writes_is_what_it_shows(shown, tmp_path):
     write_exr(tmp_path / "a.exr", shown.channels())
     expected = 255 * shown.rgba()
     there = shown.alpha > 0.1

@@ -13,7 +13,7 @@ from support.refused import refusing
 
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import (
-    image_files,
+    image_paths,
     image_size,
     read_mask,
     read_rgba,
@@ -200,4 +200,4 @@ def test_to_8bit():
     ],
 )
 def test_every_image_has_a_file_of_its_own(names, files):
-    assert [str(path) for path in image_files(names)] == files
+    assert [str(path) for path in image_paths(names)] == files

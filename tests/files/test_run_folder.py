@@ -125,7 +125,7 @@ def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_p
     assert not list(folder.path.glob("*.tmp*")) and not list(folder.path.glob(".*.tmp*"))
 
 
-def test_pictures_without_a_checkpoint_go_and_others_stay(tmp_path):
+def test_images_without_a_checkpoint_go_and_others_stay(tmp_path):
     """They may show other settings; a file of the user is none of them, nor is one that the user
     has changed.
     """
@@ -136,7 +136,7 @@ def test_pictures_without_a_checkpoint_go_and_others_stay(tmp_path):
     for path in ours:
         write_png(path, np.zeros((8, 8, 3)))
     for path in others:
-        path.write_bytes(b"picture")
+        path.write_bytes(b"image")
     folder.checkpoint.write_bytes(b"whole")
     folder.create("{}")
     assert all(path.exists() for path in ours + others)
@@ -145,9 +145,9 @@ def test_pictures_without_a_checkpoint_go_and_others_stay(tmp_path):
     assert not any(path.exists() for path in ours) and all(path.exists() for path in others)
     write_png(ours[1], np.zeros((8, 8, 3)))
     ours[1].write_bytes(b"with an arrow")
-    folder.check_pictures(30)  # it would not be made again
+    folder.check_sheets(30)  # it would not be made again
     with pytest.raises(UserError, match=f"{ours[1]}: pp-cl did not write this"):
-        folder.check_pictures(29)
+        folder.check_sheets(29)
 
 
 def test_a_file_system_without_locks_is_one_line(tmp_path, monkeypatch):

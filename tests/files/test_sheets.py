@@ -1,4 +1,4 @@
-"""The picture of predictions beside the truth and the error."""
+"""The sheet of predictions beside the truth and the error."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from pp_cl.files.sheets import GAP, HEADER, contact_sheet, write_comparison
 
 
 def tile(picture, row, column, height, width):
-    """One image of the picture."""
+    """One image of the sheet."""
     y, x = HEADER + row * (HEADER + height + GAP), column * (width + GAP)
     return picture[y : y + height, x : x + width]
 
@@ -33,7 +33,7 @@ def test_predictions_stand_beside_the_truth_and_the_error(tmp_path, rng):
     assert (picture[:HEADER] < 128).any(), "no captions"
 
 
-def test_photographs_stand_row_by_row_under_their_names(rng):
+def test_images_stand_row_by_row_under_their_names(rng):
     images = [rng.integers(0, 256, (30, 40, 3), np.uint8) for _ in range(5)]
     picture = contact_sheet(images, list("abcde"), columns=3)
     height, width = HEADER + 30 + GAP, 40 + GAP

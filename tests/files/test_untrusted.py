@@ -38,7 +38,7 @@ def test_json_of_at_most_so_many_values(tmp_path, monkeypatch):
 
 
 def test_a_zip_of_a_bounded_directory(tmp_path, monkeypatch):
-    """Each entry of which takes more memory than its text."""
+    """Each item of which takes more memory than its text."""
     with ZipFile(tmp_path / "a.zip", "w") as archive:
         for i in range(9):
             archive.writestr(str(i), b"")

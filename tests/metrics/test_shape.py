@@ -33,8 +33,8 @@ def members(surface):
 
 
 def oracle(mesh, grid, samples):
-    """(samples, 3) float64 places of the samples in units of the edge from vertex 0."""
-    corners = (mesh.vertices[mesh.faces] - np.asarray(grid.origin)) / grid.edge
+    """(samples, 3) float64 places of the samples in units of the voxel size from vertex 0."""
+    corners = (mesh.vertices[mesh.faces] - np.asarray(grid.origin)) / grid.voxel_size
     sides = corners[:, 1:] - corners[:, :1]
     ends = np.cumsum(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1))
     s = np.arange(samples, dtype=np.uint64)
@@ -75,7 +75,7 @@ def test_the_grid_grows_around_the_mesh_in_step(dev):
     grid = Grid((0.3, 0.3, 0.3), 0.25, (2, 2, 2))
     surface = sample_surface(dev, SQUARE, grid, 100)
     np.testing.assert_allclose(surface.grid.origin, (-0.2, -0.2, -0.2), atol=1e-12)
-    assert surface.grid.dims == (6, 6, 4) and surface.grid.edge == grid.edge
+    assert surface.grid.dims == (6, 6, 4) and surface.grid.voxel_size == grid.voxel_size
 
 
 def test_overlap_by_hand():

@@ -15,7 +15,7 @@ from pp_cl.commands.info_facts import describe_scene
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import agreeing, build_grid
-from pp_cl.scene.outline import REJECTED, picture
+from pp_cl.scene.outline import REJECTED, outline_sheet
 
 BOX = np.stack([CENTRE - RADIUS, CENTRE + RADIUS])
 
@@ -77,9 +77,9 @@ def test_masks_that_lie_elsewhere_are_left_out(dev):
     moved = {3: 0.06, 17: -0.06, 40: 0.2}
     for index, share in moved.items():
         views[index] = shifted(views[index], share)
-    kept, left_out, forgiven = agreeing(dev, views)
+    agreed, left_out, forgiven = agreeing(dev, views)
     assert set(left_out) == {views[index].name for index in moved} and forgiven == 0
-    assert kept == [view for index, view in enumerate(views) if index not in moved]
+    assert agreed == [view for index, view in enumerate(views) if index not in moved]
     assert max(left_out, key=left_out.get) == views[40].name
 
 
@@ -88,12 +88,12 @@ def test_a_hull_forgives_masks_that_lack_a_part(dev):
     views = ball_views(60)
     for index in (3, 17, 29, 40):
         views[index] = bitten(views[index], 0.25)
-    kept, left_out, forgiven = agreeing(dev, views)
-    assert len(kept) == 60 and not left_out and 0 < forgiven <= 4
+    agreed, left_out, forgiven = agreeing(dev, views)
+    assert len(agreed) == 60 and not left_out and 0 < forgiven <= 4
     inside = CENTRE + 0.9 * RADIUS * directions(500)
     strict, forgiving = (build_grid(dev, views, 20_000, None, n) for n in (0, forgiven))
-    lost, kept = (far_from(hull, inside) for hull in (strict, forgiving))
-    assert lost.mean() > 0.2 > 2 * kept.mean()
+    lost, lost_less = (far_from(hull, inside) for hull in (strict, forgiving))
+    assert lost.mean() > 0.2 > 2 * lost_less.mean()
 
 
 def directions(count):
@@ -103,9 +103,9 @@ def directions(count):
 
 
 def far_from(hull, places):
-    """(P,) bool: which places have no vertex of the hull within two edges."""
+    """(P,) bool: which places have no vertex of the hull within two voxels."""
     distances, _ = cKDTree(hull.grid.positions(hull.ids)).query(places)
-    return distances > 2 * hull.grid.edge
+    return distances > 2 * hull.grid.voxel_size
 
 
 def test_two_wrong_masks_come_the_worst_first():
@@ -131,11 +131,11 @@ def scene(tmp_path):
     return folder
 
 
-def test_the_scenes_facts_name_it_and_the_picture_shows_it_first(dev, scene, tmp_path, capsys):
+def test_the_scenes_facts_name_it_and_the_image_shows_it_first(dev, scene, tmp_path, capsys):
     facts, *shown = describe_scene(dev, scene, "tiny")
     [told] = facts["masks"]["disagreeing"]
     assert told["view"] == "train/r_4.png" and told["share"] > 0.15
-    sheet, plain = picture(dev, *shown), picture(dev, *shown[:2])
+    sheet, plain = outline_sheet(dev, *shown), outline_sheet(dev, *shown[:2])
     first = sheet[14 : 14 + 48, :48].astype(int)
     tinted = (first[..., 0] >= REJECTED[0]) & (first[..., 2] <= 127) & (first[..., 1] >= 60)
     assert tinted.sum() > 50
@@ -144,7 +144,7 @@ def test_the_scenes_facts_name_it_and_the_picture_shows_it_first(dev, scene, tmp
     assert "train/r_4.png: its mask rejects" in capsys.readouterr().out
 
 
-def test_a_training_warns_leaves_the_picture_and_goes_on_without(scene, tmp_path, capsys):
+def test_a_training_warns_leaves_the_image_and_goes_on_without(scene, tmp_path, capsys):
     for steps in (2, 4):
         words = arguments(scene, tmp_path / "run", 1, train__iterations=steps, points__count=500)
         assert main(words) == 0

@@ -53,8 +53,8 @@ def test_the_mesh_is_the_object(dev):
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.is_watertight and mesh.body_count == 1 and mesh.volume > 0.25
     assert mesh.euler_number < -20, "rings and spokes enclose holes"
-    edge = 1.92 / 191
-    assert np.abs(distance(vertices.astype(np.float64))).max() < edge / 2
+    voxel_size = 1.92 / 191
+    assert np.abs(distance(vertices.astype(np.float64))).max() < voxel_size / 2
     assert (vertices.min(0) > OBJECT_BOX[0]).all() and (vertices.max(0) < OBJECT_BOX[1]).all()
     assert np.linalg.norm(vertices - [0, 0, -0.08], axis=1).max() < 1.05, (
         "the tracer's ball cuts the object"
@@ -85,5 +85,5 @@ def test_the_scene_shows_the_whole_mesh(dev):
     hull = build_grid(dev, train, 20000)
     ids = hull.grid.ids_of(np.ones(hull.grid.dims[::-1], bool))
     inside = distance(hull.grid.positions(ids)) < 0
-    kept = np.isin(ids, hull.ids)
-    assert inside.sum() > 2000 and kept[inside].all()
+    in_hull = np.isin(ids, hull.ids)
+    assert inside.sum() > 2000 and in_hull[inside].all()

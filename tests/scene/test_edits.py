@@ -33,7 +33,7 @@ def test_training_and_info_obey_the_box_and_leave_out_what_was_dropped(folder, t
     assert names == [f"train/r_{i}.png" for i in (0, 1, 3, 4, 5, 6, 7)]
     grid = header["grid"]
     low = np.array(grid["origin"])
-    high = low + grid["edge"] * (np.array(grid["dims"]) - 1)
+    high = low + grid["voxel_size"] * (np.array(grid["dims"]) - 1)
     assert (low >= np.array(BOX[0]) - 1e-6).all() and (high <= np.array(BOX[1]) + 1e-6).all()
     capsys.readouterr()
     assert main(["info", str(folder), "--json"]) == 0

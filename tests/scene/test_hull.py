@@ -1,4 +1,4 @@
-"""Visual hull and grid: the kernels against the float64 oracle, the search for the edge, the
+"""Visual hull and grid: the kernels against the float64 oracle, the search for the voxel size, the
 errors.
 """
 
@@ -97,17 +97,17 @@ def carvings(monkeypatch):
 
 @pytest.mark.large
 @pytest.mark.parametrize("points", (1000, 3000, 40000))
-def test_the_edge_is_found(dev, points, carvings):
+def test_the_voxel_size_is_found(dev, points, carvings):
     found = build_grid(dev, ball_views(), points)
     assert points <= len(found.ids) <= hull.TOLERANCE * points and not found.capped
     assert carvings[-1][1] == len(found.ids) and len(carvings) <= 1 + hull.ROUNDS
     assert found.ids.dtype == np.uint32 and (np.diff(found.ids.astype(np.int64)) > 0).all()
     ids = found.grid.ids_of(np.ones(found.grid.dims[::-1], bool))
-    lattice, kept_here = found.grid.positions(ids), np.isin(ids, found.ids)
+    lattice, in_hull = found.grid.positions(ids), np.isin(ids, found.ids)
     from_centre = np.linalg.norm(lattice - CENTRE, axis=1)
-    assert kept_here[from_centre < RADIUS].all(), "a vertex inside the ball is lost"
+    assert in_hull[from_centre < RADIUS].all(), "a vertex inside the ball is lost"
     pixel = 4 / 96
-    assert from_centre[kept_here].max() < 1.6 * RADIUS + 2 * pixel  # the hull of 12 tangent cones
+    assert from_centre[in_hull].max() < 1.6 * RADIUS + 2 * pixel  # the hull of 12 tangent cones
     for axis in range(3):  # the grid is tight
         reached = positions_of(found)[:, axis]
         np.testing.assert_allclose(
@@ -170,7 +170,7 @@ def test_depth_range_holds_every_point(dev, stated):
     distances = [np.linalg.norm(positions_of(found) - v.camera.eye, axis=1) for v in views]
     near, far = depth_range(views, found)
     assert 0 < near < np.min(distances) and far > np.max(distances)
-    half_diagonal = found.grid.edge * np.linalg.norm(found.grid.dims) / 2
+    half_diagonal = found.grid.voxel_size * np.linalg.norm(found.grid.dims) / 2
     if stated is None:
         assert far - near == pytest.approx(2 * hull.DEPTH_MARGIN * half_diagonal, rel=0.05)
     if stated == (1.0, 9.0):
@@ -186,15 +186,15 @@ def test_depth_range_of_close_cameras(dev, distance):
     near, far = depth_range([replace(ball_views()[0], stored_camera=camera)], found)
     distances = np.linalg.norm(positions_of(found) - camera.eye, axis=1)
     assert near > 0 and far > distances.max()
-    assert near < distances.min() if distance > 1 else near == found.grid.edge
+    assert near < distances.min() if distance > 1 else near == found.grid.voxel_size
 
 
 @pytest.mark.large
 def test_a_box_that_is_stated_bounds_what_the_masks_allow(dev):
     box = np.stack([CENTRE, CENTRE + [3, 0.4, 3]])
     found = build_grid(dev, ball_views(), 2000, box)
-    assert (found.grid.box[0] > box[0] - 2 * found.grid.edge).all()
-    assert (found.grid.box[1] < CENTRE + [1.6, 0.4 + 2 * found.grid.edge, 1.6]).all()
+    assert (found.grid.box[0] > box[0] - 2 * found.grid.voxel_size).all()
+    assert (found.grid.box[1] < CENTRE + [1.6, 0.4 + 2 * found.grid.voxel_size, 1.6]).all()
 
 
 @pytest.mark.parametrize("points", (0, -3, 2**27 + 1))

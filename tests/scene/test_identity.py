@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from support.scenes import move_scene, write_ball_scene
 
-from pp_cl.scene.identity import difference, identity, kept_views
+from pp_cl.scene.identity import difference, identity, unpacked_views
 from pp_cl.scene.image_file import pixel_digest
 from pp_cl.scene.load import load_scene, scene_frames
 from pp_cl.scene.masks import MaskRule
@@ -61,10 +61,10 @@ def test_names_cameras_and_depth_ranges_come_back_to_the_bit(folder):
     views = [replace(view, depth_range=None) for view in views_of(folder)]
     views[1] = replace(views[1], depth_range=(0.1, 7.3))
     listed[1] = replace(listed[1], depth_range=(0.1, 7.3))
-    kept = kept_views(json.loads(json.dumps(identity(views)["views"])))
-    for one, photograph in zip(kept, listed, strict=True):
-        assert np.array_equal(one.camera.pose, photograph.camera.pose)
-        lens = [replace(p, camera=replace(p.camera, pose=None)) for p in (one, photograph)]
+    packed = unpacked_views(json.loads(json.dumps(identity(views)["views"])))
+    for one, image_file in zip(packed, listed, strict=True):
+        assert np.array_equal(one.camera.pose, image_file.camera.pose)
+        lens = [replace(p, camera=replace(p.camera, pose=None)) for p in (one, image_file)]
         assert lens[0] == lens[1]
 
 

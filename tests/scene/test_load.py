@@ -8,9 +8,9 @@ from support.transforms_scenes import refused, write_scene
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
-from pp_cl.scene.distortion import BAND_BYTES, Distortion
-from pp_cl.scene.image_file import Photograph
-from pp_cl.scene.load import BAND_COPIES, load_scene, reading, scene_frames, scene_splits
+from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lens import BAND_BYTES, LensDistortion
+from pp_cl.scene.load import BAND_COPIES, load_scene, reading_cost, scene_frames, scene_splits
 from pp_cl.scene.masks import MaskRule
 from tools.scene_formats import nerfstudio
 
@@ -34,13 +34,13 @@ def test_missing_folder_format_and_split(tmp_path):
     refused(scene, scene, "no split test", "train, val", splits=("test",))
 
 
-def test_a_split_without_photographs(tmp_path):
+def test_a_split_without_images(tmp_path):
     """The first of every eight is for testing, so that a single one leaves none for training."""
     nerfstudio.write(tmp_path, {"train": views(1)})
     file = tmp_path / "transforms.json"
     file.write_text(file.read_text().replace("train_filenames", "names"))
     assert len(load_scene(tmp_path, ("test",)).splits["test"]) == 1
-    refused(tmp_path, tmp_path, "split train has no photographs")
+    refused(tmp_path, tmp_path, "split train has no images")
 
 
 @pytest.mark.parametrize("left", [0, 3])
@@ -62,26 +62,26 @@ def test_some_views_of_a_split_are_read_and_no_others(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "distortion, source, factor, workers, per_pixel",
+    "lens, source, factor, workers, per_pixel",
     [
-        (Distortion(), "given", 1, 3, 18),
-        (Distortion(k1=0.1), "given", 3, 3, 18),
-        (Distortion(), "color", 1, 1, 178),
-        (Distortion(k1=0.1), "color", 4, 2, 28),
+        (LensDistortion(), "given", 1, 3, 18),
+        (LensDistortion(k1=0.1), "given", 3, 3, 18),
+        (LensDistortion(), "color", 1, 1, 178),
+        (LensDistortion(k1=0.1), "color", 4, 2, 28),
     ],
 )
-def test_as_many_photographs_are_read_at_once_as_memory_holds(
-    monkeypatch, distortion, source, factor, workers, per_pixel
+def test_as_many_images_are_read_at_once_as_memory_holds(
+    monkeypatch, lens, source, factor, workers, per_pixel
 ):
     """12 megapixels of float64 beside one another would take gigabytes on many cores."""
     monkeypatch.setattr("pp_cl.scene.load.os.cpu_count", lambda: 64)
     camera = Camera(np.eye(3, 4), 4000, 4000, 2000, 1500, 4000, 3000)
-    phone = Photograph("a.jpg", camera, distortion=distortion)
-    told = reading([phone] * 300, MaskRule(source), factor)
-    bands = BAND_COPIES * BAND_BYTES if distortion else 0
+    phone = ImageFile("a.jpg", camera, lens=lens)
+    told = reading_cost([phone] * 300, MaskRule(source), factor)
+    bands = BAND_COPIES * BAND_BYTES if lens else 0
     assert told == (workers, workers * per_pixel * 12_000_000 + bands)
-    small = Photograph("b.jpg", camera.downscaled(10))
-    assert reading([small] * 300)[0] == 64 and reading([small] * 5)[0] == 5
+    small = ImageFile("b.jpg", camera.downscaled(10))
+    assert reading_cost([small] * 300)[0] == 64 and reading_cost([small] * 5)[0] == 5
 
 
 def test_depth_range_of_some_views_only(tmp_path):

@@ -197,7 +197,7 @@ def test_a_ball_on_white_has_the_hull_of_its_masks(dev, tmp_path):
         masks = [view.image[..., 3] > MASK_THRESHOLD for view in (a, b)]
         assert (masks[0] != masks[1]).mean() < 0.01
     hulls = [build_grid(dev, views, 2000) for views in (cut, given)]
-    assert hulls[0].grid.edge == pytest.approx(hulls[1].grid.edge, rel=0.02)
+    assert hulls[0].grid.voxel_size == pytest.approx(hulls[1].grid.voxel_size, rel=0.02)
 
 
 def test_without_masks_points_fill_what_all_cameras_see(dev, tmp_path):
@@ -206,7 +206,7 @@ def test_without_masks_points_fill_what_all_cameras_see(dev, tmp_path):
     """
     scene = opaque_ball(tmp_path / "white")
     config = configure(preset("tiny"), scene)
-    with pytest.warns(UserWarning, match="no photograph has a mask.*--mask-from color"):
+    with pytest.warns(UserWarning, match="no image has a mask.*--mask-from color"):
         views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, 3000)
     box = hull.grid.box
@@ -229,7 +229,7 @@ def test_a_box_that_is_given_holds_the_points(dev, tmp_path):
     assert scene_box(configure(preset("tiny"), "demo")) is None
 
 
-def test_a_mask_for_some_photographs_only(dev, tmp_path):
+def test_a_mask_for_some_images_only(dev, tmp_path):
     write_ball_scene(tmp_path / "ball", views=6, size=40)
     write_png(tmp_path / "ball/train/r_2.png", read_rgba(tmp_path / "ball/train/r_2.png")[..., :3])
     with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, as others have"):

@@ -12,11 +12,11 @@ from pp_cl.scene.outline import outline
 
 def ball_points(per_radius, shell=False):
     """(Grid, ids) of the vertices in the ball; shell: of the outer two layers only."""
-    edge = RADIUS / per_radius
+    voxel_size = RADIUS / per_radius
     n = 2 * per_radius + 3
-    grid = Grid(tuple(CENTRE - edge * (n - 1) / 2), edge, (n, n, n))
+    grid = Grid(tuple(CENTRE - voxel_size * (n - 1) / 2), voxel_size, (n, n, n))
     distance = np.linalg.norm(grid.lattice() - CENTRE, axis=1).reshape(n, n, n)
-    inside = (distance <= RADIUS) & (distance > (RADIUS - 2 * edge if shell else 0))
+    inside = (distance <= RADIUS) & (distance > (RADIUS - 2 * voxel_size if shell else 0))
     return grid, grid.ids_of(inside)
 
 

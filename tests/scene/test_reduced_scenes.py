@@ -1,4 +1,4 @@
-"""Photographs that are reduced while they are read: numbers, choice, what a training sees."""
+"""Images that are reduced while they are read: numbers, choice, what a training sees."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.image_file import KEPT_BYTES, kept_bytes, shrink, shrink_factor
+from pp_cl.scene.image_file import MOST_IMAGE_BYTES, image_bytes, shrink, shrink_factor
 from pp_cl.scene.load import load_scene, open_scene, scene_frames
 
 PHONE = (4000, 3000)
@@ -51,7 +51,7 @@ def test_the_least_reduction_that_fits(count, downscale, factor):
     sizes = [PHONE] * count
     assert shrink_factor(sizes, downscale) == factor
     smaller = [f for f in range(1, factor) if downscale % f == 0]
-    assert all(kept_bytes(sizes, f) > KEPT_BYTES for f in smaller)
+    assert all(image_bytes(sizes, f) > MOST_IMAGE_BYTES for f in smaller)
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def scene(tmp_path):
 
 def large(monkeypatch, most=8 * 4 * 50 * 50):
     """Scenes are large from `most` bytes on: eight images of 98 pixels are halved."""
-    monkeypatch.setattr("pp_cl.scene.image_file.KEPT_BYTES", most)
+    monkeypatch.setattr("pp_cl.scene.image_file.MOST_IMAGE_BYTES", most)
 
 
 def opened(dev, scene, downscale):
@@ -100,14 +100,14 @@ def test_pixels_stay_as_stored_where_nothing_is_reduced(dev, scene, monkeypatch)
         assert view.shrunk == 1
 
 
-def test_too_far_is_refused_before_a_photograph_is_read(dev, scene, monkeypatch):
+def test_too_far_is_refused_before_an_image_is_read(dev, scene, monkeypatch):
     large(monkeypatch)
     monkeypatch.setattr("pp_cl.scene.image_file.read_rgba", None)
     with pytest.raises(UserError, match=r"--downscale 7: .* from 1 to 6, .*98x98"):
         opened(dev, scene, 7)
 
 
-def test_a_kept_image_is_reduced_further_in_words_of_its_file(dev, scene, monkeypatch):
+def test_a_reduced_image_is_reduced_further_in_words_of_its_file(dev, scene, monkeypatch):
     large(monkeypatch)
     view = opened(dev, scene, 4)[0]
     assert view.reduced(3).file_downscale == 6

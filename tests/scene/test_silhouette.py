@@ -1,4 +1,4 @@
-"""Photographs without a mask, where others have one."""
+"""Images without a mask, where others have one."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def views():
 
 
 def opaque(view):
-    """The photograph without its mask, on a background in colours."""
+    """The image without its mask, on a background in colours."""
     image = view.image.copy()
     image[view.image[..., 3] == 0, :3] = (200, 30, 30)
     image[..., 3] = 255

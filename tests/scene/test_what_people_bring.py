@@ -418,7 +418,7 @@ def test_it_is_refused_with_the_reason(tmp_path, report):
 def test_a_test_split_of_which_no_image_has_a_mask_is_listed(tmp_path):
     folder = a_ball(tmp_path / "scene", "colmap")
     gone("masks/000000.png.png", "masks/000008.png.png")(folder)
-    assert [one.mask for one in list_split(folder, "test").photographs] == [None, None]
+    assert [one.mask for one in list_split(folder, "test").image_files] == [None, None]
 
 
 def test_axes_that_the_user_has_stated(tmp_path):

@@ -18,8 +18,8 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.unet import UNet
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.scene.image_file import Photograph
-from pp_cl.session.memory import GIB, MIB, Room
+from pp_cl.scene.image_file import ImageFile
+from pp_cl.session.memory import GIB, MIB, MemoryPlan
 from pp_cl.session.training import open_training
 
 GRID = Grid((0, 0, 0), 0.02, (64, 64, 64))
@@ -57,12 +57,12 @@ def test_it_is_within_15_percent_of_what_a_training_takes(
     config = run_config(folder, scene, "tiny", [(*one, "test") for one in settings.items()])
     training = open_training(plain, folder, config, None)
     training.run()
-    need = training.room.need
+    need = training.memory_plan.need
     assert need.points == training.trainer.model.cloud.count
     assert 0.85 < need.device / plain.peak_bytes < 1.15
 
 
-def room(dev, base="tiny", images=3, size=(800, 600), **changes):
+def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
     """Of a training with a small network."""
     config = preset(base)
     settings = {"network.widths": "16,16,16", "raster.radius": "0.85"} | changes
@@ -71,7 +71,7 @@ def room(dev, base="tiny", images=3, size=(800, 600), **changes):
     width, height = size
     camera = Camera(np.eye(3, 4), width, width, width / 2, height / 2, width, height)
     net = UNet(dev, widths=config.network.widths)
-    return Room(config, net, [Photograph(f"{i}.png", camera) for i in range(images)])
+    return MemoryPlan(config, net, [ImageFile(f"{i}.png", camera) for i in range(images)])
 
 
 def test_each_compute_unit_has_memory_of_its_own(dev, plain, monkeypatch):
@@ -93,7 +93,7 @@ def test_each_compute_unit_has_memory_of_its_own(dev, plain, monkeypatch):
 
 
 def needed(dev, base="tiny", points=171_262, step=0, **changes):
-    return room(dev, base, **changes).need_of(GRID, points, (2, 6), step)
+    return memory_plan(dev, base, **changes).need_of(GRID, points, (2, 6), step)
 
 
 def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
@@ -106,8 +106,8 @@ def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
 
 def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
     """Its points are half as wide once, not twice."""
-    made = room(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
-    finer = Grid(GRID.origin, GRID.edge / 2, tuple(2 * n for n in GRID.dims))
+    made = memory_plan(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
+    finer = Grid(GRID.origin, GRID.voxel_size / 2, tuple(2 * n for n in GRID.dims))
     planned, found = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 7000)
     assert planned.points == found.points == 160_000
     assert found.device == pytest.approx(planned.device, rel=0.01)
@@ -115,14 +115,14 @@ def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
 
 def test_a_grid_is_not_refined_beyond_what_ids_can_number(dev):
     """Of a thin object, whose few points lie in the largest grid."""
-    made = room(dev, "full", train__refine_at="0.3,0.6")
+    made = memory_plan(dev, "full", train__refine_at="0.3,0.6")
     largest, larger = (Grid((0, 0, 0), 1e-3, (n, 512, 512)) for n in (256, 257))
     made.check_points(largest, 1000, (2, 6))
     with pytest.raises(UserError, match="train.refine_at"):
         made.check_points(larger, 1000, (2, 6))
 
 
-def test_photographs_are_counted_as_they_are_kept(dev):
+def test_images_are_counted_as_they_are_kept(dev):
     sizes = {"size": (4000, 3000), "scene__downscale": "8"}
     one, many = (needed(dev, images=count, **sizes).host for count in (300, 400))
     assert many - one == 100 * 500 * 375 * 4
@@ -150,32 +150,32 @@ def refusal(made, points=20_000):
 )
 def test_what_fits_is_accepted_and_a_byte_less_is_not(plain, what, limit, told):
     plain.info[limit] = getattr(needed(plain, points=20_000), what)
-    check(room(plain))
+    check(memory_plan(plain))
     plain.info[limit] -= 1
-    assert told in refusal(room(plain)) and plain.name in refusal(room(plain))
+    assert told in refusal(memory_plan(plain)) and plain.name in refusal(memory_plan(plain))
 
 
 def test_the_memory_asked_for(plain):
     least = needed(plain, points=20_000).device / GIB
-    check(room(plain, train__memory_gib=f"{1.01 * least:.4f}"))
-    text = refusal(room(plain, train__memory_gib=f"{0.8 * least:.3f}"))
+    check(memory_plan(plain, train__memory_gib=f"{1.01 * least:.4f}"))
+    text = refusal(memory_plan(plain, train__memory_gib=f"{0.8 * least:.3f}"))
     assert text.startswith(f"--memory {round(0.8 * least, 3)}")
     assert f"give --memory {np.ceil(100 * least) / 100:g}" in text
 
 
 def test_the_hosts_memory(plain, monkeypatch):
-    """Of photographs and of a CPU's buffers; a system that does not tell refuses nothing."""
-    photographs = {"images": 300, "size": (4000, 3000), "scene__downscale": "1"}
+    """Of images and of a CPU's buffers; a system that does not tell refuses nothing."""
+    image_files = {"images": 300, "size": (4000, 3000), "scene__downscale": "1"}
     available = "pp_cl.session.memory.available_bytes"
     monkeypatch.setattr(available, lambda: resident_bytes() + GIB)
-    assert "of the host's memory" in refusal(room(plain, **photographs))
-    check(room(plain))
+    assert "of the host's memory" in refusal(memory_plan(plain, **image_files))
+    check(memory_plan(plain))
     monkeypatch.setattr(available, lambda: None)
-    check(room(plain, **photographs))
+    check(memory_plan(plain, **image_files))
 
 
 def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
-    made = room(plain)
+    made = memory_plan(plain)
     plain.info["memory_bytes"] = needed(plain, points=preset("tiny").points.count).device
     made.check_unseen()
     plain.info["memory_bytes"] = MIB
@@ -190,7 +190,7 @@ def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, m
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
     schedule = "pp_cl.engine.training.schedule"
-    monkeypatch.setattr(f"{schedule}.KEPT_BY_PRUNING", 0.05)
+    monkeypatch.setattr(f"{schedule}.LEFT_BY_PRUNING", 0.05)
     monkeypatch.setattr(f"{schedule}.prunings", lambda train, start, end: int(end > start + 1))
     monkeypatch.setattr("pp_cl.drivers.open_device", lambda choice: plain)
     plain.info["memory_bytes"] = 30 * MIB

@@ -24,4 +24,4 @@ def test_other_footprints_are_given_a_radius(tmp_path):
     scene = write_ball_scene(tmp_path / "ball")
     words = ["train", scene, "--out", tmp_path / "run", "--set", "raster.footprint=disc"]
     status, lines = spoken(words)
-    assert status == 2 and "raster.radius: is open" in lines[-1] and "0.0015" in lines[-1]
+    assert status == 2 and "raster.radius: is automatic" in lines[-1] and "0.0015" in lines[-1]

@@ -1,4 +1,4 @@
-"""Films have the frames, the size and the speed that were asked for."""
+"""Videos have the frames, the size and the speed that were asked for."""
 
 import re
 import subprocess
@@ -27,8 +27,8 @@ def frames(height=50, width=64, channels=3, count=9):
 
 @pytest.mark.parametrize("suffix", ["mp4", "webm"])
 @pytest.mark.parametrize("size", [(50, 64), (51, 65)])
-def test_a_film_is_read_back(tmp_path, suffix, size):
-    path = tmp_path / f"film.{suffix}"
+def test_a_video_is_read_back(tmp_path, suffix, size):
+    path = tmp_path / f"video.{suffix}"
     write_video(path, frames(*size), 12.5)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
     with imageio.get_reader(str(path)) as reader:
@@ -44,8 +44,8 @@ def test_a_film_is_read_back(tmp_path, suffix, size):
 @pytest.mark.parametrize("suffix", ["mp4", "webm"])
 @pytest.mark.parametrize("size", [(48, 64)])
 def test_colours_come_back_as_players_show_them(tmp_path, suffix, size):
-    """By the tags of the film, and none are left to guess at; a column each."""
-    path = tmp_path / f"film.{suffix}"
+    """By the tags of the video, and none are left to guess at; a column each."""
+    path = tmp_path / f"video.{suffix}"
     colours = np.array([(200, 60, 30), (30, 180, 60), (40, 70, 220), (230, 200, 40), (128,) * 3])
     width = size[1] // len(colours)
     frame = np.zeros((*size, 3), np.uint8)
@@ -71,21 +71,21 @@ def test_colours_come_back_as_players_show_them(tmp_path, suffix, size):
 
 @pytest.mark.parametrize("suffix", LOOPED)
 @pytest.mark.parametrize("fps", (24, 12.5))
-def test_a_film_for_pages_lasts_as_long_as_it_should(tmp_path, suffix, fps):
+def test_a_video_for_pages_lasts_as_long_as_it_should(tmp_path, suffix, fps):
     """A gif's frames last whole hundredths of a second."""
-    write_video(tmp_path / f"film.{suffix}", frames(count=9), fps)
+    write_video(tmp_path / f"video.{suffix}", frames(count=9), fps)
     lasts = []
-    with Image.open(tmp_path / f"film.{suffix}") as film:
-        for i in range(film.n_frames):
-            film.seek(i)
-            film.load()
-            lasts.append(film.info["duration"])
-        assert film.info["loop"] == 0 and film.size == (64, 50)
+    with Image.open(tmp_path / f"video.{suffix}") as video:
+        for i in range(video.n_frames):
+            video.seek(i)
+            video.load()
+            lasts.append(video.info["duration"])
+        assert video.info["loop"] == 0 and video.size == (64, 50)
     assert len(lasts) == 9 and sum(lasts) == pytest.approx(9000 / fps, abs=5.001)
 
 
 def test_webm_keeps_what_is_transparent(tmp_path):
-    path = tmp_path / "film.webm"
+    path = tmp_path / "video.webm"
     write_video(path, frames(channels=4), 10)
     decoder = ["-c:v", "libvpx-vp9"]
     reader = imageio_ffmpeg.read_frames(
@@ -97,7 +97,7 @@ def test_webm_keeps_what_is_transparent(tmp_path):
 
 
 @pytest.mark.unix
-def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path):
+def test_a_full_disk_is_one_line_and_leaves_no_video(tmp_path):
     """Of which ffmpeg says nothing; a limit on the size of a file stands for it, in a process of
     its own.
     """
@@ -115,9 +115,9 @@ def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path):
         "except UserError as error:\n"
         "    print(error)\n"
     )
-    words = [sys.executable, "-c", script, str(tmp_path / "film.mp4")]
+    words = [sys.executable, "-c", script, str(tmp_path / "video.mp4")]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60)
-    assert "film.mp4: cannot be written" in done.stdout and done.stderr == ""
+    assert "video.mp4: cannot be written" in done.stdout and done.stderr == ""
     assert list(tmp_path.iterdir()) == []
 
 

@@ -75,7 +75,7 @@ class Page:
 
     async def open(self, address):
         """Go to an address and to the front, with everything noted that happens there."""
-        await self.call("Page.bringToFront")  # in the back no picture is painted
+        await self.call("Page.bringToFront")  # in the back no image is painted
         for domain in ("Page", "Runtime", "Log", "Network"):
             await self.call(f"{domain}.enable")
         await self.call("Page.navigate", url=address)

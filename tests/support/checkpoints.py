@@ -13,17 +13,17 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.errors import UserError
 from pp_cl.scene.demo import demo_frames
-from pp_cl.scene.identity import kept_camera
+from pp_cl.scene.identity import packed_camera
 from pp_cl.selftest.points import some_ids
 
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
     "pixels": None,
-    "views": [[one.name, kept_camera(one.camera)] for one in demo_frames("train")[:3]],
+    "views": [[one.name, packed_camera(one.camera)] for one in demo_frames("train")[:3]],
     "step": STEP,
     "finished": False,
     "initial_points": 50,
-    "grid": {"origin": [-1.0, -1.0, -1.0], "edge": 0.25, "dims": [9, 8, 7]},
+    "grid": {"origin": [-1.0, -1.0, -1.0], "voxel_size": 0.25, "dims": [9, 8, 7]},
     "depth_range": [2.0, 6.0],
 }
 

@@ -1,4 +1,4 @@
-"""Damage to files, drawn by Hypothesis: JSON, lines of text, bytes, archives of arrays, pictures.
+"""Damage to files, drawn by Hypothesis: JSON, lines of text, bytes, archives of arrays, images.
 
 `draw` is that of st.data(): each choice is printed with an example that fails, and shrinks.
 """
@@ -207,7 +207,7 @@ def damaged_npy(draw, data):
 def damaged_npz(draw, data):
     """The bytes of an archive of arrays with a changed, missing, doubled or strange member."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = [(entry.filename, archive.read(entry)) for entry in archive.infolist()]
+        members = [(zip_info.filename, archive.read(zip_info)) for zip_info in archive.infolist()]
     at, other = place_in(draw, members), place_in(draw, members)
     name, content = members[at]
     kind = one(draw, *["member"] * 7, "drop", "name", "double", "stranger", "bomb", "form", "swap")

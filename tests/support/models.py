@@ -9,7 +9,7 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
-from pp_cl.engine.raster.weights import listed_hits
+from pp_cl.engine.raster.weights import listed_fragments
 from pp_cl.selftest.points import some_ids
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
@@ -55,8 +55,8 @@ def drawn_alone(monkeypatch, renderer):
 def blend_matrix(seen):
     """(HW, N) sparse: the blend weight of each point in each pixel of an Observation."""
     pairs = seen.view.pairs
-    kept, point, weight = listed_hits(pairs, seen.view.weights)
-    offset = np.concatenate([[0], np.cumsum(kept)])[pairs.pixel_offset.get()]
+    is_listed, point, weight = listed_fragments(pairs, seen.view.weights)
+    offset = np.concatenate([[0], np.cumsum(is_listed)])[pairs.pixel_offset.get()]
     shape = pairs.pixels, pairs.points
     matrix = csr_array((weight, point.astype(np.int32), offset), shape=shape)
     return matrix[seen.view.cropped(np.arange(pairs.pixels).reshape(seen.view.size)).ravel()]

@@ -39,5 +39,5 @@ def write_ply(folder):
 
 
 def write_some_edits(folder):
-    """A pp_cl.json with a box and a dropped photograph."""
+    """A pp_cl.json with a box and a dropped image."""
     write_edits(folder, Edits(np.array([[-1.0, -1, -1], [1, 2, 3]]), frozenset({"r_1.png"})))

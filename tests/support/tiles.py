@@ -3,9 +3,9 @@
 from pp_cl.engine.layers.tiles import SIDE, grid_shape
 
 
-def pixels_of(tiles, height, width):
+def pixels_of(tile_mask, height, width):
     """(height, width) of what (rows, columns) says of the tiles."""
-    return tiles.repeat(SIDE, 0).repeat(SIDE, 1)[:height, :width]
+    return tile_mask.repeat(SIDE, 0).repeat(SIDE, 1)[:height, :width]
 
 
 def random_counts(rng, height, width):

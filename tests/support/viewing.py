@@ -60,8 +60,8 @@ class Tab:
                     return message
             self._read(deadline - time.monotonic())
 
-    def picture(self, accept=lambda _image: True):
-        """The next picture behind the frustums that is accepted, (H, W, 3) int."""
+    def image(self, accept=lambda _image: True):
+        """The next image behind the frustums that is accepted, (H, W, 3) int."""
         found = []
 
         def take(message):

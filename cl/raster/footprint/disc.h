@@ -4,7 +4,7 @@
 #define surface_range(range, shape, d) (range)
 
 ALWAYS_INLINE Coverage
-footprints_hit(const Footprints *f, const Rim *rim, const floats px, const floats py) {
+footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {
     floats distance2;
-    return (Coverage){disc_hit(f, rim, px, py, &distance2), (floats)(1.0f), f->t};
+    return (Coverage){disc_covers(f, rim, px, py, &distance2), (floats)(1.0f), f->t};
 }

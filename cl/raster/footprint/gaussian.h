@@ -1,16 +1,16 @@
 // The Gaussian of 3D Gaussian splatting, as its viewers draw it: d = exp(-|s|^2 / 2) with s the
-// distance from the centre in deviations, on the screen, where its covariance is J C J^T + LOW_PASS I:
-// C in space, J the derivative of the projection in the centre. Its depth is along the camera's axis.
-// Of a pixel that is the mean of several of a viewer's, see widened().
+// distance from the centre in deviations, on the screen, where its covariance is J C J^T + LOW_PASS
+// I: C in space, J the derivative of the projection in the centre. Its depth is along the camera's
+// axis. Of a pixel that is the mean of several of a viewer's, see widened().
 //
-// Its form is L of its covariance L L^T in world axes: its diagonal, then (1, 0), (2, 0), (2, 1). Its
-// shape is W: deviations at (x, y) pixels from the centre are (W0 x + W1 y, W2 y), and the closeness
-// in the centre is W3.
+// Its form is L of its covariance L L^T in world axes: its diagonal, then (1, 0), (2, 0), (2, 1).
+// Its shape is W: deviations at (x, y) pixels from the centre are (W0 x + W1 y, W2 y), and the
+// falloff in the centre is W3.
 #define FORM 6  // numbers of what points learn of their form, of which LOGS are logarithms
 #define LOGS 3
 #define LARGEST(radius) INFINITY     // no size is too large for one
 #define CLAMPED 1                    // features below 0 count as 0, as viewers draw colours
-#define LEAST_ALPHA (1.0f / 255.0f)  // of a hit: below it viewers draw nothing
+#define LEAST_ALPHA (1.0f / 255.0f)  // of a fragment: below it viewers draw nothing
 #define MOST_ALPHA 0.99f
 #define surface_range(range, shape, d) (range)
 
@@ -28,7 +28,7 @@ static inline float widened(const Camera *cam) {
     return low_pass(cam) + (1.0f - 1.0f / (cam->samples * cam->samples)) / 12.0f;
 }
 
-// First and last pixel that a Gaussian may hit along one axis, by its variance there.
+// First and last pixel that a Gaussian may cover along one axis, by its variance there.
 ALWAYS_INLINE void pixels_by_variance(
     const floats centre,
     const floats variance,
@@ -93,7 +93,7 @@ ALWAYS_INLINE Rim footprints_rim(const Camera *cam, const Footprints *f) {
 }
 
 ALWAYS_INLINE Coverage
-footprints_hit(const Footprints *f, const Rim *rim, const floats px, const floats py) {
+footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {
 #pragma OPENCL FP_CONTRACT OFF
     const floats dx = px + 0.5f - rim->u, dy = py + 0.5f - rim->v;
     const floats sx = f->shape[0] * dx + f->shape[1] * dy, sy = f->shape[2] * dy;
@@ -101,13 +101,12 @@ footprints_hit(const Footprints *f, const Rim *rim, const floats px, const float
     return (Coverage){s2 < DEVIATIONS * DEVIATIONS, f->shape[3] * exp(-0.5f * s2), f->z};
 }
 
-// d = exp(-|s|^2 / 2), s = W e with e from the centre u to the pixel; S = (W^T W)^-1 is the covariance
-// on the screen. With w = W^T s = S^-1 e:
-// dd/du = d w,   dd/dS = d w w^T / 2
+// d = exp(-|s|^2 / 2), s = W e with e from the centre u to the pixel; S = (W^T W)^-1 is the
+// covariance on the screen. With w = W^T s = S^-1 e: dd/du = d w, dd/dS = d w w^T / 2
 //
 // S = A A^T + v I, A = M L, with the rows m of M as above and G = sum dL/dd d w w^T:
 // dL/dA = G A,   dL/dL = M^T dL/dA,   dL/dM = dL/dA L^T
-// m_0 = fx/z (right - x/z forward):   dm_0/dx = -fx/z^2 forward,   dm_0/dz = -m_0/z + fx x/z^3 forward
+// m_0 = fx/z (right - x/z forward): dm_0/dx = -fx/z^2 forward, dm_0/dz = -m_0/z + fx x/z^3 forward
 //
 // Of pixels that are means, d is that times sqrt(|S_0| / |S|), S_0 = A A^T + low_pass() I, whose
 // logarithm's derivative by S is (S_0^-1 - S^-1) / 2: to G comes this difference times sum dL/dd d.
@@ -157,7 +156,7 @@ static inline float3 inverse_spread(const float3 a0, const float3 a1, const floa
 static inline Offsets offset_end(
     const OffsetGradient *sum,
     const Camera *cam,
-    const float edge,
+    const float voxel_size,
     const float radius,
     const Offsets offset) {
     const float x = sum->centre.x, y = sum->centre.y, z = sum->centre.z;
@@ -179,7 +178,8 @@ static inline Offsets offset_end(
     const float dL_dx = fx * (sum->dL_du.x - ahead0 / z);
     const float dL_dy = fy * (sum->dL_du.y - ahead1 / z);
     const float dL_dz = -(x * dL_dx + y * dL_dy + dot(dL_dm0, m0) + dot(dL_dm1, m1)) / z;
-    const float3 place = edge * (dL_dx * cam->right + dL_dy * cam->down + dL_dz * cam->forward);
+    const float3 place =
+        voxel_size * (dL_dx * cam->right + dL_dy * cam->down + dL_dz * cam->forward);
     const float3 of_1 = m0.y * b0 + m1.y * b1, of_2 = m0.z * b0 + m1.z * b1;  // rows of dL/dL
     return (Offsets)(place, l0.x * (m0.x * b0.x + m1.x * b1.x), l1.y * of_1.y, l2.z * of_2.z,
                      radius * of_1.x, radius * of_2.x, radius * of_2.y, (float4)(0.0f),

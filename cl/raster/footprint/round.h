@@ -12,7 +12,7 @@
 #define LEAST_ALPHA -INFINITY                          // alphas are what they are
 #define MOST_ALPHA INFINITY
 
-// First and last pixel along one axis that circles around (u, z), u = x or y, may hit.
+// First and last pixel along one axis that circles around (u, z), u = x or y, may cover.
 //
 // The tangents from the eye to a circle of radius r have slopes m with (m z - u)^2 = r^2 (1 + m^2);
 // a circle that reaches the eye's plane has no bounds.
@@ -29,7 +29,7 @@ ALWAYS_INLINE void tangents(
     const floats scale = z * z - reach * reach, root = reach * sqrt(u * u + scale);
     const floats low = (u * z - root) / scale * focal + (centre - 0.5f - margin);
     const floats high = (u * z + root) / scale * focal + (centre - 0.5f + margin);
-    // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
+    // from floor(first) to ceil(last): Pulsar's box is part of its rule of coverage
     pixels_between(low, high, z > reach, size, PULSAR, first, last);
 }
 
@@ -62,7 +62,8 @@ typedef struct {
 } Rim;
 
 // 1 / a to half an ulp, by a step of Newton's: a GPU's division may be off by 2.5, which shifts all
-// rays. Near its rim, a sphere's weight is a small difference of lengths times up to exp(1 / gamma).
+// rays. Near its rim, a sphere's weight is a small difference of lengths times up to exp(1 /
+// gamma).
 static inline float reciprocal(const float a) {
     const float nearly = 1.0f / a;
     return nearly + nearly * fma(-a, nearly, 1.0f);
@@ -89,8 +90,12 @@ ALWAYS_INLINE Rim footprints_rim(const Camera *cam, const Footprints *f) {
 // Differs from Pulsar, whose distance from the ray is that at the centre's range, whose depth is
 // that of the sphere's front, up to a radius nearer, and whose d varies within every footprint of
 // at least a pixel.
-ALWAYS_INLINE ints
-disc_hit(const Footprints *f, const Rim *rim, const floats px, const floats py, floats *distance2) {
+ALWAYS_INLINE ints disc_covers(
+    const Footprints *f,
+    const Rim *rim,
+    const floats px,
+    const floats py,
+    floats *distance2) {
 #pragma OPENCL FP_CONTRACT OFF
     const floats mx = (px + rim->left) * rim->per_fx, my = (py + rim->top) * rim->per_fy;
     const floats m2 = mx * mx + my * my + 1.0f;

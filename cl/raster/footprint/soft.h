@@ -2,11 +2,11 @@
 #include "raster/footprint/round.h"
 
 ALWAYS_INLINE Coverage
-footprints_hit(const Footprints *f, const Rim *rim, const floats px, const floats py) {
+footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {
 #pragma OPENCL FP_CONTRACT OFF
     floats distance2;
-    const ints hit = disc_hit(f, rim, px, py, &distance2);
-    return (Coverage){hit, 1.0f - sqrt(distance2) * rim->per_reach, f->t};
+    const ints covers = disc_covers(f, rim, px, py, &distance2);
+    return (Coverage){covers, 1.0f - sqrt(distance2) * rim->per_reach, f->t};
 }
 
 // The surface is that of the ball. d: at the rim a rounding below 0.
@@ -18,8 +18,8 @@ static inline float surface_range(const float range, global const float *shape, 
 // dd/dc = -e / (rho h)
 // With m along the ray, of any length: e = c - (c.m)/(m.m) m, which takes no root.
 //
-// dd/d(log h) = rho / h = 1 - d. The least h is not the point's own and grows with the range t = |c|:
-// then dd/dc has rho/h^2 dh/dc = (1 - d) c/t^2 more instead.
+// dd/d(log h) = rho / h = 1 - d. The least h is not the point's own and grows with the range t =
+// |c|: then dd/dc has rho/h^2 dh/dc = (1 - d) c/t^2 more instead.
 
 #define LEAST_RHO 1e-3f  // of h: nearer to its ray a point has no direction away from it
 
@@ -59,10 +59,10 @@ offset_add(OffsetGradient *sum, const Camera *cam, const uint q, const float d, 
 static inline Offsets offset_end(
     const OffsetGradient *sum,
     const Camera *cam,
-    const float edge,
+    const float voxel_size,
     const float radius,
     const Offsets offset) {
     const float3 of = sum->dL_dc;
-    const float3 world = edge * (of.x * cam->right + of.y * cam->down + of.z * cam->forward);
+    const float3 world = voxel_size * (of.x * cam->right + of.y * cam->down + of.z * cam->forward);
     return (Offsets)(world, sum->growth > 0.0f ? 0.0f : sum->dL_dlog);
 }

@@ -6,7 +6,7 @@
 #define surface_range(range, shape, d) (range)
 
 ALWAYS_INLINE Coverage
-footprints_hit(const Footprints *f, const Rim *rim, const floats px, const floats py) {
+footprints_cover(const Footprints *f, const Rim *rim, const floats px, const floats py) {
 #pragma OPENCL FP_CONTRACT OFF
     const floats radius = f->shape[0];
     const floats mx = (px + rim->left) * rim->per_fx, my = (py + rim->top) * rim->per_fy;

@@ -116,7 +116,7 @@ class PackedArrays:
         return self._arrays
 
 
-class Reading(Generic[T]):
+class Pending(Generic[T]):
     """A value that the host gets from a download under way.
 
     values: the target of the download, filled at the event. convert: makes the value of them.
@@ -148,7 +148,7 @@ def read_later(
     array: Array,
     start: int = 0,
     convert: Callable[[np.ndarray], Any] = lambda values: values,
-) -> Reading:
+) -> Pending:
     """array[start:], (N,), as the kernels enqueued so far will leave it. convert: applied once to
     the numpy array, when it is asked for; what it raises, get() raises.
     """
@@ -162,7 +162,7 @@ def read_later(
         src_offset=array.offset + start * array.dtype.itemsize,
         is_blocking=False,
     )
-    return Reading(dev, event, values, convert)
+    return Pending(dev, event, values, convert)
 
 
 # ---- rows; none of it takes a second array of a model's size, which may not fit into memory

@@ -181,8 +181,8 @@ class Kernel:
         self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 
     def arguments(self, values: dict[str, Any]) -> list[Any]:
-        """OpenCL arguments in order, from {name: pyopencl Array or number}. Raises
-        TypeError, ValueError.
+        """OpenCL arguments in order, from {name: pyopencl Array or number}. Raises TypeError,
+        ValueError.
         """
         if values.keys() != self.names:
             missing = [p.name for p in self.parameters if p.name not in values]

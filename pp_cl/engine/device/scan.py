@@ -3,7 +3,7 @@
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Reading, read_later
+from pp_cl.engine.device.buffers import Pending, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import launch_groups
 
@@ -21,11 +21,11 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
     _launch(dev, "scan_offsets", n, values=values, block_sum=block_sum, offsets=offsets)
 
 
-def _block_sums(dev, kernel, n, **entries):
-    """(blocks,) what the kernel finds in each block of n entries."""
+def _block_sums(dev, kernel, n, **arrays):
+    """(blocks,) what the kernel finds in each block of n numbers."""
     # of a power of two: numbers of pairs differ from step to step
     held = dev.scratch("scan", 1 << (_blocks(n) - 1).bit_length(), np.uint32)
-    _launch(dev, kernel, n, block_sum=held[: _blocks(n)], **entries)
+    _launch(dev, kernel, n, block_sum=held[: _blocks(n)], **arrays)
     return held[: _blocks(n)]
 
 
@@ -40,12 +40,12 @@ def _launch(dev, kernel, n, **arguments):
     )
 
 
-def read_total(dev: Device, offsets: Array) -> Reading[int]:
-    """The last entry of `offsets`."""
+def read_total(dev: Device, offsets: Array) -> Pending[int]:
+    """The last number of `offsets`."""
     return read_later(dev, offsets, len(offsets) - 1, lambda last: int(last[0]))
 
 
-def nonzero(dev: Device, flags: Array, indices: Array, places: Array) -> Reading[Array]:
+def nonzero(dev: Device, flags: Array, indices: Array, places: Array) -> Pending[Array]:
     """(S,) uint32 on the device, the front of `indices`: where flags are not zero, ascending.
 
     flags: (N) uint8, N >= 1. indices: (N) uint32. places: (N) uint32, where each of them stands in

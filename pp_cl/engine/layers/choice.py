@@ -96,8 +96,8 @@ def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> str:
     if variant == AUTO and not dev.is_cpu:
         variant = "local"
     elif variant == AUTO:
-        gains = math.prod(shape.size) >= WINOGRAD_FROM[shape.direction]
-        variant = "winograd" if gains else "direct"
+        is_faster = math.prod(shape.size) >= WINOGRAD_FROM[shape.direction]
+        variant = "winograd" if is_faster else "direct"
     return variant if can_run(variant, shape.k, *shape.sources, shape.co) else "direct"
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Reading, read_later
+from pp_cl.engine.device.buffers import Pending, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import channel_ranges, lanes
 
@@ -23,10 +23,10 @@ SIDE = 4
 class Tiles:
     """The tiles of a feature map that a kernel computes.
 
-    size: (height, width) of the feature map. number: how many tiles are computed. list: (?,)
-    int32: height, width, number, the computed tiles ascending. count: (rows, columns)
-    float32: in sums over the whole feature map a computed tile counts that often, for itself and
-    its copies; 0 for tiles that are not computed.
+    size: (height, width) of the feature map. number: how many tiles are computed. list: (?,) int32:
+    height, width, number, the computed tiles ascending. count: (rows, columns) float32: in sums
+    over the whole feature map a computed tile counts that often, for itself and its copies; 0 for
+    tiles that are not computed.
     """
 
     size: tuple[int, int]
@@ -68,7 +68,7 @@ def all_tiles(dev: Device, height: int, width: int) -> Tiles:
     return some_tiles(dev, (height, width), np.ones(grid_shape(height, width)))
 
 
-def tiles_find(dev: Device, x: Array, background: float) -> Reading[np.ndarray]:
+def tiles_find(dev: Device, x: Array, background: float) -> Pending[np.ndarray]:
     """(rows, columns) bool: the tiles of x (H, W, C) float32 in which some value is not
     `background`.
     """
@@ -76,11 +76,11 @@ def tiles_find(dev: Device, x: Array, background: float) -> Reading[np.ndarray]:
     return _flags(dev, "tiles_find", (h, w), c=c, background=background, x=x)
 
 
-def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Reading[np.ndarray]:
+def tiles_covered(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Pending[np.ndarray]:
     """(rows, columns) bool: the tiles of an image of size (height, width) in which some pixel has
-    hits, by its Pairs.pixel_offset (HW+1,) uint32.
+    fragments, by its Pairs.pixel_offset (HW+1,) uint32.
     """
-    return _flags(dev, "tiles_hit", size, pixel_offset=pixel_offset)
+    return _flags(dev, "tiles_covered", size, pixel_offset=pixel_offset)
 
 
 def tiles_with(pixels: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ from pp_cl.settings import NetworkConfig
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
-WHITE = 1.0  # of a target where its photograph is transparent
+WHITE = 1.0  # of a target where its image is transparent
 SIMPLE = {"gate": gate_forward, "pool": avgpool2_forward, "upsample": upsample2_forward}
 
 Size = tuple[int, int]  # (height, width)
@@ -114,14 +114,14 @@ class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
     widths: channels of the three levels. blocks: what a level computes, of settings.BLOCKS.
-    residual: adds output.SHARE of the first three features to the
-    image. variant: of the convolutions, as choose() takes it; blocking: of their kernels, as
-    shipped for the device; both may be replaced before the first pass. layers: in the order of the
-    forward pass. parameters, gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16),
-    "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device; all_parameters, all_gradients:
-    the 1-D array that they lie in, with zeros between them. Weights and biases start uniform in
-    +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient
-    0. multiple: of which the sides of images are, in pixels.
+    residual: adds output.SHARE of the first three features to the image. variant: of the
+    convolutions, as choose() takes it; blocking: of their kernels, as shipped for the device; both
+    may be replaced before the first pass. layers: in the order of the forward pass. parameters,
+    gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,),
+    ...} float32 on the device; all_parameters, all_gradients: the 1-D array that they lie in, with
+    zeros between them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for
+    Conv2d), output channels beyond CO at 0, with gradient 0. multiple: of which the sides of images
+    are, in pixels.
     """
 
     multiple = 4  # two poolings halve the height and the width
@@ -269,8 +269,7 @@ class UNet:
         return out
 
     def backward(self, grad_y: Array) -> Array:
-        """(H, W, 16) gradient of x in the last forward(x, training=True), given dL/dy (H,
-        W, 3).
+        """(H, W, 16) gradient of x in the last forward(x, training=True), given dL/dy (H, W, 3).
 
         Overwrites the gradients of all parameters; parameters and x must be as they were in
         forward. The result is in a buffer of the network. Raises RuntimeError without such a

@@ -1,5 +1,5 @@
 """Features of the visible points from their spherical harmonics, blended into the pixels by the
-weights of the hits; and the gradients of the blend, gathered by visible point.
+weights of the fragments; and the gradients of the blend, gathered by visible point.
 """
 
 from __future__ import annotations
@@ -23,62 +23,62 @@ ON_GPU = 4  # lanes there: each work-item reads vectors
 def shade_forward(
     dev: Device,
     points: ProjectedPoints,
-    shaded: Array,
+    visible: Array,
     sh: list[Array],
     *,
-    shaded_features: Array,
+    visible_features: Array,
 ) -> None:
-    """Write shaded_features, (S, 16) float32 or longer, of Gaussians at least 0.
+    """Write visible_features, (S, 16) float32 or longer, of Gaussians at least 0.
 
-    The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32, the
+    The direction of a point is normalize(point - eye) in world axes. visible: (S,) uint32, the
     visible points. sh: of PointCloud.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
     macros = footprint_macros(points.footprint)
     dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh), **macros).launch(
         "shade_forward_half" if sh_0.dtype == np.float16 else "shade_forward",
-        shaded.size * row_parts(dev),
-        s=shaded.size,
-        shaded=shaded,
+        visible.size * row_parts(dev),
+        s=visible.size,
+        visible=visible,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         sh_0=sh_0,
         sh_1=sh_1,
         sh_2a=sh_2a,
         sh_2b=sh_2b,
-        shaded_features=shaded_features,
+        visible_features=visible_features,
     )
 
 
 def blend_forward(
-    dev: Device, pairs: Pairs, weights: BlendWeights, shaded_features: Array, features: Array
+    dev: Device, pairs: Pairs, weights: BlendWeights, visible_features: Array, features: Array
 ) -> None:
-    """Write features (H, W, 16) from shaded_features, (S, 16) or longer, both float32."""
+    """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32."""
     _program(dev).launch(
         "blend_forward",
         pairs.pixels * row_parts(dev, ON_GPU),
         hw=pairs.pixels,
         pixel_offset=pairs.pixel_offset,
-        pixel_entry=weights.pixel_entry,
+        pixel_weight_point=weights.pixel_weight_point,
         point_slot=weights.point_slot,
-        shaded_features=shaded_features,
+        visible_features=visible_features,
         features=features,
     )
 
 
 def blend_backward_table(
-    shaded: int, pixels: int, pairs: int, blend: str, footprint: str = "soft"
+    visible: int, pixels: int, pairs: int, blend: str, footprint: str = "soft"
 ) -> Table:
-    """The buffers of the backward pass for a number of pixels, and room for numbers of visible
-    points and of pairs. blend: one of BLENDS.
+    """The buffers of the backward pass for a number of pixels, and capacities for numbers of
+    visible points and of pairs. blend: one of BLENDS.
     """
     return {
         "pair_gradient": ((pairs, 2), np.float32),
-        "pixel_spread": ((pixels if blend == "alpha" else 1,), np.float32),
+        "pixel_distortion": ((pixels if blend == "alpha" else 1,), np.float32),
         "pixel_blend": ((pixels if blend == "softmax" else 1,), np.float32),
-        "grad_shaded_features": ((shaded, 16), np.float32),
-        "grad_opacity": ((shaded,), np.float32),
-        "grad_offset": ((shaded if blend == "alpha" else 1, offset_width(footprint)), np.float32),
+        "grad_visible_features": ((visible, 16), np.float32),
+        "grad_opacity": ((visible,), np.float32),
+        "grad_offset": ((visible if blend == "alpha" else 1, offset_width(footprint)), np.float32),
     }
 
 
@@ -87,17 +87,17 @@ class BlendGradients:
     """Of the visible points, a row for each or more, float32, valid until the next backward pass;
     those of all other points are 0.
 
-    shaded_features: (S, 16). opacity: (S,). offset: (S, 4), of soft points composited by alpha, by
-    what the closeness of their hits changes, and of Gaussians (S, 16); None if not asked for.
-    pixel_spread: (HW,), undefined
-    without its weight. pair_gradient: (P, 2), by pair of a visible point the blend weight b and
-    what the hit adds to dL/dopacity, both 0 where it is dropped or not tracked.
+    visible_features: (S, 16). opacity: (S,). offset: (S, 4) of soft points composited by alpha, (S,
+    16) of Gaussians, through the falloff of their fragments; None if not asked for.
+    pixel_distortion: (HW,), undefined without its weight. pair_gradient: (P, 2), by pair of a
+    visible point the blend weight b and what the fragment adds to dL/dopacity, both 0 where it is
+    dropped or not tracked.
     """
 
-    shaded_features: Array
+    visible_features: Array
     opacity: Array
     offset: Array | None
-    pixel_spread: Array
+    pixel_distortion: Array
     pair_gradient: Array
 
 
@@ -109,58 +109,58 @@ def blend_backward(
     weights: BlendWeights,
     *,
     opacity: Array,
-    shaded_features: Array,
+    visible_features: Array,
     features: Array,
     grad_features: Array,
     grad_alpha: Array | None = None,
-    spread_weight: float = 0.0,
-    edge: float = 0.0,
+    distortion_weight: float = 0.0,
+    voxel_size: float = 0.0,
 ) -> BlendGradients:
-    """The gradients of the points weights.shaded, after blend_weights() with slopes.
+    """The gradients of the points weights.visible, after blend_weights() with derivatives.
 
-    opacity: (N,). shaded_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W,
-    16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij
-    b_i b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths (world
-    units) of its hits; no gradient of the depths is formed. edge: of the grid that offsets are
-    counted in, world units; 0: no gradients of offsets. Raises ValueError for grad_alpha or a
-    spread of a softmax, which has no transmittance, and for offsets unless soft points are
-    composited by alpha.
+    opacity: (N,). visible_features, features: of blend_forward(). grad_features: dL/dfeatures (H,
+    W, 16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times
+    sum_ij b_i b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths
+    (world units) of its fragments; no gradient of the depths is formed. voxel_size: of the grid
+    that offsets are counted in, world units; 0: no gradients of offsets. Raises ValueError for
+    grad_alpha or a distortion loss of a softmax, which has no transmittance, and for offsets unless
+    soft points are composited by alpha.
     """
-    is_alpha, moves = weights.blend == "alpha", edge > 0
-    if not is_alpha and (grad_alpha is not None or spread_weight > 0):
-        raise ValueError("a softmax has no gradient of alpha and of spread")
+    is_alpha, moves = weights.blend == "alpha", voxel_size > 0
+    if not is_alpha and (grad_alpha is not None or distortion_weight > 0):
+        raise ValueError("a softmax has no gradient of alpha and of a distortion loss")
     if moves and not (is_alpha and points.footprint in MOVED):
         raise ValueError(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )
-    shaded = weights.shaded
-    rows = len(shaded_features), pairs.pixels, pairs.capacity
+    visible = weights.visible
+    rows = len(visible_features), pairs.pixels, pairs.capacity
     b.require(blend_backward_table(*rows, weights.blend, points.footprint))
     clear_pairs(dev, pairs, weights, b.pair_gradient)
-    of_hits = {
+    of_fragments = {
         "hw": pairs.pixels,
         "tracked": weights.tracked,
         "pixel_offset": pairs.pixel_offset,
         "pair_key": pairs.pair_key,
-        "pixel_entry": weights.pixel_entry,
-        "pixel_slope": weights.pixel_slope,
+        "pixel_weight_point": weights.pixel_weight_point,
+        "pixel_derivative": weights.pixel_derivative,
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
     macros = footprint_macros(points.footprint)
-    program = _program(dev, GAINS=int(not is_alpha), **macros)
+    program = _program(dev, DL_DB=int(not is_alpha), **macros)
     if is_alpha:
         program.launch(
             "alpha_gradient",
             pairs.pixels,
             has_grad_alpha=int(grad_alpha is not None),
-            spread_weight=spread_weight,
+            distortion_weight=distortion_weight,
             transmittance=weights.transmittance,
             point_slot=weights.point_slot,
-            shaded_features=shaded_features,
+            visible_features=visible_features,
             grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
-            pixel_spread=b.pixel_spread,
-            **of_hits,
+            pixel_distortion=b.pixel_distortion,
+            **of_fragments,
         )
     else:
         program.launch(
@@ -168,30 +168,30 @@ def blend_backward(
             pairs.pixels,
             features=features,
             pixel_blend=b.pixel_blend,
-            **of_hits,
+            **of_fragments,
         )
     program.launch(
         "blend_backward",
-        shaded.size * row_parts(dev, ON_GPU),
-        s=shaded.size,
-        shaded=shaded,
+        visible.size * row_parts(dev, ON_GPU),
+        s=visible.size,
+        visible=visible,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_gradient=b.pair_gradient,
         pixel_blend=b.pixel_blend,
-        shaded_features=shaded_features,
+        visible_features=visible_features,
         grad_features=grad_features,
-        grad_shaded_features=b.grad_shaded_features,
+        grad_visible_features=b.grad_visible_features,
         grad_opacity=b.grad_opacity,
     )
     if moves:
         dev.program("raster/offset", **macros).launch(
             "offset_backward",
-            shaded.size,
-            s=shaded.size,
-            edge=edge,
+            visible.size,
+            s=visible.size,
+            voxel_size=voxel_size,
             radius=points.radius,
-            shaded=shaded,
+            visible=visible,
             camera=points.camera_buffer,
             point_camera=points.point_camera,
             point_shape=points.point_shape,
@@ -199,15 +199,15 @@ def blend_backward(
             opacity=opacity,
             point_offset=pairs.point_offset,
             pair_pixel=pairs.pair_pixel,
-            pair_point_closeness=pairs.pair_point_closeness,
+            pair_point_falloff=pairs.pair_point_falloff,
             pair_gradient=b.pair_gradient,
             grad_offset=b.grad_offset,
         )
     return BlendGradients(
-        b.grad_shaded_features,
+        b.grad_visible_features,
         b.grad_opacity,
         b.grad_offset if moves else None,
-        b.pixel_spread,
+        b.pixel_distortion,
         b.pair_gradient,
     )
 

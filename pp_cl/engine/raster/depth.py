@@ -21,7 +21,8 @@ def depth_forward(
 
     alpha: share of the pixel that is not background, in [0, 1]; 1 after an early stop. depth: of
     the surface, along the camera's axis, world units, mean by blend weight; median: where half of
-    the weight is reached, interpolated between hits; both infinite where alpha is 0. size: (H, W).
+    the weight is reached, interpolated between fragments; both infinite where alpha is 0. size: (H,
+    W).
     """
     alpha, depth, median = (dev.empty(size) for _ in range(3))
     dev.program("raster/depth", **footprint_macros(points.footprint)).launch(
@@ -32,8 +33,8 @@ def depth_forward(
         point_shape=points.point_shape,
         pixel_offset=pairs.pixel_offset,
         pair_key=pairs.pair_key,
-        pair_point_closeness=pairs.pair_point_closeness,
-        pixel_entry=weights.pixel_entry,
+        pair_point_falloff=pairs.pair_point_falloff,
+        pixel_weight_point=weights.pixel_weight_point,
         pixel_alpha=alpha,
         pixel_depth=depth,
         pixel_median=median,

@@ -1,5 +1,5 @@
-"""Pairs (hits) of a point and a pixel that it covers in a view: listed by point for the backward
-pass, and by pixel sorted by depth for blending.
+"""Fragments, pairs of a point and a pixel that it covers, in a view: listed by point for the
+backward pass, and by pixel sorted by depth for blending.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, Reading, Table, grown
+from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.device.scan import exclusive_scan, read_total
@@ -25,25 +25,25 @@ LONG_LIST = RUN * RUN  # keys of lists that they merge in more than one pass
 
 @dataclass(frozen=True)
 class Pairs:
-    """The hits of a view of N points and HW pixels, valid until the next ones are found.
+    """The fragments of a view of N points and HW pixels, valid until the next ones are found.
 
-    The arrays have room for P pairs. If the view has more, pixel_offset is all zeros and the other
-    arrays must not be read: find the pairs again with more room (room_needed()).
+    The arrays have a capacity of P pairs. If the view has more, pixel_offset is all zeros and the
+    other arrays must not be read: find the pairs again with more capacity (capacity_needed()).
 
     footprint: of the points, one of FOOTPRINTS. count: how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
-    pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
-    of the closeness d of Eq. (1). pair_key: (P,) uint64, depth bits << 32 | pair, sorted within
+    pair_pixel: (P,) uint32, y*W + x. pair_point_falloff: (P, 2) uint32, the point, and the bits
+    of the falloff d of Eq. (1). pair_key: (P,) uint64, depth bits << 32 | pair, sorted within
     each pixel by depth, then by point.
     """
 
     footprint: str
-    count: Reading[int]
+    count: Pending[int]
     point_offset: Array
     pixel_offset: Array
     pair_pixel: Array
-    pair_point_closeness: Array
+    pair_point_falloff: Array
     pair_key: Array
 
     @property
@@ -68,12 +68,12 @@ class Pairs:
 
 
 def pairs_table(n: int, pixels: int, pairs: int) -> Table:
-    """The buffers for n points, a number of pixels and room for a number of pairs."""
+    """The buffers for n points, a number of pixels and a capacity in pairs."""
     return {
         "point_offset": ((n + 1,), np.uint32),
         "pixel_offset": ((pixels + 1,), np.uint32),
         "pair_pixel": ((pairs,), np.uint32),
-        "pair_point_closeness": ((pairs, 2), np.uint32),
+        "pair_point_falloff": ((pairs, 2), np.uint32),
         "pair_key": ((pairs,), np.uint64),
         # for sorting the keys, then the entries of weights.py
         "pair_scratch": ((pairs,), np.uint64),
@@ -81,43 +81,43 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
 
 
 def find_pairs(
-    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], room: int = 1
+    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], capacity: int = 1
 ) -> Pairs:
-    """The hits in an image of size (height, width), if there are no more than `room`; does not wait
-    for the device.
+    """The fragments in an image of size (height, width), if there are no more than `capacity`; does
+    not wait for the device.
     """
     n, pixels = len(points.point_box), size[0] * size[1]
-    b.require(pairs_table(n, pixels, room))
+    b.require(pairs_table(n, pixels, capacity))
     exclusive_scan(dev, points.point_count, b.point_offset)
     count = read_total(dev, b.point_offset)
     dev.program("raster/pairs", LANES=lanes(dev), **footprint_macros(points.footprint)).launch(
         "pairs_fill",
         -(-n // lanes(dev)),
         n=n,
-        p=room,
+        p=capacity,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         point_shape=points.point_shape,
         point_box=points.point_box,
         point_offset=b.point_offset,
         pair_pixel=b.pair_pixel,
-        pair_point_closeness=b.pair_point_closeness,
+        pair_point_falloff=b.pair_point_falloff,
         point_key=b.pair_key if dev.is_cpu else b.pair_scratch,
     )
     list_keys = _list_by_bucket if dev.is_cpu else _list_by_key
-    list_keys(dev, b, n, pixels, room)
+    list_keys(dev, b, n, pixels, capacity)
     return Pairs(
         points.footprint,
         count,
         b.point_offset,
         b.pixel_offset,
         b.pair_pixel,
-        b.pair_point_closeness,
+        b.pair_point_falloff,
         b.pair_key,
     )
 
 
-def _list_by_bucket(dev, b, n, pixels, room):
+def _list_by_bucket(dev, b, n, pixels, capacity):
     """Sort pair_key, which is by point, and write pixel_offset."""
     program = dev.program("raster/lists_by_bucket", BUCKETS=BUCKETS)
     chunks = min(MOST_CHUNKS, dev.info["compute_units"])
@@ -128,7 +128,7 @@ def _list_by_bucket(dev, b, n, pixels, room):
         "pair_pixel": b.pair_pixel,
         "bucket_size": dev.scratch("buckets", BUCKETS * chunks, np.uint32),
     }
-    filled = {"n": n, "p": room, "point_offset": b.point_offset, **shared}
+    filled = {"n": n, "p": capacity, "point_offset": b.point_offset, **shared}
     program.launch("pairs_bucket_sizes", chunks, local=1, **filled)
     keys = {"point_key": b.pair_key, "bucket_key": b.pair_scratch}
     program.launch("pairs_bucket", chunks, local=1, **keys, **filled)
@@ -144,31 +144,38 @@ def _list_by_bucket(dev, b, n, pixels, room):
     )
 
 
-def _list_by_key(dev, b, n, pixels, room):
+def _list_by_key(dev, b, n, pixels, capacity):
     """Sort the keys in pair_scratch, which are by point, into pair_key, and write pixel_offset."""
     program = dev.program("raster/lists_by_key", RUN=RUN)
     b.require({"pixel_count": ((pixels,), np.uint32)})
     dev.fill(b.pixel_count, 0)
-    filled = {"n": n, "p": room, "point_offset": b.point_offset, "pair_pixel": b.pair_pixel}
-    program.launch("pairs_count", room, pixel_count=b.pixel_count, **filled)
+    filled = {"n": n, "p": capacity, "point_offset": b.point_offset, "pair_pixel": b.pair_pixel}
+    program.launch("pairs_count", capacity, pixel_count=b.pixel_count, **filled)
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
-    shared = {"p": room, "hw": pixels, "pair_pixel": b.pair_pixel, "pixel_offset": b.pixel_offset}
+    shared = {
+        "p": capacity,
+        "hw": pixels,
+        "pair_pixel": b.pair_pixel,
+        "pixel_offset": b.pixel_offset,
+    }
     keys, other = b.pair_key, b.pair_scratch
     counted = {"point_key": other, "pixel_count": b.pixel_count}
-    program.launch("pairs_scatter", room, pair_key=keys, **counted, **shared)
-    program.launch("pairs_sort_runs", room, pair_key=keys, sorted=other, **shared)
+    program.launch("pairs_scatter", capacity, pair_key=keys, **counted, **shared)
+    program.launch("pairs_sort_runs", capacity, pair_key=keys, sorted=other, **shared)
 
     def merge(source, target, width, group, least):
         sizes = {"width": width, "group": group, "least": least}
-        program.launch("pairs_merge_runs", room, sorted=source, pair_key=target, **sizes, **shared)
+        program.launch(
+            "pairs_merge_runs", capacity, sorted=source, pair_key=target, **sizes, **shared
+        )
 
     merge(other, keys, RUN, LONG_LIST, 0)
-    if room > LONG_LIST:  # there and back, for the lists that are longer
+    if capacity > LONG_LIST:  # there and back, for the lists that are longer
         merge(keys, other, LONG_LIST, LONG_LIST * RUN, LONG_LIST)
         merge(other, keys, LONG_LIST * RUN, MOST_PAIRS, LONG_LIST)
 
 
-def room_needed(pairs: Pairs) -> int:
+def capacity_needed(pairs: Pairs) -> int:
     """The capacity of these pairs if all fitted, else a larger one with which they fit. Waits until
     their number is known. Raises UserError for more pairs than uint32 can number.
     """

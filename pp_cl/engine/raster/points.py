@@ -43,8 +43,8 @@ SH_BLOCKS = (
     ShBlock("sh_2b", 7, 2),
 )
 SH_DEGREES = (0, 1, 2)
-MOST_OFFSET = 0.5  # edges along each axis: a point stays in its cell; radii times 0.61 to 1.65
-MOST_OF_GAUSSIANS = 2.0  # edges, logarithms and deviations
+MOST_OFFSET = 0.5  # voxel sizes each way: a point stays in its cell; radii times 0.61 to 1.65
+MOST_OF_GAUSSIANS = 2.0  # voxel sizes, logarithms and deviations
 MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: what a .spz can hold
 
 
@@ -75,11 +75,10 @@ class PointCloud:
     """The points, one row each; device arrays.
 
     ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
-    point in its cell, in edges of the grid, and the logarithm of its radius over
-    point_radius() of the settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up
-    to MOST_OF_GAUSSIANS: see cl/cloud.h. opacity: (N) float32 in [0, 1]. sh: the
-    SH coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained
-    any more.
+    point in its cell, in voxel sizes, and the logarithm of its radius over point_radius() of the
+    settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up to MOST_OF_GAUSSIANS:
+    see cl/cloud.h. opacity: (N) float32 in [0, 1]. sh: the SH coefficients, (N, count, 16) of each
+    block: float32, or float16 where they are not trained any more.
     """
 
     ids: Array
@@ -175,8 +174,8 @@ class PointCloud:
             self.sh[i] = gather_rows(dev, self.sh[i], rows)
 
     def arrays(self, dev: Device) -> dict[str, DeviceRows]:
-        """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16),
-        (N, 5, 16).
+        """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16), (N, 5,
+        16).
         """
         learned = {"ids": self.ids, "offset": self.offset, "opacity": self.opacity}
         stored = {name: DeviceRows(dev, array) for name, array in learned.items()}

@@ -1,5 +1,5 @@
 """Projection and culling: points to camera axes, the box of pixels that each may cover, and how
-many pixels it hits.
+many pixels it covers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
 
 # numbered as in cl/raster/footprint.h; each has its header beside that
 FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
-MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in edges of the grid
+MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in voxel sizes
 LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
 
 
@@ -26,11 +26,11 @@ class ProjectedPoints:
     """N points in one view, valid until the next projection.
 
     footprint: one of FOOTPRINTS. camera_buffer: (21,) float32, cl/camera.h. point_count: (N,)
-    uint32, pixels that are hit. The others are undefined in a run of LANES points without hits.
-    point_camera: (N, 4) float32, x, y, z in camera axes and the distance from the eye; (0, 0, 0,
-    -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels
-    that may be hit; last < first means none. point_shape: (N, 1) float32, the radius in world
-    units; of Gaussians (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h).
+    uint32, pixels that are covered. The others are undefined in a run of LANES points without
+    fragments. point_camera: (N, 4) float32, x, y, z in camera axes and the distance from the eye;
+    (0, 0, 0, -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of
+    the pixels that may be covered; last < first means none. point_shape: (N, 1) float32, the radius
+    in world units; of Gaussians (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h).
     cloud_offset, radius: of project_grid().
     """
 
@@ -45,7 +45,7 @@ class ProjectedPoints:
 
 
 def footprint_pixels(radius: float) -> float:
-    """How many pixels a point hits, about. radius: of its footprint, pixels."""
+    """How many pixels a point covers, about. radius: of its footprint, pixels."""
     return math.pi * max(LEAST_RADIUS, radius) ** 2
 
 

@@ -1,5 +1,5 @@
-"""The blend weight of each hit in its pixel, by alpha compositing or by the paper's softmax; the
-list of visible points, and each point's highest weight for pruning.
+"""The blend weight of each fragment in its pixel, by alpha compositing or by the paper's softmax;
+the list of visible points, and each point's highest weight for pruning.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, Reading, Table
+from pp_cl.engine.device.buffers import Buffers, Pending, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.device.scan import nonzero
@@ -18,49 +18,50 @@ from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import footprint_macros
 
 BLENDS = ("softmax", "alpha")
-NO_POINT = 0xFFFFFFFF  # of an entry behind which hits were dropped
-ALL = 2**32 - 1  # hits of a pixel that get gradients
+NO_POINT = 0xFFFFFFFF  # in pixel_weight_point, behind which fragments were dropped
+ALL = 2**32 - 1  # fragments of a pixel that get gradients
 
 
 @dataclass(frozen=True)
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
-    blend: one of BLENDS. tracked: how many nearest hits of a pixel get gradients. pixel_entry: (P,)
-    uint64, weight bits << 32 | point, each pixel's hits by depth; where hits are dropped, an entry
-    without a point ends the pixel's list. pixel_slope: (P,) float32 alike, the factor s of the
-    backward pass, dL/dopacity = s * gain (cl/raster/blend.cl); None without slopes.
-    point_is_shaded: (N,) uint8, 1 for visible points. shaded_list: `shaded`, whose length is still
-    on its way. point_slot: (N,) uint32, where a visible point stands in `shaded`, undefined for
-    others. transmittance: (HW,) float32 behind all hits, None with the softmax.
+    blend: one of BLENDS. tracked: how many nearest fragments of a pixel get gradients.
+    pixel_weight_point: (P,) uint64, weight bits << 32 | point, each pixel's fragments by depth;
+    where fragments are dropped, a number without a point ends the pixel's list. pixel_derivative:
+    (P,) float32 alike, the factor s of the backward pass, dL/dopacity = s * dL/db
+    (cl/raster/blend.cl); None without derivatives. point_is_visible: (N,) uint8, 1 for visible
+    points. visible_list: `visible`, whose length is still on its way. point_slot: (N,) uint32,
+    where a visible point stands in `visible`, undefined for others. transmittance: (HW,) float32
+    behind all fragments, None with the softmax.
     """
 
     blend: str
     tracked: int
-    pixel_entry: Array
-    pixel_slope: Array | None
-    point_is_shaded: Array
-    shaded_list: Reading[Array]
+    pixel_weight_point: Array
+    pixel_derivative: Array | None
+    point_is_visible: Array
+    visible_list: Pending[Array]
     point_slot: Array
     transmittance: Array | None
 
     @property
-    def shaded(self) -> Array:
-        """(S,) uint32, ascending: the visible points, those with a hit that is not dropped. Only
-        they are shaded and get gradients. Waits until their number is known.
+    def visible(self) -> Array:
+        """(S,) uint32, ascending: the visible points, those with a fragment that is not dropped.
+        Only they are shaded and get gradients. Waits until their number is known.
         """
-        return self.shaded_list.get()
+        return self.visible_list.get()
 
 
-def weights_table(n: int, pixels: int, slopes: int) -> Table:
-    """The buffers for n points and a number of pixels, with room for a number of slopes; the
-    entries lie in pairs_table()'s pair_scratch.
+def weights_table(n: int, pixels: int, derivatives: int) -> Table:
+    """The buffers for n points and a number of pixels, with a capacity for a number of derivatives;
+    pixel_weight_point lies in pairs_table()'s pair_scratch.
     """
     return {
-        "pixel_slope": ((slopes,), np.float32),
+        "pixel_derivative": ((derivatives,), np.float32),
         "transmittance": ((pixels,), np.float32),
-        "point_is_shaded": ((n,), np.uint8),
-        "shaded": ((n,), np.uint32),
+        "point_is_visible": ((n,), np.uint8),
+        "visible": ((n,), np.uint32),
         "point_slot": ((n,), np.uint32),
     }
 
@@ -76,28 +77,29 @@ def blend_weights(
     gamma: float,
     max_tracked: int = 0,
     early_stop: float = 0.0,
-    slopes: bool = True,
+    derivatives: bool = True,
 ) -> BlendWeights:
     """The weights of all pairs, in the buffers b of find_pairs().
 
     opacity: (N,) float32 in [0, 1]. blend: one of BLENDS. gamma: depth sharpness of the softmax.
-    max_tracked: only this many nearest hits of a pixel get gradients (64 in the paper); 0: all.
-    early_stop: in [0, 1): a pixel drops all hits behind the depth where no hit can have this share
-    any more (0.001 in the paper); 0: none. slopes: write what the backward pass reads.
+    max_tracked: only this many nearest fragments of a pixel get gradients (64 in the paper); 0:
+    all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
+    have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
+    pass reads.
     """
-    b.require(weights_table(pairs.points, pairs.pixels, pairs.capacity if slopes else 1))
-    dev.fill(b.point_is_shaded, 0)
-    defines: dict[str, Any] = {"LANES": lanes(dev), "SLOPES": int(slopes)}
+    b.require(weights_table(pairs.points, pairs.pixels, pairs.capacity if derivatives else 1))
+    dev.fill(b.point_is_visible, 0)
+    defines: dict[str, Any] = {"LANES": lanes(dev), "DERIVATIVES": int(derivatives)}
     shared: dict[str, Any] = {
         "hw": pairs.pixels,
         "early_stop": early_stop,
         "pixel_offset": pairs.pixel_offset,
         "pair_key": pairs.pair_key,
-        "pair_point_closeness": pairs.pair_point_closeness,
+        "pair_point_falloff": pairs.pair_point_falloff,
         "opacity": opacity,
-        "pixel_entry": b.pair_scratch,
-        "pixel_slope": b.pixel_slope,
-        "point_is_shaded": b.point_is_shaded,
+        "pixel_weight_point": b.pair_scratch,
+        "pixel_derivative": b.pixel_derivative,
+        "point_is_visible": b.point_is_visible,
     }
     if blend == "alpha":
         program = dev.program("raster/alpha", **footprint_macros(pairs.footprint), **defines)
@@ -107,40 +109,46 @@ def blend_weights(
         program.launch(
             "softmax_weights", pairs.pixels, sharpness=1 / gamma, camera=camera_buffer, **shared
         )
-    shaded_list = nonzero(dev, b.point_is_shaded, b.shaded, b.point_slot)
+    visible_list = nonzero(dev, b.point_is_visible, b.visible, b.point_slot)
     return BlendWeights(
         blend,
         max_tracked or ALL,
         b.pair_scratch,
-        b.pixel_slope if slopes else None,
-        b.point_is_shaded,
-        shaded_list,
+        b.pixel_derivative if derivatives else None,
+        b.point_is_visible,
+        visible_list,
         b.point_slot,
         b.transmittance if blend == "alpha" else None,
     )
 
 
-def listed_hits(pairs: Pairs, weights: BlendWeights) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """On the host, of each hit in the order of pairs.pair_key: (P,) bool, whether it is not
+def listed_fragments(
+    pairs: Pairs, weights: BlendWeights
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """On the host, of each fragment in the order of pairs.pair_key: (P,) bool, whether it is not
     dropped, and of those that are not uint32 point and float32 weight.
     """
     offset = pairs.pixel_offset.get().astype(np.int64)
-    entry = weights.pixel_entry.get()[: pairs.total]
-    point = (entry & np.uint64(NO_POINT)).astype(np.uint32)
-    # what follows an entry of no point within its pixel was never written
+    weight_point = weights.pixel_weight_point.get()[: pairs.total]
+    point = (weight_point & np.uint64(NO_POINT)).astype(np.uint32)
+    # what follows NO_POINT within its pixel was never written
     ends = np.concatenate([[0], np.cumsum(point == NO_POINT)])
-    kept = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
-    return kept, point[kept], (entry[kept] >> np.uint64(32)).astype(np.uint32).view(np.float32)
+    is_listed = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
+    return (
+        is_listed,
+        point[is_listed],
+        (weight_point[is_listed] >> np.uint64(32)).astype(np.uint32).view(np.float32),
+    )
 
 
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
     """Set (P, 2) float32 to 0 at the pairs of visible points."""
-    shaded = weights.shaded
+    visible = weights.visible
     dev.program("raster/weights").launch(
         "clear_pairs",
-        shaded.size,
-        s=shaded.size,
-        shaded=shaded,
+        visible.size,
+        s=visible.size,
+        visible=visible,
         point_offset=pairs.point_offset,
         pair_gradient=pair_gradient,
     )
@@ -159,7 +167,7 @@ def list_weights(dev: Device, b: Buffers, pairs: Pairs, weights: BlendWeights) -
         tracked=weights.tracked,
         pixel_offset=pairs.pixel_offset,
         pair_key=pairs.pair_key,
-        pixel_entry=weights.pixel_entry,
+        pixel_weight_point=weights.pixel_weight_point,
         pair_gradient=b.pair_gradient,
     )
     return b.pair_gradient
@@ -175,7 +183,7 @@ def record_weights(
     least: float = 0.0,
 ) -> None:
     """Update what pruning looks at, both (N,) float32: max_weight, the highest sum over an image's
-    pixels of a point's blend weights so far, and times_seen, how many images had a hit of the
+    pixels of a point's blend weights so far, and times_seen, how many images had a fragment of the
     point, dropped or not, and such a sum of at least `least`. pair_gradient: of blend_backward() or
     list_weights().
     """
@@ -185,7 +193,7 @@ def record_weights(
         n=pairs.points,
         least=least,
         point_offset=pairs.point_offset,
-        point_is_shaded=weights.point_is_shaded,
+        point_is_visible=weights.point_is_visible,
         pair_gradient=pair_gradient,
         max_weight=max_weight,
         times_seen=times_seen,

@@ -19,9 +19,8 @@ BETWEEN = 0.125  # pixels by which images at their own size are shifted: farther
 
 
 class Crop(NamedTuple):
-    """A part of a view. box: (x0, y0, width, height), pixels of its reduced
-    image; jitter: stored pixels by which the reduced image starts further right and down; camera:
-    of the part.
+    """A part of a view. box: (x0, y0, width, height), pixels of its reduced image; jitter: stored
+    pixels by which the reduced image starts further right and down; camera: of the part.
     """
 
     view_index: int

@@ -1,4 +1,4 @@
-"""Gains of photographs that differ in exposure or white balance, and whether they do."""
+"""Gains of images that differ in exposure or white balance, and whether they do."""
 
 import warnings
 
@@ -10,9 +10,9 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import launch_groups
 from pp_cl.engine.training.loss import corner_of
 
-KEPT = 0.7  # of a view's sums from one of its steps to the next
+DECAY = 0.7  # of a view's sums from one of its steps to the next
 PRIOR = 1e-3  # squares per pixel: black objects tell no gains
-# steps on each view, and in all, after which it is known whether photographs differ: before,
+# steps on each view, and in all, after which it is known whether images differ: before,
 # gains explain much of what a small model has not learned yet
 LOOKS, LEAST_STEPS = 2, 100
 LEAST_SHARE = 0.25  # of the squared error that gains must explain
@@ -22,9 +22,9 @@ TINY = 1e-12
 class Exposure:
     """A gain for each view and channel, relative to the views' mean, found while a training runs.
 
-    state: (views, 3, 4) float32, of each channel the sums of rendering times photograph, of the
-    rendering squared and of the photograph squared, and the gain. is_applied: whether photographs
-    are divided by their gains, or these only look on.
+    state: (views, 3, 4) float32, of each channel the sums of rendering times image, of the
+    rendering squared and of the image squared, and the gain. is_applied: whether images are divided
+    by their gains, or these only look on.
     """
 
     def __init__(self, dev: Device, views: int, is_applied: bool):
@@ -33,10 +33,10 @@ class Exposure:
         self.state = dev.upload(np.tile([0, 0, 0, 1], (views, 3, 1)), np.float32)
         self._buffers = Buffers(dev)
 
-    def target(self, view: int, photograph: Array, alpha: Array) -> Array:
-        """(H, W, 3) float32: a photograph divided by its view's gains, valid until the next call.
+    def target(self, view: int, image: Array, alpha: Array) -> Array:
+        """(H, W, 3) float32: an image divided by its view's gains, valid until the next call.
 
-        view: its index. photograph: (H, W, 3) float32, over white. alpha: (H, W) float32.
+        view: its index. image: (H, W, 3) float32, over white. alpha: (H, W) float32.
         """
         height, width = alpha.shape
         self._buffers.require({"target": ((height, width, 3), np.float32)})
@@ -46,7 +46,7 @@ class Exposure:
             hw=height * width,
             view=view,
             exposure=self.state,
-            photograph=photograph,
+            image=image,
             alpha=alpha,
             target=self._buffers.target,
         )
@@ -56,11 +56,11 @@ class Exposure:
         self,
         view: int,
         prediction: Array,
-        photograph: Array,
+        image: Array,
         alpha: Array,
         offset: tuple[int, int],
     ) -> None:
-        """Learn from a photograph as target() takes it and the prediction (PH, PW, 3), on which it
+        """Learn from an image as target() takes it and the prediction (PH, PW, 3), on which it
         lies at offset = (left, top).
         """
         (height, width), b = alpha.shape, self._buffers
@@ -73,9 +73,9 @@ class Exposure:
             h=height,
             w=width,
             pw=prediction.shape[1],
-            corner=corner_of(prediction.shape, photograph.shape, *offset),
+            corner=corner_of(prediction.shape, image.shape, *offset),
             prediction=prediction,
-            photograph=photograph,
+            image=image,
             alpha=alpha,
             row_products=b.row_products,
         )
@@ -85,7 +85,7 @@ class Exposure:
             views=len(self.state),
             view=view,
             h=height,
-            kept=KEPT,
+            decay=DECAY,
             prior=PRIOR * height * width,
             row_products=b.row_products,
             exposure=self.state,
@@ -107,7 +107,7 @@ class Exposure:
             return None
         self.is_applied = True
         warnings.warn(
-            f"the photographs differ in exposure or white balance ({share:.0%} of their error);"
+            f"the images differ in exposure or white balance ({share:.0%} of their error);"
             " a gain of each view and channel is found beside the model (train.exposure)",
             stacklevel=2,
         )
@@ -115,7 +115,7 @@ class Exposure:
 
 
 def decided_at(begun: int, views: int) -> int:
-    """The step after which it is known whether the photographs of a training differ. begun: the
-    step at which its moments started.
+    """The step after which it is known whether the images of a training differ. begun: the step at
+    which its moments started.
     """
     return begun + max(LOOKS * views, LEAST_STEPS)

@@ -7,14 +7,14 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, Reading, Table, read_later
+from pp_cl.engine.device.buffers import Buffers, Pending, Table, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import group_items, lanes, launch_groups
 from pp_cl.errors import Diverged
 
 TAPS = 11  # pixels, the side of an SSIM window
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
-FURTHER = ("mask", "spread")  # terms that not every training has
+FURTHER = ("mask", "distortion")  # terms that not every training has
 
 
 def loss_table(
@@ -27,8 +27,8 @@ def loss_table(
     blocks = (-(-3 * width // 16) * 16 + MARGIN) // values  # vectors in a scratch row
     return {
         "moments": ((window_rows, 4, blocks, values), np.float32),
-        "slopes": ((window_rows, 3, blocks, values), np.float32),
-        "row_slopes": ((window_rows, 3, blocks, values), np.float32),
+        "derivatives": ((window_rows, 3, blocks, values), np.float32),
+        "row_derivatives": ((window_rows, 3, blocks, values), np.float32),
         "partial_terms": ((window_rows + height, blocks, 4), np.float32),
         "row_terms": ((window_rows + height, 4), np.float32),
         "grad_prediction": ((*padded, 3), np.float32),
@@ -90,16 +90,16 @@ class Loss:
             blocks=blocks,
             weight=self.ssim_weight,
             moments=b.moments,
-            slopes=b.slopes,
+            derivatives=b.derivatives,
             partial_terms=b.partial_terms,
         )
         program.launch(
-            "loss_row_slopes",
+            "loss_row_derivatives",
             (blocks, window_rows),
             v=window_rows,
             blocks=blocks,
-            slopes=b.slopes,
-            row_slopes=b.row_slopes,
+            derivatives=b.derivatives,
+            row_derivatives=b.row_derivatives,
         )
         if prediction.shape != target.shape:
             self.dev.fill(b.grad_prediction, 0)
@@ -115,7 +115,7 @@ class Loss:
             beta=self.beta,
             prediction=prediction,
             target=target,
-            row_slopes=b.row_slopes,
+            row_derivatives=b.row_derivatives,
             grad_prediction=b.grad_prediction,
             partial_terms=b.partial_terms,
         )
@@ -144,7 +144,7 @@ class Loss:
             terms=self.terms,
         )
 
-    def read(self, step: int) -> Reading[dict[str, float]]:
+    def read(self, step: int) -> Pending[dict[str, float]]:
         """{"loss", "l1", "ssim", "psnr"} of the crop of a step, from 1 on, and the terms that were
         added. Asking for them raises Diverged if one is not finite.
         """

@@ -59,25 +59,25 @@ class Optimiser:
         gradients: BlendGradients,
         *,
         points: ProjectedPoints,
-        shaded: Array,
+        visible: Array,
         sh_eps: float,
     ) -> None:
         """One step by the gradients of the visible points, and by those of the network, which lie
         in model.net.gradients.
 
-        step: from 1. points: as projected into the rendered
-        view. shaded: (S) uint32, the visible ones. sh_eps: eps of the SH coefficients.
+        step: from 1. points: as projected into the rendered view. visible: (S) uint32, the visible
+        ones. sh_eps: eps of the SH coefficients.
         """
         net = self.model.net
         rmsprop_update(
             self.dev,
             step,
             rates,
-            gradients.shaded_features,
+            gradients.visible_features,
             gradients.opacity,
             gradients.offset,
             points=points,
-            shaded=shaded,
+            visible=visible,
             cloud=self.model.cloud,
             state=self.state,
             sh_eps=sh_eps,
@@ -199,12 +199,12 @@ def rmsprop_update(
     dev: Device,
     step: int,
     rates: Rates,
-    grad_shaded_features: Array,
+    grad_visible_features: Array,
     grad_opacity: Array,
     grad_offset: Array | None,
     *,
     points: ProjectedPoints,
-    shaded: Array,
+    visible: Array,
     cloud: PointCloud,
     state: PointState,
     sh_eps: float,
@@ -214,7 +214,7 @@ def rmsprop_update(
     stay. The gradient of a SH coefficient is the product of its harmonic in the direction from the
     eye to the point and the gradient of the point's feature; it is never formed.
 
-    step: from 1 on. points, shaded and sh_eps: as Optimiser.update() takes them.
+    step: from 1 on. points, visible and sh_eps: as Optimiser.update() takes them.
     """
     degree = max((d for d in range(stored_degree(cloud.sh) + 1) if rates.sh[d] > 0), default=0)
     root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(cloud.sh)
@@ -233,9 +233,9 @@ def rmsprop_update(
     fits = program.kernels["rmsprop_move"].largest_group >= parts
     program.launch(
         "rmsprop_move",
-        len(shaded) * parts,
+        len(visible) * parts,
         None if fits else parts,  # is refused: the parts of a point wait for each other
-        s=len(shaded),
+        s=len(visible),
         step=step,
         eps=root * sh_eps,
         rate_0=root * rates.sh[0],
@@ -244,10 +244,10 @@ def rmsprop_update(
         point_eps=root * POINT_EPS,
         rate_offset=root * rates.offset,
         rate_opacity=root * rates.opacity,
-        shaded=shaded,
+        visible=visible,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
-        grad_shaded_features=grad_shaded_features,
+        grad_visible_features=grad_visible_features,
         grad_offset=v["offset"] if grad_offset is None else grad_offset,
         grad_opacity=grad_opacity,
         last_step=state.last_step,

@@ -22,8 +22,8 @@ SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
 def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainConfig) -> Array:
     """(M,) uint32, ascending: the points that are kept during training. A point is judged once
     PRUNE_LOOKS steps had it in their image: it is kept if its blend weight reached
-    train.prune_weight in one of them and its opacity is at least LEAST_OPACITY, and its
-    counts start anew. Points seen less often are kept.
+    train.prune_weight in one of them and its opacity is at least LEAST_OPACITY, and its counts
+    start anew. Points seen less often are kept.
 
     The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
     Raises Diverged for weights and opacities that are not finite, which nothing later would find.
@@ -49,8 +49,7 @@ def final_points_to_keep(
     least: int,
 ) -> Array:
     """(M,) uint32, ascending: the points of a finished training that weigh at least
-    train.prune_weight in `least` training views and have LEAST_OPACITY. NaN counts as
-    too little.
+    train.prune_weight in `least` training views and have LEAST_OPACITY. NaN counts as too little.
 
     max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
     many it is train.prune_weight.
@@ -62,7 +61,7 @@ def final_points_to_keep(
 
 def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Config) -> Array:
     """final_points_to_keep() of training views: in one of them, where there are many in two, as
-    what a single photograph shows is mostly a speck in others.
+    what a single image shows is mostly a speck in others.
     """
     dev, cloud, train = renderer.dev, renderer.model.cloud, config.train
     max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
@@ -76,8 +75,8 @@ def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Co
 
 def points_of_large_parts(model: Model) -> Array:
     """(M,) uint32, ascending: the points of parts that are large enough to be of the object."""
-    is_kept = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
-    return model.dev.upload(np.flatnonzero(is_kept), np.uint32)
+    is_large = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
+    return model.dev.upload(np.flatnonzero(is_large), np.uint32)
 
 
 def _listed(dev, keep, weight):

@@ -19,7 +19,7 @@ EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 
 DELAYED = 0.01  # of a learning rate, at the first step of its warm-up
 # The share of the points that pruning leaves by the next refinement or the last step, about: 0.45
 # to 0.73 on lego with the presets tiny, small and full.
-KEPT_BY_PRUNING = 0.6
+LEFT_BY_PRUNING = 0.6
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[S
             now = max(start, step)
             yield Stretch(points, sum(now < at for at in refined), averaged <= now)
             to_come = prunings(train, now, end) / max(1, prunings(train, start, end))
-            points = round(points * KEPT_BY_PRUNING**to_come) * (8 if end in refined else 1)
+            points = round(points * LEFT_BY_PRUNING**to_come) * (8 if end in refined else 1)
         start = end
 
 
@@ -131,8 +131,8 @@ def gamma_at(step: int, steps: int) -> float:
 
 
 def rising_weight(step: int, steps: int, last: float = 1.0) -> float:
-    """A loss weight that rises linearly from 0 to `last`: of the spread, and of alphas below the
-    mask. At first there is no surface that these could make sharp or opaque.
+    """A loss weight that rises linearly from 0 to `last`: of the distortion loss, and of alphas
+    below the mask. At first there is no surface that these could make sharp or opaque.
     """
     return last * step / steps
 

@@ -51,7 +51,7 @@ class PointState:
 
     @property
     def times_seen(self) -> Array:
-        """(N) float32: number of those images that had a hit of the point, occluded or not."""
+        """(N) float32: number of those images that had a fragment of the point, occluded or not."""
         return self._arrays["times_seen"]
 
     @property

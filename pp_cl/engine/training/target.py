@@ -1,4 +1,4 @@
-"""The training target on the device: a photograph reduced by area on premultiplied colour, over
+"""The training target on the device: an image reduced by area on premultiplied colour, over
 white.
 """
 
@@ -15,7 +15,7 @@ AROUND = 2  # pixels on either side of a place that interpolation reads
 
 
 def target_table(size: tuple[int, int]) -> Table:
-    """The buffers of Target for a crop of size (height, width), beside the photograph's rows."""
+    """The buffers of Target for a crop of size (height, width), beside the image's rows."""
     return {"target": ((*size, 3), np.float32), "alpha": (size, np.float32)}
 
 
@@ -51,7 +51,7 @@ class Target:
         last = top + view.downscale * height + AROUND
         rows = view.image[first : max(last, first + 1)]
         most = min(view.downscale * height + 2 * AROUND, stored_height) * stored_width * 4
-        image = self.dev.scratch("photograph", most, np.uint8)[: rows.size].reshape(rows.shape)
+        image = self.dev.scratch("stored image", most, np.uint8)[: rows.size].reshape(rows.shape)
         self.dev.send(image, rows)
         across, down = (stored - d for stored, d in zip(jitter, whole, strict=True))
         name, own = "target_forward", dict[str, Any](downscale=view.downscale)

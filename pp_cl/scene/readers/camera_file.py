@@ -11,7 +11,14 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.scene.readers.common import read_json
-from pp_cl.scene.readers.frame import GL_FROM_CV, LEAST_ANGLE, Frame, distortion, pinhole, rigid
+from pp_cl.scene.readers.frame import (
+    GL_FROM_CV,
+    LEAST_ANGLE,
+    Frame,
+    lens_distortion,
+    pinhole,
+    rigid,
+)
 
 FORMATS = (
     "a camera_path.json (with camera_path), a transforms.json (with frames), or a cameras.json (a"
@@ -43,7 +50,7 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
 
 
 def _transforms_camera(frame, size):
-    distortion(frame)  # the model is checked; what it bends is a photograph's, not a rendering's
+    lens_distortion(frame)  # the model is checked; what it bends is an image's, not a rendering's
     return pinhole(frame, *_size(frame, ("w", "h"), size))
 
 

@@ -18,7 +18,7 @@ from pp_cl.errors import Unusable, UserError, quoted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.found import LeftOut, find_image, usable
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import (
     MOST,
     SPLITS,
@@ -32,7 +32,7 @@ FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
 ANNOTATIONS = "frame_annotations.jgz"
 # characters of a file of annotations, and frames in it: the largest category has less than half
 MOST_TEXT, MOST_FRAMES = 2**30, 2**20
-MOST_KEPT = 2**22  # characters of the frames of one sequence: 3,500 of them
+MOST_SUM = 2**22  # characters of the frames of one sequence: 3,500 of them
 BETWEEN = re.compile(r"[\s,\[]*")  # objects of a list
 PIECE = 2**18  # characters that are unpacked at once; a frame takes some 1,200
 # PyTorch3D: x left, y up, z forwards; OpenCV: x right, y down, z forwards
@@ -53,8 +53,8 @@ def splits(folder: Path) -> list[str]:
     return sorted(listed) if listed else SPLITS
 
 
-def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
-    """The photographs of a split, in the order of their frame numbers.
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
+    """The images of a split, in the order of their frame numbers.
 
     Version 1: frames that set_lists.json calls known are for training, unseen ones for testing.
     Version 2: as the first of set_lists/*.json has it that names the sequence, those of many views
@@ -74,7 +74,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
         chosen = hold_out(chosen, split)
     else:
         chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
-    read = partial(_photograph, folder)
+    read = partial(_image_file, folder)
     return list(usable(progress(chosen), read, lambda one: f"frame {one.index}", left_out))
 
 
@@ -88,7 +88,7 @@ def _annotations(file, sequence, _changed):
     """[(index, annotation)] of a sequence's frames, of a file last changed then. Raises
     UserError.
     """
-    found, left = [], MOST_KEPT
+    found, left = [], MOST_SUM
     try:
         with opened_regular(file) as packed, gzip.open(packed, "rt", encoding="utf-8") as opened:
             for index, (own, size) in enumerate(_objects(opened)):
@@ -97,7 +97,7 @@ def _annotations(file, sequence, _changed):
                     left -= size
                 if left < 0 or index == MOST_FRAMES:
                     raise ValueError(
-                        f"more than {MOST_FRAMES} frames, or {MOST_KEPT} characters of one sequence"
+                        f"more than {MOST_FRAMES} frames, or {MOST_SUM} characters of one sequence"
                     )
     except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
         raise refusal(file, error, "gzipped JSON") from None
@@ -156,7 +156,7 @@ def _path(frame, key):
     return path
 
 
-def _photograph(folder, frame):
+def _image_file(folder, frame):
     name = _found(folder, frame, "image")
     mask = _found(folder, frame, "mask") if frame.get("mask") is not None else None
     size = image_size(folder / name)
@@ -164,7 +164,7 @@ def _photograph(folder, frame):
     if stated not in (None, [size[1], size[0]]):
         there = f"but {name} has {size[0]}x{size[1]}; copy it again"
         raise frame.error("image", f"has the size {quoted(stated, 40)} (height, width), {there}")
-    return Photograph(name, _camera(frame, size), mask=mask)
+    return ImageFile(name, _camera(frame, size), mask=mask)
 
 
 def _found(folder, frame, key):

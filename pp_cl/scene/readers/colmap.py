@@ -21,9 +21,9 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
-from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.found import LeftOut, find_image, folder_named, holds_images, usable
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.readers.common import (
     MOST,
     fail_at,
@@ -64,7 +64,7 @@ NOT_READ = (
 )
 ONE_FOCAL = ("SIMPLE_", "RADIAL")  # how models with one focal length begin
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
-MOST_ENTRIES = 2**17  # of a file, cameras or images
+MOST_RECORDS = 2**17  # of a file, cameras or images
 MOST_NAME = 1024  # bytes of an image's name
 MOST_LINE = 2**22  # characters of a line: 150,000 2D points
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP
@@ -100,8 +100,8 @@ def recognises(folder: Path) -> bool:
     return bool(_models(folder))
 
 
-def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
-    """The photographs of a split: test is every eighth in the order of their names.
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
+    """The images of a split: test is every eighth in the order of their names.
 
     Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
     Raises UserError naming the file, and the image.
@@ -120,7 +120,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
             )
     chosen = hold_out(sorted(images, key=lambda image: image.name), split)
     near = _images_of(folder, model) or folder / IMAGES
-    read = partial(_photograph, folder, near.relative_to(folder).as_posix(), model, lenses)
+    read = partial(_image_file, folder, near.relative_to(folder).as_posix(), model, lenses)
     return list(usable(progress(chosen), read, lambda image: image.name, left_out))
 
 
@@ -169,7 +169,7 @@ def _suffix(folder):
     return None
 
 
-def _photograph(folder, near, model, lenses, image):
+def _image_file(folder, near, model, lenses, image):
     fail = fail_at(model, image.name)
     name, lens = find_image(folder, f"{near}/{image.name}", fail), lenses[image.camera]
     if isinstance(lens, Unusable):
@@ -180,7 +180,7 @@ def _photograph(folder, near, model, lenses, image):
     fx, fy, cx, cy, *coefficients = numbers
     is_fisheye = lens.model.endswith("FISHEYE")
     order = ("k1", "k2", "k3", "k4") if is_fisheye else PERSPECTIVE
-    distortion = Distortion(**dict(zip(order, coefficients, strict=False)), fisheye=is_fisheye)
+    distortion = LensDistortion(**dict(zip(order, coefficients, strict=False)), fisheye=is_fisheye)
     w, x, y, z, *place = image.pose
     if not _are_numbers(image.pose) or abs(np.linalg.norm((w, x, y, z)) - 1) > 1e-3:
         raise Unusable(fail("its pose is no unit quaternion and place; fix it"), "no pose")
@@ -188,7 +188,7 @@ def _photograph(folder, near, model, lenses, image):
     pose = np.column_stack([rotation, -rotation @ place])
     camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
     camera = fitted(camera, image_size(folder / name, (lens.width, lens.height)), fail)
-    return Photograph(name, camera, distortion=distortion)
+    return ImageFile(name, camera, lens=distortion)
 
 
 # The model ----------------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
     suffix = _suffix(folder)
     lenses: dict[int, Lens | Unusable] = {}
     file = folder / f"cameras{suffix}"
-    for where, (identity, lens) in _entries(file, _binary_camera, CAMERA, _text_camera):
+    for where, (identity, lens) in _records(file, _binary_camera, CAMERA, _text_camera):
         model, width, height, parameters = lens
         if model not in MODELS:
             raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
@@ -214,7 +214,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
             lens = Unusable(f"{where}: {model} has {text}", BROKEN_CAMERA)
         lenses[identity] = lens
     file, images = folder / f"images{suffix}", {}
-    for where, image in _entries(file, _binary_image, IMAGE, _text_image):
+    for where, image in _records(file, _binary_image, IMAGE, _text_image):
         # the name goes into messages of one line
         has_controls = any(unicodedata.category(letter) == "Cc" for letter in image.name)
         if has_controls or not 1 <= len(image.name) <= MOST_NAME:
@@ -228,8 +228,8 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
         if name in images:
             raise UserError(f"{file}: {image.name}: stands there twice; remove one")
         images[name] = image
-        if len(images) > MOST_ENTRIES:
-            raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
+        if len(images) > MOST_RECORDS:
+            raise UserError(f"{file}: holds more than {MOST_RECORDS} records; split the model")
     if not images:
         raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
     return lenses, list(images.values())
@@ -241,7 +241,7 @@ def read_points(folder: Path) -> Iterator[Sequence[float]]:
     """
     for suffix in (".bin", ".txt"):
         if (file := folder / f"points3D{suffix}").is_file():
-            yield from (point for _, point in _entries(file, _binary_point, POINT, _text_point))
+            yield from (point for _, point in _records(file, _binary_point, POINT, _text_point))
             return
 
 
@@ -250,8 +250,8 @@ def _are_numbers(values):
     return all(abs(value) < MOST for value in values)
 
 
-def _entries(file, take, form, parse):
-    """(place in words, entry) of each entry of a file, which take(opened) reads of a binary one,
+def _records(file, take, form, parse):
+    """(place in words, record) of each record of a file, which take(opened) reads of a binary one,
     and parse(line, next line) of a text file, whose lines are of a form. Files are not held whole:
     points make them large. Raises UserError.
     """
@@ -282,7 +282,7 @@ def _text_entries(file, form, parse):
                 continue
             where = f"{file}: line {number}"
             try:
-                entry = parse(line.strip())
+                record = parse(line.strip())
             except (IndexError, ValueError, OverflowError):
                 raise UserError(f"{where}: is not {form}; copy the file again") from None
             if form == IMAGE:  # a second line has its 2D points
@@ -291,10 +291,10 @@ def _text_entries(file, form, parse):
                 # else an image without its line of points would hide the next one
                 if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
                     raise UserError(
-                        f"{file}: line {number}: must be the 2D points of {entry.name[:80]!r}, X Y"
+                        f"{file}: line {number}: must be the 2D points of {record.name[:80]!r}, X Y"
                         " POINT3D_ID each; give every image a second line, empty if it has none"
                     )
-            yield where, entry
+            yield where, record
 
 
 def _text_camera(line):
@@ -320,10 +320,10 @@ def _binary_entries(file, take):
     with opened_regular(file) as opened:
         (count,) = _take(opened, "Q")
         for index in range(count):  # a count that is too large ends at the file's end
-            yield f"{file}: entry {index + 1}", take(opened)
+            yield f"{file}: record {index + 1}", take(opened)
         size = os.fstat(opened.fileno()).st_size
         if opened.tell() != size:
-            raise ValueError(f"its entries end at byte {opened.tell()}, the file at {size}")
+            raise ValueError(f"its records end at byte {opened.tell()}, the file at {size}")
 
 
 def _take(opened, form):

@@ -23,9 +23,9 @@ from pp_cl.files.untrusted import (
     refusal,
 )
 from pp_cl.scene.found import Fail, LeftOut, numbered, usable
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 
-HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
+HELD_OUT = 8  # one image of so many, the first among them, as LLFF and 3DGS do
 SPLITS = ["test", "train"]  # of a format that knows none
 MOST_JSON = 2**26  # bytes of a JSON file: 100,000 frames of 670
 MOST_ARRAYS = 2**25  # bytes of all arrays of a file, as float64: 100,000 cameras need 25 million
@@ -59,8 +59,8 @@ def progress(items: Sequence[Item]) -> Iterable[Item]:
 
 
 def folder_images(folder: Path, name: str) -> list[str]:
-    """Paths relative to the scene's folder of the images in its folder `name`, sorted,
-    hidden files left out. Raises UserError where there are none.
+    """Paths relative to the scene's folder of the images in its folder `name`, sorted, hidden files
+    left out. Raises UserError where there are none.
     """
     found = [
         file.name
@@ -78,11 +78,11 @@ def in_order(
     images: Sequence[str],
     split: str,
     left_out: LeftOut,
-    read: Callable[[int, str], Photograph],
-) -> list[Photograph]:
-    """The photographs of a split whose cameras, called so in a file, stand there in the order of
-    the names of their images. Where images are gone, the numbers in the names of the others tell
-    which. read(index, image) gives a Photograph. Raises UserError where nothing tells.
+    read: Callable[[int, str], ImageFile],
+) -> list[ImageFile]:
+    """The images of a split whose cameras, called so in a file, stand there in the order of the
+    names of their images. Where images are gone, the numbers in the names of the others tell which.
+    read(index, image) gives an ImageFile. Raises UserError where nothing tells.
     """
     places = numbered(images, len(cameras))
     if places is None:
@@ -180,13 +180,13 @@ def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
     arrays, left = {}, MOST_ARRAYS
     try:
         with opened_zip(file) as archive:
-            for entry in archive.infolist():
-                name = entry.filename.removesuffix(".npy")
-                if name == entry.filename or not name.startswith(wanted):
+            for zip_info in archive.infolist():
+                name = zip_info.filename.removesuffix(".npy")
+                if name == zip_info.filename or not name.startswith(wanted):
                     continue
-                if entry.compress_type not in KINDS:  # others take memory of their own
+                if zip_info.compress_type not in KINDS:  # others take memory of their own
                     raise ValueError(f"{name} is packed as numpy does not")
-                with archive.open(entry) as opened:
+                with archive.open(zip_info) as opened:
                     arrays[name] = _read_array(opened, left)
                 left -= arrays[name].nbytes
     except Exception as error:  # zipfile and numpy meet broken bytes with whatever comes up

@@ -10,8 +10,8 @@ import numpy as np
 
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
-from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.found import Fail, find_image
+from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.readers.common import MOST, numbers
 
 # values of camera_model: perspective lenses, and fisheyes
@@ -137,7 +137,7 @@ def _focal_length(frame, length_key, angle_key, size):
     return length
 
 
-def distortion(frame: Frame) -> Distortion:
+def lens_distortion(frame: Frame) -> LensDistortion:
     """The lens distortion of a frame in the format of nerfstudio or instant-ngp. Raises UserError
     for a lens other than OpenCV's perspective one and its fisheye.
     """
@@ -151,7 +151,7 @@ def distortion(frame: Frame) -> Distortion:
         if frame.number(key):
             raise frame.error(key, f"is not modelled with this lens; {UNDISTORT}")
     numbers = {key: frame.number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4")}
-    return Distortion(**numbers, fisheye=is_fisheye)
+    return LensDistortion(**numbers, fisheye=is_fisheye)
 
 
 def rigid(value: Any, fail: Fail) -> np.ndarray:

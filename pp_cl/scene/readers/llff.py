@@ -8,7 +8,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.found import LeftOut, image_folder
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import (
     fail_at,
     fitted,
@@ -33,8 +33,8 @@ def recognises(folder: Path) -> bool:
     return (folder / POSES).is_file()
 
 
-def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
-    """The photographs of a split, in the order of their names.
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
+    """The images of a split, in the order of their names.
 
     Where the images are smaller or larger than the poses say, the focal length is scaled. Near and
     far bound all that was photographed, not the object, and are left out. Raises UserError naming
@@ -54,7 +54,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
             )
         pose = rigid(np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]]), fail)
         camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
-        return Photograph(name, fitted(camera, image_size(folder / name, (width, height)), fail))
+        return ImageFile(name, fitted(camera, image_size(folder / name, (width, height)), fail))
 
     cameras = [f"row {index}" for index in range(len(rows))]
     images = folder_images(folder, image_folder(folder))

@@ -11,7 +11,7 @@ from scipy.linalg import rq
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import image_size
 from pp_cl.scene.found import LeftOut, image_folder
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz, two_splits
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
@@ -27,8 +27,8 @@ def recognises(folder: Path) -> bool:
     return _file(folder) is not None
 
 
-def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
-    """The photographs of a split: test is every eighth in the order of the images' names.
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
+    """The images of a split: test is every eighth in the order of the images' names.
 
     The world is that of world_mat, in its own units. scale_mat, where it is there, moves the unit
     sphere around the object, which gives the depth range. Raises UserError naming the file and the
@@ -47,11 +47,11 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
         key, scale = cameras[index], f"scale_mat_{index}"
         camera = _camera(matrices[key], image_size(folder / name), fail_at(file, key))
         if scale not in scales:
-            return Photograph(name, camera)
+            return ImageFile(name, camera)
         middle, radius = _sphere(scales[scale], fail_at(file, scale))
         distance = np.linalg.norm(camera.eye - middle)
         near_far = max(distance - radius, 1e-3 * radius), distance + radius
-        return Photograph(name, camera, (float(near_far[0]), float(near_far[1])))
+        return ImageFile(name, camera, (float(near_far[0]), float(near_far[1])))
 
     images = folder_images(folder, image_folder(folder, IMAGES))
     return in_order(file, cameras, images, split, left_out, read)

@@ -9,7 +9,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.found import LeftOut, usable
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import fail_at, fitted, folder_images, read_numbers
 from pp_cl.scene.readers.frame import rigid
 
@@ -31,8 +31,8 @@ def splits(folder: Path) -> list[str]:
     return sorted(_names(folder))
 
 
-def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
-    """The photographs of a split, in the order of their names. Poses are camera-to-world with
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
+    """The images of a split, in the order of their names. Poses are camera-to-world with
     OpenCV's axes; near and far are Euclidean distances. Raises UserError naming the file.
     """
     names = _names(folder)[split]
@@ -52,7 +52,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
         pose = rigid(read_numbers(pose_file), fail_at(pose_file))
         size = image_size(folder / name, stated)
         camera = Camera(pose, *lens, *(stated or size))
-        return Photograph(name, fitted(camera, size, fail_at(file)), depth_range)
+        return ImageFile(name, fitted(camera, size, fail_at(file)), depth_range)
 
     return list(usable(names, read, str, left_out))
 

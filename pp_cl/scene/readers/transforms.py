@@ -14,7 +14,7 @@ from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.found import LeftOut, usable
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import (
     SPLITS,
     checked_box,
@@ -24,7 +24,7 @@ from pp_cl.scene.readers.common import (
     progress,
     read_json,
 )
-from pp_cl.scene.readers.frame import Frame, distortion, frame_keys, pinhole
+from pp_cl.scene.readers.frame import Frame, frame_keys, lens_distortion, pinhole
 
 FILES = "transforms_train.json or transforms.json"
 SINGLE = "transforms.json"
@@ -48,8 +48,8 @@ def splits(folder: Path) -> list[str]:
     return sorted(listed) or SPLITS
 
 
-def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
-    """The photographs of transforms_<split>.json; or those of transforms.json that its
+def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
+    """The images of transforms_<split>.json; or those of transforms.json that its
     <split>_filenames names, and where it has no such lists every eighth for test, the others for
     train.
 
@@ -66,7 +66,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[Photograph]:
             raise frame.error("file_path", f"{name!r} stands there twice; remove one")
         frames[name] = frame
     chosen = list(frames) if files else _of_split(file, data, frames, split)
-    return list(usable(chosen, lambda name: _photograph(folder, frames[name]), str, left_out))
+    return list(usable(chosen, lambda name: _image_file(folder, frames[name]), str, left_out))
 
 
 def box(folder: Path) -> np.ndarray | None:
@@ -150,8 +150,8 @@ def _of_split(file, data, frames, split):
     return [name for name in ordered if wanted & {name, paths[name]}]
 
 
-def _photograph(folder, frame):
-    """The Photograph of one frame, its camera of the image's size. Raises Unusable."""
+def _image_file(folder, frame):
+    """The ImageFile of one frame, its camera of the image's size. Raises Unusable."""
     name = frame.image("file_path", folder)
     if name is None:
         raise frame.error("file_path", "is missing; add the path of the image")
@@ -165,7 +165,7 @@ def _photograph(folder, frame):
     if is_stated and (None in near_far or near_far[0] >= near_far[1]):
         key = "near" if near_far[0] is None else "far"
         raise frame.error(key, "near and far must both be given, far above near, or neither")
-    return Photograph(name, camera, near_far if is_stated else None, mask, distortion(frame))
+    return ImageFile(name, camera, near_far if is_stated else None, mask, lens_distortion(frame))
 
 
 def write_scene(splits: dict[str, list[View]], folder: Path | str) -> None:

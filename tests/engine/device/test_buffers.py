@@ -56,7 +56,7 @@ def test_packed_arrays(dev, rng):
     assert before < dev.bytes < used
 
 
-def test_a_reading_is_what_the_kernels_before_it_left(dev, rng):
+def test_a_pending_value_is_what_the_kernels_before_it_left(dev, rng):
     """Whatever is enqueued after it."""
     first, second = (rng.normal(size=257).astype(np.float32) for _ in range(2))
     array = dev.upload(first)
@@ -74,10 +74,10 @@ def test_kernels_that_fail_on_the_device_are_told_of(dev, monkeypatch):
     def failing():
         raise cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
 
-    reading = read_later(dev, dev.zeros((3,)))
-    reading._event = SimpleNamespace(wait=failing)
+    pending = read_later(dev, dev.zeros((3,)))
+    pending._event = SimpleNamespace(wait=failing)
     with pytest.raises(UserError, match="cannot finish its work .*EXEC_STATUS"):
-        reading.get()
+        pending.get()
     with monkeypatch.context() as patch:
         patch.setattr(dev, "queue", SimpleNamespace(finish=failing))
         with pytest.raises(UserError, match="cannot finish its work"):
@@ -128,7 +128,7 @@ def test_parts_are_joined(dev, rng, monkeypatch, n, piece):
 
 
 def test_what_was_fetched_or_written_is_not_kept(dev):
-    """A preview or a film would keep a dozen of its images beside the one that is shown."""
+    """A preview or a video would keep a dozen of its images beside the one that is shown."""
     array, zeros = dev.upload(np.arange(9, dtype=np.float32)), np.zeros(9, np.float32)
     [packed] = PackedArrays(dev).send([((9,), np.float32)], [zeros])
     hosts = [dev.download(array), array.get(), array[:5].get(), packed.get(), zeros]

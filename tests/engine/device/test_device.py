@@ -101,13 +101,13 @@ def test_memory_is_counted_and_given_back(plain):
 
 def test_buffers_are_held_to_the_largest_allocation_and_to_the_memory(plain):
     plain.info["max_allocation_bytes"], plain.info["memory_bytes"] = 1000, 2200
-    kept = plain.empty((250,))
+    held = plain.empty((250,))
     with pytest.raises(UserError, match=r"a buffer of shape \(251,\) needs .*lower --points"):
         plain.empty((251,))
     more = plain.empty((250,))
     with pytest.raises(UserError, match="in use"):
         plain.upload(np.zeros(51, np.float32))
-    assert plain.bytes == kept.nbytes + more.nbytes
+    assert plain.bytes == held.nbytes + more.nbytes
     plain.empty((50,))
 
 

@@ -22,7 +22,7 @@ from pp_cl.engine.training.loss import TAPS
 from pp_cl.reference.network import network, network_gradients
 from pp_cl.settings import BLOCKS
 
-BACKGROUND = 1.0  # of a pixel without hits, cl/common.h
+BACKGROUND = 1.0  # of a pixel without fragments, cl/common.h
 LAYERS = unet_layers((16, 16, 16))
 GRADIENT = np.float32([0.3, -0.2, 0.1])
 SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
@@ -62,7 +62,7 @@ def scene(rng, place, size=SIZE):
     return x, grad_y
 
 
-def active_tiles(x):
+def active_mask(x):
     """(rows, columns) bool: the tiles of (H, W, C) that are not all background."""
     return halve((x != BACKGROUND).any(2), 2)
 
@@ -70,7 +70,7 @@ def active_tiles(x):
 def run(dev, net, x, grad_y, *, sparse):
     """[image, gradient of x, gradients of the parameters] as the device computes them."""
     other = halve((grad_y != GRADIENT).any(2), 2)
-    plan = net.plan_tiles(x.shape[:2], active_tiles(x), other) if sparse else None
+    plan = net.plan_tiles(x.shape[:2], active_mask(x), other) if sparse else None
     x = dev.upload(x)
     y = net.forward(x, True, plan).get()
     return [y, net.backward(dev.upload(grad_y)).get(), *[g.get() for g in net.gradients.values()]]
@@ -84,7 +84,7 @@ def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     expected = run(dev, net, x, grad_y, sparse=False)
     actual = run(dev, net, x, grad_y, sparse=True)
     device_x = dev.upload(x)
-    plan = net.plan_tiles(SIZE, active_tiles(x))
+    plan = net.plan_tiles(SIZE, active_mask(x))
     assert (plan.computed_fraction < 0.4) == (name != "everywhere")
     np.testing.assert_array_equal(net.forward(device_x, False, plan).get(), actual[0])
     if variant == "direct":  # Winograd mixes the last bits of a tile
@@ -112,7 +112,7 @@ def test_few_tiles_in_large_images_only(dev, rng):
     net = UNet(dev, (16, 16, 16))
     for height, end, chosen in ((256, 60, True), (256, 240, False), (252, 60, False)):
         x = scene(rng, (slice(40, end), slice(40, end)), (height, 256))[0]
-        plan = net.plan_tiles(x.shape[:2], active_tiles(x))
+        plan = net.plan_tiles(x.shape[:2], active_mask(x))
         assert (plan is not None) == chosen
         if chosen:
             assert plan.computed_fraction <= pp_cl.engine.network.unet.MOST_COMPUTED

@@ -46,22 +46,22 @@ def test_gradients_against_finite_differences(dev, rng, rule, gamma):
     assert relative_error(gradients["features"].ravel()[some], numeric) < 1e-4
 
 
-def test_gradients_of_the_spread_against_finite_differences(dev, rng):
+def test_gradients_of_the_distortion_loss_against_finite_differences(dev, rng):
     blended = Blended(dev, rng, n=60, rule="alpha")
     blended.grad[:] = 0
 
     def loss(opacity):
-        return oracle.spread(blended.geometry, oracle.alpha(blended.geometry, opacity)).sum()
+        return oracle.distortion(blended.geometry, oracle.alpha(blended.geometry, opacity)).sum()
 
     numeric = numeric_gradient(loss, blended.opacity.astype(np.float64), 1e-5, np.arange(60))
     assert np.abs(numeric).max() > 0.1
-    assert relative_error(blended.gradients(spread_weight=1.0)["opacity"], numeric) < 1e-5
+    assert relative_error(blended.gradients(distortion_weight=1.0)["opacity"], numeric) < 1e-5
 
 
-def test_hits_at_one_depth_and_single_hits_have_no_spread(dev):
+def test_fragments_at_one_depth_and_single_fragments_have_no_distortion_loss(dev):
     for z in ([0.5], [0.5] * 7):
         scene, _ = blend_on_axis(dev, z, [0.5] * len(z), 0.1, rule="alpha")
-        gradients = scene.gradients(np.zeros((1, 1, 16)), spread_weight=1e6)
+        gradients = scene.gradients(np.zeros((1, 1, 16)), distortion_weight=1e6)
         assert (gradients["opacity"] == 0).all()
 
 
@@ -74,11 +74,16 @@ def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
     opacity = np.where(np.arange(31) == point, np.nan, 0.1)
     scene.blend(opacity, 0.1, np.zeros((31, 16)), rule="alpha")
     through = scene.weights.transmittance.get().ravel()
-    np.testing.assert_array_equal(np.isnan(through), scene.hits()[point])
+    np.testing.assert_array_equal(np.isnan(through), scene.fragments()[point])
     highest, seen = dev.zeros((31,)), dev.zeros((31,))
     listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
     record_weights(dev, scene.pairs, scene.weights, listed, highest, seen)
     assert np.isnan(highest.get()[point])
+
+
+def test_a_softmax_has_no_distortion_loss(dev, rng):
+    with pytest.raises(ValueError, match="distortion"):
+        Blended(dev, rng).gradients(distortion_weight=1.0)
 
 
 def test_the_softmax_by_hand(dev):
@@ -97,12 +102,12 @@ def test_the_softmax_by_hand(dev):
     assert weight[1] == 0 and hidden != 0 and abs(hidden) < 1e-30
 
 
-def test_untracked_hits_without_weight_are_shaded(dev, rng):
+def test_untracked_fragments_without_weight_are_shaded(dev, rng):
     """A weight may underflow to 0 beyond max_tracked; its point is in the pixels' lists, so it must
     be shaded.
     """
     blended = Blended(dev, rng, n=300, gamma=1e-3, radius=0.4, max_tracked=1, early_stop=1e-30)
-    listed_zero = blended.geometry["hit"] & ~blended.dropped & (blended.weight == 0)
+    listed_zero = blended.geometry["fragment"] & ~blended.dropped & (blended.weight == 0)
     assert listed_zero.any() and np.isfinite(blended.features).all()
 
 
@@ -113,8 +118,8 @@ def test_two_runs_give_the_same_bits(dev, rule, early_stop):
     for _ in range(2):
         rng = np.random.default_rng(3)
         blended = Blended(dev, rng, n=3000, radius=0.2, rule=rule, early_stop=early_stop)
-        shaded, gradients = blended.scene.weights.shaded.get(), blended.gradients()
-        runs.append([blended.weight, shaded, blended.features, *gradients.values()])
+        visible, gradients = blended.scene.weights.visible.get(), blended.gradients()
+        runs.append([blended.weight, visible, blended.features, *gradients.values()])
     assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))
 
 

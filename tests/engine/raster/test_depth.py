@@ -22,7 +22,7 @@ def test_soft_points_are_balls(dev, rng):
         centre = dense.camera_space(scene.camera, position[None])[0]
         along = ray @ centre
         across = np.linalg.norm(centre - along[:, None] * ray, axis=1)
-        # a pixel's closeness takes its distance at the centre's range, second order in it
+        # a pixel's falloff takes its distance at the centre's range, second order in it
         inside = (alpha > 0) & (across < 0.9 * radius)
         assert inside.sum() > 10
         front = (along - np.sqrt(radius**2 - np.minimum(across, radius) ** 2)) * ray[:, 2]
@@ -30,12 +30,14 @@ def test_soft_points_are_balls(dev, rng):
         np.testing.assert_allclose(median[inside], depth[inside], rtol=1e-6)
 
 
-def test_a_closeness_that_is_rounded_below_0_has_a_depth(dev):
-    """Of the nearest of two hits, as a GPU's square roots and quotients may round it at the rim."""
+def test_a_falloff_that_is_rounded_below_0_has_a_depth(dev):
+    """Of the nearest of two fragments, as a GPU's square roots and quotients may round it at the
+    rim.
+    """
     scene, _ = blend_on_axis(dev, [0.9, 0.5], [1.0, 1.0], 0.1, rule="alpha")
-    hits = scene.pairs.pair_point_closeness.get()
-    hits[0, 1] = np.float32(-(2.0**-23)).view(np.uint32)
-    scene.pairs = replace(scene.pairs, pair_point_closeness=dev.upload(hits))
+    fragments = scene.pairs.pair_point_falloff.get()
+    fragments[0, 1] = np.float32(-(2.0**-23)).view(np.uint32)
+    scene.pairs = replace(scene.pairs, pair_point_falloff=dev.upload(fragments))
     scene.blend([1.0, 1.0], 0.1, np.zeros((2, 16)), rule="alpha")
     arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
     assert scene.weight()[0, 0] < 0 and all(np.isfinite(array.get()).all() for array in arrays)

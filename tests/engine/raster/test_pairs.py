@@ -9,23 +9,23 @@ from support.guarded import large
 
 from pp_cl.bench.spheres import find_all_pairs
 from pp_cl.engine.device.buffers import Buffers
-from pp_cl.engine.raster.pairs import MOST_PAIRS, find_pairs, room_needed
+from pp_cl.engine.raster.pairs import MOST_PAIRS, capacity_needed, find_pairs
 from pp_cl.engine.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 
 
 def by_point(pairs):
-    """[(pixels, closeness)] of each point."""
+    """[(pixels, falloff)] of each point."""
     offsets = pairs.point_offset.get()[1:-1]
-    closeness = pairs.pair_point_closeness.get()[: pairs.total, 1].view(np.float32)
+    falloff = pairs.pair_point_falloff.get()[: pairs.total, 1].view(np.float32)
     pixels = np.split(pairs.pair_pixel.get()[: pairs.total], offsets)
-    return list(zip(pixels, np.split(closeness, offsets), strict=True))
+    return list(zip(pixels, np.split(falloff, offsets), strict=True))
 
 
 @pytest.mark.parametrize("kind", FOOTPRINTS)
-def test_hits_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind):
-    """As where a compiler rounds in one way where hits are counted, in another where they are
+def test_fragments_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind):
+    """As where a compiler rounds in one way where fragments are counted, in another where they are
     written: all other points' pairs are what they would be, and no slot is left undefined.
     """
     camera, n = make_camera(), 300
@@ -71,15 +71,15 @@ def test_lists_of_all_lengths_side_by_side_are_sorted(dev, rng, lengths):
 
 def bits(pairs):
     """[arrays] of what is valid of the pairs."""
-    names = ("pair_pixel", "pair_point_closeness", "pair_key")
+    names = ("pair_pixel", "pair_point_falloff", "pair_key")
     arrays = [getattr(pairs, name).get()[: pairs.total] for name in names]
     return [*arrays, pairs.point_offset.get(), pairs.pixel_offset.get()]
 
 
-def test_more_room_is_a_number_of_the_kernels():
+def test_more_capacity_is_a_number_of_the_kernels():
     """A quarter more than needed, but no more than uint32 can number."""
     for total, expected in ((900, 1000), (1001, 1251), (3_500_000_000, MOST_PAIRS)):
-        assert room_needed(SimpleNamespace(capacity=1000, total=total)) == expected
+        assert capacity_needed(SimpleNamespace(capacity=1000, total=total)) == expected
 
 
 def test_buffers_serve_views_of_any_size(dev, rng):

@@ -1,5 +1,5 @@
-"""Views that no photographer takes: from inside the object, of millions of pixels, through
-one huge point.
+"""Views that no photographer takes: from inside the object, of millions of pixels, through one huge
+point.
 """
 
 from dataclasses import replace
@@ -17,8 +17,8 @@ pytestmark = pytest.mark.kernels
 
 
 def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=oracle.DEPTH_RANGE):
-    """A scene's hits, features and gradients against the oracle; returns the scene. Left out are
-    pixels where rounding decides over a hit, or makes up most of a closeness.
+    """A scene's fragments, features and gradients against the oracle; returns the scene. Left out
+    are pixels where rounding decides over a fragment, or makes up most of a falloff.
     """
     # a Gaussian's centre may lie hundreds of pixels beside the image, where float32 rounds it by
     # 3e-5 of one, and its deviation is half a pixel
@@ -26,16 +26,16 @@ def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=ora
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
     scene = PairedPoints(dev, camera, positions, radius, kind=kind, depth_range=depth_range)
     geometry = oracle.geometry(camera, positions, radius, kind, depth_range=depth_range)
-    hits, clear = scene.hits(), geometry["margin"] > 1e-3
-    assert np.array_equal(hits[clear], geometry["hit"][clear]) and (~clear).mean() < 0.02
+    fragments, clear = scene.fragments(), geometry["margin"] > 1e-3
+    assert np.array_equal(fragments[clear], geometry["fragment"][clear]) and (~clear).mean() < 0.02
     inner = (geometry["margin"] > 1e-2).all(axis=0)
     assert inner.mean() > 0.5
-    blend = oracle.blend(geometry | {"hit": hits}, opacity, gamma)
+    blend = oracle.blend(geometry | {"fragment": fragments}, opacity, gamma)
     features = scene.blend(opacity, gamma, point_features).reshape(-1, 16)
     assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-4 * unit
     grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
     gradients = scene.gradients(grad)
-    expected = oracle.gradients(geometry | {"hit": hits}, blend, point_features, grad)
+    expected = oracle.gradients(geometry | {"fragment": fragments}, blend, point_features, grad)
     assert relative_error(gradients["features"], expected[0]) < 1e-5 * unit
     assert relative_error(gradients["opacity"], expected[1]) < 5e-5 * unit
     return scene
@@ -68,7 +68,7 @@ def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
     positions = camera.eye + directions * (front + radius)[:, None]
     scene = check(dev, rng, camera, positions, radius, kind, depth_range=(0.5, 3.0))
     placed = scene.projected.point_camera.get()
-    left_out = ~(placed[:, 3] >= 0)  # NaN where nothing is known of a point that hits no pixel
+    left_out = ~(placed[:, 3] >= 0)  # NaN where nothing is known of a point that covers no pixel
     assert (left_out[front < 0.5 - 1e-4]).all() and (~left_out).sum() > 40
     assert (placed[~left_out, 2] < radius[~left_out]).any()  # reaches the plane of the eye
 
@@ -78,7 +78,7 @@ def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
 def test_one_point_over_the_whole_image(dev, rng, kind, size):
     camera = replace(make_camera(*size), fx=300.0, fy=300.0, cx=size[0] / 2, cy=size[1] / 2)
     scene = check(dev, rng, camera, camera.eye + 4 * camera.pose[:, 2:3].T, 1.9, kind, gamma=0.5)
-    assert scene.hits().all()
+    assert scene.fragments().all()
 
 
 @pytest.mark.large

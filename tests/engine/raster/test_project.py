@@ -16,27 +16,27 @@ from pp_cl.selftest.points import PairedPoints, make_camera, make_points, some_i
 def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
     camera = replace(make_camera(focal=32.0), pose=np.eye(3, 4), fy=32.0)
 
-    def kept(positions, radius):
+    def drawn(positions, radius):
         scene = PairedPoints(dev, camera, positions, radius, depth_range=(2.0, 4.0))
         return np.isin(np.arange(4), scene.seen).tolist()
 
     positions = np.array([[0, 0, 2.0], [0, 0, 1.9999], [0, 0, 4.0], [0, 0, 4.0001]])
-    assert kept(positions, 0.0) == [True, False, True, False]
-    assert kept(positions + [0, 0, 0.5], 0.5) == [True, False, True, False]
+    assert drawn(positions, 0.0) == [True, False, True, False]
+    assert drawn(positions + [0, 0, 0.5], 0.5) == [True, False, True, False]
 
 
 @pytest.mark.parametrize("kind", FOOTPRINTS)
-def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
+def test_boxes_hold_the_fragments_and_little_more(dev, rng, kind):
     """At most three columns and rows more on each side: a disc's tip may miss all pixel centres."""
     camera = make_camera()
     positions, radius = make_points(rng, 400), rng.uniform(0.05, 0.4, 400)
     if kind == "gaussian":  # as wide as the others
         radius /= dense.DEVIATIONS
     scene = PairedPoints(dev, camera, positions, radius, kind=kind)
-    hits = scene.hits().reshape(400, camera.height, camera.width)
+    fragments = scene.fragments().reshape(400, camera.height, camera.width)
     boxes, compared = scene.projected.point_box.get().astype(int), 0
-    for i in np.flatnonzero(hits.any(axis=(1, 2))):
-        rows, columns = np.nonzero(hits[i])
+    for i in np.flatnonzero(fragments.any(axis=(1, 2))):
+        rows, columns = np.nonzero(fragments[i])
         first, last = boxes[i, :2], boxes[i, 2:]
         least, most = (columns.min(), rows.min()), (columns.max(), rows.max())
         assert (first <= least).all() and (last >= most).all()
@@ -46,7 +46,7 @@ def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
 
 
 @pytest.mark.parametrize("kind", ["disc", "soft"])
-def test_what_whole_bricks_miss_no_point_of_them_hits(dev, rng, monkeypatch, kind):
+def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, kind):
     """Crops at all borders of the points; offsets that move them towards these."""
     grid = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
     ids = some_ids(rng, grid, 12_000)
@@ -88,7 +88,7 @@ def test_a_pixel_of_samples_is_nearly_the_mean_of_a_viewers(dev, rng, deviation,
     for position in make_points(rng, 20)[:, None]:
         scene = PairedPoints(dev, camera, position, deviation, kind="gaussian")
         exact = dense.geometry(viewer, position, deviation, "gaussian")
-        drawn = np.where(exact["hit"], exact["closeness"], 0).reshape(30, 3, 30, 3)
-        found = scene.geometry()["closeness"].reshape(30, 30)
+        drawn = np.where(exact["fragment"], exact["falloff"], 0).reshape(30, 3, 30, 3)
+        found = scene.geometry()["falloff"].reshape(30, 30)
         assert found.max() > 0.1
         np.testing.assert_allclose(found, drawn.mean((1, 3)), atol=bound)

@@ -1,4 +1,4 @@
-"""Parity with Pulsar (PyTorch3D, compiled with exact exp and log): pictures, hit counts and
+"""Parity with Pulsar (PyTorch3D, compiled with exact exp and log): images, fragment counts and
 gradients of its fixtures.
 """
 
@@ -66,7 +66,7 @@ class Case:
             dev, self.camera, self.positions, self.radius, kind="sphere", depth_range=depth_range
         )
         # The weights sum to one, so features shifted from Pulsar's background to ours shift the
-        # picture alike.
+        # image alike.
         self.shift = 1 - self["in_bg"].astype(np.float64)
         point_features = self._padded(self["in_features"] + self.shift)
         features = self.scene.blend(
@@ -128,10 +128,12 @@ def name(request):
     return request.param
 
 
-def test_picture_and_hits(dev, data, name):
+def test_image_and_fragments(dev, data, name):
     case = Case(dev, data, name)
-    hits = np.diff(case.scene.pairs.pixel_offset.get().astype(np.int64)).reshape(case.scene.shape)
-    assert np.array_equal(hits, case["exact_n_hits"])
+    fragments = np.diff(case.scene.pairs.pixel_offset.get().astype(np.int64)).reshape(
+        case.scene.shape
+    )
+    assert np.array_equal(fragments, case["exact_n_hits"])
     assert np.abs(case.image - case["exact_image"]).max() < (
         3e-3 if name.startswith("c_") else 1e-4
     )

@@ -1,5 +1,5 @@
-"""Photographs of one object at different exposures: that they differ is seen, their gains are
-found, and a training that stops goes on with them.
+"""Images of one object at different exposures: that they differ is seen, their gains are found, and
+a training that stops goes on with them.
 """
 
 import json
@@ -26,7 +26,7 @@ SETTINGS = {"downscale": 1, "train__iterations": STEPS, "train__checkpoint_every
 
 
 def write_demo(dev, folder, gains):
-    """The demo's folder, small, with few photographs, multiplied by gains (VIEWS, 3)."""
+    """The demo's folder, small, with few images, multiplied by gains (VIEWS, 3)."""
     views = demo_views(dev, "train", VIEWS, size=48)
     images = [view.image.copy() for view in views]
     for image, gain in zip(images, gains, strict=True):
@@ -52,12 +52,12 @@ def exposed(runs, tmp_path_factory):
 
 def test_gains_are_found_and_a_training_goes_on_with_them(exposed, tmp_path, monkeypatch):
     """They are right but for what harmonics of the direction take for the object's."""
-    (scene, finished), run, kept = exposed, tmp_path / "run", 0
+    (scene, finished), run, saved = exposed, tmp_path / "run", 0
     for stop in (DECIDED - 1, DECIDED, STEPS - 1):
-        train_and_interrupt(scene, run, stop - kept, monkeypatch, **SETTINGS)
+        train_and_interrupt(scene, run, stop - saved, monkeypatch, **SETTINGS)
         header, arrays = load_checkpoint(run / "checkpoint.npz")
-        kept = header["step"]
-        assert kept == stop // EVERY * EVERY
+        saved = header["step"]
+        assert saved == stop // EVERY * EVERY
     error = np.log(arrays["exposure"][..., 3] / GAINS)
     error -= error.mean(axis=0)
     assert error.std() < 0.4 * np.log(GAINS).std()
@@ -67,7 +67,7 @@ def test_gains_are_found_and_a_training_goes_on_with_them(exposed, tmp_path, mon
 
 
 def test_views_are_compared_without_and_with_their_best_gains(exposed, capsys):
-    """The photographs for testing are two of those for training."""
+    """The images for testing are two of those for training."""
     _, run = exposed
     assert main(["eval", str(run)]) == 0
     result = json.loads((run / "eval" / "metrics.json").read_text())
@@ -80,7 +80,7 @@ def test_views_are_compared_without_and_with_their_best_gains(exposed, capsys):
 
 
 def test_gains_explain_nothing_where_there_is_no_error(dev):
-    """As of an object that is black in all photographs."""
+    """As of an object that is black in all images."""
     exposure, alpha = Exposure(dev, 2, is_applied=False), dev.upload(np.ones((5, 7)), np.float32)
     for view in range(2):
         exposure.fit(view, dev.zeros((5, 7, 3)), dev.zeros((5, 7, 3)), alpha, (0, 0))

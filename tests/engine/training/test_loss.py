@@ -143,14 +143,14 @@ def test_its_terms_by_name(dev, rng):
 def test_terms_that_are_not_finite_are_told_as_often_as_asked(dev, values, named):
     loss = Loss(dev, 0.2)
     loss.terms.set(np.float32([*values, 0, 0, 0, 0]))
-    reading = loss.read(7)
+    pending = loss.read(7)
     for _ in range(2):
         with pytest.raises(Diverged, match=rf"at step 7 \({named}\)$"):
-            reading.get()
+            pending.get()
 
 
 def test_the_mask_is_learned(tmp_path):
-    """The alpha of the test views is nearer to that of the photographs, and exceeds it less."""
+    """The alpha of the test views is nearer to that of the images, and exceeds it less."""
     scene, errors = write_ball_scene(tmp_path / "ball"), []
     for weight in (0, 3):
         out = tmp_path / str(weight)
@@ -165,7 +165,7 @@ def test_the_mask_is_learned(tmp_path):
 
 
 def reduced_alpha(view):
-    """(H, W) of the reduced photograph."""
+    """(H, W) of the reduced image."""
     k, camera = view.downscale, view.camera
     alpha = view.image[..., 3].reshape(camera.height, k, camera.width, k)
     return alpha.mean(axis=(1, 3)) / 255

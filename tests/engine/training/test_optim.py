@@ -18,8 +18,8 @@ pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
 
 def test_momentum_goes_on_without_a_gradient(dev, rng):
     """In arrays of any rank, for as long as training takes."""
-    start, slope = rng.standard_normal((2, 3, 11))
-    grads = slope * (0.3 + rng.standard_normal((1000, 3, 11)))
+    start, scale = rng.standard_normal((2, 3, 11))
+    grads = scale * (0.3 + rng.standard_normal((1000, 3, 11)))
     grads[2::3] = 0
     oracle, parameter, _ = adam_steps(dev, start, grads, rate=0.02, eps=1e-8)
     assert np.abs(oracle.parameter - start).max() > 1
@@ -67,7 +67,7 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
     basis = optim.basis(directions, np.zeros(3))
     grad = 1e-4 * np.ones((len(basis), 16))
     others = {"offset": np.zeros((len(basis), 4)), "opacity": np.zeros(len(basis))}
-    twin = optim.RmsProp(basis, 0.5, sh=np.zeros((len(basis), 9, 16)), **others)
+    twin = optim.RmsProp({"sh": np.zeros((len(basis), 9, 16))} | others, basis, 0.5)
     adam = optim.Adam(np.zeros((len(basis), 9, 16)), beta1=0.0)
     rates = {"sh": np.ones(9), "offset": 0, "opacity": 0}
     twin.step(1, {"sh": grad} | others, rates, {"sh": 0.0, "offset": 1.0, "opacity": 1.0})
@@ -77,11 +77,11 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
         of_degree = adam.v[:, degree**2 : (degree + 1) ** 2, 0].mean(axis=1)
         np.testing.assert_allclose(of_degree, twin.v["sh"][:, 0], rtol=1e-9)  # in every direction
     shared = np.sqrt(adam.v / twin.v["sh"][:, None])
-    np.testing.assert_allclose(adam.parameter * shared, twin.sh, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(adam.parameter * shared, twin.values["sh"], rtol=1e-9, atol=1e-12)
 
 
 def test_points_without_a_gradient_keep_their_values(dev, rng):
-    cloud, shaded = Cloud(dev, rng, 257), np.arange(0, 257, 2)
+    cloud, visible = Cloud(dev, rng, 257), np.arange(0, 257, 2)
     # all at a bound may stay there
     cloud.cloud.opacity.set(rng.uniform(0.3, 0.7, 257).astype(np.float32))
 
@@ -91,9 +91,9 @@ def test_points_without_a_gradient_keep_their_values(dev, rng):
 
     for _ in range(2):
         before = state()
-        cloud.step(gradients(rng, 257), shaded)
+        cloud.step(gradients(rng, 257), visible)
         after = state()
-        moved = np.isin(np.arange(257), shaded) & (np.arange(257) % 3 > 0)
+        moved = np.isin(np.arange(257), visible) & (np.arange(257) % 3 > 0)
         for new, old in zip(after, before, strict=True):
             np.testing.assert_array_equal(new[~moved], old[~moved])
             assert (new[moved] != old[moved]).any()
@@ -109,7 +109,7 @@ def test_degrees_at_rate_0_stay(dev, rng, rates):
     for _ in range(3):
         cloud.step(gradients(rng, 31), np.arange(31), rates=replace(RATES, sh=rates))
     found = cloud.learned()["sh"]
-    assert relative_error(found, cloud.twin.sh) < 1e-6
+    assert relative_error(found, cloud.twin.values["sh"]) < 1e-6
     for degree, rate in enumerate(rates):
         part = np.s_[:, degree**2 : (degree + 1) ** 2]
         assert (found[part] == cloud.start["sh"][part]).all() == (rate == 0)

@@ -50,7 +50,7 @@ def test_gamma():
     assert gammas == pytest.approx([0.1, 0.031623, 0.01], abs=5e-7)
 
 
-def test_the_spread_weight_rises_from_nothing():
+def test_the_distortion_weight_rises_from_nothing():
     weights = [rising_weight(step, 200, 3.0) for step in range(200)]
     assert weights[0] == 0 and weights[100] == pytest.approx(1.5) and max(weights) < 3
     np.testing.assert_allclose(np.diff(weights), 3 / 200)

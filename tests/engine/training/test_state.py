@@ -20,7 +20,7 @@ from pp_cl.settings import TrainConfig
 pytestmark = pytest.mark.kernels  # of refine.cl
 
 
-def kept(dev, weights, least_weight, opacities, seen=None, least=1):
+def survivors(dev, weights, least_weight, opacities, seen=None, least=1):
     settings = TrainConfig(prune_weight=least_weight)
     arrays = weights, seen or [1] * len(weights), opacities
     arrays = (dev.upload(np.asarray(a, np.float32)) for a in arrays)
@@ -40,10 +40,10 @@ def filled(dev, cloud, rng):
 
 
 def test_keep_needs_weight_and_opacity(dev):
-    assert kept(dev, [1, 0, 1, 0.5, 2], 0.5, [1, 1, 0.009, 0.01, 0.6]) == [0, 3, 4]
-    assert kept(dev, [1, 0, 1], 0, [1, 1, 0]) == [0, 1]
-    assert kept(dev, [np.nan, 1, 1], 0, [1, 1, np.nan]) == [1]
-    assert kept(dev, [1, 1, 1], 0.5, [1, 1, 1], seen=[1, 2, 0], least=2) == [1]
+    assert survivors(dev, [1, 0, 1, 0.5, 2], 0.5, [1, 1, 0.009, 0.01, 0.6]) == [0, 3, 4]
+    assert survivors(dev, [1, 0, 1], 0, [1, 1, 0]) == [0, 1]
+    assert survivors(dev, [np.nan, 1, 1], 0, [1, 1, np.nan]) == [1]
+    assert survivors(dev, [1, 1, 1], 0.5, [1, 1, 1], seen=[1, 2, 0], least=2) == [1]
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_keep_needs_weight_and_opacity(dev):
     [([1, 3, 2], 1), ([0, 0, 0], 0), ([np.nan, 1, 2], 2), ([np.nan] * 3, 0)],
 )
 def test_one_point_always_survives(dev, weights, survivor):
-    assert kept(dev, weights, 5, [0, 0, 0]) == [survivor]
+    assert survivors(dev, weights, 5, [0, 0, 0]) == [survivor]
 
 
 @pytest.mark.parametrize("share", [2, 10])

@@ -25,7 +25,7 @@ def world(camera):
 
 
 def splatting(camera):
-    """An entry of cameras.json: OpenCV's axes."""
+    """A camera of cameras.json: OpenCV's axes."""
     return {
         "id": 0,
         "img_name": "a",
@@ -38,8 +38,8 @@ def splatting(camera):
     }
 
 
-def path_entry(camera):
-    """An entry of nerfstudio's camera_path: the angle across the height."""
+def path_camera(camera):
+    """A camera of nerfstudio's camera_path: the angle across the height."""
     fov = np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))
     return {"camera_to_world": np.ravel(world(camera)).tolist(), "fov": fov, "aspect": 1}
 
@@ -56,7 +56,7 @@ CONTENTS = {
         "camera_type": "perspective",
         "render_width": 64,
         "render_height": 64,
-        "camera_path": [path_entry(camera) for camera in CAMERAS],
+        "camera_path": [path_camera(camera) for camera in CAMERAS],
     },
 }
 

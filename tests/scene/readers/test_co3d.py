@@ -68,15 +68,15 @@ def test_projection_follows_pytorch3d(tmp_path, rng, size, kind):
     image = {"path": "apple/1_2_3/images/a.png", "size": [size[1], size[0]]}
     frame = {"sequence_name": "1_2_3", "frame_number": 4, "image": image, "viewpoint": viewpoint}
     annotate(folder, [frame])
-    [photograph] = read_split(folder, "test", [])
-    camera = photograph.camera
+    [image_file] = read_split(folder, "test", [])
+    camera = image_file.camera
     for point in rng.normal(size=(20, 3)):
         x, y, z = point @ rotation + place
         ndc = focal * [x, y] / z + centre
         scale = np.array(size) / 2 if kind != "ndc_isotropic" else min(size) / 2
         expected = np.array(size) / 2 - scale * ndc
         np.testing.assert_allclose(camera.project(point)[:2], expected, rtol=0, atol=1e-9)
-    assert photograph.mask is None and (camera.width, camera.height) == size
+    assert image_file.mask is None and (camera.width, camera.height) == size
 
 
 def test_set_lists_of_version_1(tmp_path):
@@ -185,7 +185,7 @@ def test_bad_file(sequence, case):
     refused(sequence, sequence.parent / name)
 
 
-@pytest.mark.parametrize("bound, words", [("TEXT", "1000 c"), ("FRAMES", "10 f"), ("KEPT", "5 c")])
+@pytest.mark.parametrize("bound, words", [("TEXT", "1000 c"), ("FRAMES", "10 f"), ("SUM", "5 c")])
 def test_annotations_beyond_all_bounds(sequence, monkeypatch, bound, words):
     monkeypatch.setattr(f"pp_cl.scene.readers.co3d.MOST_{bound}", int(words[:-2]))
     refused(sequence, sequence.parent / ANNOTATIONS, words)

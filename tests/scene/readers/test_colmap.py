@@ -11,14 +11,14 @@ from support.same_scene import held_out, same, views
 from support.transforms_scenes import left_out, refused
 
 from pp_cl.files.image import write_png
-from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.load import scene_frames
 from pp_cl.scene.readers.colmap import read_model, read_split
 from tools.capture_demo import align, cameras
 from tools.scene_formats import colmap
 
 SIZE = (30, 22)
-# What COLMAP 3.8 found of photographs by tools/capture_demo.py: six of the 64 images with their
+# What COLMAP 3.8 found of images by tools/capture_demo.py: six of the 64 images with their
 # first 2D points, one with none, which COLMAP's model_converter then wrote in both forms.
 BY_COLMAP = Path(__file__).parent / "colmap_models"
 
@@ -63,49 +63,49 @@ def test_a_projection_by_hand(tmp_path):
     half = np.sqrt(0.5)
     (tmp_path / "cameras.txt").write_text("# c\n7 OPENCV 30 22 40 41 14 12 .1 .01 .002 -.003\n")
     (tmp_path / "images.txt").write_text(f"1 {half} 0 0 {half} 1 2 5 7 sub/a b.png\n1 2 -1\n")
-    [photograph] = read_split(tmp_path, "test", [])
-    camera, d = photograph.camera, photograph.distortion
+    [image_file] = read_split(tmp_path, "test", [])
+    camera, d = image_file.camera, image_file.lens
     point = np.array([0.3, -0.2, 0.7])
     expected = np.array([0.2 + 1, 0.3 + 2, 0.7 + 5])  # (x, y) -> (-y, x), then t
     np.testing.assert_allclose(camera.pose[:, :3].T @ (point - camera.eye), expected, atol=1e-12)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 41, 14, 12)
     assert (d.k1, d.k2, d.p1, d.p2, d.k3) == (0.1, 0.01, 0.002, -0.003, 0)
-    assert photograph.name == "images/sub/a b.png" and photograph.mask is None
+    assert image_file.name == "images/sub/a b.png" and image_file.mask is None
 
 
 @pytest.mark.parametrize(
-    "line, focal, distortion",
+    "line, focal, lens",
     [
-        ("SIMPLE_PINHOLE 30 22 40 15 11", (40, 40), Distortion()),
-        ("PINHOLE 30 22 40 42 15 11", (40, 42), Distortion()),
-        ("SIMPLE_RADIAL 30 22 40 15 11 .2", (40, 40), Distortion(0.2)),
-        ("RADIAL 30 22 40 15 11 .2 -.1", (40, 40), Distortion(0.2, -0.1)),
-        ("FISHEYE 30 22 40 42 15 11", (40, 42), Distortion(fisheye=True)),
-        ("SIMPLE_RADIAL_FISHEYE 30 22 40 15 11 .2", (40, 40), Distortion(0.2, fisheye=True)),
-        ("RADIAL_FISHEYE 30 22 40 15 11 .2 -.1", (40, 40), Distortion(0.2, -0.1, fisheye=True)),
+        ("SIMPLE_PINHOLE 30 22 40 15 11", (40, 40), LensDistortion()),
+        ("PINHOLE 30 22 40 42 15 11", (40, 42), LensDistortion()),
+        ("SIMPLE_RADIAL 30 22 40 15 11 .2", (40, 40), LensDistortion(0.2)),
+        ("RADIAL 30 22 40 15 11 .2 -.1", (40, 40), LensDistortion(0.2, -0.1)),
+        ("FISHEYE 30 22 40 42 15 11", (40, 42), LensDistortion(fisheye=True)),
+        ("SIMPLE_RADIAL_FISHEYE 30 22 40 15 11 .2", (40, 40), LensDistortion(0.2, fisheye=True)),
+        ("RADIAL_FISHEYE 30 22 40 15 11 .2 -.1", (40, 40), LensDistortion(0.2, -0.1, fisheye=True)),
         (
             "OPENCV_FISHEYE 30 22 40 42 15 11 .2 -.1 .3 -.4",
             (40, 42),
-            Distortion(0.2, -0.1, k3=0.3, k4=-0.4, fisheye=True),
+            LensDistortion(0.2, -0.1, k3=0.3, k4=-0.4, fisheye=True),
         ),
         (
             "FULL_OPENCV 30 22 40 42 15 11 1 2 3 4 5 6 7 8",
             (40, 42),
-            Distortion(k1=1, k2=2, p1=3, p2=4, k3=5, k4=6, k5=7, k6=8),
+            LensDistortion(k1=1, k2=2, p1=3, p2=4, k3=5, k4=6, k5=7, k6=8),
         ),
     ],
 )
-def test_models(text, line, focal, distortion):
+def test_models(text, line, focal, lens):
     edit(text, "cameras.txt", lambda lines: [f"{i + 1} {line}" for i in range(11)])
-    for photograph in read_split(text, "train", []):
-        camera = photograph.camera
-        assert (camera.fx, camera.fy) == focal and photograph.distortion == distortion
+    for image_file in read_split(text, "train", []):
+        camera = image_file.camera
+        assert (camera.fx, camera.fy) == focal and image_file.lens == lens
         assert (camera.cx, camera.cy) == (15, 11)
 
 
 @pytest.mark.parametrize("form", ["binary", "text"])
 def test_a_model_that_colmap_wrote(tmp_path, form):
-    """The same photographs from both forms, their cameras where the demo's are."""
+    """The same images from both forms, their cameras where the demo's are."""
     shutil.copytree(BY_COLMAP / form, tmp_path / "sparse" / "0")
     (tmp_path / "images").mkdir()
     numbers = (0, 9, 20, 31, 42, 53)
@@ -116,7 +116,7 @@ def test_a_model_that_colmap_wrote(tmp_path, form):
     for one in found:
         camera, k1 = one.camera, -0.0025245658661648311
         assert camera.fx == camera.fy == 323.03151019681525 and (camera.cx, camera.cy) == (200, 200)
-        assert one.distortion == Distortion(k1=k1)
+        assert one.lens == LensDistortion(k1=k1)
     true = cameras(400)
     alignment = align([one.camera for one in found], [true[i] for i in numbers])
     assert alignment.position < 0.02 and alignment.degrees < 0.2
@@ -249,10 +249,10 @@ def test_models_of_later_versions_are_named(binary):
     refused(binary, "SIMPLE_DIVISION", command, splits=("test",))
 
 
-def test_more_entries_or_letters_than_a_model_has(written, monkeypatch):
+def test_more_records_or_letters_than_a_model_has(written, monkeypatch):
     folder, _ = written
-    monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_ENTRIES", 10)
-    refused(folder, "more than 10 entries")
+    monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_RECORDS", 10)
+    refused(folder, "more than 10 records")
     if (folder / "sparse/0/images.txt").exists():
         monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_LINE", 40)
         refused(folder, "has 40 characters or more")

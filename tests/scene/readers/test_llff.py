@@ -34,12 +34,12 @@ def test_axes_are_down_right_and_back(tmp_path):
     write_png(tmp_path / "images" / "a.JPG.png", np.zeros((22, 30, 3)))
     pose = np.array([[0, 1, 0, 0, 22], [-1, 0, 0, 0, 30], [0, 0, 1, 5, 40.0]])
     np.save(tmp_path / FILE, np.append(pose.ravel(), [1, 9])[None])
-    [photograph] = read_split(tmp_path, "test", [])
-    camera = photograph.camera
+    [image_file] = read_split(tmp_path, "test", [])
+    camera = image_file.camera
     right, down, depth = camera.pose[:, :3].T @ (np.array([0.3, 0.2, 1]) - camera.eye)
     np.testing.assert_allclose((right, down, depth), (0.3, -0.2, 4), atol=1e-12)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15, 11)
-    assert photograph.depth_range is None and photograph.mask is None
+    assert image_file.depth_range is None and image_file.mask is None
 
 
 # --------------------------------------------------------------------------------------------------

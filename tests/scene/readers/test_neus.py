@@ -55,12 +55,12 @@ def test_a_projection_by_hand(tmp_path):
     (tmp_path / "image").mkdir()
     write_png(tmp_path / "image" / "0.png", np.zeros((22, 30, 3)))
     np.savez(tmp_path / FILE, world_mat_0=world, world_mat_inv_0=np.eye(4))
-    [photograph] = read_split(tmp_path, "test", [])
-    camera = photograph.camera
+    [image_file] = read_split(tmp_path, "test", [])
+    camera = image_file.camera
     np.testing.assert_allclose(camera.pose[:, :3], rotation.T, atol=1e-12)
     np.testing.assert_allclose(camera.eye, (1, 2, 3), atol=1e-12)
     np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (50, 40, 16, 10))
-    assert photograph.depth_range is None
+    assert image_file.depth_range is None
 
 
 def test_the_box_is_that_of_the_stated_sphere(scene):
@@ -78,9 +78,9 @@ def test_the_sphere_gives_the_depth_range(scene):
     matrix = np.diag([0.5, 0.5, 0.5, 1])
     matrix[:3, 3] = 0.1, 0, 0.2
     edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
-    for photograph in read_split(scene, "train", []):
-        distance = np.linalg.norm(photograph.camera.eye - [0.1, 0, 0.2])
-        assert photograph.depth_range == pytest.approx((distance - 0.5, distance + 0.5))
+    for image_file in read_split(scene, "train", []):
+        distance = np.linalg.norm(image_file.camera.eye - [0.1, 0, 0.2])
+        assert image_file.depth_range == pytest.approx((distance - 0.5, distance + 0.5))
     matrix = np.diag([10.0, 10, 10, 1])  # the cameras are within
     edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
     near, far = read_split(scene, "train", [])[0].depth_range

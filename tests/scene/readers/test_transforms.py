@@ -10,7 +10,7 @@ from support.transforms_scenes import SIZE, left_out, opengl_pose, refused, trai
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
 
@@ -220,7 +220,7 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
     keys |= {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0, "p2": 0}
     write_scene(tmp_path, edit=lambda data: data.update(keys))
     [one, *_] = transforms.read_split(tmp_path, "train", [])
-    assert one.distortion == Distortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
+    assert one.lens == LensDistortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
     write_scene(tmp_path, edit=lambda data: data.update(keys, p2=0.1))
     refused(tmp_path, tmp_path / "transforms_train.json", "p2:")
 

@@ -1,4 +1,4 @@
-"""From photographs and films to scenes: known cameras are found, each stage is done once, and what
+"""From photographs and videos to scenes: known cameras are found, each stage is done once, and what
 goes wrong ends in one line.
 """
 
@@ -22,7 +22,7 @@ from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
 from pp_cl.files.image import read_rgba, to_8bit, write_png
 from pp_cl.scene.demo import render
-from pp_cl.scene.distortion import Distortion, undistort
+from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.scene.load import load_scene, scene_format, scene_frames
 from pp_studio.capture import poses
 from pp_studio.capture.features import quiet, verification
@@ -130,7 +130,7 @@ def test_nothing_in_the_scene_is_distorted(captured):
     """Images, cameras, masks and what COLMAP's model says of its points are of pinholes."""
     splits = [scene_frames(captured, split) for split in ("train", "test")]
     one = splits[0][0]
-    assert not any(view.distortion for split in splits for view in split)
+    assert not any(view.lens for split in splits for view in split)
     model = colmap.Reconstruction(captured / "sparse" / "0")
     focal, _, cx, cy = model.camera(1).params
     assert (focal, cx, cy) == pytest.approx((one.camera.fx, one.camera.cx, one.camera.cy))
@@ -138,7 +138,7 @@ def test_nothing_in_the_scene_is_distorted(captured):
     k1 = bent.camera(1).params[3]
     assert abs(k1) > 1e-5
     frame = read_rgba(captured / "capture" / "frames" / Path(one.name).name)
-    straight = undistort(open_device(), frame, one.camera, Distortion(k1))
+    straight = undistort(open_device(), frame, one.camera, LensDistortion(k1))
     np.testing.assert_array_equal(read_rgba(captured / one.name), straight)
 
 
@@ -167,14 +167,14 @@ def test_wrong_matches_do_not_pull_at_the_cameras():
     model = colmap.synthesize_dataset(
         colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=400)
     )
-    true = [one.camera for one in poses.photographs(model)]
+    true = [one.camera for one in poses.image_files(model)]
     rng = np.random.default_rng(0)
     for image in model.images.values():
         for one in image.points2D:
             if one.has_point3D():
                 one.xy = one.xy + rng.normal(0, 4 if one.point3D_id % 20 == 0 else 0.2, 2)
     poses.refine(model)
-    found = align([one.camera for one in poses.photographs(model)], true)
+    found = align([one.camera for one in poses.image_files(model)], true)
     assert found.position < 0.001 and found.degrees < 0.02
 
 
@@ -273,16 +273,16 @@ def test_what_is_the_users_stays(captured, shot, tmp_path):
     )
     assert changed(scene) == before
     shutil.copy(captured / "capture" / "frames" / "003.png", own)
-    kept = {}
+    times = {}
     for folder in [scene, *(path for path in scene.rglob("*") if path.is_dir())]:
         for name in ("mine.png", ".own", "pairs.txt"):
             (folder / name).write_text("mine")
-            kept[folder / name] = (folder / name).stat().st_mtime_ns
+            times[folder / name] = (folder / name).stat().st_mtime_ns
     for words, ended in (([], (0, 0)), (["--from", "images"], (2, 1))):
         status, lines = capture(shot[0], scene, *words)
         assert (status, len(lines)) == ended, lines
-    assert {path: changed(scene).get(path, kept[path]) for path in kept} == kept
-    assert all(path.read_text() == "mine" for path in kept)
+    assert {path: changed(scene).get(path, times[path]) for path in times} == times
+    assert all(path.read_text() == "mine" for path in times)
     assert (scene / "transforms.json").exists()
 
 
@@ -340,14 +340,14 @@ def test_photographs_of_no_use(shot, tmp_path, make):
     assert not (scene / "transforms.json").exists()
 
 
-def test_films(shot, tmp_path):
-    """The sharpest frames are taken; a black film, and a missing one, end in one line."""
+def test_videos(shot, tmp_path):
+    """The sharpest frames are taken; a black video, and a missing one, end in one line."""
     pytest.importorskip("imageio_ffmpeg")
     sharp = [np.array(Image.open(file)) for file in sorted(shot[0].iterdir())]
     soft = [np.array(Image.fromarray(one).filter(ImageFilter.GaussianBlur(3))) for one in sharp]
     frames = [frame for two in zip(soft, sharp, strict=True) for frame in two] * 10
-    write_video(tmp_path / "film.mp4", frames, 24)  # 240 frames, of which each second one is sharp
-    taken = take_images(tmp_path / "film.mp4", tmp_path / "images")["images"]
+    write_video(tmp_path / "video.mp4", frames, 24)  # 240 frames, of which each second one is sharp
+    taken = take_images(tmp_path / "video.mp4", tmp_path / "images")["images"]
     chosen = [int(one["name"][:6]) for one in taken]
     assert len(chosen) > 100 and all(number % 2 for number in chosen)
     black = [to_8bit(np.zeros((64, 96, 3)))] * 30

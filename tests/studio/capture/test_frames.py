@@ -1,4 +1,4 @@
-"""Photographs and films as cameras, phones and other programs write them: all are taken, or left
+"""Photographs and videos as cameras, phones and other programs write them: all are taken, or left
 out with a reason.
 """
 
@@ -178,35 +178,37 @@ def test_names_that_colmap_can_list(shots, tmp_path):
 
 
 @pytest.fixture
-def film(shots, tmp_path):
-    """A film of 48 frames."""
+def video(shots, tmp_path):
+    """A video of 48 frames."""
     pytest.importorskip("imageio_ffmpeg")
-    write_video(tmp_path / "film.webm", [np.roll(one, k, 0) for one in shots for k in range(4)], 24)
-    return tmp_path / "film.webm"
+    write_video(
+        tmp_path / "video.webm", [np.roll(one, k, 0) for one in shots for k in range(4)], 24
+    )
+    return tmp_path / "video.webm"
 
 
-def remade(film, name, *options):
-    """The film written anew by ffmpeg."""
+def remade(video, name, *options):
+    """The video written anew by ffmpeg."""
     import imageio_ffmpeg
 
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *options[:-1], "-i", film]
-    target = film.with_name(name)
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *options[:-1], "-i", video]
+    target = video.with_name(name)
     with target.open("wb") as file:
         subprocess.run([*command, *options[-1], "pipe:1"], stdout=file, check=True)
     return target
 
 
-def test_a_film_that_states_no_length(film, tmp_path):
+def test_a_video_that_states_no_length(video, tmp_path):
     """As browsers record them."""
-    live = remade(film, "live.webm", ["-c", "copy", "-f", "webm", "-live", "1"])
-    whole, found = (take_images(one, tmp_path / one.stem)["images"] for one in (film, live))
+    live = remade(video, "live.webm", ["-c", "copy", "-f", "webm", "-live", "1"])
+    whole, found = (take_images(one, tmp_path / one.stem)["images"] for one in (video, live))
     assert [one["name"] for one in found] == [one["name"] for one in whole] and len(found) > 40
 
 
-def test_a_film_that_is_shown_turned(film, tmp_path, caplog):
+def test_a_video_that_is_shown_turned(video, tmp_path, caplog):
     """As phones make them: upright, without a word of ffmpeg's."""
     fragments = ["-c:v", "libx264", "-f", "mp4", "-movflags", "frag_keyframe+empty_moov"]
-    flat = remade(film, "flat.mp4", fragments)
+    flat = remade(video, "flat.mp4", fragments)
     turned = remade(flat, "turned.mp4", "-display_rotation", "90", ["-c", "copy", *fragments[2:]])
     found = take_images(turned, tmp_path / "images")["images"]
     assert {tuple(one["size"]) for one in found} == {SIZE[::-1]} and not caplog.records
@@ -235,7 +237,7 @@ def display(colour, transfer):
     "transfer, primaries, off",
     [("arib-std-b67", "bt2020", 12), ("smpte2084", "unknown", 5)],
 )
-def test_a_film_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primaries, off):
+def test_a_video_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primaries, off):
     """10 bits of BT.2020, as phones make them; other programs leave its primaries to be guessed.
     Off by what HLG's system gamma, which ffmpeg applies to each channel, makes of colours; without
     tone mapping they are washed out, by 30 and more.
@@ -250,18 +252,18 @@ def test_a_film_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primari
         for one in frames_
     )
     tags = f"color_primaries={primaries}:color_trc={transfer}:colorspace=bt2020nc:range=tv"
-    film = tmp_path / "film.mov"
+    video = tmp_path / "video.mov"
     subprocess.run(
         [
             *(imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo"),
             *("-pix_fmt", "rgb48le", "-s", "160x120", "-r", "24", "-i", "-", "-vf"),
             "scale=out_color_matrix=bt2020:out_range=tv,format=yuv420p10le,setparams=" + tags,
-            *("-c:v", "libx265", "-x265-params", "log-level=error", str(film)),
+            *("-c:v", "libx265", "-x265-params", "log-level=error", str(video)),
         ],
         input=raw,
         check=True,
     )
-    found = take_images(film, tmp_path / "images")["images"]
+    found = take_images(video, tmp_path / "images")["images"]
     for one in found:
         image = read_rgba(tmp_path / "images" / one["name"])[..., :3].astype(float)
         true = frames_[int(one["name"][:6])]
@@ -270,12 +272,12 @@ def test_a_film_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primari
             assert np.abs(image[row, column] - true[row, column]).max() < 2 * off
 
 
-def test_what_is_no_film_is_one_line_without_the_programs_banner(tmp_path):
-    (tmp_path / "film.mov").write_bytes(b"no film" * 100)
+def test_what_is_no_video_is_one_line_without_the_programs_banner(tmp_path):
+    (tmp_path / "video.mov").write_bytes(b"no video" * 100)
     with pytest.raises(
         UserError, match=r"cannot be read as a video \(Error opening input"
     ) as caught:
-        take_images(tmp_path / "film.mov", tmp_path / "images")
+        take_images(tmp_path / "video.mov", tmp_path / "images")
     assert "ffmpeg version" not in str(caught.value)
 
 

@@ -21,13 +21,13 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_mask, read_rgba
 from pp_cl.scene.demo import OBJECT_BOX, demo_mesh, render
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
 from tools.capture_demo import ROOM, cameras, room
 
 pytest.importorskip("cv2")
 
 from pp_studio.capture import backdrop, cut
-from pp_studio.capture.masks import mask_file, picture, program_words, write_masks
+from pp_studio.capture.masks import mask_file, outline_sheet, program_words, write_masks
 from pp_studio.capture.window import Window, window
 
 SIZE, VIEWS = 96, 12
@@ -46,7 +46,7 @@ class Capture:
         rng = np.random.default_rng(3)
         self.folder, self.box = folder, 1.06 * np.array(box)
         (folder / "images").mkdir(parents=True)
-        self.truth, self.photographs, self.seen = [], [], []
+        self.truth, self.image_files, self.seen = [], [], []
         on_wall = rng.normal(size=(2000 if wall else 600, 3))
         on_wall *= ROOM / np.linalg.norm(on_wall, axis=1, keepdims=True)
         self.points, self.count = np.concatenate([surface, on_wall]), len(surface)
@@ -54,14 +54,14 @@ class Capture:
             rgba = image / 255
             noise = gaussian_filter(rng.uniform(0, 1, rgba[..., :3].shape), (1.5, 1.5, 0))
             behind = wall(camera) if wall else 1.2 * (noise - noise.mean()) + WALL
-            photograph = rgba[..., :3] * rgba[..., 3:] + behind * (1 - rgba[..., 3:])
+            image = rgba[..., :3] * rgba[..., 3:] + behind * (1 - rgba[..., 3:])
             if i == 0 and spoil:
-                spoil(photograph)
-            one = Photograph(f"images/{i:02d}.png", camera)
-            Image.fromarray(np.uint8(255 * np.clip(photograph, 0, 1))).save(folder / one.name)
-            self.photographs.append(one)
+                spoil(image)
+            one = ImageFile(f"images/{i:02d}.png", camera)
+            Image.fromarray(np.uint8(255 * np.clip(image, 0, 1))).save(folder / one.name)
+            self.image_files.append(one)
             self.truth.append(rgba[..., 3] > 0.5)
-            whole = Window("", photograph, camera, (0, 0, SIZE, SIZE))
+            whole = Window("", image, camera, (0, 0, SIZE, SIZE))
             found, rows, columns = whole.inside(self.points)
             is_shown = self.truth[-1][rows, columns] == (found < self.count)
             self.seen.append(found[is_shown & (rng.uniform(size=len(found)) < 0.5)])
@@ -69,7 +69,7 @@ class Capture:
     def write(self, **options):
         """The line of write_masks."""
         line, _, self.box = write_masks(
-            self.folder, self.photographs, self.box, self.points, self.seen, **options
+            self.folder, self.image_files, self.box, self.points, self.seen, **options
         )
         return line
 
@@ -81,7 +81,7 @@ class Capture:
 
     def file(self, number):
         """The mask of a photograph."""
-        return mask_file(self.folder, self.photographs[number].name)
+        return mask_file(self.folder, self.image_files[number].name)
 
 
 @pytest.fixture(autouse=True)
@@ -108,7 +108,7 @@ def capture(tmp_path):
 def given_masks(capture, folder):
     """A folder of the true masks, named like the photographs."""
     folder.mkdir()
-    for one, mask in zip(capture.photographs, capture.truth, strict=True):
+    for one, mask in zip(capture.image_files, capture.truth, strict=True):
         Image.fromarray(np.uint8(255 * mask)).save(folder / Path(one.name).name)
     return folder
 
@@ -128,8 +128,8 @@ def test_a_box_that_cuts_the_object_grows(capture):
     cut_off[1, [0, 2]] = 0.4
     capture.box = cut_off
     held = (capture.points[: capture.count] < cut_off[1]).all(1)
-    kept = np.append(held, np.ones(len(capture.points) - capture.count, bool))
-    capture.seen = [seen[kept[seen]] for seen in capture.seen]
+    is_seen = np.append(held, np.ones(len(capture.points) - capture.count, bool))
+    capture.seen = [seen[is_seen[seen]] for seen in capture.seen]
     capture.write()
     assert capture.agreement().min() < 0.8 and (capture.box == cut_off).all()
     for i in range(VIEWS):
@@ -176,7 +176,7 @@ def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
     box = [[-0.8, -0.8, -0.8], [0.8, 0.8, 1.4]]
     capture = turned(tmp_path / "scene", views, box, np.zeros((1, 3)), wall)
     windows, masks = [], []
-    for one, *images in zip(capture.photographs, capture.truth, plain, strict=True):
+    for one, *images in zip(capture.image_files, capture.truth, plain, strict=True):
         windows.append(window(read_rgba(capture.folder / one.name)[..., :3], one, capture.box))
         masks.append([windows[-1].reduced(np.uint8(image)) > 0 for image in images])
         windows[-1].mask = masks[-1][0]
@@ -209,8 +209,8 @@ def test_the_other_views_carve_what_one_takes_for_the_object(tmp_path):
     """What looks like the object stands beside it in one photograph."""
     place = np.s_[20:40, 16:40]
 
-    def bystander(photograph):
-        photograph[place] = photograph[38:58, 36:60]
+    def bystander(image):
+        image[place] = image[38:58, 36:60]
 
     capture = ball(tmp_path / "scene", bystander)
     capture.seen[0] = capture.seen[0][capture.seen[0] < capture.count]  # it hides the wall
@@ -223,8 +223,8 @@ def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
     """A stain of the wall's colour in the middle of the object in one photograph."""
     place = np.s_[40:56, 40:56]
 
-    def stain(photograph):
-        photograph[place] = WALL
+    def stain(image):
+        image[place] = WALL
 
     capture = ball(tmp_path / "scene", stain)
     capture.seen[0] = capture.seen[0][capture.seen[0] >= capture.count]
@@ -253,7 +253,7 @@ def test_a_mask_that_the_user_has_written_has_the_shape_of_its_image(capture):
     with pytest.warns(UserWarning, match="masks are resized"):
         assert "kept" in capture.write()
     with pytest.warns(UserWarning, match="masks are resized"):
-        picture(capture.folder, capture.photographs)
+        outline_sheet(capture.folder, capture.image_files)
     Image.fromarray(np.zeros((SIZE, SIZE // 2), np.uint8)).save(capture.file(3))
     with pytest.raises(UserError, match="make it the image's size"):
         capture.write()
@@ -295,7 +295,7 @@ def test_a_given_mask_that_is_missing_is_named(capture, tmp_path):
 
 def test_alpha_is_the_mask(capture):
     """Of photographs that have one."""
-    for one, mask in zip(capture.photographs, capture.truth, strict=True):
+    for one, mask in zip(capture.image_files, capture.truth, strict=True):
         rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
         Image.fromarray(np.dstack([rgb, np.uint8(255 * mask)])).save(capture.folder / one.name)
     assert f"{VIEWS} of their alpha" in capture.write()
@@ -304,7 +304,7 @@ def test_alpha_is_the_mask(capture):
 
 def before_a_screen(capture):
     """Give all photographs a green background."""
-    for one, mask in zip(capture.photographs, capture.truth, strict=True):
+    for one, mask in zip(capture.image_files, capture.truth, strict=True):
         rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
         rgb[~mask] = SCREEN
         Image.fromarray(rgb).save(capture.folder / one.name)
@@ -325,7 +325,7 @@ def test_spots_of_the_backgrounds_colour_are_no_gaps(capture):
     """One on the ball is seen from a few sides, but the others see the ball behind it."""
     before_a_screen(capture)
     spotted = 0
-    for one in capture.photographs:
+    for one in capture.image_files:
         spot = one.camera.project(np.array([[0.75, 0.1, 0.25]]))
         if spot[2][0] < np.linalg.norm(one.camera.eye) - 0.6:
             x, y = (int(place[0]) for place in spot[:2])
@@ -355,7 +355,7 @@ def program(tmp_path, text):
 
 def test_a_program_makes_the_masks(capture, tmp_path):
     """It is given each photograph and where to write; the alpha of a cut-out is the mask."""
-    capture.photographs, capture.seen = capture.photographs[:2], capture.seen[:2]
+    capture.image_files, capture.seen = capture.image_files[:2], capture.seen[:2]
     cut_out = "cut = Image.open(sys.argv[1]).convert('RGB')\ncut.putalpha(mask)\ncut.save"
     text = PROGRAM.replace("mask.save", cut_out)
     assert "2 by the program" in capture.write(command=program(tmp_path, text))
@@ -401,12 +401,12 @@ def test_a_box_without_an_object_is_refused(capture, case):
         capture.write()
 
 
-def test_a_photograph_beside_the_object_has_an_empty_mask(capture):
-    """As films have them, where they begin or end; the others are cut out all the same."""
-    one = capture.photographs[3]
+def test_a_image_beside_the_object_has_an_empty_mask(capture):
+    """As videos have them, where they begin or end; the others are cut out all the same."""
+    one = capture.image_files[3]
     eye, ahead = 3 * one.camera.eye, one.camera.pose[:, 2] + 0.84 * one.camera.pose[:, 0]
     camera = Camera.look_at(eye, eye + ahead, fx=one.camera.fx, width=SIZE, height=SIZE)
-    capture.photographs[3] = replace(one, camera=camera)
+    capture.image_files[3] = replace(one, camera=camera)
     line = capture.write()
     assert f"1 empty, as the object is outside, {VIEWS - 1} cut out" in line
     assert not read_mask(capture.file(3)).any()

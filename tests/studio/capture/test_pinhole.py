@@ -7,17 +7,17 @@ from PIL import Image
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.distortion import Distortion, undistort
-from pp_cl.scene.image_file import Photograph
+from pp_cl.scene.image_file import ImageFile
+from pp_cl.scene.lens import LensDistortion, undistort
 from pp_studio.capture.pinhole import undistort_model, undistorted_mask, write_images
 
 colmap = pytest.importorskip("pycolmap")
 CAMERA = Camera(np.eye(3, 4), 80.0, 80.0, 48.0, 32.0, 96, 64)
-LENS = Distortion(-0.2)
+LENS = LensDistortion(-0.2)
 
 
 def taken(*names, lens=LENS):
-    return [Photograph(f"images/{name}", CAMERA, distortion=lens) for name in names]
+    return [ImageFile(f"images/{name}", CAMERA, lens=lens) for name in names]
 
 
 def test_images_are_written_once_in_the_format_of_the_photographs(dev, tmp_path, rng):
@@ -28,8 +28,8 @@ def test_images_are_written_once_in_the_format_of_the_photographs(dev, tmp_path,
     Image.fromarray(colours).save(frames / "a.jpg", quality=95)
     Image.fromarray(colours).save(frames / "b.png")
     Image.fromarray(alpha).save(frames / "c.png")
-    photographs = taken("a.jpg", "b.png", "c.png")
-    assert write_images(dev, frames, images, photographs) == 3
+    image_files = taken("a.jpg", "b.png", "c.png")
+    assert write_images(dev, frames, images, image_files) == 3
     for name, mode in (("a.jpg", "RGB"), ("b.png", "RGB"), ("c.png", "RGBA")):
         with Image.open(images / name) as image:
             assert image.mode == mode and image.size == (96, 64)
@@ -39,13 +39,13 @@ def test_images_are_written_once_in_the_format_of_the_photographs(dev, tmp_path,
         assert off.max() == 0 if name != "a.jpg" else off.mean() < 3
     (images / "b.png").unlink()
     before = (images / "a.jpg").stat().st_mtime_ns
-    assert write_images(dev, frames, images, photographs) == 1, "those that are there stay"
+    assert write_images(dev, frames, images, image_files) == 1, "those that are there stay"
     assert (images / "b.png").is_file() and (images / "a.jpg").stat().st_mtime_ns == before
 
 
 def test_a_lens_that_folds_the_image_is_refused(dev, tmp_path):
     with pytest.raises(UserError, match="a.png: the lens that was found folds"):
-        write_images(dev, tmp_path, tmp_path / "images", taken("a.png", lens=Distortion(-2.0)))
+        write_images(dev, tmp_path, tmp_path / "images", taken("a.png", lens=LensDistortion(-2.0)))
     assert not (tmp_path / "images").exists()
 
 
@@ -53,7 +53,7 @@ def test_masks_move_as_their_photographs_do(dev):
     mask = np.zeros((64, 96), np.uint8)
     mask[10:50, 12:70] = 255
     expected = undistort(dev, np.dstack([mask] * 3 + [mask * 0 + 255]), CAMERA, LENS)[..., 0]
-    [one], [straight] = taken("a.png"), taken("a.png", lens=Distortion())
+    [one], [straight] = taken("a.png"), taken("a.png", lens=LensDistortion())
     assert np.abs(undistorted_mask(dev, mask, one).astype(int) - expected).max() <= 1
     assert np.array_equal(undistorted_mask(dev, mask, straight), mask)
 

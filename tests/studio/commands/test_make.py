@@ -30,7 +30,7 @@ def test_the_page_links_what_is_there(made):
     _, folder = made
     page = (folder / "index.html").read_text("utf-8")
     named = set(re.findall(r'(?:src|href|content)="([\w.]+\.\w+)"', page))
-    assert named == {"model.html", "film.mp4", "splat.ply", "views.png", "thumbnail.png"}
+    assert named == {"model.html", "video.mp4", "splat.ply", "views.png", "thumbnail.png"}
     assert all((folder / name).stat().st_size > 0 for name in named)
     assert "<title>out</title>" in page and "<!--" not in page
     assert "PSNR, dB" in page and "the training has not seen" in page
@@ -41,10 +41,10 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
     scene, folder = made
     checkpoint = (folder / "run/checkpoint.npz").read_bytes()
     (folder / "index.html").unlink()
-    made = [(folder / name).stat().st_mtime_ns for name in ("film.mp4", "splat.ply")]
+    made = [(folder / name).stat().st_mtime_ns for name in ("video.mp4", "splat.ply")]
     assert main(["make", scene, "--out", str(folder)]) == 0
     assert "is finished" in capsys.readouterr().out
-    assert made == [(folder / name).stat().st_mtime_ns for name in ("film.mp4", "splat.ply")]
+    assert made == [(folder / name).stat().st_mtime_ns for name in ("video.mp4", "splat.ply")]
     assert (folder / "index.html").exists()
     assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
     status, lines = spoken(["make", scene, "--out", folder, "--minutes", "7"])

@@ -1,4 +1,4 @@
-"""`pp-cl render`: films and frames as asked for, what is taken up again, what is refused."""
+"""`pp-cl render`: videos and frames as asked for, what is taken up again, what is refused."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from support.refused import failure
 from pp_cl.cli import main
 from pp_cl.files.atomic import MANIFEST
 from pp_cl.files.image import read_rgba
-from pp_studio.export import film
+from pp_studio.export import render_video
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +23,13 @@ def trained(finished):
     return str(finished)
 
 
-def test_a_film_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp_path, capsys):
-    film = tmp_path / "new" / "film.mp4"
-    words = ["render", trained, "--out", str(film), "--seconds", "0.5", "--fps", "12"]
+def test_a_video_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp_path, capsys):
+    video = tmp_path / "new" / "video.mp4"
+    words = ["render", trained, "--out", str(video), "--seconds", "0.5", "--fps", "12"]
     assert main([*words, "--size", "48x32"]) == 0
-    assert capsys.readouterr().out.splitlines()[1] == f"wrote {film}"
-    assert list(film.parent.iterdir()) == [film]
-    with imageio.get_reader(str(film)) as read:
+    assert capsys.readouterr().out.splitlines()[1] == f"wrote {video}"
+    assert list(video.parent.iterdir()) == [video]
+    with imageio.get_reader(str(video)) as read:
         data = read.get_meta_data()
         assert data["size"] == (48, 32) and data["fps"] == 12
         frames = [frame.astype(int) for frame in read.iter_data()]
@@ -37,17 +37,26 @@ def test_a_film_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp_
 
 
 @pytest.mark.parametrize("suffix", ["gif", "webp"])
-def test_a_film_whose_frames_would_fill_the_memory_is_not_begun(trained, tmp_path, suffix):
+def test_a_video_whose_frames_would_fill_the_memory_is_not_begun(trained, tmp_path, suffix):
     """Pillow keeps them all: 200 of 960x540 took 450 MB as WebP, with imageio 46 as MP4."""
-    out = tmp_path / f"film.{suffix}"
+    out = tmp_path / f"video.{suffix}"
     words = ("render", trained, "--out", out, "--seconds", "60", "--size", "1920x1080")
     assert "--format mp4" in failure(*words)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypatch):
-    words = ["render", trained, "--out", str(tmp_path / "film.gif"), "--seconds", "1", "--fps", "4"]
-    write, done = film.write_png, []
+def test_a_video_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypatch):
+    words = [
+        "render",
+        trained,
+        "--out",
+        str(tmp_path / "video.gif"),
+        "--seconds",
+        "1",
+        "--fps",
+        "4",
+    ]
+    write, done = render_video.write_png, []
 
     def stopping(path, image):
         if len(done) == 2:
@@ -56,20 +65,20 @@ def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypa
         done.append(path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(film, "write_png", stopping)
+        patch.setattr(render_video, "write_png", stopping)
         assert main(words) == 130
-    assert not (tmp_path / "film.gif").exists()
+    assert not (tmp_path / "video.gif").exists()
     with FileLock(done[0].parent / ".pp-cl.lock"):
-        assert "film.gif.frames: another process" in failure(*words)
+        assert "video.gif.frames: another process" in failure(*words)
     assert main(words) == 0
     assert "rendered 2 of 4 frames" in capsys.readouterr().out
-    assert list(tmp_path.iterdir()) == [tmp_path / "film.gif"]
-    assert main([*words, "--background", "black"]) == 0  # a film is made anew
+    assert list(tmp_path.iterdir()) == [tmp_path / "video.gif"]
+    assert main([*words, "--background", "black"]) == 0  # a video is made anew
     assert "rendered 4 of 4 frames" in capsys.readouterr().out
     done[0].parent.mkdir()
     (done[0].parent / ".mine.png").write_bytes(b"mine")
     assert main(words) == 0 and (done[0].parent / ".mine.png").read_bytes() == b"mine"
-    with imageio.get_reader(str(tmp_path / "film.gif")) as read:
+    with imageio.get_reader(str(tmp_path / "video.gif")) as read:
         assert read.get_length() == 4
 
 

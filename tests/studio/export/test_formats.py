@@ -47,8 +47,8 @@ def test_a_box_holds_a_part_and_axes_turn_it(name, run, tmp_path):
         read = trimesh.load(path, process=False)
         [some] = read.geometry.values() if suffix == ".glb" else [read]
         places[axes] = some.vertices
-    edge = run.model.grid.edge
-    assert places["scene"][:, 2].max() == pytest.approx(0.25, abs=2 * edge)
+    voxel_size = run.model.grid.voxel_size
+    assert places["scene"][:, 2].max() == pytest.approx(0.25, abs=2 * voxel_size)
     assert places["scene"][:, 2].min() < -0.5, "there is more of the ball below"
     turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
     np.testing.assert_allclose(places["scene"] @ turn.T, places["viewer"], atol=1e-5)
@@ -63,12 +63,12 @@ def test_they_read_back_as_a_scene(run, tmp_path):
             assert view.camera.pose == pytest.approx(camera.pose)
             for name in ("fx", "fy", "cx", "cy", "width", "height"):
                 assert getattr(view.camera, name) == pytest.approx(getattr(camera, name))
-            picture = run.render(camera)
-            assert np.array_equal(view.image, to_8bit(picture.rgba()))
+            rendered = run.render(camera)
+            assert np.array_equal(view.image, to_8bit(rendered.rgba()))
             rgba = view.image / 255
             over_white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
-            covered = picture.alpha > 0.2  # below, colours that alpha cannot carry are cut
-            assert np.abs(over_white - picture.colour)[covered].mean() < 0.01
+            covered = rendered.alpha > 0.2  # below, colours that alpha cannot carry are cut
+            assert np.abs(over_white - rendered.colour)[covered].mean() < 0.01
 
 
 def test_a_scene_without_test_views_gives_training_views(run, run_folder, tmp_path):

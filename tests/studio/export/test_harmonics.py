@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.models import blend_matrix
 
-from pp_cl.files.picture import Picture
+from pp_cl.files.rendered_view import RenderedView
 from pp_studio.export.harmonics import basis, fit_harmonics
 from pp_studio.export.observe import directions, observe
 
@@ -35,14 +35,14 @@ def test_images_of_known_harmonics_are_reproduced(run, rng, monkeypatch):
         [np.full((n, 1, 3), 0.5), rng.normal(scale=0.02, size=(n, 8, 3))], axis=1
     ).astype(np.float32)
 
-    def picture(camera):
+    def rendered(camera):
         (seen,) = observe(run, [camera], "")
         image = drawn(run, known, seen).reshape(30, 30, 3)
         alpha = blend_matrix(seen).sum(1).reshape(30, 30)
-        return Picture(image, alpha, alpha, alpha)
+        return RenderedView(image, alpha, alpha, alpha)
 
     with monkeypatch.context() as patch:
-        patch.setattr(run, "render", picture)
+        patch.setattr(run, "render", rendered)
         found = fit_harmonics(run)
     for seen in observe(run, run.cameras("train")[::4], ""):
         error = np.abs(drawn(run, found, seen) - drawn(run, known, seen))

@@ -11,7 +11,7 @@ import trimesh
 from support.refused import refusing
 
 from pp_cl.run import load_run
-from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.lens import LensDistortion
 from pp_studio.export.formats import export_run
 from pp_studio.export.length import metres_per_unit, set_length, surface_point
 
@@ -31,7 +31,7 @@ def text_of(one, position):
 
 
 def rims(one, share):
-    """Two points of the ball, left and right of its middle in a photograph, and their distance."""
+    """Two points of the ball, left and right of its middle in an image, and their distance."""
     towards = one.camera.eye / np.linalg.norm(one.camera.eye)
     right = np.cross(one.camera.pose[:, 1], towards)
     right /= np.linalg.norm(right)
@@ -40,18 +40,18 @@ def rims(one, share):
 
 
 def test_pixels_tell_where_the_surface_is(mine):
-    one = mine.photographs("train")[2]
+    one = mine.image_files("train")[2]
     ends, length = rims(one, 0.6)
     found = [surface_point(mine, text_of(one, end)) for end in ends]
     assert np.linalg.norm(found[0] - found[1]) == pytest.approx(length, rel=0.08)
     assert metres_per_unit(mine) == 1
 
 
-def test_pixels_are_those_of_the_photograph_as_the_lens_has_it(mine, monkeypatch):
-    lens, one = Distortion(k1=-0.25, p1=0.01), mine.photographs("train")[2]
+def test_pixels_are_those_of_the_image_as_the_lens_has_it(mine, monkeypatch):
+    lens, one = LensDistortion(k1=-0.25, p1=0.01), mine.image_files("train")[2]
     camera, x, y = one.camera, 20.4, 35.6
     straight = surface_point(mine, f"{one.name}:{x},{y}")
-    listed = [replace(each, distortion=lens) for each in mine.photographs("train")]
+    listed = [replace(each, lens=lens) for each in mine.image_files("train")]
     monkeypatch.setattr("pp_studio.export.length.scene_frames", lambda *_, **__: listed)
     x, y = lens.apply((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
     bent = f"{one.name}:{x * camera.fx + camera.cx:.3f},{y * camera.fy + camera.cy:.3f}"
@@ -68,24 +68,24 @@ def test_exports_are_in_metres(mine, tmp_path, name):
         return [np.ptp(vertex[axis]) for axis in "xyz"]
 
     before = spans(tmp_path / "a.ply")
-    one = mine.photographs("train")[0]
+    one = mine.image_files("train")[0]
     first, second = (text_of(one, end) for end in rims(one, 0.6)[0])
     apart = np.linalg.norm(surface_point(mine, first) - surface_point(mine, second))
     assert set_length(mine, first, second, 0.24) == pytest.approx(0.24 / apart)
     assert spans(tmp_path / "b.ply") == pytest.approx(np.multiply(before, 0.24 / apart), rel=1e-3)
-    kept = json.loads((mine.folder.path / "length.json").read_text())
-    assert kept["between"] == [first, second] and kept["metres"] == 0.24
+    stored = json.loads((mine.folder.path / "length.json").read_text())
+    assert stored["between"] == [first, second] and stored["metres"] == 0.24
     assert export_run(mine, name, tmp_path / "c.ply", window=60).endswith(", in metres")
 
 
 def test_what_tells_no_length_is_refused(mine):
-    one = mine.photographs("train")[0]
+    one = mine.image_files("train")[0]
     good = text_of(one, mine.model.positions().mean(0))
     with refusing("PHOTO:X,Y"):
         surface_point(mine, "a.jpg")
-    with refusing(f"no training photograph of that name; did you mean {one.name}?"):
+    with refusing(f"no training image of that name; did you mean {one.name}?"):
         surface_point(mine, f"{one.name}x:1,2")
-    with refusing("no training photograph of that name; name one such as train/"):
+    with refusing("no training image of that name; name one such as train/"):
         surface_point(mine, "qqq:1,2")
     with refusing("60x60"):
         surface_point(mine, f"{one.name}:60,2")

@@ -20,7 +20,7 @@ def mesh(run):
 
 def test_it_is_the_ball(run, mesh):
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
-    assert np.median(distance) < 1.5 * run.model.grid.edge
+    assert np.median(distance) < 1.5 * run.model.grid.voxel_size
     made = trimesh.Trimesh(mesh.vertices, mesh.faces)
     assert made.is_watertight
     assert made.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.25)  # faces look outwards

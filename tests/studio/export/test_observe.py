@@ -27,7 +27,7 @@ def test_rows_sum_to_alpha_up_to_an_early_stop_and_columns_to_the_points_weights
     check(run)
 
 
-def test_dropped_hits_are_no_part_of_it(run_folder, session_device, tmp_path):
+def test_dropped_fragments_are_no_part_of_it(run_folder, session_device, tmp_path):
     shutil.copytree(run_folder, tmp_path / "run")
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     config["raster"]["early_stop"] = 0.3
@@ -45,9 +45,9 @@ def test_it_blends_what_the_rasteriser_blends(run):
     (seen,) = observe(run, [camera], "test")
     matrix = blend_matrix(seen)
     raster = run.renderer.forward(camera, run.gamma, until="features")
-    shaded = raster.weights.shaded.get()
+    visible = raster.weights.visible.get()
     points = np.zeros((run.model.cloud.count, 16), np.float32)
-    points[shaded] = raster.shaded_features.get()[: len(shaded)]
+    points[visible] = raster.visible_features.get()[: len(visible)]
     blended = matrix @ points + (1 - matrix.sum(1))[:, None]  # the background's features are 1
     features = run.render(camera, features=True).features.reshape(-1, 16)
     assert blended == pytest.approx(features, abs=1e-4)
@@ -57,7 +57,7 @@ def test_blending_and_gathering_are_the_matrix_and_its_transpose(run, rng):
     for seen in observe(run, run.cameras("test"), "test", blending=True):
         matrix = blend_matrix(seen)
         colours, values = rng.normal(size=(run.model.cloud.count, 3)), rng.normal(size=(900, 3))
-        assert seen.gathered(values) == pytest.approx((matrix.T @ values)[seen.shaded], abs=1e-5)
-        blended, rest = seen.blended(colours[seen.shaded])
+        assert seen.gathered(values) == pytest.approx((matrix.T @ values)[seen.visible], abs=1e-5)
+        blended, rest = seen.blended(colours[seen.visible])
         assert blended == pytest.approx(matrix @ colours, abs=1e-5)
         assert rest == pytest.approx(1 - matrix.sum(1), abs=1e-5)

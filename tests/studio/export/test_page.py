@@ -33,7 +33,7 @@ def element(page, name):
     return re.search(rf'id="{name}">(.*?)</script>', page.read_text("utf-8"), re.DOTALL)[1]
 
 
-def kept(page):
+def content_of(page):
     """(header, rows of POINT, coefficients (N, 9, 3), opacity (N,)) that the page holds."""
     header = json.loads(element(page, "header"))
     rows = np.frombuffer(base64.b64decode(element(page, "points")), POINT)
@@ -44,7 +44,7 @@ def kept(page):
 
 def predicted(run, page, camera):
     """(H, W, 3) uint8: what the page is to draw, by the run's own blend weights."""
-    _, _, coefficients, _ = kept(page)
+    _, _, coefficients, _ = content_of(page)
     positions = run.model.positions()
     at = basis(directions(positions, camera))
     (seen,) = observe(run, [camera], "")
@@ -69,7 +69,7 @@ def test_it_needs_nothing_but_itself(page):
 
 
 def test_points_are_kept_to_within_a_step(run, page):
-    header, rows, _, opacity = kept(page)
+    header, rows, _, opacity = content_of(page)
     places = header["origin"] + header["unit"] * rows["place"].astype(float)
     assert places == pytest.approx(run.model.positions(), abs=0.6 * header["unit"])
     assert header["count"] == len(rows) and header["stride"] == POINT.itemsize == 36
@@ -116,7 +116,7 @@ def test_a_browser_sorts_the_points_from_far_to_near(page):
             ...[0, 1, 2].map((k) => ppcl.positions[3 * i + k] - eye[k]))).concat([ppcl.order.length,
             new Set(ppcl.order).size]);"""
     *distances, count, different = ask(page, script)
-    assert count == different == kept(page)[0]["count"]
+    assert count == different == content_of(page)[0]["count"]
     assert np.diff(distances).max() < 1.1 * np.ptp(distances) / 65535
 
 
@@ -146,7 +146,7 @@ def test_the_address_says_the_camera(run, page):
 
 @pytest.mark.parametrize("fragment", ["#eye=1,2&target=x&up=,,&fov=-3", "#eye=1,2,3&target=1,2,3"])
 def test_a_broken_address_shows_the_first_look(page, fragment):
-    header = kept(page)[0]
+    header = content_of(page)[0]
     camera = looking(header["eye"], header["centre"], header["up"], header["fov"])
     check_address(page, fragment, camera)
 
@@ -186,7 +186,7 @@ def in_address(found, name):
 def test_mouse_and_keys_move_the_camera(page):
     found = ask(page, CONTROLS)
     assert len(set(found["seen"])) == 4 and found["seen"][0] == found["seen"][4]
-    header = kept(page)[0]
+    header = content_of(page)[0]
     eye, target = (in_address(found, name) for name in ("eye", "target"))
     centre, first = (np.array(header[name]) for name in ("centre", "eye"))
     assert target == pytest.approx(centre, abs=1e-5)

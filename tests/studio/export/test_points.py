@@ -59,7 +59,7 @@ def test_the_ply_reads_back_by_plyfile(run, written):
     assert (vertex["point_opacity"] == points.opacity).all()
     assert (vertex["weight"] == points.weight).all()
     offset = run.model.cloud.offset.get()[points.rows, 3]
-    spacings = vertex["radius"] / run.model.grid.edge / run.config.raster.radius
+    spacings = vertex["radius"] / run.model.grid.voxel_size / run.config.raster.radius
     assert np.log(spacings) == pytest.approx(offset, abs=1e-5)
     stored = run.model.cloud.arrays(run.dev)
     by_degree = [stored[f"points.sh{degree}"].get()[points.rows] for degree in range(3)]

@@ -80,12 +80,12 @@ def test_what_is_no_colour(run, ply):
     turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
     vertices = grid.positions(run.model.cloud.ids.get())
     apart = cKDTree(vertices).query(found["positions"] @ turn, p=np.inf)[0]
-    assert apart.max() < (MOST_OF_GAUSSIANS + 1e-4) * grid.edge
+    assert apart.max() < (MOST_OF_GAUSSIANS + 1e-4) * grid.voxel_size
     assert 0.3 * len(vertices) < len(apart) <= len(vertices)
     assert turn @ up == pytest.approx([0, -1, 0])
     assert found["opacity"].min() > 1 / 255 and found["opacity"].max() < 0.991
     size = np.linalg.eigvalsh(found["covariance"]) ** 0.5
-    size /= DEVIATION * run.config.raster.radius * grid.edge
+    size /= DEVIATION * run.config.raster.radius * grid.voxel_size
     assert size.min() > 0.02 and size.max() < 2 * np.exp(MOST_OF_GAUSSIANS)
     assert np.median(size[:, 2] / size[:, 0]) > 1.1  # none of them stayed a ball
     assert all((vertex[f"n{axis}"] == 0).all() for axis in "xyz")
@@ -108,7 +108,7 @@ def test_gaussians_look_like_the_run_in_the_window_that_they_are_for(run, ply, t
     assert likeness(run, small, 1) > 37 and likeness(run, ply, 1) < 30
 
 
-def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monkeypatch):
+def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatch):
     """And to as many renderings between them if they are few; to renderings alone where exposures
     differ, or where the scene is gone.
     """
@@ -119,19 +119,19 @@ def test_they_are_fitted_to_the_photographs_that_the_run_learned_from(run, monke
             fit_gaussians(run, window)
         return fitted.call_args[0][3]
 
-    photographs, found = run.scene("train").splits["train"], views()
-    assert len(found) == 2 * len(photographs)
+    images, found = run.scene("train").splits["train"], views()
+    assert len(found) == 2 * len(images)
     with monkeypatch.context() as patch:  # for a window that is smaller than the images
         for module in ("pp_cl.engine.views", "pp_studio.export.gaussians"):
             patch.setattr(f"{module}.MIN_SIDE", 8)
         assert {view.camera.width for view in views(15)} == {15}
-    for one, other in zip(photographs, found, strict=False):
+    for one, other in zip(images, found, strict=False):
         assert one.name == other.name and (one.image == other.image).all()
-    rendered = [view.image.shape for view in run.rendered(run.photographs("train"), opaque=True)]
-    assert [view.image.shape for view in found[len(photographs) :]] == rendered
+    rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
+    assert [view.image.shape for view in found[len(images) :]] == rendered
     with monkeypatch.context() as patch:
-        patch.setattr(gaussians, "ENOUGH", len(photographs))
-        assert [view.name for view in views()] == [view.name for view in photographs]
+        patch.setattr(gaussians, "ENOUGH", len(images))
+        assert [view.name for view in views()] == [view.name for view in images]
     monkeypatch.setitem(run.header, "left_out", [found[0].name])
     assert [view.name for view in views()][:2] == [found[1].name, found[2].name]
     monkeypatch.setitem(run.header, "exposed", True)

@@ -54,12 +54,12 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     assert np.abs(turn @ up - (0, 1, 0)).max() < 1e-6
     solid.vertices = solid.vertices @ turn
     for camera in run.cameras("test"):
-        picture, rays = run.render(camera), camera.rays().reshape(-1, 3)
+        rendered, rays = run.render(camera), camera.rays().reshape(-1, 3)
         eyes = np.broadcast_to(camera.eye, rays.shape)
         places, ray, face = solid.ray.intersects_location(eyes, rays, multiple_hits=False)
         shares = trimesh.triangles.points_to_barycentric(solid.triangles[face], places)
         uv = (solid.visual.uv[solid.faces[face]] * shares[..., None]).sum(1)
         found = image[((1 - uv[:, 1]) * 256).astype(int) % 256, (uv[:, 0] * 256).astype(int) % 256]
-        shown = picture.rgba().reshape(-1, 4)[ray]
+        shown = rendered.rgba().reshape(-1, 4)[ray]
         sure = shown[:, 3] > 0.95
         assert sure.sum() > 150 and np.abs(found - shown[:, :3])[sure].mean() < 0.06

@@ -30,7 +30,7 @@ def views(run):
     return run.scene("train").splits["train"]
 
 
-def test_every_quantity_is_another_picture(run, views):
+def test_every_quantity_is_another_image(run, views):
     images = {show: draw(run, views, CAMERA, show) for show in SHOWN}
     assert len({image.tobytes() for image, _ in images.values()}) == len(SHOWN)
     assert {image.shape for image, _ in images.values()} == {(48, 48, 3), (24, 24, 3)}
@@ -42,12 +42,12 @@ def test_the_error_is_that_of_the_nearest_view_from_its_own_camera(run, views):
     view = views[5]
     near = replace(view.camera, pose=view.camera.pose + 1e-3 * np.eye(3, 4, 3))
     error, line = draw(run, views, near, "error")
-    photograph, name = draw(run, views, near, "photograph")
+    photo, name = draw(run, views, near, "photograph")
     assert line == f"{view.name}, error x4" and name == view.name
     rendering = to_8bit(run.render(view.camera).colour).astype(int)
-    expected = np.minimum(4 * np.abs(rendering - photograph), 255)
+    expected = np.minimum(4 * np.abs(rendering - photo), 255)
     assert np.abs(error - expected).max() <= 5  # both are rounded, four times
-    assert photograph.min() < 250 and error.max() > 5
+    assert photo.min() < 250 and error.max() > 5
     with pytest.raises(UserError, match="photographs"):
         draw(run, [], near, "error")
 
@@ -56,9 +56,9 @@ def test_fragments_are_those_of_the_pairs(run):
     camera = replace(CAMERA, width=45, height=43)  # is padded
     image, line = draw(run, [], camera, "fragments")
     view = run.renderer.forward(camera, run.gamma, until="weights")
-    hits = view.cropped(np.diff(view.pairs.pixel_offset.get().astype(int)).reshape(view.size))
-    assert line == f"0 to {hits.max()} fragments" and hits.max() > 1
-    np.testing.assert_array_equal(image, colour_scale(hits, 0, hits.max(), hits > 0))
+    fragments = view.cropped(np.diff(view.pairs.pixel_offset.get().astype(int)).reshape(view.size))
+    assert line == f"0 to {fragments.max()} fragments" and fragments.max() > 1
+    np.testing.assert_array_equal(image, colour_scale(fragments, 0, fragments.max(), fragments > 0))
 
 
 def test_the_nearest_view_counts_place_and_direction():

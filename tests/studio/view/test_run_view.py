@@ -26,7 +26,7 @@ CAMERA = ring_cameras(3, 48)[2]
 
 @pytest.fixture
 def view(served, dev, copied):
-    """The small run, loaded; its pictures are larger than it was trained, as JPEG loses less."""
+    """The small run, loaded; its renderings are larger than it was trained, as JPEG loses less."""
     found = RunView(served[0], dev, RunFolder(copied))
     found.look()
     found.page._focal = 2 * CAMERA.fy
@@ -35,7 +35,7 @@ def view(served, dev, copied):
 
 @contextlib.contextmanager
 def looking(view, address, camera=CAMERA):
-    """A Tab at a camera, of whose pictures none is drawn yet."""
+    """A Tab at a camera, of whose renderings none is drawn yet."""
     with tab(address) as opened:
         opened.look(camera, view.page._space)
         wait(lambda: any(np.allclose(t.camera.eye, camera.eye) for t in view.page._tabs.values()))
@@ -50,19 +50,19 @@ def drawn(view):
 
 
 def like(view, camera, **look):
-    """Whether a picture is what draw() gives, but for what JPEG takes."""
+    """Whether a rendering is what draw() gives, but for what JPEG takes."""
     expected, _ = draw(view.page.run, view.page._views, camera, **look)
     return lambda image: image.shape == expected.shape and np.abs(image - expected).mean() < 4
 
 
-def test_a_moving_camera_gets_drafts_and_one_at_rest_the_full_picture(view, served, monkeypatch):
+def test_a_moving_camera_gets_drafts_and_one_at_rest_the_full_image(view, served, monkeypatch):
     with looking(view, served[1]) as opened:
         monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)
         assert view.page.draw_next() and not view.page.draw_next()
-        assert opened.picture().shape == (24, 24, 3)
+        assert opened.image().shape == (24, 24, 3)
         monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
         assert view.page.draw_next() and not view.page.draw_next()
-        opened.picture(like(view, CAMERA.resized(96, 96)))
+        opened.image(like(view, CAMERA.resized(96, 96)))
         view.page.renew()
         assert view.page.draw_next()
 
@@ -74,8 +74,8 @@ def test_switches_change_what_is_drawn(view, served):
         ("Exposure, stops", -2.0, {"show": "depth", "exposure": -2.0}),
         ("As trained", True, {"show": "depth"}),
         ("Show", "colour", {}),
-        ("Points kept, %", 20, {"kept": 0.2}),
-        ("Points kept, %", -7, {"kept": 0.01}),  # what no slider says
+        ("Points kept, %", 20, {"share": 0.2}),
+        ("Points kept, %", -7, {"share": 0.01}),  # what no slider says
     )
     checks = [like(view, camera, **look) for _, _, look in changes]
     with looking(view, served[1]) as opened, drawing(view.page):
@@ -84,12 +84,12 @@ def test_switches_change_what_is_drawn(view, served):
                 opened.send("CommandTriggerMessage", uuid=opened.handles[label]["uuid"])
             else:
                 opened.set(label, value)
-            opened.picture(check)
+            opened.image(check)
 
 
-def test_the_picture_is_saved_as_it_is(view, served):
+def test_the_image_is_saved_as_it_is(view, served):
     with looking(view, served[1]) as opened, drawing(view.page):
-        opened.set("Save picture", True)
+        opened.set("Save image", True)
         name, content = opened.file()
     image = np.array(Image.open(io.BytesIO(content)))
     assert name == f"{view._folder.path.name}_step_40_colour.png"
@@ -126,7 +126,7 @@ def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
     with looking(view, served[1]) as one, looking(view, served[1]) as other:
         wait(lambda: len(view.page._tabs) == 2)
         drawn(view)
-        assert one.picture().shape == other.picture().shape
+        assert one.image().shape == other.image().shape
         other.look(CAMERA, view.page._space)
     wait(lambda: not view.page._tabs)
     assert not view.page.draw_next()
@@ -158,7 +158,7 @@ def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copie
         assert "cannot be read" in view.told.content and view.page.run is second
 
 
-def test_a_run_whose_photographs_are_gone_is_still_shown(served, dev, copied):
+def test_a_run_whose_images_are_gone_is_still_shown(served, dev, copied):
     config = json.loads((copied / "config.json").read_text())
     config["scene"]["path"] = "/nowhere/at/all"
     (copied / "config.json").write_text(json.dumps(config))
@@ -167,7 +167,7 @@ def test_a_run_whose_photographs_are_gone_is_still_shown(served, dev, copied):
     assert "/nowhere/at/all" in view.told.content
     with looking(view, served[1]) as opened:
         drawn(view)
-        assert (opened.picture() < 200).any()
+        assert (opened.image() < 200).any()
         assert len([node for node in opened.nodes.values() if "fov" in node["props"]]) == 8
         opened.set("Show", "error")
         wait(lambda: view.page._show.value == "error")
@@ -184,7 +184,7 @@ def training(dev, scene, tmp_path, runs):
 
 
 def test_a_watched_training_has_the_same_bits(training, tmp_path):
-    cameras, pictures = ring_cameras(5, 96), []
+    cameras, images = ring_cameras(5, 96), []
     with shown_training(training) as (address, on_step), tab(address) as opened:
         page = page_of(on_step)
 
@@ -195,11 +195,11 @@ def test_a_watched_training_has_the_same_bits(training, tmp_path):
             while time.monotonic() < deadline:
                 on_step(step, row)
                 time.sleep(0.01)
-            pictures.append(page.run.header["step"])
+            images.append(page.run.header["step"])
 
         training.run(follow)
-        shapes = {opened.picture().shape[:2] for _ in range(3)}
-    assert pictures == list(range(1, 16)) and max(map(max, shapes)) <= 48
+        shapes = {opened.image().shape[:2] for _ in range(3)}
+    assert images == list(range(1, 16)) and max(map(max, shapes)) <= 48
     assert arrays(tmp_path / "run") == arrays(tmp_path / "alone")
 
 

@@ -62,7 +62,7 @@ def test_cameras_points_and_a_suggested_box_are_shown(page, opened, folder):
 
 
 def test_a_view_of_two_splits_is_listed_once(served, folder):
-    """The page's list throws in the browser where two entries are equal."""
+    """The page's list throws in the browser where two items are equal."""
     shutil.copy(folder / "transforms_test.json", folder / "transforms_val.json")
     names = ScenePage(served[0], folder)._view.options
     assert len(names) == len(set(names)) == 10

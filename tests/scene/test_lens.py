@@ -9,24 +9,24 @@ from support.transforms_scenes import refused, write_scene
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.distortion import Distortion, undistort
 from pp_cl.scene.image_file import shrink
+from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.scene.load import load_scene
 
 CAMERA = Camera(np.eye(3, 4), 150.0, 140.0, 84.0, 57.5, 161, 120)
 LENSES = {
-    "barrel": Distortion(k1=-0.2, k2=0.03),
-    "pincushion": Distortion(k1=0.15),
-    "tangential": Distortion(p1=0.01, p2=-0.008),
-    "all": Distortion(-0.15, 0.04, 0.004, -0.003, 0.01),
-    "fisheye": Distortion(fisheye=True),
-    "bent fisheye": Distortion(k1=0.04, k2=-0.02, k3=0.01, k4=-0.004, fisheye=True),
+    "barrel": LensDistortion(k1=-0.2, k2=0.03),
+    "pincushion": LensDistortion(k1=0.15),
+    "tangential": LensDistortion(p1=0.01, p2=-0.008),
+    "all": LensDistortion(-0.15, 0.04, 0.004, -0.003, 0.01),
+    "fisheye": LensDistortion(fisheye=True),
+    "bent fisheye": LensDistortion(k1=0.04, k2=-0.02, k3=0.01, k4=-0.004, fisheye=True),
 }
 
 
 def test_the_formula_by_hand():
     """x = 0.3, y = -0.2: r^2 = 0.13."""
-    x, y = Distortion(0.1, 0.01, 0.002, -0.003, 0.5).apply(np.array(0.3), np.array(-0.2))
+    x, y = LensDistortion(0.1, 0.01, 0.002, -0.003, 0.5).apply(np.array(0.3), np.array(-0.2))
     radial = 1 + 0.1 * 0.13 + 0.01 * 0.13**2 + 0.5 * 0.13**3
     assert x == pytest.approx(0.3 * radial + 2 * 0.002 * -0.06 - 0.003 * (0.13 + 2 * 0.09))
     assert y == pytest.approx(-0.2 * radial + 0.002 * (0.13 + 2 * 0.04) + 2 * -0.003 * -0.06)
@@ -45,8 +45,8 @@ def test_a_fisheye_by_hand():
 def test_without_coefficients_nothing_changes(dev, rng):
     image = rng.integers(0, 256, (120, 161, 4), np.uint8)
     image[..., 3] = 255
-    assert not Distortion() and Distortion(k3=1e-9)
-    assert np.array_equal(undistort(dev, image, CAMERA, Distortion()), image)
+    assert not LensDistortion() and LensDistortion(k3=1e-9)
+    assert np.array_equal(undistort(dev, image, CAMERA, LensDistortion()), image)
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -87,15 +87,15 @@ def test_one_colour_stays_one_colour(dev, name):
 
 def test_a_lens_that_folds_is_refused(tmp_path):
     """1 + 3 k1 r^2 < 0 from r = 0.58 on."""
-    assert Distortion(k1=float("nan")).folds(CAMERA)
-    assert Distortion(k1=-1.0).folds(CAMERA) and not Distortion(k1=-0.5).folds(CAMERA)
+    assert LensDistortion(k1=float("nan")).folds(CAMERA)
+    assert LensDistortion(k1=-1.0).folds(CAMERA) and not LensDistortion(k1=-0.5).folds(CAMERA)
     data = write_scene(tmp_path)
     data["k1"] = -9.0
     (tmp_path / "transforms_train.json").write_text(json.dumps(data))
     refused(tmp_path, tmp_path / "train_0.png", "fold the image over")
 
 
-def test_photographs_of_a_scene_are_undistorted(dev, tmp_path):
+def test_images_of_a_scene_are_undistorted(dev, tmp_path):
     data = write_scene(tmp_path)
     data.update(k1=0.3, p1=0.01, camera_model="OPENCV")
     (tmp_path / "transforms_train.json").write_text(json.dumps(data))
@@ -103,13 +103,13 @@ def test_photographs_of_a_scene_are_undistorted(dev, tmp_path):
         load_scene(tmp_path)
     for view in load_scene(tmp_path, dev=dev).splits["train"]:
         stored = read_rgba(tmp_path / view.name)
-        expected = undistort(dev, stored, view.stored_camera, Distortion(k1=0.3, p1=0.01))
+        expected = undistort(dev, stored, view.stored_camera, LensDistortion(k1=0.3, p1=0.01))
         np.testing.assert_array_equal(view.image, expected)
         assert (view.image != stored).any()
 
 
 @pytest.mark.parametrize("factor", (2, 3, 5))
-def test_reducing_a_warp_as_it_is_read_is_reducing_the_warped_photograph(dev, data, factor):
+def test_reducing_a_warp_as_it_is_read_is_reducing_the_warped_image(dev, data, factor):
     """At most a level of 255 apart in 99.9 % of the pixels: the whole warp is rounded once more.
     To reduce first, and to warp the small image, differs by more in a fifth of them.
     """

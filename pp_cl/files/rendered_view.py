@@ -17,7 +17,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Picture:
+class RenderedView:
     """A view as a model shows it, over white. Float32 arrays of H rows and W columns.
 
     colour: (H, W, 3), sRGB in [0, 1], over white. alpha: (H, W) in [0, 1], the share that the
@@ -54,7 +54,7 @@ class Picture:
     def channels(self) -> dict[str, np.ndarray]:
         """{channel: (H, W) float32} for OpenEXR: R, G, B, in linear light and multiplied by alpha,
         A; Z, the median depth, and mean.Z, both infinite where nothing is; feature.00 to feature.15
-        where the picture has them.
+        where the rendering has them.
         """
         rgba = self.rgba()
         light = srgb_to_linear(rgba[..., :3]) * rgba[..., 3:]
@@ -70,21 +70,21 @@ class Picture:
         write_png(path, self.over(background))
 
     def _repr_png_(self) -> bytes:
-        """The picture over white, by which a notebook shows it."""
+        """The rendering over white, by which a notebook shows it."""
         encoded = io.BytesIO()
         Image.fromarray(to_8bit(self.colour)).save(encoded, "PNG")
         return encoded.getvalue()
 
 
-def mean_picture(pictures: Iterable[Picture]) -> Picture:
+def mean_rendered_view(views: Iterable[RenderedView]) -> RenderedView:
     """The mean of several samples of one view, each of which is forgotten before the next is taken;
     depths and features are those of the first.
     """
-    taken = iter(pictures)
+    taken = iter(views)
     first, n = next(taken), 1
     colour, alpha = first.colour, first.alpha
     for sample in taken:
         colour, alpha, n = colour + sample.colour, alpha + sample.alpha, n + 1
         del sample
     colour, alpha = ((total / np.float64(n)).astype(np.float32) for total in (colour, alpha))
-    return Picture(colour, alpha, first.depth, first.median_depth, first.features)
+    return RenderedView(colour, alpha, first.depth, first.median_depth, first.features)

@@ -9,22 +9,22 @@ import pytest
 from PIL import Image
 
 from pp_cl.files.image import read_rgba
-from pp_cl.files.picture import Picture, mean_picture
+from pp_cl.files.rendered_view import RenderedView, mean_rendered_view
 from pp_cl.files.srgb import linear_to_srgb, srgb_to_linear
 
 
-def picture(rng, height=7, width=5):
-    """(Picture, straight colours): a known object over white."""
+def view_and_colours(rng, height=7, width=5):
+    """(RenderedView, straight colours): a known object over white."""
     straight = rng.random((height, width, 3)).astype(np.float32)
     alpha = rng.random((height, width)).astype(np.float32)
     alpha[0], alpha[1] = 0, 1
     colour = straight * alpha[..., None] + 1 - alpha[..., None]
     depth = np.where(alpha > 0, 3 + alpha, np.inf).astype(np.float32)
-    return Picture(colour, alpha, depth, depth), straight
+    return RenderedView(colour, alpha, depth, depth), straight
 
 
 def test_it_is_what_the_object_shows_over_a_colour(rng):
-    shown, straight = picture(rng)
+    shown, straight = view_and_colours(rng)
     over = shown.over((0.2, 0.4, 0.6))
     alpha = shown.alpha[..., None]
     expected = straight * alpha + (1 - alpha) * np.float32([0.2, 0.4, 0.6])
@@ -33,7 +33,7 @@ def test_it_is_what_the_object_shows_over_a_colour(rng):
 
 
 def test_straight_colours_come_back(rng):
-    shown, straight = picture(rng)
+    shown, straight = view_and_colours(rng)
     rgba, channels = shown.rgba(), shown.channels()
     np.testing.assert_array_equal(rgba[..., 3], shown.alpha)
     seen = shown.alpha > 0.05
@@ -52,7 +52,7 @@ def test_transfer_functions_are_inverse():
 
 
 def test_it_is_saved_and_shown_in_a_notebook(rng, tmp_path):
-    shown, _ = picture(rng)
+    shown, _ = view_and_colours(rng)
     shown.save(tmp_path / "white.png")
     shown.save(tmp_path / "clear.png", background=None)
     white, clear = (read_rgba(tmp_path / f"{name}.png") for name in ("white", "clear"))
@@ -64,7 +64,7 @@ def test_it_is_saved_and_shown_in_a_notebook(rng, tmp_path):
 @pytest.mark.parametrize("n", [1, 4, 9])
 def test_the_mean_of_samples(rng, n):
     """Of which the first is held, and one more."""
-    samples, held = [picture(rng)[0] for _ in range(n)], []
+    samples, held = [view_and_colours(rng)[0] for _ in range(n)], []
 
     def drawn():
         for sample in samples:
@@ -74,7 +74,7 @@ def test_the_mean_of_samples(rng, n):
             yield copied
             del copied
 
-    mean = mean_picture(drawn())
+    mean = mean_rendered_view(drawn())
     for name in ("colour", "alpha"):
         of_all = np.mean([getattr(sample, name) for sample in samples], axis=0)
         np.testing.assert_array_equal(getattr(mean, name), of_all)

@@ -1,4 +1,4 @@
-"""Renders a run along a camera path: frames in a folder, resumed by a later call, and films of
+"""Renders a run along a camera path: frames in a folder, resumed by a later call, and videos of
 them.
 """
 
@@ -31,8 +31,8 @@ from pp_cl.files import (
 from pp_studio.video import write_video
 
 MOST_IDENTITY = 1000  # bytes of it
-# bytes of a frame's pixel that Pillow keeps until the film is written, and of all that it may
-KEPT, MOST_KEPT = {".webp": 4, ".gif": 1}, 2**31
+# bytes of a frame's pixel that Pillow keeps until the video is written, and of all that it may
+PIXEL_BYTES, MOST_HELD = {".webp": 4, ".gif": 1}, 2**31
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
 LOCK = ".pp-cl.lock"
 OnFrame = Callable[[float | None], None]
@@ -89,35 +89,35 @@ def render_frames(
         for camera, path in zip(cameras, paths, strict=True):
             start, there = time.perf_counter(), path.exists()
             if not there:
-                picture = run.render(camera, samples=style.samples, features=style.features)
+                rendered = run.render(camera, samples=style.samples, features=style.features)
                 if style.suffix == "exr":
-                    write_exr(path, picture.channels())
+                    write_exr(path, rendered.channels())
                 else:
-                    write_png(path, picture.over(style.background))
+                    write_png(path, rendered.over(style.background))
             on_frame(None if there else time.perf_counter() - start)
     return paths
 
 
-def render_film(
-    run: Run, cameras: Sequence[Camera], film: Path, fps: float, style: Style, on_frame: OnFrame
+def render_video(
+    run: Run, cameras: Sequence[Camera], video: Path, fps: float, style: Style, on_frame: OnFrame
 ) -> None:
-    """Render a film, whose frames are in a hidden folder beside it until it is written, for a later
-    call to go on with. Raises UserError as render_frames and write_video do, and for a film whose
-    frames would fill the memory.
+    """Render a video, whose frames are in a hidden folder beside it until it is written, for a
+    later call to go on with. Raises UserError as render_frames and write_video do, and for a video
+    whose frames would fill the memory.
     """
-    check_file(film)
-    kept = KEPT.get(film.suffix.lower(), 0) * sum(c.width * c.height for c in cameras)
-    if kept > MOST_KEPT:
+    check_file(video)
+    held = PIXEL_BYTES.get(video.suffix.lower(), 0) * sum(c.width * c.height for c in cameras)
+    if held > MOST_HELD:
         raise UserError(
-            f"{film}: in this format all frames are in memory at once, {kept / 2**30:.1f} GiB; make"
-            " it shorter or smaller, or write --format mp4"
+            f"{video}: in this format all frames are in memory at once, {held / 2**30:.1f} GiB;"
+            " make it shorter or smaller, or write --format mp4"
         )
-    folder = film.with_name(f".{film.name}.frames")
+    folder = video.with_name(f".{video.name}.frames")
     paths = render_frames(run, cameras, folder, style, on_frame, replace=True)
     images = (read_rgba(path) for path in paths)
     if style.background is not None:
         images = (image[..., :3] for image in images)
-    write_video(film, images, fps)
+    write_video(video, images, fps)
     remove_ours(folder.iterdir())
     if {path.name for path in folder.iterdir()} <= {LOCK, MANIFEST}:
         shutil.rmtree(folder)

@@ -1,10 +1,10 @@
-// A photograph freed of its lens distortion, and reduced by area in the same pass: a cubic B-spline
-// through its premultiplied pixels (Unser 1991), whose edge goes on outside of the image, is read where the
-// lens puts the samples of a pinhole camera.
+// An image freed of its lens distortion, and reduced by area in the same pass: a cubic B-spline
+// through its premultiplied pixels (Unser 1991), whose edge goes on outside of the image, is read
+// where the lens puts the samples of a pinhole camera.
 #include "common.h"
 
 #define POLE -0.26794919f  // sqrt(3) - 2, of the recursion that makes a spline's coefficients
-#define GAIN 6.0f          // of both of its directions
+#define SCALE 6.0f         // of both of its directions
 #define MARGIN 8  // coefficients on either side of the image; further out they are constant
 
 static inline float4 premultiplied(const uchar4 pixel) {
@@ -13,7 +13,7 @@ static inline float4 premultiplied(const uchar4 pixel) {
 }
 
 // One work-item per row: reads it as the image has it, writes its spline's coefficients.
-kernel void spline_rows(
+kernel void lens_spline_rows(
     const int width,
     const int rows,        // of the coefficients: a band, which may reach outside of the image
     const int first,       // row of the image that is the band's first
@@ -31,12 +31,12 @@ kernel void spline_rows(
     c *= -POLE / (1.0f - POLE);
     for (int x = last; x >= 0; x--) {
         c = POLE * (c - out[x]);
-        out[x] = GAIN * c;
+        out[x] = SCALE * c;
     }
 }
 
 // One work-item per column of the coefficients: the same along it, in place.
-kernel void spline_columns(
+kernel void lens_spline_columns(
     const int columns,
     const int rows,
     global float4 *coefficients)  // (rows, columns, 4)
@@ -51,11 +51,11 @@ kernel void spline_columns(
     for (int y = 0; y < rows; y++) {
         at -= columns;
         c = POLE * (c - *at);
-        *at = GAIN * c;
+        *at = SCALE * c;
     }
 }
 
-// Where the lens puts the point (x / z, y / z): OpenCV's models, as Distortion.apply has them.
+// Where the lens puts the point (x / z, y / z): OpenCV's models, as LensDistortion.apply has them.
 // lens: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, and whether it is a fisheye.
 static inline float2 distorted(global const float *lens, const float x, const float y) {
     const float k1 = lens[4], k2 = lens[5], p1 = lens[6], p2 = lens[7], k3 = lens[8];
@@ -79,14 +79,14 @@ static inline float4 spline(const float t) {
 
 // One work-item per pixel of the result: reads factor x factor places of the spline, writes their
 // mean as straight RGBA.
-kernel void undistort(
+kernel void lens_undistort(
     const int width,  // of the band of the result
     const int height,
     const int top,     // row of the result that is the band's first
     const int factor,  // samples of a pixel, each way
     const int columns,
     const int rows,
-    const int first,                    // row of the photograph whose coefficients are the first
+    const int first,                    // row of the image whose coefficients are the first
     global const float *lens,           // (13)
     global const float4 *coefficients,  // (rows, columns, 4)
     global uchar4 *image)               // (height, width, 4)

@@ -1,4 +1,4 @@
-"""Lens distortion models, and undistorting photographs."""
+"""Lens distortion models, and undistorting images."""
 
 from dataclasses import astuple, dataclass
 
@@ -9,16 +9,14 @@ from pp_cl.engine.device.device import Device
 
 PROBED = 65  # places along each axis
 BAND_BYTES = 2**23  # of the spline's coefficients that are on the device at a time
-MARGIN = (
-    8  # coefficients beyond the image's left and right border, as cl/scene/distortion.cl has it
-)
+MARGIN = 8  # coefficients beyond the image's left and right border, as cl/scene/lens.cl has it
 # rows beyond those that are read, after which nothing is left of where the recursion began (3e-7)
 RUN_UP = 12
-ROWS_PROBED = 9  # of a band, to find the rows of the photograph that it shows
+ROWS_PROBED = 9  # of a band, to find the rows of the image that it shows
 
 
 @dataclass(frozen=True)
-class Distortion:
+class LensDistortion:
     """Coefficients of OpenCV's models: radial (k1, k2, k3, over k4, k5, k6) and tangential (p1, p2)
     of a perspective lens, k1 to k4 of a fisheye.
     """
@@ -69,27 +67,27 @@ class Distortion:
 
 
 def undistort(
-    dev: Device, image: np.ndarray, camera: Camera, distortion: Distortion, factor: int = 1
+    dev: Device, image: np.ndarray, camera: Camera, lens: LensDistortion, factor: int = 1
 ) -> np.ndarray:
     """(H // factor, W // factor, 4) uint8 straight RGBA that the camera would have taken without
     distortion, reduced `factor` times: means of factor x factor samples, each by cubic spline on
-    premultiplied colour; beyond the photograph's border its edge goes on.
+    premultiplied colour; beyond the image's border its edge goes on.
 
     image: (H, W, 4) uint8 straight RGBA, as the lens has it. camera: of H x W pixels.
     """
     width, height = camera.width // factor, camera.height // factor
-    program, columns = dev.program("scene/distortion"), camera.width + 2 * MARGIN
-    lens = [camera.fx, camera.fy, camera.cx, camera.cy, *astuple(distortion)]
-    numbers, found = dev.upload(lens, np.float32), np.empty((height, width, 4), np.uint8)
+    program, columns = dev.program("scene/lens"), camera.width + 2 * MARGIN
+    packed = [camera.fx, camera.fy, camera.cx, camera.cy, *astuple(lens)]
+    numbers, found = dev.upload(packed, np.float32), np.empty((height, width, 4), np.uint8)
     most = max(1, BAND_BYTES // (16 * columns * factor))
     for top in range(0, height, most):
         bottom = min(top + most, height)
-        first, last = _source_rows(camera, distortion, factor * top, factor * bottom)
+        first, last = _source_rows(camera, lens, factor * top, factor * bottom)
         shape = last - first, columns, 4
         there = image[max(first, 0) : min(last, camera.height)]
         coefficients = dev.empty(shape)
         program.launch(
-            "spline_rows",
+            "lens_spline_rows",
             (shape[0],),
             width=camera.width,
             rows=shape[0],
@@ -99,7 +97,7 @@ def undistort(
             coefficients=coefficients,
         )
         program.launch(
-            "spline_columns",
+            "lens_spline_columns",
             (columns,),
             columns=columns,
             rows=shape[0],
@@ -107,7 +105,7 @@ def undistort(
         )
         band = dev.empty((bottom - top, width, 4), np.uint8)
         program.launch(
-            "undistort",
+            "lens_undistort",
             (width, bottom - top),
             width=width,
             height=bottom - top,
@@ -124,14 +122,14 @@ def undistort(
     return found
 
 
-def _source_rows(camera, distortion, top, bottom):
-    """(first, last + 1) row of a photograph that the rows top to bottom of the camera without
+def _source_rows(camera, lens, top, bottom):
+    """(first, last + 1) row of an image that the rows top to bottom of the camera without
     distortion need, the RUN_UP on both sides included; both may lie outside of the image, by as
     little as its edge takes to be constant.
     """
     x = (np.arange(camera.width + 1) - camera.cx) / camera.fx
     y = (np.linspace(top, bottom, ROWS_PROBED) - camera.cy) / camera.fy
-    rows = camera.fy * distortion.apply(*np.meshgrid(x, y))[1] + camera.cy
+    rows = camera.fy * lens.apply(*np.meshgrid(x, y))[1] + camera.cy
     beyond = MARGIN + RUN_UP
     first = int(np.clip(rows.min() - 3, -MARGIN, camera.height - 1)) - RUN_UP
     last = int(np.clip(rows.max() + 4, 1, camera.height + MARGIN)) + RUN_UP
