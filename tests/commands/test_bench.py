@@ -55,7 +55,7 @@ def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
             assert row["forward_ms"] + row["backward_ms"] == pytest.approx(
                 sum(row["stages_ms"].values())
             )
-            assert 0 < row["shaded"] <= row["points"] and 0 < row["max_err"] < 1e-4
+            assert 0 < row["visible"] <= row["points"] and 0 < row["max_err"] < 1e-4
 
 
 def test_a_step_on_a_small_scene(tmp_path, capsys):
