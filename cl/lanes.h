@@ -79,10 +79,6 @@ ALWAYS_INLINE void store_part(const floats value, global float16 *rows, const si
     ((global floats *)rows)[row * ROW_PARTS + ROW_PART] = value;
 }
 
-ALWAYS_INLINE floats load_half_part(global const half *rows, const size_t row) {
-    return LANED(vload_half)(row * ROW_PARTS + ROW_PART, rows);
-}
-
 // load_lanes(p, count): the values at p, of which `count` exist; the others read as 0.
 // store_lanes(value, p, count): writes the first `count` of the values to p.
 #if LANES == 16

@@ -29,16 +29,15 @@ static inline void sh_basis_of_point(global const float *camera, const float4 po
     basis[8] = SH_2D * (d.x * d.x - d.y * d.y);
 }
 
-// READ_AHEAD() of all coefficients of point i in sh_0, sh_1, sh_2a and sh_2b, up to DEGREE. width:
-// elements of a row of 16 channels, 1 of float16 or 16 of half.
-#define SH_READ_AHEAD(i, width)                                                                    \
+// READ_AHEAD() of all coefficients of point i in sh_0, sh_1, sh_2a and sh_2b, up to DEGREE.
+#define SH_READ_AHEAD(i)                                                                           \
     {                                                                                              \
-        const size_t row = (size_t)(i) * (width);                                                  \
+        const size_t row = (i);                                                                    \
         READ_AHEAD(sh_0 + row);                                                                    \
-        for (uint b = 0; b < 3 * (width); b += (width)) {                                          \
+        for (uint b = 0; b < 3; b++) {                                                             \
             if (DEGREE >= 1) READ_AHEAD(sh_1 + 3 * row + b);                                       \
             if (DEGREE >= 2) READ_AHEAD(sh_2a + 3 * row + b);                                      \
-            if (DEGREE >= 2 && b < 2 * (width)) READ_AHEAD(sh_2b + 2 * row + b);                   \
+            if (DEGREE >= 2 && b < 2) READ_AHEAD(sh_2b + 2 * row + b);                             \
         }                                                                                          \
     }
 

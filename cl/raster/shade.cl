@@ -9,26 +9,6 @@
 #define DEGREE 2  // of the highest harmonics in use: 0, 1 or 2
 #endif
 
-// Blends `features` of the coefficients of point i, read by LOAD(index, array), in the direction
-// from the eye to it.
-#define SHADE(LOAD, i, features)                                                                   \
-    float basis[9];                                                                                \
-    sh_basis_of_point(camera, point_camera[i], basis);                                             \
-    floats features = basis[0] * LOAD(i, sh_0);                                                    \
-    if (DEGREE >= 1)                                                                               \
-        for (uint b = 0; b < 3; b++)                                                               \
-            features += basis[1 + b] * LOAD(3 * i + b, sh_1);                                      \
-    if (DEGREE >= 2) {                                                                             \
-        for (uint b = 0; b < 3; b++)                                                               \
-            features += basis[4 + b] * LOAD(3 * i + b, sh_2a);                                     \
-        for (uint b = 0; b < 2; b++)                                                               \
-            features += basis[7 + b] * LOAD(2 * i + b, sh_2b);                                     \
-    }                                                                                              \
-    if (CLAMPED) features = features < 0.0f ? 0.0f : features; /* a NaN stays one */
-
-#define LOAD_FLOAT(index, array) load_part(array, index)
-#define LOAD_HALF(index, array) load_half_part(array, index)
-
 // One work-item per part of a visible point: reads its coefficients and where it is, writes its
 // features.
 kernel void shade_forward(
@@ -45,27 +25,16 @@ kernel void shade_forward(
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = visible[g];
-    SH_READ_AHEAD(visible[min(g + POINTS_AHEAD, s - 1)], 1)
-    SHADE(LOAD_FLOAT, i, features)
-    store_part(features, visible_features, g);
-}
-
-// The same from coefficients of 16 bits.
-kernel void shade_forward_half(
-    const uint s,                       // visible points
-    global const uint *visible,         // (S) their indices
-    global const float *camera,         // (21) camera.h
-    global const float4 *point_camera,  // (N, 4) x, y, z, distance
-    global const half *sh_0,            // (N, 1, 16)
-    global const half *sh_1,            // (?, ?, 16) (N, 3, 16), not read at degree 0
-    global const half *sh_2a,           // (?, ?, 16) (N, 3, 16), not read below degree 2
-    global const half *sh_2b,           // (?, ?, 16) (N, 2, 16), not read below degree 2
-    global float16 *visible_features)   // (?, 16) a row for each
-{
-    const uint g = get_global_id(0) / ROW_PARTS;
-    if (g >= s) return;
-    const uint i = visible[g];
-    SH_READ_AHEAD(visible[min(g + POINTS_AHEAD, s - 1)], CHANNELS)
-    SHADE(LOAD_HALF, i, features)
+    SH_READ_AHEAD(visible[min(g + POINTS_AHEAD, s - 1)])
+    float basis[9];
+    sh_basis_of_point(camera, point_camera[i], basis);
+    floats features = basis[0] * load_part(sh_0, i);
+    if (DEGREE >= 1)
+        for (uint b = 0; b < 3; b++) features += basis[1 + b] * load_part(sh_1, 3 * i + b);
+    if (DEGREE >= 2) {
+        for (uint b = 0; b < 3; b++) features += basis[4 + b] * load_part(sh_2a, 3 * i + b);
+        for (uint b = 0; b < 2; b++) features += basis[7 + b] * load_part(sh_2b, 2 * i + b);
+    }
+    if (CLAMPED) features = features < 0.0f ? 0.0f : features;  // a NaN stays one
     store_part(features, visible_features, g);
 }

@@ -81,7 +81,7 @@ kernel void rmsprop_move(
     const size_t g = min(row, s - 1), i = visible[g];
     const size_t soon = visible[min(row + POINTS_AHEAD, s - 1)];
     READ_AHEAD(v + soon);
-    SH_READ_AHEAD(soon, 1)
+    SH_READ_AHEAD(soon)
     const uint last = last_step[i];
 #if ROW_PARTS > 1
     barrier(CLK_GLOBAL_MEM_FENCE);  // all parts of a point have read it

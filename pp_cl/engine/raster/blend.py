@@ -36,7 +36,7 @@ def shade_forward(
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
     macros = footprint_macros(points.footprint)
     dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh), **macros).launch(
-        "shade_forward_half" if sh_0.dtype == np.float16 else "shade_forward",
+        "shade_forward",
         visible.size * row_parts(dev),
         s=visible.size,
         visible=visible,
