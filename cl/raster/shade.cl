@@ -30,10 +30,13 @@ kernel void shade_forward(
     sh_basis_of_point(camera, point_camera[i], basis);
     floats features = basis[0] * load_part(sh_0, i);
     if (DEGREE >= 1)
-        for (uint b = 0; b < 3; b++) features += basis[1 + b] * load_part(sh_1, 3 * i + b);
+        for (uint b = 0; b < 3; b++)
+            features += basis[1 + b] * load_part(sh_1, 3 * i + b);
     if (DEGREE >= 2) {
-        for (uint b = 0; b < 3; b++) features += basis[4 + b] * load_part(sh_2a, 3 * i + b);
-        for (uint b = 0; b < 2; b++) features += basis[7 + b] * load_part(sh_2b, 2 * i + b);
+        for (uint b = 0; b < 3; b++)
+            features += basis[4 + b] * load_part(sh_2a, 3 * i + b);
+        for (uint b = 0; b < 2; b++)
+            features += basis[7 + b] * load_part(sh_2b, 2 * i + b);
     }
     if (CLAMPED) features = features < 0.0f ? 0.0f : features;  // a NaN stays one
     store_part(features, visible_features, g);
