@@ -2,7 +2,6 @@
 
 import ctypes
 import mmap
-import os
 import sys
 from pathlib import Path
 
@@ -28,7 +27,7 @@ def resident_bytes() -> int:
         pages = int((PROC / "self/statm").read_text().split()[1])
     except (OSError, IndexError, ValueError):
         return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
+    return pages * mmap.PAGESIZE
 
 
 def ask_for_huge_pages(address: int, nbytes: int) -> None:
