@@ -14,7 +14,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyopencl as cl
@@ -26,7 +26,6 @@ from pp_cl.engine.device.kernel import Kernel, cut, parse_signatures, quiet_comp
 from pp_cl.errors import BuildError, UserError
 
 SMALLER = "lower --points or raise --downscale"
-FINISH = "finish its work"  # what drivers of GPUs often fail at, for lack of memory
 HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
 # Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
 # multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
@@ -162,10 +161,25 @@ class QueuedArray(Array):
         """Nothing."""
 
 
+class Launch(NamedTuple):
+    """A launch that has been checked. offset: of its first work-item, or None. values: in the
+    kernel's order; arguments: the same by name. watched: it may take too long for a watchdog.
+    """
+
+    kernel: Kernel
+    size: tuple[int, ...]
+    local: tuple[int, ...]
+    offset: tuple[int, ...] | None
+    values: list[Any]
+    arguments: dict[str, Any]
+    watched: bool
+
+
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
-    kernels are launched in parts.
+    kernels are launched in parts. launches: so far. waited: CPU seconds of threads that waited for
+    the device; drivers of CPUs have them compute meanwhile.
     """
 
     def __init__(self, device: cl.Device):
@@ -179,7 +193,9 @@ class Device:
         profiling: Any = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=profiling)
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
-        self.bytes = self.peak_bytes = 0
+        self.bytes = self.peak_bytes = self.launches = 0
+        self.waited = 0.0
+        self._recorded: list[Launch] | None = None  # what recorded() yields
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
@@ -337,7 +353,47 @@ class Device:
 
     def finish(self) -> None:
         """Wait until everything enqueued is done."""
-        self.attempt(FINISH, self.queue.finish)
+        self.wait(self.queue.finish)
+
+    def wait(self, function: Callable[[], Any]) -> None:
+        """Call a function of the driver that waits. Raises UserError as attempt(): drivers of GPUs
+        often fail there, for lack of memory.
+        """
+        start = time.thread_time()
+        self.attempt("finish its work", function)
+        self.waited += time.thread_time() - start
+
+    @contextmanager
+    def recorded(self) -> Iterator[list[Launch]]:
+        """Yields the list of the launches inside the block, which enqueue() repeats. They keep
+        their arguments alive.
+        """
+        launches: list[Launch] = []
+        self._recorded = launches
+        try:
+            yield launches
+        finally:
+            self._recorded = None
+
+    def enqueue(self, launch: Launch) -> None:
+        """Enqueue a launch, which has been checked. Raises UserError as attempt()."""
+        kernel = launch.kernel
+        event = self.attempt(
+            kernel.run,
+            kernel.kernel,
+            self.queue,
+            launch.size,
+            launch.local,
+            *launch.values,
+            global_offset=launch.offset,
+        )
+        self.launches += 1
+        if self._recorded is not None:
+            self._recorded.append(launch)
+        if launch.watched:  # what drivers hand to the system together is timed together
+            self.queue.flush()
+        if self.debug:
+            self.observe(kernel, event, launch.arguments)
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
         """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
@@ -508,16 +564,4 @@ class Program:
         watched = multiply_adds > 0 and self.device.has_watchdog
         parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if watched else 1
         for offset, part in cut(size, local, parts, along) if parts > 1 else [(None, size)]:
-            event = self.device.attempt(
-                f"run {kernel.label}",
-                kernel.kernel,
-                self.device.queue,
-                part,
-                local,
-                *values,
-                global_offset=offset,
-            )
-            if watched:  # what drivers hand to the system together is timed together
-                self.device.queue.flush()
-            if self.device.debug:
-                self.device.observe(kernel, event, arguments)
+            self.device.enqueue(Launch(kernel, part, local, offset, values, arguments, watched))

@@ -27,6 +27,9 @@ class Means:
         """Nothing: there are no parameters."""
         return {}
 
+    def release(self) -> None:
+        """Do nothing: no arrays are held."""
+
     def freeze(self) -> None:
         """Do nothing: there are no parameters."""
 
