@@ -12,7 +12,7 @@ import time
 import weakref
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
 # Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
 # multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
 MOST_MULTIPLY_ADDS = 25e9
+UNTIMED = nullcontext()  # a stage
 STANDARD = ("-cl-std=CL1.2",)  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
 INTEL_PLATFORM = "Intel(R) OpenCL"
@@ -411,20 +412,20 @@ class Device:
                 f"{'; the log of the system may say more' if unsaid else ''}"
             ) from error
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> AbstractContextManager[None]:
         """Times the part of a pass called `name` under PP_DEBUG >= 1 and timed_stages().
 
         When timed, the queue is drained before and after, so that stages do not overlap.
         """
-        if self._stage_seconds is None:
-            yield
-            return
+        return UNTIMED if self._stage_seconds is None else self._timed(name, self._stage_seconds)
+
+    @contextmanager
+    def _timed(self, name, seconds):
         self.finish()
         start = time.perf_counter()
         yield
         self.finish()
-        self._stage_seconds[name].append(time.perf_counter() - start)
+        seconds[name].append(time.perf_counter() - start)
 
     @contextmanager
     def timed_stages(self) -> Iterator[dict[str, list[float]]]:
