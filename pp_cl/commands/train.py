@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.config import run_config
-    from pp_cl.drivers import open_device
+    from pp_cl.drivers import device_line, open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
         )
         return
     dev = open_device(options.device)
-    print(f"device: {dev.name} [{dev.info['platform']}]")
+    print(device_line(dev, options.device))
     training = open_training(dev, folder, config, stored)
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
