@@ -28,6 +28,7 @@ from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
 from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
+from pp_cl.progress import Progress
 from pp_cl.run import Run, load_run
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import (
@@ -253,9 +254,10 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     views, info = _read_views(dev, config, split_files)
 
     start = time.perf_counter()
-    agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
-    seconds = time.perf_counter() - start
-    sheet = sheet_of_masks(dev, views, hull, agreement.left_out)
+    with Progress("carving the visual hull"):
+        agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
+        seconds = time.perf_counter() - start
+        sheet = sheet_of_masks(dev, views, hull, agreement.left_out)
 
     cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
     model = Model(dev, hull.grid, depth_range, cloud, net=net)
