@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,6 +27,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
+from platformdirs import user_cache_dir
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.kernel import quiet_compiler
@@ -38,6 +40,7 @@ RUNTIME_LIBRARIES = ("libintelocl.so", "intelocl64.dll")
 CHOSEN = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH")  # where users name drivers
 REST = "the system's OpenCL drivers"  # where nobody tells them apart before they are loaded
 SECONDS = 20  # of a driver: a first build takes 1 to 2, several times as long on a busy machine
+STALE = 20  # seconds; pyopencl keeps its cache locked for milliseconds
 BEGINS = "pp-cl begins with "  # the line of report() before it tries a driver
 TEMPORARY_CACHE = "pp-cl-cache-"
 UNSEEN = "was not seen when its driver was tried"
@@ -202,10 +205,15 @@ def find_problem(device: cl.Device) -> str | None:
 
 def _give_cache():
     """Drivers and pyopencl fail where the user's cache cannot be written (containers, service
-    accounts): a temporary one.
+    accounts): a temporary one. And with the lock of a process that was killed in it, pyopencl waits
+    a minute at each build.
     """
     # pyopencl 2026.1 reads this variable, unset or not, where its cache cannot be written: KeyError
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
+    for lock in Path(user_cache_dir("pyopencl", "pyopencl")).glob("*/lock"):
+        with suppress(OSError):  # of another process that was faster
+            if time.time() - lock.stat().st_mtime > STALE:
+                lock.unlink()
     if sys.platform == "win32":
         return  # which has caches elsewhere
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
