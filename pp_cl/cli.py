@@ -15,6 +15,7 @@ from contextlib import nullcontext, redirect_stdout, suppress
 
 from pp_cl import __version__
 from pp_cl.commands import COMMANDS
+from pp_cl.commands.signals import WORDS, answered, number_of
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
 from pp_cl.files.atomic import mend
 
@@ -65,16 +66,18 @@ class _Parser(argparse.ArgumentParser):
 
 
 def program(argv: Sequence[str] | None = None) -> int:
-    """main() of a process of its own: a further Ctrl-C ends what Python does after it, and streams
-    may be as shells give them: closed, full, without a reader.
+    """main() of a process of its own: Ctrl-C and SIGTERM end it within seconds, a further Ctrl-C
+    what Python does after it; and streams may be as shells give them: closed, full, without a
+    reader.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     try:
-        return main(argv)
-    except KeyboardInterrupt:  # a second one, where main() told of the first
-        return 128 + signal.SIGINT
+        with answered():
+            return main(argv)
+    except KeyboardInterrupt as second:  # where main() told of the first
+        return 128 + number_of(second)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         for stream in (sys.stdout, sys.stderr):
@@ -122,8 +125,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "failed to map segment" not in str(error):  # as the loader says it
             raise
         return _fail(f"no memory to load a library ({error}); raise its limit (ulimit -v)")
-    except KeyboardInterrupt:
-        return _fail("interrupted", 128 + signal.SIGINT)
+    except KeyboardInterrupt as error:
+        number = number_of(error)
+        return _fail(WORDS[number], 128 + number)
 
 
 def _show_warning(message, *_args, **_kwargs):

@@ -90,6 +90,40 @@ def test_a_further_interrupt_shows_no_traceback(told, then, status):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.unix
+@pytest.mark.parametrize("number, word", [(2, "interrupted"), (15, "terminated")])
+@pytest.mark.parametrize("loud", ["hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)", "wait()"])
+def test_a_signal_ends_what_does_not_look_at_it(number, word, loud):
+    """A long call of a library, or one that waits whatever comes: one line, and the status."""
+    lines = f"""
+        import hashlib, sys, time
+        from pp_cl import cli
+        from pp_cl.commands import compare
+
+        def wait():
+            while True:
+                try:
+                    time.sleep(600)
+                except KeyboardInterrupt:
+                    pass
+
+        def run(options):
+            print("begun", flush=True)
+            {loud}
+
+        compare.run = run
+        sys.exit(cli.program(["compare", "a", "b"]))
+    """
+    command = [sys.executable, "-c", dedent(lines)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (128 + number, f"pp-cl: {word}\n")
+
+
 def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_bugs(monkeypatch):
     errors = [ImportError("x.so: failed to map segment from shared object"), ImportError("x")]
     monkeypatch.setattr("pp_cl.commands.devices.run", lambda _: (_ for _ in ()).throw(errors[0]))

@@ -294,8 +294,7 @@ class Capture:
         return folder if any(folder.iterdir()) else None
 
     def _matches(self):
-        is_video = not self.source.is_dir()
-        pairs = isolated(self.work, features.match, self.database, is_video)
+        pairs = isolated(self.work, features.match, self.database)
         turntable = self.options["turntable"]
         turns = isolated(self.work, still.remove_still, self.database, self.turns, turntable)
         line = f"{pairs} pairs of images"

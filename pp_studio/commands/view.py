@@ -49,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
     from pp_cl import find_run, open_device, stored_config
+    from pp_cl.commands.signals import unhurried
     from pp_cl.errors import UserError, name_of, require
     from pp_cl.scene import scene_splits
     from pp_studio.view.run_view import RunView
@@ -75,6 +76,7 @@ def run(options: argparse.Namespace) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     with (
+        unhurried(),
         suppress(KeyboardInterrupt),
         started(name_of(folder), options.host, options.port) as (server, address),
     ):
