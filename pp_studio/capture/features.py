@@ -143,17 +143,19 @@ def match(database: Path) -> int:
         pairs = pairs_of(places, descriptors)
         left = [(i, j) for i, j in pairs if not db.exists_two_view_geometry(ids[i], ids[j])]
         with (
+            ThreadPoolExecutor(cores()) as pool,
             tempfile.TemporaryDirectory(prefix="pp-cl-") as folder,
             Progress("matches", len(pairs), "pair", done=len(pairs) - len(left)) as progress,
         ):
             listed = Path(folder) / "pairs.txt"
             for first in range(0, len(left), PAIRS_AT_ONCE):
                 some = left[first : first + PAIRS_AT_ONCE]
-                for i, j in some:
-                    if not db.exists_matches(ids[i], ids[j]):
-                        found = matches_of(descriptors[i], descriptors[j])
-                        db.write_matches(ids[i], ids[j], found)
+                new = [(i, j) for i, j in some if not db.exists_matches(ids[i], ids[j])]
+                made = pool.map(lambda two: matches_of(*(descriptors[i] for i in two)), new)
+                for (i, j), found in zip(new, made, strict=True):
+                    db.write_matches(ids[i], ids[j], found)
                     progress.update()
+                progress.update(len(some) - len(new))
                 lines = [f"{images[i].name} {images[j].name}\n" for i, j in some]
                 listed.write_text("".join(lines), "utf-8")
                 colmap.verify_matches(database, listed, verification(colmap))
@@ -239,10 +241,11 @@ def pairs_of(
     # of a row of images that are alike the best counts twice, or they would be of one place
     rows = np.pad(alike, ((0, 0), (1, 1)))
     score = np.where(near, 0, alike * (1 + (alike >= np.maximum(rows[:, :-2], rows[:, 2:]))))
-    order = np.argsort(-score, axis=1, kind="stable")[:, :BEST]
-    chosen = near.copy()
-    np.put_along_axis(chosen, order, np.take_along_axis(score, order, 1) > 0, 1)
-    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(chosen | chosen.T, 1))]
+    best = np.argsort(-score, axis=1, kind="stable")[:, :BEST]
+    chosen = np.zeros_like(near)
+    np.put_along_axis(chosen, best, True, 1)
+    chosen = near | ((chosen | chosen.T) & (score > 0))
+    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(chosen, 1))]
 
 
 def _alikeness(places, descriptors):
@@ -256,8 +259,8 @@ def _alikeness(places, descriptors):
         large[i, : len(some)], at[i, : len(some)] = some[:LARGE], place[:LARGE]
     alike = np.zeros((count, count), int)
     for i in track(range(count - 1), "choosing pairs", "image"):
-        products = (large[i + 1 :] @ large[i].T)  # (others, their features, this one's)
-        mine, _ = _best(products.transpose(0, 2, 1).copy())
+        products = (large[i + 1 :].reshape(-1, 128) @ large[i].T).reshape(-1, LARGE, LARGE)
+        mine = products.argmax(1)
         theirs, clearly = _best(products)
         features = np.arange(LARGE)
         mutual = clearly & (np.take_along_axis(mine, theirs, 1) == features)

@@ -79,6 +79,8 @@ def _begin():
     """The process ends with its parent, which alone answers signals; only Python writes to
     stderr.
     """
+    # NumPy's threads beside ours would wait for each other, long where the machine is busy
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stderr = os.fdopen(os.dup(2), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)

@@ -134,8 +134,9 @@ class Capture:
             for stage in left:
                 start = time.monotonic()
                 found = getattr(self, f"_{stage}")()
-                write_json(self._file(stage), found)
-                self.tell(f"{stage}: {found['line']} ({time.monotonic() - start:.0f} s)")
+                seconds = time.monotonic() - start
+                write_json(self._file(stage), found | {"seconds": round(seconds, 1)})
+                self.tell(f"{stage}: {found['line']} ({seconds:.0f} s)")
 
     def _is_done(self, stage):
         return self._file(stage).is_file()
