@@ -1,5 +1,5 @@
-"""Features of the images by OpenCV and their matches by NumPy, which are many times faster here than
-pycolmap's; they are checked by pycolmap and kept in its database.
+"""Features of the images by OpenCV and their matches by NumPy, both many times faster than those of
+pycolmap on a CPU; it checks them, and keeps them in its database.
 """
 
 import os
