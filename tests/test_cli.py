@@ -120,7 +120,10 @@ def test_a_signal_ends_what_does_not_look_at_it(number, word, loud):
     ) as process:
         assert process.stdout.readline() == "begun\n"
         process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
+        try:
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert (process.returncode, errors) == (128 + number, f"pp-cl: {word}\n")
 
 

@@ -40,5 +40,8 @@ def test_a_signal_is_one_line_and_its_status(number, word, where):
     ) as process:
         assert process.stdout.readline() == "begun\n"
         process.send_signal(number)
-        _, errors = process.communicate(timeout=LIMIT)
+        try:
+            _, errors = process.communicate(timeout=LIMIT)
+        finally:
+            process.kill()
     assert (process.returncode, errors) == (128 + number, f"pp-cl: {word}\n")
