@@ -77,11 +77,12 @@ def find_features(
             made = pool.map(lambda image: _features(images / image.name, masks), left)
             made = track(made, "features", "image", len(found), done=len(found) - len(left))
             for image, (keypoints, descriptors) in zip(left, made, strict=True):
-                db.write_keypoints(image.image_id, keypoints)
-                db.write_descriptors(
-                    image.image_id,
-                    colmap.FeatureDescriptors(colmap.FeatureExtractorType.SIFT, descriptors),
-                )
+                kind = colmap.FeatureExtractorType.SIFT
+                with colmap.DatabaseTransaction(db):  # a stopped run leaves both or none
+                    db.write_keypoints(image.image_id, keypoints)
+                    db.write_descriptors(
+                        image.image_id, colmap.FeatureDescriptors(kind, descriptors)
+                    )
         return {image.name: db.num_keypoints_for_image(image.image_id) for image in found}
 
 
@@ -159,7 +160,7 @@ def match(database: Path) -> int:
                 lines = [f"{images[i].name} {images[j].name}\n" for i, j in some]
                 listed.write_text("".join(lines), "utf-8")
                 colmap.verify_matches(database, listed, verification(colmap))
-        return db.num_verified_image_pairs()
+        return len(db.read_two_view_geometry_num_inliers()[0])
 
 
 def matches_of(one: np.ndarray, other: np.ndarray) -> np.ndarray:
