@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import shlex
 import time
 from pathlib import Path
@@ -60,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_studio.export.result import INDEX, SPLAT, begin_result, is_newer, write_result
     from pp_studio.export.result import MINUTES as PASSED
 
-    out, is_scene = Path(options.out), _is_scene(options.source)
+    share, out, is_scene = _share(), Path(options.out), _is_scene(options.source)
     if is_scene:
         shared.refuse(options, ("turntable", "mask_command", "box"), "only of photographs")
     begin_result(out)
@@ -87,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
             print(f"wrote {page}: open it in a browser; it grows as parts are done")
         if not folder.config.exists():
             training = clock.training()
-            chosen = next(name for name, least in PRESET_FROM.items() if training >= least)
+            chosen = next(n for n, least in PRESET_FROM.items() if share * training >= least)
             preset = ["--preset", options.preset or chosen, "--minutes", f"{training:.3g}"]
         else:  # as it began, unless told otherwise, which train refuses
             preset = ["--preset", options.preset] if options.preset else []
@@ -166,6 +167,12 @@ class _Clock:
             flush=True,
         )
         return left - after
+
+
+def _share():
+    """Of the processor, what others leave: what is running already goes on beside the training."""
+    cores = os.cpu_count() or 1
+    return cores / (cores + (os.getloadavg()[0] if hasattr(os, "getloadavg") else 0))
 
 
 def _is_scene(source):
