@@ -39,6 +39,7 @@ GAUSSIAN = np.dtype(
     ]
 )
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
+LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
 
 STEPS = 7000
 # Of the steps of windows larger than the images, those that draw renderings as large as these, each
@@ -144,6 +145,16 @@ def fitted_gaussians(run: Run, window: int = WINDOW) -> tuple[np.ndarray, np.nda
         except UserError as error:
             warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
     return table, origin
+
+
+def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
+    the colours that the network gives them. Raises UserError as check_drawable does.
+    """
+    check_drawable(run)
+    radius = run.config.raster.radius * run.model.grid.voxel_size
+    cloud = _cloud(run, fit_harmonics(run, steps=0))
+    return _table(run, cloud, DEVIATION * radius), run.model.grid.centre
 
 
 def _key(run, window):
