@@ -23,6 +23,7 @@ from pp_studio.export.page import card, filled, fitted, page_text, still, unfitt
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS, CAMERAS, MASKS = "thumbnail.png", "views.png", "cameras.png", "masks.png"
 VIDEOS = ("video.mp4", "video.webp")
+MINUTES = "minutes.json"  # those asked for, and those that have passed
 LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
 WHAT = {
     MODEL: "the model alone, one page that needs no network",
@@ -36,7 +37,7 @@ def begin_result(folder: Path) -> None:
     """Make the folder. Raises UserError where it holds other files, or one in the place of a file
     of the result that is not the program's.
     """
-    names = (INDEX, MODEL, SPLAT, STILL, VIEWS, CAMERAS, MASKS, *VIDEOS)
+    names = (INDEX, MODEL, SPLAT, STILL, VIEWS, CAMERAS, MASKS, MINUTES, *VIDEOS)
     mend = "move it away, or choose another --out"
     own(folder, [folder / name for name in names], mend, alone=True)
 
