@@ -144,6 +144,12 @@ def fitted_gaussians(run: Run, window: int = WINDOW) -> tuple[np.ndarray, np.nda
     return table, origin
 
 
+def kept_gaussians(run: Run, window: int = WINDOW) -> tuple[np.ndarray, np.ndarray] | None:
+    """What fitted_gaussians() has kept for the run's checkpoint, None where there is nothing."""
+    table = _kept(run.folder.path / FILE, _key(run, window))
+    return None if table is None else (table, run.model.grid.centre)
+
+
 def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
     the colours that the network gives them. Raises UserError as check_drawable does.

@@ -21,6 +21,7 @@ from pp_studio.camera_path import level
 from pp_studio.export import WINDOW
 from pp_studio.export.gaussians import LOW_PASS, first_gaussians, fitted_gaussians
 from pp_studio.export.harmonics import COUNT
+from pp_studio.large import render_large
 
 # A Gaussian's bytes: place in the box of all; opacity; logarithms of its deviations; x, y and z of
 # the quaternion that turns its axes, of which the one with the largest w is taken, so that all lie
@@ -177,7 +178,7 @@ def still(run: Run) -> np.ndarray:
     width, height = STILL
     focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     camera = Camera.look_at(eye, centre, up, fx=focal, width=width, height=height)
-    return to_8bit(run.render(camera).colour)
+    return to_8bit(render_large(run, camera).colour)
 
 
 def _header(run, gaussians, corner):

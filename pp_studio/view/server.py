@@ -14,6 +14,7 @@ from pp_cl.errors import UserError
 
 LOOPBACK, PORT = "127.0.0.1", 8733
 ANY = ("0.0.0.0", "::")  # noqa: S104 compared with, not bound to
+NARROW = 600  # pixels across: on a phone the panel would cover the picture
 
 
 @contextmanager
@@ -42,7 +43,13 @@ def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterat
     try:
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
+        server.on_client_connect(_make_room)
         yield server, f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
+
+
+def _make_room(client):
+    if client.camera.image_width < NARROW:
+        client.gui.main_panel.minimize()
