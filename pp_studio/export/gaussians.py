@@ -17,9 +17,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
-from pp_cl import Config, Run
+from pp_cl import Config, Run, track
 from pp_cl.engine import MIN_SIDE, Crop, Crops, Means, Model, PointCloud, Trainer, View
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
@@ -105,11 +104,9 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     scale = min(int(samples), CROP // LEAST_CROP)
     config = _config(run.config, scale)
     trainer = Trainer(dev, config, model, views)
-    steps = tqdm(
-        range(config.train.iterations), "fitting Gaussians", unit="step", leave=False, disable=None
-    )
-    for step in steps:
-        if step in (0, round(COARSE * len(steps))):
+    steps = config.train.iterations
+    for step in track(range(steps), "fitting Gaussians", "step"):
+        if step in (0, round(COARSE * steps)):
             net.scale = scale if step else 1
             trainer.crops = LargeCrops(trainer.views, config, net.scale, samples)
         trainer.train_step()
