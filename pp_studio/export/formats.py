@@ -24,6 +24,7 @@ from pp_studio.export.points import coloured_points, in_world, inside, write_ply
 from pp_studio.export.splat import (
     Y_DOWN,
     Y_UP,
+    in_spz,
     splats,
     upright,
     write_splat_glb,
@@ -114,7 +115,9 @@ def export_run(
         if name == "splat":
             write_splat_ply(path, table)
         elif name == "splat-spz":
+            table, times = in_spz(table)
             write_splat_spz(path, table)
+            unit += "" if times == 1 else f", times {times:g}"
         else:
             write_splat_glb(path, table, metres * origin)
         moved = f", less {', '.join(f'{x:g}' for x in metres * origin)}" if origin.any() else ""
@@ -128,7 +131,7 @@ def export_run(
         axes = "turned upright, y up" if axes == VIEWER else "its scene's"
         write_ply(path, points, run.model.cloud, f"{axes}{unit}")
     else:
-        colours = gltf_colours(points.colours)
+        colours = gltf_colours(points.colours / 255)
         write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})
     return f"{len(points.rows)} of {count} points{unit}"
 

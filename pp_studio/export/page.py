@@ -39,7 +39,8 @@ BLUR = 0.0  # pixels^2: of the unfitted, which nothing has widened
 OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
 PLACES, TURNED = np.iinfo(np.uint16).max, 240
 FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
-ROOM = 1.2  # of the first look, times the ball of the points
+FILLED = 0.8  # of the shorter side, by the object as it is turned round; lines of text are above
+SAMPLED_POINTS = 20_000
 STILL = 600, 315  # pixels; the least that is shown large beside a link
 
 
@@ -200,11 +201,19 @@ def _header(run, gaussians, corner):
 
 def first_look(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """(eye, up), both (3,), with which a page begins: it looks at the middle of run.ball from the
-    side of the first training view, 20 degrees above the horizon, and shows the whole ball with
-    some ROOM around it.
+    side of the first training view, 20 degrees above the horizon, and shows the whole object, also
+    when it is turned round.
     """
-    centre, radius = run.ball
-    cameras = run.cameras("train")
+    centre, cameras = run.ball[0], run.cameras("train")
     up, rise = up_of(cameras), np.radians(20)
-    towards = np.cos(rise) * level(cameras[0].eye - centre, up) + np.sin(rise) * up
-    return centre + ROOM * radius / np.sin(np.radians(FIELD_OF_VIEW) / 2) * towards, up
+    ahead = level(cameras[0].eye - centre, up)
+    points = run.model.positions() - centre
+    points = points[:: max(1, len(points) // SAMPLED_POINTS)]
+    half, distance = FILLED * np.tan(np.radians(FIELD_OF_VIEW) / 2), 0.0
+    for angle in np.radians(range(0, 360, 15)):
+        side = np.cos(angle) * ahead + np.sin(angle) * np.cross(up, ahead)
+        towards = np.cos(rise) * side + np.sin(rise) * up
+        right = np.cross(up, side)
+        across = np.abs(points @ np.stack([right, np.cross(towards, right)], axis=1)).max(axis=1)
+        distance = max(distance, float((across / half + points @ towards).max()))
+    return centre + distance * (np.cos(rise) * ahead + np.sin(rise) * up), up

@@ -40,7 +40,7 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
     if suffix == "glb":
         (read,) = read.geometry.values()
         colours = read.visual.vertex_attributes["color"]
-        assert np.array_equal(colours, gltf_colours(mesh.colours))
+        assert np.array_equal(colours, gltf_colours(mesh.colours / 255))
         header, stored = glb(path)
         outwards = read.vertices / np.linalg.norm(read.vertices, axis=1)[:, None]
         assert np.median((stored["NORMAL"] * outwards).sum(1)) > 0.9
