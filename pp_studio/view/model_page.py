@@ -23,6 +23,7 @@ from pp_cl.scene import frame_keys, up_of
 from pp_studio.camera_path import through
 from pp_studio.export.gaussians import CONSTANT, kept_gaussians
 from pp_studio.view.drawing import DARK, OWN_CAMERA, SHOWN, draw
+from pp_studio.view.server import switches
 from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 
 STILL = 0.2  # seconds without movement until the full resolution is drawn
@@ -92,14 +93,15 @@ class ModelPage:
             frustum.on_click(
                 lambda event, c=camera: self._space.look_through(c, event.client.camera)
             )
-        self._add_switches(run.config.raster.early_stop, is_training)
-        self._add_path_and_curve()
+        self._status = server.gui.add_markdown("")
+        with switches(server):
+            self._add_switches(run.config.raster.early_stop, is_training)
+            self._add_path_and_curve()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._disconnected)
 
     def _add_switches(self, early_stop, is_training):
         gui = self._server.gui
-        self._status = gui.add_markdown("")
         self._show = gui.add_dropdown("Show", SHOWN, hint="keys 1 to 7")
         for i, show in enumerate(SHOWN):
             command = gui.add_command(f"Show {show}", hotkey=str(i + 1))

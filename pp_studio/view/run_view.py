@@ -79,7 +79,7 @@ class RunView:
             views = run.scene("train").splits["train"]
         except UserError as error:
             self.told.content = f"no photographs: {error}"
-        announce(self._server, f"building kernels for {self._dev.name}, the first time in minutes")
+        announce(self._server, "building kernels, which takes a while the first time")
         self.page = ModelPage(self._server, run, views)
 
 
