@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ def parts(run: Run, camera: Camera) -> int:
 
 
 def render_large(
-    run: Run, camera: Camera, *, on_part: Callable[[], object] = lambda: None, **options
+    run: Run, camera: Camera, *, on_part: Callable[[], object] = lambda: None, **options: Any
 ) -> RenderedView:
     """run.render(camera, **options), in which the points are as dense as the network knows them:
     an image that is much finer than those of the training is woven of several, each of them shifted

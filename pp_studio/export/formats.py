@@ -15,7 +15,7 @@ from pp_cl.engine import View
 from pp_cl.errors import UserError, require
 from pp_cl.files import check_file, check_new_folder, check_ours, image_paths, own, write_text
 from pp_cl.scene import write_scene
-from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
+from pp_studio.export import AXES_OF, FORMATS, QUICK, VIEWER
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.length import metres_per_unit
 from pp_studio.export.mesh import coloured_mesh, write_mesh
@@ -58,13 +58,13 @@ def export_run(
     path: Path | str,
     *,
     min_weight: float = 0.0,
-    window: int = WINDOW,
+    quality: str = QUICK,
     box: Sequence[float] | None = None,
     axes: str | None = None,
     others: Iterable[Run] = (),
 ) -> str:
     """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
-    min_weight, window, box, axes: as the options. others: further runs of a gallery. Raises
+    min_weight, quality, box, axes: as the options. others: further runs of a gallery. Raises
     UserError for what cannot be written, before which nothing is.
     """
     if name not in FORMATS:
@@ -108,7 +108,7 @@ def export_run(
     if name in ("splat", "splat-spz", "splat-glb"):
         if name == "splat-spz":
             require("splat-spz", "gsply")
-        table, origin = splats(run, turn, window, within)
+        table, origin = splats(run, turn, quality, within)
         table["position"] *= metres
         table["deviations"] *= metres
         _begin_default(name, path)

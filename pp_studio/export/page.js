@@ -174,10 +174,11 @@ function compiled(gl, ...sources) {
   return program;
 }
 
-// How many of the canvas's pixels one of those is wide that the Gaussians were fitted for.
+// How many of the canvas's pixels one is wide of the nearest window for which the Gaussians are made.
 function magnification(camera, eye) {
   const distance = Math.hypot(...add(eye, header.centre, -1));
-  return header.pixel * Math.min(camera.fx, camera.fy) / Math.max(distance, 1e-9);
+  const finer = header.pixel * Math.min(camera.fx, camera.fy) / Math.max(distance, 1e-9);
+  return finer / Math.min(Math.max(finer, header.windows[0]), header.windows[1]);
 }
 
 function makeDrawer(gl) {
@@ -234,8 +235,8 @@ function makeDrawer(gl) {
       place("axes"), false, [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]]);
     gl.uniform4f(place("focal"), camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform2f(place("size"), camera.width, camera.height);
-    // Gaussians look as they were fitted in all sizes: what viewers widen them by grows with them,
-    // and a pixel that shows several of the fit's is their mean
+    // Gaussians look as they do in that window: what viewers widen them by grows with them, and a
+    // pixel that shows several of the window's is their mean
     const square = magnification(camera, world) ** 2, fitted = header.low_pass * square;
     gl.uniform1f(place("low_pass"), fitted);
     gl.uniform1f(place("widened"), fitted + Math.max(0, 1 - square) / 12);

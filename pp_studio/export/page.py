@@ -18,8 +18,13 @@ from pp_cl.errors import name_of
 from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
 from pp_cl.scene import up_of
 from pp_studio.camera_path import level
-from pp_studio.export import WINDOW
-from pp_studio.export.gaussians import LOW_PASS, first_gaussians, fitted_gaussians
+from pp_studio.export.gaussians import (
+    DOUBLINGS,
+    LOW_PASS,
+    first_gaussians,
+    fitted_gaussians,
+    kept_gaussians,
+)
 from pp_studio.export.harmonics import COUNT
 from pp_studio.large import render_large
 
@@ -35,7 +40,6 @@ PACKED = np.dtype(
         ("colour", "u1", 27),
     ]
 )
-BLUR = 0.0  # pixels^2: of the unfitted, which nothing has widened
 OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
 PLACES, TURNED = np.iinfo(np.uint16).max, 240
 FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
@@ -45,30 +49,28 @@ STILL = 600, 315  # pixels; the least that is shown large beside a link
 
 
 class Gaussians(NamedTuple):
-    """table, origin: as fitted_gaussians() gives them. pixel: world units, what a pixel of the
-    renderings shows for which they are made, in the middle of the object. low_pass: pixels^2, by
-    which these renderings widen them.
+    """table, origin: as fitted_gaussians() gives them. windows: least and most pixels of a window,
+    for one of the run's images each way, in which they look right with all variances on the screen
+    widened by low_pass, pixels^2.
     """
 
     table: np.ndarray
     origin: np.ndarray
-    pixel: float
+    windows: tuple[float, float]
     low_pass: float
 
 
 def fitted(run: Run) -> Gaussians:
     """The run's Gaussians for viewers. Raises UserError as fitted_gaussians does."""
-    longest = max(max(camera.width, camera.height) for camera in run.cameras("train"))
-    # photographs much larger than the window are reduced a whole number of times, others enlarged
-    reduced = min(max(1, round(longest / WINDOW)), longest / WINDOW)
-    return Gaussians(*fitted_gaussians(run), reduced * _pixel(run), LOW_PASS)
+    windows = 2 ** DOUBLINGS[0], 2 ** DOUBLINGS[1]
+    return Gaussians(*(kept_gaussians(run) or fitted_gaussians(run)), windows, LOW_PASS)
 
 
 def unfitted(run: Run) -> Gaussians:
     """The run's points as Gaussians, for a page before there is time to fit them. Raises UserError
     as first_gaussians does.
     """
-    return Gaussians(*first_gaussians(run), _pixel(run), BLUR)
+    return Gaussians(*first_gaussians(run), (1.0, 1.0), 0.0)
 
 
 def _pixel(run):
@@ -191,7 +193,8 @@ def _header(run, gaussians, corner):
         "origin": (gaussians.origin + corner).tolist(),
         "nearest": run.nearest,
         "centre": centre.tolist(),
-        "pixel": gaussians.pixel,
+        "pixel": _pixel(run),
+        "windows": gaussians.windows,
         "low_pass": gaussians.low_pass,
         "eye": eye.tolist(),
         "up": up.tolist(),

@@ -90,8 +90,7 @@ def render_frames(
         for camera, path in zip(cameras, paths, strict=True):
             start, there = time.perf_counter(), path.exists()
             if not there:
-                options = {"samples": style.samples, "features": style.features}
-                rendered = render_large(run, camera, **options)
+                rendered = render_large(run, camera, samples=style.samples, features=style.features)
                 if style.suffix == "exr":
                     write_exr(path, rendered.channels())
                 else:

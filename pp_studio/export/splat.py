@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from pp_cl import Run
 from pp_cl.files import atomic_path
 from pp_cl.scene import up_of
+from pp_studio.export import QUICK
 from pp_studio.export.gaussians import CONSTANT, FACTORS, ORDER, fitted_gaussians
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.harmonics import COUNT, basis
@@ -29,14 +30,14 @@ Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in
 
 
 def splats(
-    run: Run, turn: np.ndarray, window: int, box: np.ndarray | None = None
+    run: Run, turn: np.ndarray, quality: str = QUICK, box: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() for a `window` in the world
+    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() of a quality in the world
     turned by (3, 3), those in a box (2, 3) of the scene or all. Positions are relative to the
     origin, which is 0 unless float32 is too coarse there. Raises UserError as fitted_gaussians and
     inside() do.
     """
-    table, centre = fitted_gaussians(run, window)
+    table, centre = fitted_gaussians(run, quality)
     positions = table["position"] + centre
     held = inside(positions, box)
     table, positions = table[held], positions[held] @ turn.T

@@ -18,7 +18,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import load_run
-from pp_studio.export import gaussians
+from pp_studio.export import QUALITIES, QUICK
 from pp_studio.export.gaussians import GAUSSIAN, check_drawable
 from pp_studio.export.page import (
     PACKED,
@@ -32,18 +32,12 @@ from pp_studio.export.page import (
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def steps():
-    """Of the fit, as many as make it look like the run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaussians, "STEPS", 300)
-        yield
-
-
 @pytest.fixture(scope="module")
 def page(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "view.html"
-    path.write_text(page_text(run, fitted(run)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(QUALITIES, QUICK, (300, 0.0))  # as many steps as make it look like the run
+        path.write_text(page_text(run, fitted(run)))
     return path
 
 
@@ -75,7 +69,8 @@ def predicted(page, camera):
     header = header_of(page)
     rows = np.frombuffer(base64.b64decode(element(page, "gaussians")), PACKED)
     distance = np.linalg.norm(camera.eye - header["centre"])
-    magnified = (header["pixel"] * camera.fx / distance) ** 2
+    finer = header["pixel"] * camera.fx / distance
+    magnified = (finer / np.clip(finer, *header["windows"])) ** 2
     low_pass = header["low_pass"] * magnified
     splats = splats_of(*unpacked(header, rows))
     return to_8bit(draw_splats(splats, camera, low_pass, low_pass + max(0, 1 - magnified) / 12))
@@ -133,8 +128,8 @@ def test_a_browser_draws_gaussians_by_their_rules_in_all_sizes(run, page):
     """Those of the fit, and means of its pixels, or as they were fitted in finer ones."""
     [first, *_] = run.cameras("test")
     header = header_of(page)
-    side = first.width * np.linalg.norm(first.eye - header["centre"]) / header["pixel"] / first.fx
-    cameras = [first.resized(*(2 * [round(times * side)])) for times in (0.1, 0.5, 1, 2)]
+    assert header["windows"] == [2, 8]
+    cameras = [first.resized(*(2 * [round(times * first.width)])) for times in (0.8, 2, 5, 16)]
     for image, camera in zip(drawn(page, cameras), cameras, strict=True):
         assert psnr(image, predicted(page, camera)) > 42
 
@@ -296,7 +291,7 @@ def test_the_runs_name_is_text(run_folder, session_device, tmp_path):
     folder = tmp_path / "<b> & </script>".replace("/", "")
     shutil.copytree(run_folder, folder)
     one = np.ones(1, GAUSSIAN)
-    text = page_text(load_run(session_device, folder), Gaussians(one, np.zeros(3), 1.0, 0.3))
+    text = page_text(load_run(session_device, folder), Gaussians(one, np.zeros(3), (1, 1), 0))
     assert "<title>&lt;b&gt; &amp; &lt;script&gt;</title>" in text
 
 

@@ -18,7 +18,6 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.session.training import open_training
-from pp_studio.export import gaussians
 from pp_studio.export.gaussians import fitted_gaussians
 from pp_studio.large import render_large
 from pp_studio.view.drawing import draw
@@ -166,7 +165,6 @@ def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monke
 
 
 def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copied, monkeypatch):
-    monkeypatch.setattr(gaussians, "STEPS", 3)
     table, _ = fitted_gaussians(load_run(dev, copied))
     view = RunView(served[0], dev, RunFolder(copied))
     view.look()
