@@ -43,8 +43,8 @@ def test_it_is_woven_of_images_at_the_scale_of_the_training(run):
 
 def test_a_camera_that_is_near_is_a_large_one(run):
     camera, centre = run.cameras("test")[0], run.ball[0]
-    large = camera.resized(96, 96)
+    large = camera.resized(128, 128)
     pose = camera.pose.copy()
     pose[:, 3] = centre + (camera.eye - centre) / 2
-    assert parts(run, replace(camera.resized(48, 48), pose=pose)) == parts(run, large) == 4
+    assert parts(run, replace(camera.resized(64, 64), pose=pose)) == parts(run, large) == 4
     assert parts(run, camera.resized(20, 20)) == 1
