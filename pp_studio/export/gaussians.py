@@ -20,11 +20,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl import Config, Run, track
-from pp_cl.engine import Crop, Crops, Means, Model, PointCloud, Trainer
+from pp_cl.engine import Crop, Crops, FirstFeatures, Model, PointCloud, Trainer
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
 from pp_studio.camera_path import between
-from pp_studio.export import QUALITIES, QUICK
+from pp_studio.export import BEST, QUALITIES, QUICK
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 FILE = "gaussians.npz"  # in the folder of a run
@@ -82,14 +82,14 @@ def fit_gaussians(run: Run, steps: int, cell: float) -> tuple[PointCloud, float]
     """
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud = begun(run, coefficients, cell)
-    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=Means(dev))
+    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:
         listed = run.image_files("train")
         cameras = between([one.camera for one in listed])
         more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
-    config = _config(run.config, steps)
+    config = config_of(run, steps)
     trainer = Trainer(dev, config, model, views)
     trainer.crops = WindowCrops(trainer.views, config.train, 0)
     for _ in track(range(steps), "fitting Gaussians", "step"):
@@ -246,9 +246,9 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     return PointCloud.of_gaussians(dev, ids[first], offset, opacity, sh)
 
 
-def _config(given: Config, steps: int) -> Config:
-    """What the trainer follows here."""
-    config = copy.deepcopy(given)
+def config_of(run: Run, steps: int) -> Config:
+    """What the trainer follows here, and how the Gaussians are drawn."""
+    config = copy.deepcopy(run.config)
     raster, train = config.raster, config.train
     raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
     raster.radius *= DEVIATION
@@ -258,8 +258,9 @@ def _config(given: Config, steps: int) -> Config:
     train.exposure, train.ssim_weight = "off", 0.0
     train.prune_weight = 0.0  # points are judged in images, where larger windows show more
     # Colours, which begin nearly right, would diverge with their default rates, many times these;
-    # shapes have the longest way.
+    # shapes have the longest way. In few steps both must go faster.
+    faster = (QUALITIES[BEST][0] / steps) ** 0.25
     train.rate_steps = 0
-    train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
-    train.offset_rate = (4e-2, 4e-3)
+    train.sh_rate = (1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster)
+    train.opacity_rate, train.offset_rate = (2.3e-2, 6.8e-3), (4e-2 * faster, 4e-3 * faster)
     return config
