@@ -20,11 +20,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl import Config, Run, track
-from pp_cl.engine import Crop, Crops, Means, Model, PointCloud, Trainer
+from pp_cl.engine import MIN_SIDE, Crop, Crops, FirstFeatures, Model, PointCloud, Trainer, View
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
 from pp_studio.camera_path import between
-from pp_studio.export import QUALITIES, QUICK
+from pp_studio.export import BEST, QUALITIES, QUICK
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 FILE = "gaussians.npz"  # in the folder of a run
@@ -41,12 +41,14 @@ GAUSSIAN = np.dtype(
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
 LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
 
-# A window has 2^1 to 2^3 pixels for one of the images each way, so many in a step. In smaller ones
-# what viewers widen cannot be sharp, and to try costs the others some dB.
-DOUBLINGS = 1.0, 3.0
+# Pixels on the longer side of the smallest window for which splats are made; in smaller ones
+# viewers widen Gaussians by more than points are apart, and to try costs all others some dB.
+WINDOW = 600
+DOUBLINGS = 2.0  # from there to the largest
 # Images that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
 # to the 57 of ethiopian_head.
 ENOUGH = 200
+LARGEST = 800  # pixels to which images are reduced, about: of more, a crop would show too little
 CROP = 192  # pixels on each side of a step's crop
 EARLY_STOP = 1e-4  # of viewers
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
@@ -69,10 +71,16 @@ FACTORS = np.array(
 class WindowCrops(Crops):
     """Crops as windows of any size show them: a pixel is the mean of several of a window's."""
 
+    def __init__(self, views: list[View], config: Config):
+        super().__init__(views, config.train, 0)
+        longest = max(max(view.camera.width, view.camera.height) for view in views)
+        # at least the images' own pixels, at most a quarter of them
+        self._first = float(np.log2(WINDOW / longest).clip(0, 1))
+
     def draw(self, step: int) -> Crop:
         """See Crops."""
-        crop = super().draw(step)
-        samples = 2 ** np.random.default_rng((self._seed, step, 1)).uniform(*DOUBLINGS)
+        crop, rng = super().draw(step), np.random.default_rng((self._seed, step, 1))
+        samples = 2 ** (self._first + DOUBLINGS * rng.random())
         return crop._replace(camera=replace(crop.camera, samples=samples))
 
 
@@ -83,16 +91,19 @@ def fit_gaussians(run: Run, steps: int, cell: float) -> tuple[PointCloud, float]
     """
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud = begun(run, coefficients, cell)
-    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=Means(dev))
+    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:
         listed = run.image_files("train")
         cameras = between([one.camera for one in listed])
         more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
-    config = _config(run.config, steps)
+    sides = [side for view in views for side in (view.camera.width, view.camera.height)]
+    factor = max(1, min(round(max(sides) / LARGEST), min(sides) // MIN_SIDE))
+    views = [view.reduced(factor * view.downscale) for view in views]
+    config = config_of(run, steps)
     trainer = Trainer(dev, config, model, views)
-    trainer.crops = WindowCrops(trainer.views, config.train, 0)
+    trainer.crops = WindowCrops(trainer.views, config)
     for _ in track(range(steps), "fitting Gaussians", "step"):
         trainer.train_step()
     trainer.check()
@@ -266,9 +277,9 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     return PointCloud.of_gaussians(dev, ids[first], offset, opacity, sh)
 
 
-def _config(given: Config, steps: int) -> Config:
-    """What the trainer follows here."""
-    config = copy.deepcopy(given)
+def config_of(run: Run, steps: int) -> Config:
+    """What the trainer follows here, and how the Gaussians are drawn."""
+    config = copy.deepcopy(run.config)
     raster, train = config.raster, config.train
     raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
     raster.radius *= DEVIATION
@@ -278,8 +289,9 @@ def _config(given: Config, steps: int) -> Config:
     train.exposure, train.ssim_weight = "off", 0.0
     train.prune_weight = 0.0  # points are judged in images, where larger windows show more
     # Colours, which begin nearly right, would diverge with their default rates, many times these;
-    # shapes have the longest way.
+    # shapes have the longest way. In few steps both must go faster.
+    faster = (QUALITIES[BEST][0] / steps) ** 0.25
     train.rate_steps = 0
-    train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
-    train.offset_rate = (4e-2, 4e-3)
+    train.sh_rate = (1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster)
+    train.opacity_rate, train.offset_rate = (2.3e-2, 6.8e-3), (4e-2 * faster, 4e-3 * faster)
     return config
