@@ -74,14 +74,21 @@ class WindowCrops(Crops):
     def __init__(self, views: list[View], config: Config):
         super().__init__(views, config.train, 0)
         longest = max(max(view.camera.width, view.camera.height) for view in views)
-        # at least the images' own pixels, at most a quarter of them
-        self._first = float(np.log2(WINDOW / longest).clip(0, 1))
+        self._least, self._most = windows(longest)
 
     def draw(self, step: int) -> Crop:
         """See Crops."""
         crop, rng = super().draw(step), np.random.default_rng((self._seed, step, 1))
-        samples = 2 ** (self._first + DOUBLINGS * rng.random())
+        samples = self._least * (self._most / self._least) ** rng.random()
         return crop._replace(camera=replace(crop.camera, samples=samples))
+
+
+def windows(longest: float) -> tuple[float, float]:
+    """Least and most pixels of a window, for one pixel of images of `longest` ones, each way, of
+    the windows for which Gaussians are made.
+    """
+    least = min(max(WINDOW / longest, 1.0), 2.0)  # from the images' own pixels to a quarter of them
+    return least, least * 2**DOUBLINGS
 
 
 def fit_gaussians(run: Run, steps: int, cell: float) -> tuple[PointCloud, float]:

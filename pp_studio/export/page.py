@@ -19,11 +19,12 @@ from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
 from pp_cl.scene import up_of
 from pp_studio.camera_path import level
 from pp_studio.export.gaussians import (
-    DOUBLINGS,
+    LARGEST,
     LOW_PASS,
     first_gaussians,
     fitted_gaussians,
     kept_gaussians,
+    windows,
 )
 from pp_studio.export.harmonics import COUNT
 from pp_studio.large import render_large
@@ -62,8 +63,11 @@ class Gaussians(NamedTuple):
 
 def fitted(run: Run) -> Gaussians:
     """The run's Gaussians for viewers. Raises UserError as fitted_gaussians does."""
-    windows = 2 ** DOUBLINGS[0], 2 ** DOUBLINGS[1]
-    return Gaussians(*(kept_gaussians(run) or fitted_gaussians(run)), windows, LOW_PASS)
+    longest = max(max(camera.width, camera.height) for camera in run.cameras("train"))
+    reduced = max(1, round(longest / LARGEST))  # as the fit reduces them
+    least, most = windows(longest / reduced)
+    table, origin = kept_gaussians(run) or fitted_gaussians(run)
+    return Gaussians(table, origin, (least / reduced, most / reduced), LOW_PASS)
 
 
 def unfitted(run: Run) -> Gaussians:
