@@ -31,7 +31,8 @@ PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
 LEAST_TRAINING = 0.6  # of what the capture leaves; after a long capture, 0.25 of all
 PER_PHOTOGRAPH = 0.05  # minutes that a capture takes, about: on two cores with AVX-512
-FPS, LEAST_FPS, SECONDS = 30, 8, 4  # of the video
+OF_SPLAT = 0.6  # of what is left after the evaluation
+LEAST_FPS = 8  # of the video
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Do the steps that are left, and say what to open."""
     from pp_cl import RunFolder, load
+    from pp_studio.export.gaussians import fitted_gaussians
     from pp_studio.export.result import INDEX, SPLAT, begin_result, is_newer, write_result
     from pp_studio.export.result import MINUTES as PASSED
 
@@ -99,11 +101,13 @@ def run(options: argparse.Namespace) -> None:
         _step("eval", str(folder), "--split", split, *device)
         show(split)
         if not is_newer(out / SPLAT, folder.checkpoint):
+            # of which export makes the file
+            fitted_gaussians(load(folder.path, options.device), minutes=OF_SPLAT * clock.left)
             words = ["--format", "splat"]
             _step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
             show(split)
         if not is_newer(out / video, folder.checkpoint):
-            words = ["--fps", f"{_fps(folder, split, clock.left):d}"]
+            words = ["--fps", f"{_fps(load(folder.path, options.device), split, clock.left):d}"]
             _step("render", str(folder), "--out", str(out / video), *words, *device)
             show(split)
     print(
@@ -225,14 +229,19 @@ def _video():
     return VIDEOS[0]
 
 
-def _fps(folder, split, minutes):
+def _fps(run, split, minutes):
     """Frames a second of a video that takes so many minutes, about: by the time that a frame of the
-    evaluation took.
+    evaluation took, of which larger ones are woven.
     """
     from pp_cl.scene import read_json
+    from pp_studio.commands.render import FPS, LEAST_HEIGHT, SECONDS
+    from pp_studio.large import parts
 
-    seconds = read_json(folder.metrics(split))["seconds_per_frame"]
-    return int(min(max(LEAST_FPS, 60 * minutes / (SECONDS * seconds)), FPS))
+    camera = run.cameras("train")[0]
+    times = max(1, LEAST_HEIGHT / camera.height)
+    larger = camera.resized(round(times * camera.width), round(times * camera.height))
+    seconds = read_json(run.folder.metrics(split))["seconds_per_frame"] * parts(run, larger) ** 2
+    return round(min(max(LEAST_FPS, 60 * minutes / (SECONDS * seconds)), FPS))
 
 
 def _held_out(scene):
