@@ -57,6 +57,19 @@ def first_signal(*, in_haste: bool = False) -> Iterator[list[int]]:
 
 
 @contextmanager
+def deferred() -> Iterator[None]:
+    """Ctrl-C and SIGTERM are answered after the block; processes that start in it get none."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
 def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
     """Gives a function that makes signals do again what they did before the block."""
     before = {number: signal.getsignal(number) for number in STOPPING}
