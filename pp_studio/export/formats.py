@@ -19,7 +19,7 @@ from pp_studio.export import AXES_OF, FORMATS, QUICK, VIEWER
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.length import metres_per_unit
 from pp_studio.export.mesh import coloured_mesh, write_mesh
-from pp_studio.export.page import page_text, write_gallery
+from pp_studio.export.page import fitted, page_text, write_gallery
 from pp_studio.export.points import coloured_points, in_world, inside, write_ply
 from pp_studio.export.splat import (
     Y_DOWN,
@@ -85,18 +85,20 @@ def export_run(
         mesh = coloured_mesh(run, within)
         _begin_default(name, path)
         write_mesh(path, replace(mesh, vertices=placed(mesh.vertices)))
-        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unit}"
+        unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
+        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unlit}{unit}"
     if name == "textured":
         solid = textured_mesh(run, turn, within)
         solid.apply_scale(metres)
         _begin_default(name, path)
         write_textured(path, solid)
-        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces{unit}"
+        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
     if name == "html":
-        text = page_text(run)
+        gaussians = fitted(run)
+        text = page_text(run, gaussians)
         _begin_default(name, path)
         write_text(path, text)
-        return f"{count} points, {len(text) / 1e6:.1f} MB"
+        return f"{len(gaussians.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     if name == "gallery":
         return f"{write_gallery(path, chain([run], others))} pages and their index"
     if name == "scene":

@@ -11,6 +11,8 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import math
+import time
 import warnings
 import zipfile
 from dataclasses import replace
@@ -19,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl import Config, Run, track
+from pp_cl import Config, Progress, Run
 from pp_cl.engine import MIN_SIDE, Crop, Crops, FirstFeatures, Model, PointCloud, Trainer, View
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
@@ -39,6 +41,7 @@ GAUSSIAN = np.dtype(
     ]
 )
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
+LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
 
 # Pixels on the longer side of the smallest window for which splats are made; in smaller ones
 # viewers widen Gaussians by more than points are apart, and to try costs all others some dB.
@@ -50,6 +53,9 @@ ENOUGH = 200
 LARGEST = 800  # pixels to which images are reduced, about: of more, a crop would show too little
 CROP = 192  # pixels on each side of a step's crop
 EARLY_STOP = 1e-4  # of viewers
+# Steps that build the kernels, after which the time of the others is known, and that a fit in some
+# minutes has in any case.
+BUILDING, TIMED, FEWEST = 3, 10, 40
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
 # rim: the root of its second moment. With the disc's opacity it covers 0.91 of the disc.
 DEVIATION = 0.39
@@ -73,21 +79,32 @@ class WindowCrops(Crops):
     def __init__(self, views: list[View], config: Config):
         super().__init__(views, config.train, 0)
         longest = max(max(view.camera.width, view.camera.height) for view in views)
-        # at least the images' own pixels, at most a quarter of them
-        self._first = float(np.log2(WINDOW / longest).clip(0, 1))
+        self._least, self._most = windows(longest)
 
     def draw(self, step: int) -> Crop:
         """See Crops."""
         crop, rng = super().draw(step), np.random.default_rng((self._seed, step, 1))
-        samples = 2 ** (self._first + DOUBLINGS * rng.random())
+        samples = self._least * (self._most / self._least) ** rng.random()
         return crop._replace(camera=replace(crop.camera, samples=samples))
 
 
-def fit_gaussians(run: Run, steps: int, cell: float) -> tuple[PointCloud, float]:
-    """(Gaussians, the deviation of one without offsets): fitted in so many steps, from the points
-    that training views show, those in a cubic `cell`, in voxel sizes, as one; 0: each point. Of the
-    features of their SH, which are 3D Gaussian splatting's, the first three are sRGB colour.
+def windows(longest: float) -> tuple[float, float]:
+    """Least and most pixels of a window, for one pixel of images of `longest` ones, each way, of
+    the windows for which Gaussians are made.
     """
+    least = min(max(WINDOW / longest, 1.0), 2.0)  # from the images' own pixels to a quarter of them
+    return least, least * 2**DOUBLINGS
+
+
+def fit_gaussians(
+    run: Run, steps: int, cell: float, minutes: float = math.inf
+) -> tuple[PointCloud, float]:
+    """(Gaussians, the deviation of one without offsets): fitted in so many steps, or as many as
+    take these minutes, from the points that training views show, those in a cubic `cell`, in voxel
+    sizes, as one; 0: each point. Of the features of their SH, which are 3D Gaussian splatting's,
+    the first three are sRGB colour.
+    """
+    end = time.monotonic() + 60 * minutes
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud = begun(run, coefficients, cell)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
@@ -103,14 +120,24 @@ def fit_gaussians(run: Run, steps: int, cell: float) -> tuple[PointCloud, float]
     config = config_of(run, steps)
     trainer = Trainer(dev, config, model, views)
     trainer.crops = WindowCrops(trainer.views, config)
-    for _ in track(range(steps), "fitting Gaussians", "step"):
-        trainer.train_step()
+    with Progress("fitting Gaussians", steps, "step") as progress:
+        while trainer.step < config.train.iterations:
+            trainer.train_step()
+            progress.update()
+            if trainer.step == BUILDING:
+                first = time.monotonic()
+            if trainer.step == TIMED and minutes < math.inf:
+                now = time.monotonic()
+                fitting = TIMED + int((end - now) * (TIMED - BUILDING) / (now - first))
+                progress.total = config.train.iterations = min(max(fitting, FEWEST), steps)
     trainer.check()
     trainer.finish()
     return cloud, config.raster.radius * run.model.grid.voxel_size
 
 
-def fitted_gaussians(run: Run, quality: str = QUICK) -> tuple[np.ndarray, np.ndarray]:
+def fitted_gaussians(
+    run: Run, quality: str = QUICK, minutes: float = math.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """((M,) records of GAUSSIAN, (3,) float64 origin): the run as Gaussians that are drawn without
     its network, in the axes and units of its scene, as 3D Gaussian splatting defines them.
 
@@ -122,20 +149,40 @@ def fitted_gaussians(run: Run, quality: str = QUICK) -> tuple[np.ndarray, np.nda
     direction from the eye to the mean.
 
     Fitted once for a checkpoint and kept in the run's folder as FILE; later calls read that.
-    quality: one of QUALITIES. Raises UserError as check_drawable does.
+    quality: one of QUALITIES. minutes: at most, which costs steps. Raises UserError as
+    check_drawable does.
     """
     check_drawable(run)
     path, origin = run.folder.path / FILE, run.model.grid.centre
     key = _key(run, quality)
     table = _kept(path, key)
     if table is None:
-        table = _table(run, *fit_gaussians(run, *QUALITIES[quality]))
+        table = _table(run, *fit_gaussians(run, *QUALITIES[quality], minutes))
         try:
             with atomic_file(path) as file:
                 np.savez(file, key=np.array(key), gaussians=table)
         except UserError as error:
             warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
     return table, origin
+
+
+def kept_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray] | None:
+    """What fitted_gaussians() has kept for the run's checkpoint, of the last quality that was
+    asked for; None where there is nothing.
+    """
+    found = (_kept(run.folder.path / FILE, _key(run, quality)) for quality in QUALITIES)
+    table = next((one for one in found if one is not None), None)
+    return None if table is None else (table, run.model.grid.centre)
+
+
+def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
+    the colours that the network gives them. Raises UserError as check_drawable does.
+    """
+    check_drawable(run)
+    radius = run.config.raster.radius * run.model.grid.voxel_size
+    cloud = begun(run, fit_harmonics(run, steps=0), 0)
+    return _table(run, cloud, DEVIATION * radius), run.model.grid.centre
 
 
 def _key(run, quality):
@@ -226,7 +273,7 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     area = (unit * np.exp(moved[:, 3])) ** 2  # of a round one, in voxel sizes, over 2 pi
     one = np.arange(len(rows))  # the Gaussian of a point
     if cell:
-        _, one = np.unique(places // cell, axis=0, return_inverse=True)
+        one = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
     count = one.max() + 1
     weight = area * opacity + 1e-6  # of those that are invisible, too, if they are alone
     total = np.bincount(one, weight, count)[:, None]

@@ -12,6 +12,7 @@ import numpy as np
 from pp_cl.files import atomic_file, srgb_to_linear
 
 POINTS, TRIANGLES = 0, 4  # of a primitive
+UNLIT = "KHR_materials_unlit"  # the light of the photographs is in the colours
 TYPES = {np.dtype("f4"): 5126, np.dtype("u2"): 5123, np.dtype("u4"): 5125}
 
 
@@ -68,6 +69,7 @@ def write_glb(
     }
     if faces is not None:  # without a material it would be metal
         gltf["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
+        make_unlit(gltf)
     if extension:
         primitive["extensions"] = dict([extension])
         gltf["extensionsUsed"] = [extension[0]]
@@ -79,6 +81,15 @@ def write_glb(
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
         file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
         file.writelines(array.tobytes() for array in stored)
+
+
+def make_unlit(gltf: dict[str, Any]) -> None:
+    """Have viewers show the materials of a glTF document without lamps; those that do not know how
+    light them as before.
+    """
+    for material in gltf.get("materials", ()):
+        material["extensions"] = {UNLIT: {}}
+    gltf["extensionsUsed"] = [*gltf.get("extensionsUsed", ()), UNLIT]
 
 
 def gltf_colours(colours: np.ndarray) -> np.ndarray:
