@@ -22,6 +22,7 @@ MADE = ("orbit", "spiral")  # paths that the program makes
 SECONDS, FPS = 4, 30
 FASTEST_GIF = 50  # frames per second; browsers show faster ones slowly
 MOST_FRAMES = 100_000
+LEAST_HEIGHT = 720  # of an orbit or spiral; an even number, as the width beside it, for mp4
 
 
 def _colour(text):
@@ -53,7 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(*VIDEOS, *IMAGES),
         help="a video (mp4, webm, webp, gif) or frames (png, exr); by --out, else mp4",
     )
-    add("--size", type=shared.size, metavar="WxH", help="pixels (default: those of the training)")
+    add(
+        "--size",
+        type=shared.size,
+        metavar="WxH",
+        help="pixels (default: those of the training; an orbit or spiral is at least"
+        f" {LEAST_HEIGHT} high)",
+    )
     add(
         "--fov",
         type=shared.number(1, 150),
@@ -94,9 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a video of them where one is asked for."""
-    from tqdm import tqdm
-
-    from pp_cl import load
+    from pp_cl import Progress, load
     from pp_cl.files import own
     from pp_studio.export.render_video import render_frames, render_video
     from pp_studio.video import check_video
@@ -117,7 +122,7 @@ def run(options: argparse.Namespace) -> None:
     if kind in VIDEOS and not options.out:
         own(out.parent, [out], "move it away, or choose another --out")
     seconds = []
-    with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
+    with Progress("rendering", len(cameras), "frame") as bar:
 
         def on_frame(took):
             bar.update()
@@ -216,5 +221,8 @@ def _cameras(run, path, count, *, size, fov):
         return [shaped(camera) for camera in run.cameras(path)]
     training = run.cameras("train")
     around, first = Surroundings(training, run.model.positions()), shaped(training[0])
+    if not size and first.height < LEAST_HEIGHT:
+        width = 2 * round(first.width / first.height * LEAST_HEIGHT / 2)
+        first = first.resized(width, LEAST_HEIGHT)
     make = around.orbit if path == "orbit" else around.spiral
     return make(first, count)
