@@ -11,6 +11,8 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import math
+import time
 import warnings
 import zipfile
 from dataclasses import replace
@@ -19,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl import Config, Run, track
+from pp_cl import Config, Progress, Run
 from pp_cl.engine import MIN_SIDE, Crop, Crops, FirstFeatures, Model, PointCloud, Trainer, View
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
@@ -52,6 +54,9 @@ ENOUGH = 200
 LARGEST = 800  # pixels to which images are reduced, about: of more, a crop would show too little
 CROP = 192  # pixels on each side of a step's crop
 EARLY_STOP = 1e-4  # of viewers
+# Steps that build the kernels, after which the time of the others is known, and that a fit in some
+# minutes has in any case.
+BUILDING, TIMED, FEWEST = 3, 10, 40
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
 # rim: the root of its second moment. With the disc's opacity it covers 0.91 of the disc.
 DEVIATION = 0.39
@@ -92,11 +97,15 @@ def windows(longest: float) -> tuple[float, float]:
     return least, least * 2**DOUBLINGS
 
 
-def fit_gaussians(run: Run, steps: int, cell: float) -> tuple[PointCloud, float]:
-    """(Gaussians, the deviation of one without offsets): fitted in so many steps, from the points
-    that training views show, those in a cubic `cell`, in voxel sizes, as one; 0: each point. Of the
-    features of their SH, which are 3D Gaussian splatting's, the first three are sRGB colour.
+def fit_gaussians(
+    run: Run, steps: int, cell: float, minutes: float = math.inf
+) -> tuple[PointCloud, float]:
+    """(Gaussians, the deviation of one without offsets): fitted in so many steps, or as many as
+    take these minutes, from the points that training views show, those in a cubic `cell`, in voxel
+    sizes, as one; 0: each point. Of the features of their SH, which are 3D Gaussian splatting's,
+    the first three are sRGB colour.
     """
+    end = time.monotonic() + 60 * minutes
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
     cloud = begun(run, coefficients, cell)
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
@@ -112,14 +121,24 @@ def fit_gaussians(run: Run, steps: int, cell: float) -> tuple[PointCloud, float]
     config = config_of(run, steps)
     trainer = Trainer(dev, config, model, views)
     trainer.crops = WindowCrops(trainer.views, config)
-    for _ in track(range(steps), "fitting Gaussians", "step"):
-        trainer.train_step()
+    with Progress("fitting Gaussians", steps, "step") as progress:
+        while trainer.step < config.train.iterations:
+            trainer.train_step()
+            progress.update()
+            if trainer.step == BUILDING:
+                first = time.monotonic()
+            if trainer.step == TIMED and minutes < math.inf:
+                now = time.monotonic()
+                fitting = TIMED + int((end - now) * (TIMED - BUILDING) / (now - first))
+                progress.total = config.train.iterations = min(max(fitting, FEWEST), steps)
     trainer.check()
     trainer.finish()
     return cloud, config.raster.radius * run.model.grid.voxel_size
 
 
-def fitted_gaussians(run: Run, quality: str = QUICK) -> tuple[np.ndarray, np.ndarray]:
+def fitted_gaussians(
+    run: Run, quality: str = QUICK, minutes: float = math.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """((M,) records of GAUSSIAN, (3,) float64 origin): the run as Gaussians that are drawn without
     its network, in the axes and units of its scene, as 3D Gaussian splatting defines them.
 
@@ -131,14 +150,15 @@ def fitted_gaussians(run: Run, quality: str = QUICK) -> tuple[np.ndarray, np.nda
     direction from the eye to the mean.
 
     Fitted once for a checkpoint and kept in the run's folder as FILE; later calls read that.
-    quality: one of QUALITIES. Raises UserError as check_drawable does.
+    quality: one of QUALITIES. minutes: at most, which costs steps. Raises UserError as
+    check_drawable does.
     """
     check_drawable(run)
     path, origin = run.folder.path / FILE, run.model.grid.centre
     key = _key(run, quality)
     table = _kept(path, key)
     if table is None:
-        table = _table(run, *fit_gaussians(run, *QUALITIES[quality]))
+        table = _table(run, *fit_gaussians(run, *QUALITIES[quality], minutes))
         try:
             with atomic_file(path) as file:
                 np.savez(file, key=np.array(key), gaussians=table)
