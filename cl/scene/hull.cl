@@ -3,6 +3,8 @@
 // b.
 #include "common.h"
 
+#define NONE 0x8000
+
 // One work-item per word of a mask's row: reads the alpha of its 32 pixels, writes the set of those
 // above `threshold`.
 kernel void pack_mask(
@@ -55,6 +57,7 @@ kernel void carve(
     const uint words,  // words per grid row
     const uint views,
     const uint least,                  // images
+    const uint doubt,                  // images that one doubting takes away
     const uint forgiven,               // masks
     global const float4 *projections,  // (views, 3, 4) (i, j, k, 1) -> (u w, v w, w)
     global const uint4 *view_masks,    // (views, 4) width, height, words per row, first word
@@ -65,9 +68,11 @@ kernel void carve(
     const uint word = get_global_id(0), row = get_global_id(1);
     if (word >= words || row >= rows) return;
     const float4 first = (float4)(32.0f * word, row % ny, row / ny, 1.0f);
-    uint tally[32];  // views that see the vertex, and from bit 16 on those that reject it
+    // From bit 16 on the views that reject a vertex; below, from NONE on, those that see it without
+    // those whose frame has background where the vertex is beside it.
+    uint tally[32];
     for (uint b = 0; b < 32; b++)
-        tally[b] = 0;
+        tally[b] = NONE;
     uint alive = 1;
     for (uint view = 0; view < views && alive; view++) {
         const float4 pu = projections[3 * view], pv = projections[3 * view + 1],
@@ -80,17 +85,19 @@ kernel void carve(
             const float w = w0 + pw.x * b;
             const float u = (u0 + pu.x * b) / w, v = (v0 + pv.x * b) / w;
             const uint in = w > 0 && u >= 0 && u < width && v >= 0 && v < height;
-            const uint x = in ? (uint)u : 0, y = in ? (uint)v : 0;
-            const uint on = masks[mask.w + y * mask.z + (x >> 5)] >> (x & 31);
+            const uint x = clamp(u, 0.0f, width - 1), y = clamp(v, 0.0f, height - 1);
+            const uint on = masks[mask.w + y * mask.z + (x >> 5)] >> (x & 31) & 1;
             const uint counts = in | view_is_whole[view];
             tally[b] += counts + ((counts & ~(in & on)) << 16);
+            tally[b] -= w > 0 && !counts && !on ? doubt : 0;
             alive |= tally[b] >> 16 <= forgiven;
         }
     }
     uint in_hull = 0;
     for (uint b = 0; b < 32; b++) {
-        const uint seen = tally[b] & 0xffff, rejected = tally[b] >> 16;
-        in_hull |= (uint)(seen >= least && views * rejected <= forgiven * seen) << b;
+        const int seen = (int)(tally[b] & 0xffff) - NONE;
+        const uint rejected = tally[b] >> 16;
+        in_hull |= (uint)(seen >= (int)least && views * rejected <= forgiven * seen) << b;
     }
     bits[row * words + word] = in_hull;
 }

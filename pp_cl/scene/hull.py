@@ -14,7 +14,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
-from pp_cl.scene.agreement import explain_empty_hull
+from pp_cl.scene.agreement import Disagreement, disagreements, explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
@@ -26,6 +26,7 @@ TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends th
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
+DOUBT = 4
 LEAST_SEEING = 3  # images that see a vertex: what lies behind the object is in few
 # A view is left out if more than this share of its mask, and several times the usual, is beside
 # the hull: masks moved by 6 % of the image have 0.05 to 0.13 there, right ones 0.03 at most.
@@ -79,6 +80,7 @@ class Carver:
         self.view_masks = dev.upload(table, np.uint32)
         is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
         self.view_is_whole = dev.upload(is_whole, np.uint32)
+        self.doubt = DOUBT if sum(is_whole) < LEAST_SEEING else 0
 
     def _add_mask(self, view, words, first):
         """Write the widened mask of a view from word `first` on."""
@@ -124,6 +126,7 @@ class Carver:
             words=words,
             views=len(self.cameras),
             least=self.least,
+            doubt=self.doubt,
             forgiven=forgiven,
             projections=self.dev.upload(projections, np.float32),
             view_masks=self.view_masks,
@@ -253,10 +256,11 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
 
     The hull lies between them for every view: near is the distance to the ball around it,
     DEPTH_MARGIN times enlarged, but at least half the distance to its box and one voxel size. A
-    range stated by the dataset is kept, but widened to the ball itself, since points outside of it
-    would be missing.
+    range stated by the dataset, for most views, is kept, but widened to the ball itself, since
+    points outside of it would be missing.
     """
     stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
+    stated = stated if 2 * len(stated) > len(views) else []
     half = grid.voxel_size * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
     offsets = np.stack([view.camera.eye for view in views]) - grid.centre
     from_centre = np.linalg.norm(offsets, axis=1)
@@ -331,6 +335,16 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
         key=lambda forgiven: _shares_beside(dev, left, box, forgiven).mean() <= MOST_MISSED,
     )
     return Agreement(left, left_out, least)
+
+
+def contradicting(
+    views: Sequence[View], hull: Hull, agreement: Agreement
+) -> list[Disagreement]:
+    """disagreements() around a hull of views of which those of the agreement are left. Where no
+    mask need be forgiven, only those left out disagree: what one alone carves away, no other shows.
+    """
+    found = disagreements(views, hull.grid.box)
+    return [one for one in found if agreement.forgiven or one.view.name in agreement.left_out]
 
 
 def _shares_beside(dev, views, box, forgiven):
