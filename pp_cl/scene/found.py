@@ -2,6 +2,7 @@
 cannot be used is left out.
 """
 
+import hashlib
 import os
 import posixpath
 import re
@@ -18,7 +19,7 @@ from pp_cl.files.image import ENDINGS
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
 MASK_FOLDERS = ("masks", "mask")
 IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says nothing
-COMPARED = 2**14  # bytes of an image file by which copies of it are known
+PIECE = 2**20  # bytes of a file that are read at once
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -83,22 +84,24 @@ def find_image(folder: Path, given: str, fail: Fail, kind: str = "image") -> str
 
 
 def pictures_of(files: Sequence[Path]) -> list[object]:
-    """What is the same for files that are copies of one picture, and differs for others: of files
-    of one size some of their bytes are compared. That of a file which is missing is its path.
+    """What is the same for files that are copies of one picture, and differs for others: the path,
+    or the digest where two have one size.
     """
     sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
     often = Counter(sizes)
     return [
-        _part(file, size) if size >= 0 and often[size] > 1 else file
+        _digest(file) if size >= 0 and often[size] > 1 else file
         for file, size in zip(files, sizes, strict=True)
     ]
 
 
-def _part(file, size):
-    """(size of a file, the bytes in its middle)."""
+def _digest(file):
+    """The digest of a file."""
+    digest = hashlib.sha256()
     with file.open("rb") as opened:
-        opened.seek(max(size - COMPARED, 0) // 2)
-        return size, opened.read(COMPARED)
+        while piece := opened.read(PIECE):
+            digest.update(piece)
+    return digest.digest()
 
 
 def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:

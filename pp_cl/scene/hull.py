@@ -26,7 +26,6 @@ TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends th
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
-DOUBT = 4
 LEAST_SEEING = 3  # images that see a vertex: what lies behind the object is in few
 # A view is left out if more than this share of its mask, and several times the usual, is beside
 # the hull: masks moved by 6 % of the image have 0.05 to 0.13 there, right ones 0.03 at most.
@@ -61,7 +60,9 @@ class Carver:
 
     Masks are widened by a pixel, which keeps vertices that touch the silhouette, and by one of the
     reduced image: by so much are poses and masks of images wrong. least: images that must see a
-    vertex.
+    vertex. doubts: 1 where so few masks end within their image that an image takes one of these
+    away from what lies beside it, if the nearest pixel of its border is beside the mask: so images
+    that are cropped to the object bound it, and those that it leaves do not cut it off.
     """
 
     def __init__(self, dev: Device, views: Sequence[View]):
@@ -80,7 +81,8 @@ class Carver:
         self.view_masks = dev.upload(table, np.uint32)
         is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
         self.view_is_whole = dev.upload(is_whole, np.uint32)
-        self.doubt = DOUBT if sum(is_whole) < LEAST_SEEING else 0
+        # else these bound the object, and close-ups must not take away what lies beside them
+        self.doubts = int(sum(is_whole) < self.least)
 
     def _add_mask(self, view, words, first):
         """Write the widened mask of a view from word `first` on."""
@@ -126,7 +128,7 @@ class Carver:
             words=words,
             views=len(self.cameras),
             least=self.least,
-            doubt=self.doubt,
+            doubts=self.doubts,
             forgiven=forgiven,
             projections=self.dev.upload(projections, np.float32),
             view_masks=self.view_masks,
@@ -151,8 +153,8 @@ def build_grid(
 
     views: of any sizes; their stored images and cameras are used. box: (2, 3), which holds all
     vertices; None: what the masks allow, and where no view has one what all cameras see. A vertex
-    is inside if LEAST_SEEING images see it and it lies in the mask of each one that does, widened
-    as Carver has it, but for `forgiven` of all views (agreeing()). The search starts from the box
+    is inside if LEAST_SEEING images see it and it lies in the mask of each one that does, both as
+    Carver has it, but for `forgiven` of all views (agreeing()). The search starts from the box
     that the masks allow and rescales the voxel size from the measured count, until the count is
     `points` to 1.02 points. At CELL_CAP vertices of the grid, or after 8 rounds, the best carving
     is taken: the smallest with enough points, else the largest. Raises UserError for an impossible

@@ -65,7 +65,7 @@ INVERTED = 0.95  # of the border of an image: hardly any object ends inside and 
 BESIDE = 0.5  # of what is transparent, that a mask which is not of the object holds
 WRONG = "what the scene's files say of it is wrong"  # of a view whose error is no Unusable
 OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
-OF_TRAINING = "pictures that are training views, too, so that figures flatter"
+OF_TRAINING = "pictures that are in training, too, so that figures flatter"
 # {what lies in the folder of a program or dataset that is not read: which of its exports is}
 EXPORTS = {
     "*.xml": 'Metashape\'s, maybe; use its Export Cameras with the type "Colmap"',
