@@ -12,7 +12,7 @@ from skimage.morphology import closing, dilation, disk
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid, smallest_voxel_size
-from pp_cl.engine.views import MASK_THRESHOLD, View, border
+from pp_cl.engine.views import MASK_THRESHOLD, View, border, evenly
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import Disagreement, disagreements, explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
@@ -38,6 +38,7 @@ MOST_LEFT_OUT = 1 / 8  # of the views
 # views gain 1.4 dB where 12 of 60 masks may reject, in place of 4.
 MOST_MISSED, MOST_FORGIVEN = 0.0002, 1 / 4
 COMPARED_POINTS, COMPARED_SIZE = 60_000, 128  # pixels of the images in which this is looked up
+SAMPLED_POINTS = 1000
 VERTEX_WORK = 10  # multiply-adds that project a vertex into a view, and find its pixel
 CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size of the eyes' box
 
@@ -339,14 +340,27 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
     return Agreement(left, left_out, least)
 
 
-def contradicting(
-    views: Sequence[View], hull: Hull, agreement: Agreement
-) -> list[Disagreement]:
+def contradicting(views: Sequence[View], hull: Hull, agreement: Agreement) -> list[Disagreement]:
     """disagreements() around a hull of views of which those of the agreement are left. Where no
     mask need be forgiven, only those left out disagree: what one alone carves away, no other shows.
     """
     found = disagreements(views, hull.grid.box)
     return [one for one in found if agreement.forgiven or one.view.name in agreement.left_out]
+
+
+def misplaced(grid: Grid, ids: np.ndarray, views: Sequence[View]) -> list[View]:
+    """The views with a mask on which a share of the points with these ids (N,) falls that is
+    several times smaller than usual, of those that their image shows: their cameras, or masks, are
+    of another place.
+    """
+    places = grid.positions(np.array(evenly(ids, SAMPLED_POINTS)))
+    masked, shares = [view for view in views if view.has_mask], []
+    for view in masked:
+        column, row, is_shown = view.stored_camera.pixels(places)
+        is_on = view.hull_alpha[row, column] > MASK_THRESHOLD
+        shares.append((is_on & is_shown).sum() / max(is_shown.sum(), 1))
+    least = np.median(shares or [0]) / TIMES_USUAL
+    return [view for view, share in zip(masked, shares, strict=True) if share < least]
 
 
 def _shares_beside(dev, views, box, forgiven):

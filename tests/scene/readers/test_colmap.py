@@ -253,7 +253,11 @@ def test_models_of_later_versions_are_named(binary):
 
 
 def test_panoramas_are_no_unknown_lens(text):
-    edit(text, "cameras.txt", lambda lines: [f"{i + 1} EQUIRECTANGULAR 30 22 30 22" for i in range(11)])
+    edit(
+        text,
+        "cameras.txt",
+        lambda lines: [f"{i + 1} EQUIRECTANGULAR 30 22 30 22" for i in range(11)],
+    )
     refused(text, "EQUIRECTANGULAR is panoramic")
 
 
