@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -52,18 +53,23 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
     """What drivers showed the user stays unread: a cache folder for the session, with nothing in
-    it but the weights of LPIPS.
+    it but the weights of LPIPS. All processes share it, as they take the same device.
     """
     cached = cache_folder() / WEIGHTS_FILE
-    folder = tmp_path_factory.mktemp("cache")
-    lent = folder / WEIGHTS_FILE
+    folder = tmp_path_factory.getbasetemp()
+    if os.environ.get("PYTEST_XDIST_WORKER"):  # whose folder is inside that of all
+        folder = folder.parent
+    lent = folder / "cache" / WEIGHTS_FILE
+    lent.parent.mkdir(exist_ok=True)
     if cached.exists():
-        lent.symlink_to(cached.resolve())
+        with suppress(FileExistsError):
+            lent.symlink_to(cached.resolve())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PP_CACHE", str(folder))
+        patch.setenv("PP_CACHE", str(lent.parent))
         yield
     if lent.exists() and not lent.is_symlink() and not cached.exists():  # fetched by a test
-        shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
+        with suppress(FileNotFoundError):  # another process was first
+            shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.config import run_config
-    from pp_cl.drivers import open_device
+    from pp_cl.drivers import device_line, open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
         )
         return
     dev = open_device(options.device)
-    print(f"device: {dev.name} [{dev.info['platform']}]")
+    print(device_line(dev, options.device))
     training = open_training(dev, folder, config, stored)
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
@@ -159,38 +159,45 @@ def _sizes(cameras):
 
 
 def _run(training, options):
-    """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
-    from pp_cl.commands.progress import Progress
+    """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM: at once in
+    the first step, which builds kernels, else at the end of the step.
+    """
+    from pp_cl.commands.progress import TrainingProgress
     from pp_cl.commands.signals import first_signal
     from pp_cl.errors import Stopped
     from pp_cl.files.scalars import curves
 
     trainer, folder = training.trainer, training.folder
     with ExitStack() as stack:
-        followers = [stack.enter_context(Progress(training))]
+        followers = [stack.enter_context(TrainingProgress(training))]
         if options.tensorboard:
             drawn = curves(folder.path / "tensorboard", trainer.step)
             followers.append(stack.enter_context(drawn))
         if options.view:
             viewer = importlib.import_module(COMMANDS["view"])
             followers.append(stack.enter_context(viewer.following(training)))
-        caught = stack.enter_context(first_signal())
+        first, caught = trainer.step + 1, []
 
         def on_step(step, row):
+            nonlocal caught
+            if step == first:
+                caught = stack.enter_context(first_signal())
             for follower in followers:
                 follower(step, row)
 
         try:
             seconds = training.run(on_step, lambda: bool(caught))
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as signalled:
+            number, *_ = signalled.args or [signal.SIGINT]
             resumes = "goes on from" if folder.checkpoint.exists() else "starts over, there is no"
             raise Stopped(
-                f"stopped at once; the same command {resumes} {folder.checkpoint}",
-                128 + signal.SIGINT,
+                f"stopped at once; the same command {resumes} {folder.checkpoint}", 128 + number
             ) from None
-    if trainer.step < training.config.train.iterations:
+    if caught:
+        is_finished = trainer.step == training.config.train.iterations
+        goes_on = "the training is finished" if is_finished else "the same command goes on"
         raise Stopped(
-            f"stopped at step {trainer.step}; wrote {folder.checkpoint}; the same command goes on",
+            f"stopped at step {trainer.step}; wrote {folder.checkpoint}; {goes_on}",
             128 + caught[0],
         )
     return seconds

@@ -1,12 +1,15 @@
 """`pp-cl make`: what is left is done, and a folder tells of it."""
 
+import importlib
 import re
 import shutil
+import signal
 
 import pytest
 from support.runs import spoken
 
 from pp_cl.cli import main
+from pp_cl.commands import COMMANDS
 from pp_cl.files.atomic import own, write_json
 from pp_cl.files.image import read_rgba
 from pp_studio.capture import STAGES
@@ -48,7 +51,7 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
     assert (folder / "index.html").exists()
     assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
     status, lines = spoken(["make", scene, "--out", folder, "--minutes", "7"])
-    assert status == 2 and "train.minutes is 0.1 there, 7.0 asked for" in lines[-1]
+    assert status == 2 and f"{folder}: was begun with --minutes 0.1; leave it out" in lines[-1]
 
 
 def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, monkeypatch):
@@ -65,6 +68,25 @@ def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, mo
     with pytest.raises(AttributeError):  # of what is not there to serve
         main(["view", str(folder), "--port", "0"])
     assert shown[0].path == folder / "run"
+
+
+@pytest.mark.parametrize("stage, number", [("eval", signal.SIGTERM), ("render", signal.SIGINT)])
+def test_a_signal_ends_it_and_the_same_command_goes_on(made, capsys, monkeypatch, stage, number):
+    """20 moments of a process: test_make_stopped.py."""
+    scene, folder = made
+    words, real = ["make", scene, "--out", str(folder)], importlib.import_module(COMMANDS[stage])
+    for name in ("index.html", "video.mp4"):
+        (folder / name).unlink(missing_ok=True)
+
+    def signalled(options):
+        signal.raise_signal(number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(real, "run", signalled)
+        assert main(words) == 128 + number
+    assert capsys.readouterr().err.splitlines()[-1] == "pp-cl: interrupted"
+    assert main(words) == 0
+    assert (folder / "index.html").exists() and (folder / "video.mp4").exists()
 
 
 def test_what_is_not_its_own_stays(made, tmp_path):
@@ -104,6 +126,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
             raise Enough
 
     monkeypatch.setattr(make, "_step", step)
+    monkeypatch.setattr("pp_studio.export.result.write_result", lambda *given: None)
     photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
     found.mkdir(parents=True)
@@ -112,7 +135,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
     with pytest.raises(Enough):
         spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])
     scene, box = str(tmp_path / "out/scene"), "--box=-1.0,-1.0,-1.0,1.0,1.0,2.0"
-    minutes = words[1] if "--minutes" in words else "20"
+    minutes = {"3": "2", "60": "55"}.get(words[-1] if words else "", "15")
     assert steps == [
         ("capture", (str(photographs), "--out", scene, "--turntable", "--masks", "M", box)),
         (
