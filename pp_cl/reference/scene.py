@@ -54,7 +54,9 @@ def in_hull(
         away = np.minimum(np.abs(u - np.round(u)), np.abs(v - np.round(v)))
         border[front] = np.minimum(border[front], away)
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        row, column = (np.clip(a, 0, n - 1).astype(int) for a, n in zip((v, u), mask.shape, strict=True))
+        row, column = (
+            np.clip(a, 0, n - 1).astype(int) for a, n in zip((v, u), mask.shape, strict=True)
+        )
         doubting = front[~inside & ~mask[row, column]]
         front, u, v = front[inside], u[inside].astype(int), v[inside].astype(int)
         held = np.zeros(len(positions), bool)
