@@ -12,7 +12,7 @@ from skimage.morphology import closing, dilation, disk
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid, smallest_voxel_size
-from pp_cl.engine.views import MASK_THRESHOLD, View, border, evenly
+from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import Disagreement, disagreements, explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
@@ -353,7 +353,7 @@ def misplaced(grid: Grid, ids: np.ndarray, views: Sequence[View]) -> list[View]:
     several times smaller than usual, of those that their image shows: their cameras, or masks, are
     of another place.
     """
-    places = grid.positions(np.array(evenly(ids, SAMPLED_POINTS)))
+    places = grid.positions(ids[:: max(1, len(ids) // SAMPLED_POINTS)])
     masked, shares = [view for view in views if view.has_mask], []
     for view in masked:
         column, row, is_shown = view.stored_camera.pixels(places)
