@@ -235,5 +235,6 @@ def memory_line(memory_plan: MemoryPlan) -> str:
     need, dev = memory_plan.need, memory_plan.dev
     has, on_host = _size(dev.info["memory_bytes"]), f"{_size(need.host)} of the computer's"
     if dev.is_cpu:
-        return f"memory: up to {on_host} {has}"
-    return f"memory: up to {_size(need.device)} of the {has} of {dev.name}, and {on_host}"
+        return f"memory: up to {on_host} {has}, with {need.points} points"
+    on_device = f"{_size(need.device)} of the {has} of {dev.name}"
+    return f"memory: up to {on_device}, with {need.points} points, and {on_host}"
