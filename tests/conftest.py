@@ -17,7 +17,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 from pp_cl.scene import hull
-from pp_studio.export import gaussians, texture
+from pp_studio.export import QUALITIES, QUICK, texture
 
 # of Hypothesis: the same few examples each time, or as many as `make fuzz` is told
 settings.register_profile(
@@ -79,7 +79,7 @@ def small_work():
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hull, "COMPARED_POINTS", 8000)
-        patch.setattr(gaussians, "STEPS", 40)
+        patch.setitem(QUALITIES, QUICK, (40, 0.0))
         patch.setattr(texture, "SIDE", 256)
         yield
 

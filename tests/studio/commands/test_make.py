@@ -126,6 +126,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
             raise Enough
 
     monkeypatch.setattr(make, "_step", step)
+    monkeypatch.setattr(make, "_share", lambda: 1.0)
     monkeypatch.setattr("pp_studio.export.result.write_result", lambda *given: None)
     photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
