@@ -274,7 +274,7 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     area = (unit * np.exp(moved[:, 3])) ** 2  # of a round one, in voxel sizes, over 2 pi
     one = np.arange(len(rows))  # the Gaussian of a point
     if cell:
-        _, one = np.unique(places // cell, axis=0, return_inverse=True)
+        one = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
     count = one.max() + 1
     weight = area * opacity + 1e-6  # of those that are invisible, too, if they are alone
     total = np.bincount(one, weight, count)[:, None]
