@@ -102,13 +102,9 @@ def device_line(device: Device, choice: str | None) -> str:
 def _match(found, choice):
     """How one of list_devices() matches `choice`, 0 the best, NONE not at all."""
     index, device, _ = found
-    if not choice or choice == index:
-        return 0
-    if choice.lower() in device.platform.name.lower():
-        return 1
-    if choice.lower() == device.name.strip().lower():
-        return 2
-    return 3 if choice.lower() in device.name.lower() else NONE
+    word, name = (choice or index).lower(), device.name.strip().lower()
+    ways = word == index, word in device.platform.name.lower(), word == name, word in name
+    return next((n for n, matches in enumerate(ways) if matches), NONE)
 
 
 def list_devices(*, again: bool = False) -> list[Listed]:
@@ -146,13 +142,15 @@ def separate_devices() -> list[str]:
     working = by_speed(list_devices())
     if not working:
         open_device()  # says what is wrong
-    gpus: dict[str, dict[str, list[str]]] = {}  # name: {platform: indices}
-    for index, device, _ in working if is_gpu(working[0][1]) else ():
-        if is_gpu(device):
-            platforms = gpus.setdefault(device.name.strip(), {})
-            platforms.setdefault(device.platform.name, []).append(index)
-    separate = [index for platforms in gpus.values() for index in next(iter(platforms.values()))]
-    return separate or [working[0][0]]
+    if not is_gpu(working[0][1]):
+        return [working[0][0]]
+    owners: dict[str, str] = {}  # {name of a GPU: the platform that it is taken of}
+    return [
+        index
+        for index, device, _ in working
+        if is_gpu(device)
+        and owners.setdefault(device.name.strip(), device.platform.name) == device.platform.name
+    ]
 
 
 def mend() -> str:
