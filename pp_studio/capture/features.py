@@ -21,7 +21,7 @@ from pp_studio.capture.packages import needed
 
 LENS = "SIMPLE_RADIAL"  # with more, few photographs agree on a wrong focal length
 LARGEST = 1600  # pixels, longer side; larger images are reduced for their features
-FEATURES = 4096  # of an image, at most
+FEATURES = 4096  # of an image, at most: the largest
 CONTRAST = 0.02  # of a feature, of 1, at least; three layers of an octave share it
 UNIT = 512  # length of a descriptor of bytes, as COLMAP has them
 RATIO, FARTHEST = 0.8, 0.7  # of the second best match's angle, and radians
@@ -104,23 +104,19 @@ def _features(file, masks):
     if masks is not None:
         with Image.open(masks / f"{file.name}.png") as image:
             mask = np.array(image.convert("L").resize(reduced, Image.Resampling.NEAREST))
-    # those in the mask are counted here, as OpenCV chooses first
-    sift = cv2.SIFT_create(
-        0 if masks else FEATURES, contrastThreshold=CONTRAST, enable_precise_upscale=True
-    )
+    sift = cv2.SIFT_create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(gray, mask)
     if not found:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
-    response = np.array([one.response for one in found])
-    best = np.argsort(-response, kind="stable")[:FEATURES]
-    scale = np.array([one.size / 2 for one in found])[best]
-    best = best[np.argsort(-scale, kind="stable")]
-    keypoints = np.array([(*one.pt, one.size / 2, np.radians(one.angle)) for one in found])[best]
+    keypoints = np.array([(*one.pt, one.size / 2, np.radians(one.angle)) for one in found])
+    # of photographs of a shining head twice as many of the largest match as of the strongest
+    best = np.argsort(-keypoints[:, 2], kind="stable")[:FEATURES]
+    keypoints, descriptors = keypoints[best], descriptors[best]
     larger = size / reduced
     keypoints[:, :2] = (keypoints[:, :2] + 0.5) * larger
     keypoints[:, 2] *= larger.mean()
     # the root of what they share, by which a few strong gradients count less (Arandjelovic 2012)
-    shares = np.sqrt(descriptors[best] / descriptors[best].sum(1, keepdims=True))
+    shares = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     rounded = np.minimum(np.rint(UNIT * shares), 255).astype(np.uint8)
     return keypoints.astype(np.float32), rounded
 

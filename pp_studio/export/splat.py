@@ -22,9 +22,9 @@ from pp_studio.export.points import in_world, inside, table_of, write_elements
 # 4 % more, and lego loses 0.05 dB less; two steps, one a degree, take more bytes than their mean.
 STEPS_OF_PLACE = 1
 STEP_OF_HARMONICS = 5 / 64
-# What a .spz holds: deviations of 8 bits from e^-10 to 380, places below 2^19. Gaussians that are
-# usually this wide, in its units, fit with all that is seen of them: 2^19 is some 10,000 voxels.
-WIDTHS_IN_SPZ = 2e-4, 4.0
+# What a .spz holds: places below 2^19, and deviations of 8 bits from e^-10 to 380; of Gaussians
+# that are usually as wide as the least here, what it makes thicker is hardly seen.
+MOST_PLACE, LEAST_WIDTH, MOST_WIDTH = 5e5, 2e-4, 380.0
 STORED = 16  # functions in a .ply: many programs read no file but of degree 3
 Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in glTF
 
@@ -87,10 +87,10 @@ def in_spz(table: np.ndarray) -> tuple[np.ndarray, float]:
     """(splats() in units that a .spz holds, how many of these a unit was): 1, or a power of ten for
     what is far too large or too small.
     """
-    usual = float(np.median(table["deviations"].max(axis=1)))
-    least, most = WIDTHS_IN_SPZ
-    up, down = math.log10(least / usual), math.log10(usual / most)
-    times = 10.0 ** (math.ceil(max(0, up)) - math.ceil(max(0, down)))
+    widest = table["deviations"].max(axis=1)
+    too_large = max(np.abs(table["position"]).max() / MOST_PLACE, widest.max() / MOST_WIDTH, 1)
+    too_small = max(LEAST_WIDTH / np.median(widest), 1)
+    times = 10.0 ** (math.ceil(math.log10(too_small)) - math.ceil(math.log10(too_large)))
     scaled = table.copy()
     for name in ("position", "deviations"):
         scaled[name] *= times
