@@ -95,28 +95,25 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _first_line(training):
-    """A line of text: the grid that the training starts from, or the step it resumes at."""
+    """A line of text: the points that the training starts from, or the step it resumes at."""
     from pp_cl.scene.hull import CELL_CAP, spacing_pixels
 
     hull, trainer = training.hull, training.trainer
     points = trainer.model.cloud.count
     if hull is None:
         return f"resuming at step {trainer.step} with {points} points"
-    grid, (near, far) = trainer.model.grid, trainer.model.depth_range
-    spacing = spacing_pixels(grid, [view.camera for view in trainer.views])
+    spacing = spacing_pixels(trainer.model.grid, [view.camera for view in trainer.views])
     asked = training.config.points.count
     capped = (
-        f"\nhull: only {points} of the {asked} points asked for, since a finer grid would have"
-        f" more than {CELL_CAP} cells"
+        f"\npoints: only {points} of the {asked} asked for, since a finer grid would have more than"
+        f" {CELL_CAP} cells"
     )
     finer = "".join(
-        f", then {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
+        f", later {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
     )
     return (
-        f"hull: {points} points on a {'x'.join(map(str, grid.dims))} grid, voxel size"
-        f" {grid.voxel_size:.6g} ({spacing:.2f} pixels{finer}), depth {near:.3f} to {far:.3f}"
-        f" ({hull.seconds:.1f} s)"
-        f"{capped if hull.capped else ''}"
+        f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
+        f" the object ({hull.seconds:.1f} s){capped if hull.capped else ''}"
     )
 
 
@@ -152,13 +149,7 @@ def _images_line(training, chosen):
     if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
-    k = view.downscale
-    jitter = f"{k}x{k} offsets" if k > 1 else "at most an eighth of a pixel"
-    reduced = f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter {jitter}"
-    return (
-        f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
-        f"{reduced if view.shrunk > 1 else ''}"
-    )
+    return f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
 
 
 def _sizes(cameras):

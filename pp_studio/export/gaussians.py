@@ -41,6 +41,7 @@ GAUSSIAN = np.dtype(
     ]
 )
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
+FIRST_VIEWS = 40  # of which the points have their colours before the fit
 LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
 
 # Pixels on the longer side of the smallest window for which splats are made; in smaller ones
@@ -181,7 +182,7 @@ def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """
     check_drawable(run)
     radius = run.config.raster.radius * run.model.grid.voxel_size
-    cloud = begun(run, fit_harmonics(run, steps=0), 0)
+    cloud = begun(run, fit_harmonics(run, steps=0, most=FIRST_VIEWS), 0)
     return _table(run, cloud, DEVIATION * radius), run.model.grid.centre
 
 

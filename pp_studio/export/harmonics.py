@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
 from pp_cl import Run
+from pp_cl.engine import evenly
 from pp_studio.export.observe import directions, look, observe, progress
 
 COUNT = 9  # functions of basis()
@@ -28,15 +29,16 @@ def basis(towards: np.ndarray) -> np.ndarray:
     return np.stack(rows, 1).astype(np.float32)
 
 
-def fit_harmonics(run: Run, steps: int) -> np.ndarray:
-    """(N, 9, 3) float32: coefficients of basis(), of the sRGB colour of each of the run's points.
+def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
+    """(N, 9, 3) float32: coefficients of basis(), of the sRGB colour of each of the run's points, 0
+    of those that no view shows. most: of the training views, spread evenly; None: all.
 
     Colours are blended as the features are, over white, and clamped at last: one point's may lie
     outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
     gradients, preconditioned by A's blocks of a point. Views are weighed anew in each, since the
     weights of all would fill the memory.
     """
-    cameras, n = run.cameras("train"), run.model.cloud.count
+    cameras, n = evenly(run.cameras("train"), most), run.model.cloud.count
     positions = run.model.positions()
 
     def functions(seen):

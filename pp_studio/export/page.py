@@ -128,7 +128,8 @@ def page_text(run: Run, gaussians: Gaussians, still: str = "", title: str = "") 
     """
     rows, about = pack(gaussians.table)
     data = base64.b64encode(rows.tobytes()).decode()
-    header = json.dumps(about | _header(run, gaussians, about["corner"]))
+    corner = about.pop("corner")
+    header = json.dumps(about | _header(run, gaussians, corner))
     return filled(
         "page.html",
         {

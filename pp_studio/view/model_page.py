@@ -58,7 +58,7 @@ class _MovedError(Exception):
 
 
 class ModelPage:
-    """run: may be replaced by that of another checkpoint. views: its training views, none where the
+    """run: that of the last take(). views: its training views, none where the
     photographs are gone. most_pixels: of a rendering. is_training: the model changes while it is
     shown, and has no memory for a copy. woken: is set when a tab wants something.
     """
@@ -159,8 +159,9 @@ class ModelPage:
                     )
                 tab = self._tabs[client.client_id]
                 tab.camera, tab.moved = camera, time.monotonic()
-                if self._by_browser(tab) and not tab.splat.visible:
-                    tab.splat.visible = True
+                splat = self._by_browser(tab)
+                if splat and not splat.visible:
+                    splat.visible = True
                     client.scene.set_background_image(WHITE)
                 self.woken.set()
 
@@ -175,8 +176,9 @@ class ModelPage:
         return client.scene.add_gaussian_splats("/splat", **self._splat)
 
     def _by_browser(self, tab):
-        """Whether the tab's browser draws Gaussians while its camera moves."""
-        return tab.splat and self._took > SLOW and self._show.value == SHOWN[0]
+        """The Gaussians that the tab's browser draws while its camera moves, if it does."""
+        is_wanted = self._took > SLOW and self._show.value == SHOWN[0]
+        return tab.splat if is_wanted else None
 
     async def _disconnected(self, client):
         self._tabs.pop(client.client_id, None)
@@ -210,6 +212,15 @@ class ModelPage:
             event.client.send_file_download("path.json", text.encode(), save_immediately=True)
 
     # ---- what the thread that has the device calls
+
+    def take(self, run: Run) -> None:
+        """Show another checkpoint of the run, to which no Gaussians are fitted yet."""
+        self.run, self._splat = run, None
+        for tab in list(self._tabs.values()):
+            splat, tab.splat = tab.splat, None
+            if splat:
+                splat.remove()
+        self.renew()
 
     def renew(self) -> None:
         """Have all tabs that rest drawn again, as the model has changed."""

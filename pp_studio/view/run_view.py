@@ -71,8 +71,7 @@ class RunView:
     def _take(self, run):
         self.told.content = ""
         if self.page:
-            self.page.run = run
-            self.page.renew()
+            self.page.take(run)
             return
         views = []
         try:

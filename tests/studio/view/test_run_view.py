@@ -179,6 +179,9 @@ def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copi
         assert not view.page.draw_next(), "no draft is drawn"
         monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
         assert view.page.draw_next() and not seen.splat.visible
+        os.utime(copied / "checkpoint.npz", ns=(1, 1))
+        view.look()
+        assert seen.splat is None, "they are of the checkpoint before"
 
 
 def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copied):
