@@ -129,11 +129,8 @@ class Training:
         trainer, train = self.trainer, self.config.train
         with self.folder.open_log(trainer.step) as log:
             pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
-            seconds, budget, earlier = (
-                log.seconds,
-                Budget(train, pixels, self._is_automatic("train.refine_at")),
-                log.seconds,
-            )
+            budget = Budget(train, pixels, self._is_automatic("train.refine_at"))
+            seconds = earlier = log.seconds
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < train.iterations:
