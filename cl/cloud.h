@@ -2,6 +2,9 @@
 // the offset from the vertex of the grid, in voxel sizes, and the logarithm of the radius. Of
 // Gaussians in place of that the triangle L of the covariance L L^T, in deviations of one without
 // offsets: the logarithms of its diagonal, then (1, 0), (2, 0) and (2, 1), then zeros.
+//
+// Opacities have rows of 4, o and a vector w in world axes, for the opacity o + w . d, in [0, 1], of
+// a point that is seen in the direction d from the eye.
 #ifndef PP_CLOUD_H
 #define PP_CLOUD_H
 

@@ -15,9 +15,7 @@
 // basis[0..8] of the direction from the eye to a point. point: x, y, z in the camera's axes,
 // distance.
 static inline void sh_basis_of_point(global const float *camera, const float4 point, float *basis) {
-    const Camera cam = camera_load(camera);
-    const float3 c = point.xyz / point.w;
-    const float3 d = c.x * cam.right + c.y * cam.down + c.z * cam.forward;
+    const float3 d = direction_of_point(camera, point);
     basis[0] = SH_0;
     basis[1] = -SH_1 * d.y;
     basis[2] = SH_1 * d.z;

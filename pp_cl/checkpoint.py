@@ -27,7 +27,7 @@ from pp_cl.files.untrusted import opened_zip, refusal, strict_json
 from pp_cl.scene.identity import unpacked_views
 from pp_cl.settings import Config
 
-FORMAT = 3  # raised when the arrays change meaning
+FORMAT = 4  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
 # {key of the header: its types as JSON has them}, and those that it may lack
@@ -267,8 +267,8 @@ def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> di
     degrees = SH_DEGREES[: config.points.sh_degree + 1]
     sh_dtype = np.float16 if step is None else np.float32
     network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
-    table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
-    table["points.offset"] = (n, 4), np.float32
+    table: dict[str, Any] = {"points.ids": ((n,), np.uint32)}
+    table |= {f"points.{name}": ((n, 4), np.float32) for name in ("offset", "opacity")}
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}
     if step is not None:

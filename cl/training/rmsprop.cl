@@ -5,7 +5,9 @@
 // features, and is never stored. The squares of the harmonics of a degree add up to the same in all
 // directions (Unsoeld 1927), so all coefficients of a feature share one second moment v, an average
 // of G^2 / (4 pi), which is the mean of Y_k^2 G^2 over the directions. They move by rate Y_k G /
-// (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike.
+// (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike. The gradient of
+// the opacity's vector w (cloud.h) is that of the opacity times the direction, and shares its second
+// moment. Where an opacity is at a bound only what leads away from it moves w.
 //
 // A point without a gradient stays where it is; the decay of its second moments waits until it has
 // one.
@@ -60,6 +62,7 @@ kernel void rmsprop_move(
     const float point_eps,  // of offset and opacity, as the next two
     const float rate_offset,
     const float rate_opacity,
+    const float rate_lobe,  // of the opacity's vector
     global const uint *visible,                   // (S) their indices
     global const float *camera,                   // (21) camera.h
     global const float4 *point_camera,            // (N, 4) x, y, z, distance
@@ -71,7 +74,7 @@ kernel void rmsprop_move(
     global float *v_offset,                       // (N, OFFSETS)
     global float *v_opacity,                      // (N)
     global float *offset,                         // (N, OFFSETS) cloud.h
-    global float *opacity,                        // (N)
+    global float4 *opacity,                       // (N, 4) cloud.h
     global float16 *sh_0,                         // (N, 1, 16)
     global float16 *sh_1,                         // (?, ?, 16) (N, 3, 16), untouched at degree 0
     global float16 *sh_2a,                        // (?, ?, 16) (N, 3, 16), untouched below degree 2
@@ -95,8 +98,12 @@ kernel void rmsprop_move(
         last_step[i] = step;
         const float w = decay * v_opacity[i] + DECAY2 * a * a;
         v_opacity[i] = w;
-        const float moved = opacity[i] - rate_opacity * a / (sqrt(w) + point_eps);
-        opacity[i] = BOUNDED(moved, 0.0f, 1.0f);
+        const float move = a / (sqrt(w) + point_eps);
+        const float3 along = direction_of_point(camera, point_camera[i]);
+        const float moved = opacity[i].x - rate_opacity * move;
+        const float3 lobe = opacity[i].yzw - rate_lobe * move * along;
+        opacity[i] = (float4)(
+            BOUNDED(moved, 0.0f, 1.0f), BOUNDED(lobe, (float3)(-1.0f), (float3)(1.0f)));
         if (MOVES_OFFSET) {
             const Offsets u = decay * OFFSETS_AT(v_offset, i) + DECAY2 * o * o, most = MOST_OFFSET;
             OFFSETS_AT(v_offset, i) = u;

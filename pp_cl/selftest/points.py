@@ -249,6 +249,7 @@ class PairedGaussians(PairedPoints):
                 dev.upload(grid.packed()),
                 point_id=dev.upload(ids, np.uint32),
                 cloud_offset=dev.upload(offset, np.float32),
+                opacity=dev.zeros((len(ids), 4)),
                 radius=radius,
             )
         )

@@ -55,6 +55,7 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             dev.upload(GRID.packed()),
             point_id=dev.upload(ids, np.uint32),
             cloud_offset=dev.upload(offset),
+            opacity=dev.zeros((n, 4)),
             radius=0.01,
         )
         place, covers = dense.camera_space(camera, positions), points.point_count.get() > 0

@@ -134,7 +134,7 @@ def _cloud(run, coefficients):
     offset[:, :3], offset[:, 3:6] = given[:, :3], given[:, 3:]  # round, as large as the points
     sh = np.zeros((len(rows), 9, 16), np.float32)
     sh[..., :3] = coefficients[rows][:, ORDER] / FACTORS[:, None]
-    opacity = cloud.opacity.get()[rows].clip(0, MOST_OPAQUE)
+    opacity = cloud.opacity.get()[rows, 0].clip(0, MOST_OPAQUE)
     return PointCloud.of_gaussians(dev, cloud.ids.get()[rows], offset, opacity, sh)
 
 
@@ -158,5 +158,5 @@ def _config(given: Config, scale: int) -> Config:
     else:
         train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
         train.prune_weight = 0.0  # points are judged in images, where larger renderings show more
-    train.offset_rate = (4e-2, 4e-3)
+    train.offset_rate, train.lobe_rate = (4e-2, 4e-3), 0.0
     return config

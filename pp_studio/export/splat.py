@@ -57,7 +57,7 @@ def splats(
     """
     check_drawable(run)
     cloud, deviation = fit_gaussians(run, window)
-    opacity, offset = cloud.opacity.get().clip(0, MOST_OPAQUE), cloud.offset.get()
+    opacity, offset = cloud.opacity.get()[:, 0].clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
     positions = grid.positions(cloud.ids.get()[rows]) + grid.voxel_size * offset[rows, :3]
     held = inside(positions, box)

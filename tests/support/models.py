@@ -23,8 +23,8 @@ def make_model(dev, rng, n=90):
     ids = some_ids(rng, GRID, n)
     net = UNet(dev, widths=WIDTHS, seed=3)
     model = Model(dev, GRID, (2.0, 6.0), PointCloud.create(dev, ids), net=net)
-    opacity = rng.uniform(0.2, 1, n).astype(np.float32)
-    opacity[::9], opacity[4::9] = 0, 1
+    opacity = rng.uniform([0.2, -0.6, -0.6, -0.6], [1, 0.6, 0.6, 0.6], (n, 4)).astype(np.float32)
+    opacity[::9, 0], opacity[4::9, 0] = 0, 1
     model.cloud.opacity.set(opacity)
     for array in model.cloud.sh:
         array.set(rng.normal(size=array.shape).astype(np.float32))

@@ -10,7 +10,7 @@ from support.models import make_model
 from pp_cl.engine.raster.points import SH_DEGREES
 from pp_cl.engine.training.optim import Optimiser, adam_update, ema_update
 from pp_cl.engine.training.state import PointState
-from pp_cl.reference import optim
+from pp_cl.reference import dense, optim
 from pp_cl.selftest.optim import RATES, Cloud, adam_steps, gradients
 
 pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
@@ -63,13 +63,15 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
     """Of the oracle: for one gradient seen from everywhere, v is the mean of those that Adam keeps
     of the coefficients, and the moves are Adam's with that mean.
     """
-    directions = rng.standard_normal((20_000, 3))
-    basis = optim.basis(directions, np.zeros(3))
+    directions = dense.directions(rng.standard_normal((20_000, 3)), np.zeros(3))
+    basis = dense.sh_basis(directions)
     grad = 1e-4 * np.ones((len(basis), 16))
-    others = {"offset": np.zeros((len(basis), 4)), "opacity": np.zeros(len(basis))}
-    twin = optim.RmsProp({"sh": np.zeros((len(basis), 9, 16))} | others, basis, 0.5)
+    others = {"offset": np.zeros((len(basis), 4))}
+    values = {"sh": np.zeros((len(basis), 9, 16)), "opacity": np.zeros((len(basis), 4))} | others
+    others["opacity"] = np.zeros(len(basis))
+    twin = optim.RmsProp(values, directions, 0.5)
     adam = optim.Adam(np.zeros((len(basis), 9, 16)), beta1=0.0)
-    rates = {"sh": np.ones(9), "offset": 0, "opacity": 0}
+    rates = {"sh": np.ones(9), "offset": 0, "opacity": 0, "lobe": 0}
     twin.step(1, {"sh": grad} | others, rates, {"sh": 0.0, "offset": 1.0, "opacity": 1.0})
     adam.step(basis[:, :, None] * grad[:, None], 1.0, 0.0)
     np.testing.assert_allclose(adam.v[:, :, 0].mean(axis=0), twin.v["sh"][0, 0], rtol=0.03)
@@ -83,7 +85,7 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
 def test_points_without_a_gradient_keep_their_values(dev, rng):
     cloud, visible = Cloud(dev, rng, 257), np.arange(0, 257, 2)
     # all at a bound may stay there
-    cloud.cloud.opacity.set(rng.uniform(0.3, 0.7, 257).astype(np.float32))
+    cloud.cloud.opacity.set(rng.uniform(0.3, 0.7, (257, 4)).astype(np.float32))
 
     def state():
         moments = {name: v.get() for name, v in cloud.state.second_moments.items()}
