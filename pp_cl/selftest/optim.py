@@ -33,8 +33,8 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 class Cloud:
     """n points on the grid, with random offsets, opacities and coefficients up to a degree, and
-    their float64 twin. width: of an offset. start, learned(): of "sh" (N, count, 16), "offset" (N,
-    width), "opacity" (N, 4).
+    their float64 twin. width: of an offset. positions: (N, 3) in the world. start, learned(): of
+    "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 4).
     """
 
     def __init__(
@@ -61,10 +61,11 @@ class Cloud:
             array.set(self.start["sh"][:, block.first : block.first + block.count].copy())
         self.cloud.offset.set(self.start["offset"])
         self.cloud.opacity.set(self.start["opacity"])
-        directions = dense.directions(GRID.positions(ids), EYE)
+        self.positions = GRID.positions(ids)
+        directions = dense.directions(self.positions, EYE)
         self.twin = optim.RmsProp(self.start, directions, most, most_sh)
         self.state = PointState(dev, self.cloud)
-        self._points = seen_points(dev, GRID.positions(ids), CAMERA)
+        self._points = seen_points(dev, self.positions, CAMERA)
 
     def step(
         self,
@@ -115,7 +116,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     towards = positions - camera.eye
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
-    absent = (dev.zeros((1,)),) * 4
+    absent = (dev.zeros((1,)),) * 5
     return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 

@@ -143,8 +143,8 @@ class PointCloud:
         begins = [block.first for block in sh_blocks(2)[1:]]
         blocks = np.split(sh.clip(-most, most).astype(np.float32), begins, axis=1)
         opacities = dev.upload(_from_all_sides(opacity))
-        sh_blocks_ = [dev.upload(block) for block in blocks]
-        return cls(dev.upload(ids, np.uint32), dev.upload(padded), opacities, sh_blocks_)
+        sh_arrays = [dev.upload(block) for block in blocks]
+        return cls(dev.upload(ids, np.uint32), dev.upload(padded), opacities, sh_arrays)
 
     def learned(self) -> dict[str, Array]:
         """{name: array} of all that training changes: "offset", "opacity", and the SH by block."""

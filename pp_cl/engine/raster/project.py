@@ -31,8 +31,8 @@ class ProjectedPoints:
     (0, 0, 0, -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of
     the pixels that may be covered; last < first means none. point_shape: (N, 1) float32, the radius
     in world units; of Gaussians (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h).
-    point_opacity: (N,) float32 in [0, 1], from the eye; None of spheres. cloud_offset, radius: of
-    project_grid().
+    point_opacity: (N,) float32 in [0, 1], from the eye; of spheres undefined. cloud_offset, radius:
+    of project_grid().
     """
 
     footprint: str
@@ -41,7 +41,7 @@ class ProjectedPoints:
     point_box: Array
     point_count: Array
     point_shape: Array
-    point_opacity: Array | None = None
+    point_opacity: Array
     cloud_offset: Array | None = None
     radius: float = 0.0
 
@@ -92,7 +92,8 @@ def project_grid(
     """Project the points, each in the cell of a grid's vertex, into a camera.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
-    PointCloud.offset; of Gaussians (N, 16). opacity: (N, 4) float32, PointCloud.opacity. radius: of points without offsets, world units.
+    PointCloud.offset; of Gaussians (N, 16). opacity: (N, 4) float32, PointCloud.opacity. radius: of
+    points without offsets, world units.
     """
     n = point_id.size
     b.require(projection_table(n, footprint))

@@ -81,7 +81,7 @@ def points_of_large_parts(model: Model) -> Array:
 
 
 def highest_opacity(dev: Device, opacity: Array) -> np.ndarray:
-    """(N,) float32: PointCloud.opacity from the side from which it is highest, before the bounds."""
+    """(N,) float32 of PointCloud.opacity: from the side from which it is highest, unbounded."""
     rows = dev.download(opacity)
     return rows[:, 0] + np.linalg.norm(rows[:, 1:], axis=1)
 

@@ -11,7 +11,7 @@ from pp_cl.engine.raster.points import SH_DEGREES
 from pp_cl.engine.training.optim import Optimiser, adam_update, ema_update
 from pp_cl.engine.training.state import PointState
 from pp_cl.reference import dense, optim
-from pp_cl.selftest.optim import RATES, Cloud, adam_steps, gradients
+from pp_cl.selftest.optim import EYE, RATES, Cloud, adam_steps, gradients
 
 pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
 
@@ -115,3 +115,22 @@ def test_degrees_at_rate_0_stay(dev, rng, rates):
     for degree, rate in enumerate(rates):
         part = np.s_[:, degree**2 : (degree + 1) ** 2]
         assert (found[part] == cloud.start["sh"][part]).all() == (rate == 0)
+
+
+def test_an_opacity_moves_as_it_changes_with_what_is_learned(dev, rng):
+    """Against finite differences of the float64 opacity from the eye, inside its bounds: the first
+    step of RMSprop is the rate times the sign of the gradient.
+    """
+    cloud = Cloud(dev, rng, 31)
+    start = np.hstack([rng.uniform(0.4, 0.6, (31, 1)), rng.uniform(-0.1, 0.1, (31, 3))])
+    cloud.cloud.opacity.set(start.astype(np.float32))
+    grads = gradients(rng, 31)
+    cloud.step(grads, np.arange(31), rates=replace(RATES, opacity=0.1, lobe=0.1))
+    slope = np.empty((31, 4))
+    for k in range(4):
+        step = 1e-6 * np.eye(4)[k]
+        higher, lower = (dense.opacities(cloud.positions, EYE, start + s) for s in (step, -step))
+        slope[:, k] = (higher - lower) / 2e-6
+    moved = cloud.cloud.opacity.get() - start
+    expected = -0.1 * np.sign(grads["opacity"])[:, None] * slope
+    np.testing.assert_allclose(moved, expected, atol=1e-6)
