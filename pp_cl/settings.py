@@ -192,7 +192,7 @@ class TrainConfig:
         (3e-2, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
     )
     lobe_rate: float = setting(
-        1.0,
+        0.25,
         "learning rate of how opacities depend on the direction, times opacity_rate (0: they do"
         " not)",
         0,

@@ -7,7 +7,8 @@
 // of G^2 / (4 pi), which is the mean of Y_k^2 G^2 over the directions. They move by rate Y_k G /
 // (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike. The gradient of
 // the opacity's vector w (cloud.h) is that of the opacity times the direction, and shares its second
-// moment. Where an opacity is at a bound only what leads away from it moves w.
+// moment. Where the opacity is at a bound w
+// moves only away from it: else it would grow for as long as gradients point beyond the bound.
 //
 // A point without a gradient stays where it is; the decay of its second moments waits until it has
 // one.
@@ -99,11 +100,13 @@ kernel void rmsprop_move(
         const float w = decay * v_opacity[i] + DECAY2 * a * a;
         v_opacity[i] = w;
         const float move = a / (sqrt(w) + point_eps);
-        const float3 along = direction_of_point(camera, point_camera[i]);
-        const float moved = opacity[i].x - rate_opacity * move;
-        const float3 lobe = opacity[i].yzw - rate_lobe * move * along;
+        const float3 along = direction_of_point(camera, point_camera[i]), lobe = opacity[i].yzw;
+        const float before = opacity[i].x, seen = before + dot(lobe, along);
+        const bool stays = a < 0.0f ? seen >= 1.0f : seen <= 0.0f;
+        const float moved = before - rate_opacity * move;
+        const float3 turned = lobe - (stays ? 0.0f : rate_lobe * move) * along;
         opacity[i] = (float4)(
-            BOUNDED(moved, 0.0f, 1.0f), BOUNDED(lobe, (float3)(-1.0f), (float3)(1.0f)));
+            BOUNDED(moved, 0.0f, 1.0f), BOUNDED(turned, (float3)(-1.0f), (float3)(1.0f)));
         if (MOVES_OFFSET) {
             const Offsets u = decay * OFFSETS_AT(v_offset, i) + DECAY2 * o * o, most = MOST_OFFSET;
             OFFSETS_AT(v_offset, i) = u;

@@ -69,8 +69,10 @@ class RmsProp:
         offset = self.values["offset"] - rates["offset"] * moves["offset"]
         self.values["offset"] = np.clip(offset, -self.most, self.most)
         mean, vector = np.split(opacity, [1], axis=1)
+        seen, grad = (mean[:, 0] + (vector * self.directions).sum(1)), moves["opacity"]
+        grad_of_vector = np.where(np.where(grad < 0, seen >= 1, seen <= 0), 0, grad)[:, None]
+        vector = vector - rates["lobe"] * grad_of_vector * self.directions
         mean = mean - rates["opacity"] * moves["opacity"][:, None]
-        vector = vector - rates["lobe"] * moves["opacity"][:, None] * self.directions
         self.values["opacity"] = np.hstack([np.clip(mean, 0, 1), np.clip(vector, -1, 1)])
 
 

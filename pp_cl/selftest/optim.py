@@ -235,13 +235,10 @@ def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         for _ in range(60):
             cloud.step(gradients(rng, 257, 1e4, width), np.arange(257))
         most, learned = cloud.cloud.most_offset, cloud.learned()
-        opacity = learned["opacity"]
-        for values, bounds in (
-            (learned["offset"], (-most, most)),
-            (opacity[:, 0], (0.0, 1.0)),
-            (opacity[:, 1:], (-1.0, 1.0)),
-        ):
+        mean, vector = np.split(learned["opacity"], [1], axis=1)
+        for values, bounds in ((learned["offset"], (-most, most)), (mean, (0.0, 1.0))):
             yield exact([values.min(), values.max()], bounds)
+        yield exact(abs(vector).max() <= 1, True)
         for name in ("offset", "opacity"):
             yield finite(learned[name])
             yield absolute(learned[name], cloud.twin.values[name], 1e-5)  # sixty moves

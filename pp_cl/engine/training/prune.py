@@ -22,14 +22,14 @@ SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
 def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainConfig) -> Array:
     """(M,) uint32, ascending: the points that are kept during training. A point is judged once
     PRUNE_LOOKS steps had it in their image: it is kept if its blend weight reached
-    train.prune_weight in one of them and its opacity from some side is at least LEAST_OPACITY, and
-    its counts start anew. Points seen less often are kept.
+    train.prune_weight in one of them and its opacity, the mean of all sides, is at least
+    LEAST_OPACITY, and its counts start anew. Points seen less often are kept.
 
     The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
     Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
     weight, seen = dev.download(state.max_weight), dev.download(state.times_seen)
-    opacities = highest_opacity(dev, opacity)
+    opacities = dev.download(opacity)[:, 0]
     broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
@@ -49,15 +49,14 @@ def final_points_to_keep(
     least: int,
 ) -> Array:
     """(M,) uint32, ascending: the points of a finished training that weigh at least
-    train.prune_weight in `least` training views and have LEAST_OPACITY from some side. NaN counts
-    as too little.
+    train.prune_weight in `least` training views and have LEAST_OPACITY. NaN counts as too little.
 
     max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
     many it is train.prune_weight.
     """
     weight, seen = dev.download(max_weight), dev.download(times_seen)
     keep = (weight >= train.prune_weight) & (seen >= least)
-    return _listed(dev, keep & (highest_opacity(dev, opacity) >= LEAST_OPACITY), weight)
+    return _listed(dev, keep & (dev.download(opacity)[:, 0] >= LEAST_OPACITY), weight)
 
 
 def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Config) -> Array:
@@ -78,12 +77,6 @@ def points_of_large_parts(model: Model) -> Array:
     """(M,) uint32, ascending: the points of parts that are large enough to be of the object."""
     is_large = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
     return model.dev.upload(np.flatnonzero(is_large), np.uint32)
-
-
-def highest_opacity(dev: Device, opacity: Array) -> np.ndarray:
-    """(N,) float32 of PointCloud.opacity: from the side from which it is highest, unbounded."""
-    rows = dev.download(opacity)
-    return rows[:, 0] + np.linalg.norm(rows[:, 1:], axis=1)
 
 
 def _listed(dev, keep, weight):
