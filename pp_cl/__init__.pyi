@@ -5,6 +5,8 @@ from .errors import UserError as UserError
 from .evaluate import evaluate_run as evaluate_run
 from .files.rendered_view import RenderedView as RenderedView
 from .files.run_folder import RunFolder as RunFolder
+from .progress import Progress as Progress
+from .progress import track as track
 from .run import Run as Run
 from .run import find_run as find_run
 from .run import load as load

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View
@@ -15,6 +14,7 @@ from pp_cl.files.image import image_paths, write_png
 from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
 from pp_cl.metrics.published import differences, published_rows
+from pp_cl.progress import Progress, track
 from pp_cl.run import Run, load
 
 SHOWN_VIEWS = 4  # rows of the comparison image
@@ -66,7 +66,7 @@ def evaluate(
     run's images had gains, views are also measured after the best ones, exposed_alike().
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. A progress bar shows on a terminal. Raises UserError
+    place of what an earlier evaluation left. Progress shows on stderr. Raises UserError
     for a missing or broken split, a folder that may not be written, an `out` that holds something
     else than an evaluation, and a file in the place of one that it writes which no evaluation has
     written as it is now.
@@ -83,8 +83,7 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     costs, shown = [], []
     every = render_views(run, views)
-    bar = tqdm(every, "measuring", len(views), unit="view", leave=False, disable=None)
-    for i, rendered in enumerate(bar):
+    for i, rendered in enumerate(track(every, "measuring", "view", len(views))):
         image, truth = rendered.image, rendered.truth
         rows.append({"name": rendered.name} | measure(image, truth))
         if "exposed" in run.header:
@@ -135,7 +134,8 @@ def _about(run, costs):
 def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
     """Each view as the run renders it, in turn."""
     target = Target(run.dev)
-    run.render(views[0].camera)  # builds the programs
+    with Progress("building kernels"):
+        run.render(views[0].camera)
     for view in views:
         start = time.perf_counter()
         result = run.renderer.forward(view.camera, run.gamma)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from pp_cl.checkpoint import load_run_state
 from pp_cl.config import configure, load_config
@@ -26,6 +25,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.files.rendered_view import RenderedView, mean_rendered_view
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.progress import track
 from pp_cl.scene.identity import difference, unpacked_views
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.load import DEMO, Scene, list_split, open_scene, scene_format, scene_frames
@@ -113,10 +113,10 @@ class Run:
 
     def rendered(self, image_files: Sequence[ImageFile], *, opaque: bool) -> list[View]:
         """Views at the resolution of the run whose images are its own renderings. opaque: over
-        white, as it was trained; else straight RGBA. A progress bar shows on a terminal.
+        white, as it was trained; else straight RGBA. Progress shows on stderr.
         """
         views = []
-        for one in tqdm(image_files, "rendering", unit="view", leave=False, disable=None):
+        for one in track(image_files, "rendering", "view"):
             camera = one.camera.downscaled(self.config.scene.downscale)
             rendered = self.render(camera)
             image = _over_white(rendered) if opaque else rendered.rgba()

@@ -137,8 +137,8 @@ class TrainConfig:
     )
     minutes: float = setting(
         0.0,
-        "minutes for the steps, whose number follows from the measured speed, within 25 %; reading"
-        " the scene and `pp-cl eval` come on top (0: as many steps as set)",
+        "minutes of the training with all that comes before and after its steps, whose number"
+        " follows from the measured speed, within 15 % (0: as many steps as set)",
         0,
         1440,
     )

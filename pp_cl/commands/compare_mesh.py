@@ -5,7 +5,6 @@ of the PlenopticPoints supplemental.
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from pp_cl.checkpoint import opened_run
 from pp_cl.engine.device.device import Device
@@ -13,6 +12,7 @@ from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
+from pp_cl.progress import Progress
 from pp_cl.run import check_scene, stored_config
 from pp_cl.scene.demo import demo_mesh
 from pp_cl.scene.hull import CELL_CAP, agreeing, hull_on
@@ -35,7 +35,7 @@ def mesh_shape(dev: Device, mesh: Mesh, voxel_size: float | None, samples: int) 
 
 def _sampled(dev, mesh, grid, samples):
     """sample_surface() under a progress bar, which shows on a terminal."""
-    with tqdm(total=samples, desc="sampling", unit_scale=True, leave=False, disable=None) as bar:
+    with Progress("sampling", samples, "sample") as bar:
         return sample_surface(dev, mesh, grid, samples, advance=bar.update)
 
 

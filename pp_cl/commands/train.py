@@ -169,14 +169,14 @@ def _sizes(cameras):
 
 def _run(training, options):
     """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
-    from pp_cl.commands.progress import Progress
+    from pp_cl.commands.progress import TrainingProgress
     from pp_cl.commands.signals import first_signal
     from pp_cl.errors import Stopped
     from pp_cl.files.scalars import curves
 
     trainer, folder = training.trainer, training.folder
     with ExitStack() as stack:
-        followers = [stack.enter_context(Progress(training))]
+        followers = [stack.enter_context(TrainingProgress(training))]
         if options.tensorboard:
             drawn = curves(folder.path / "tensorboard", trainer.step)
             followers.append(stack.enter_context(drawn))

@@ -15,12 +15,12 @@ from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, border, check_downscale, evenly
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, quoted
 from pp_cl.files.image import is_transparent, read_rgba
+from pp_cl.progress import track
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.edits import EDITS, read_edits
@@ -414,7 +414,7 @@ def load_scene(
     downscale: int | None = None,
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
-    """Scene of the given splits from a folder; a progress bar shows on a terminal.
+    """Scene of the given splits from a folder; progress shows on stderr.
 
     most: views to read of each split, spread evenly; None: all. dev: removes distortion, and finds
     silhouettes for training views whose masks are missing, which are left out without it.
@@ -497,7 +497,7 @@ def _read_views(folder, image_files, masks, dev, factor, left_out):
 
     with ThreadPoolExecutor(reading_cost(image_files, masks, factor)[0]) as pool:
         reads, count = pool.map(read, image_files), len(image_files)
-        found = list(tqdm(reads, "reading images", count, unit="image", leave=False, disable=None))
+        found = list(track(reads, "reading images", "image", count))
     for image_file, error in zip(image_files, found, strict=True):
         if isinstance(error, UserError):
             left_out.append((image_file.name, error))

@@ -10,7 +10,7 @@ from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.settings import TrainConfig
 
 PLANS = 50  # in the minutes given
-FIXED = 0.8  # share of the steps after which their number stays: soon the averages begin
+FIXED = 0.8  # share of the steps after which their number rises no more: soon the averages begin
 FOG = 0.35  # of the first step's time, which later ones save: a third of the steps clears it
 DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
 ENDING = 0.15  # of a step's time, for as many pixels of a training view, which the end looks at
@@ -24,16 +24,18 @@ class Budget:
         self._train = train
         self._ending = ENDING * pixels / train.crop**2 if train.crop else 0.0  # steps
         self._times: deque[float] = deque(maxlen=MOST)
-        self._next = 0.0  # seconds of training at which to plan
+        self._last = self._next = 0.0  # seconds: of the last step, and at which to plan
 
-    def plan(self, step: int, seconds: float, took: float) -> bool:
-        """Plan if that is due after a step, which took seconds, as all up to it; whether it was."""
+    def plan(self, step: int, seconds: float) -> bool:
+        """Plan if that is due after a step, up to whose end so many seconds have passed since the
+        training was opened; whether it was.
+        """
         train = self._train
-        self._times.append(took)
+        self._times.append(seconds - self._last)
+        self._last = seconds
         if step in refine_steps(train):
             self._times.clear()
-        enough = len(self._times) >= FEWEST and seconds >= self._next
-        if not enough or step >= FIXED * train.iterations:
+        if len(self._times) < FEWEST or seconds < self._next:
             return False
         self._next = seconds + 60 * train.minutes / PLANS
         left = 60 * train.minutes - seconds
@@ -48,14 +50,18 @@ def replan(train: TrainConfig, step: int, left: float, ending: float = 0.0) -> N
     steps at last that its end takes as long as.
     """
     steps, shares = train.iterations, [share for share in train.refine_at if 0 < share < 1]
+    is_late = step >= FIXED * steps
     past = {share: at for share in shares if (at := max(1, round(share * steps))) <= step}
     to_come = [at / steps for at in refine_steps(train) if at > step]
     all_as_one, start = 0.0, 0.0
     for level, end in enumerate([*to_come, 1.0]):
         all_as_one += (end - start) * DEARER**level
         start = end
-    soonest = min([FIXED, *(share for share in shares if share not in past)])  # is not jumped over
+    # is not jumped over
+    soonest = min([1.0 if is_late else FIXED, *(share for share in shares if share not in past)])
     left -= ending * DEARER ** len(to_come)
     planned = max(round((step + left) / all_as_one), math.ceil((step + 1) / soonest))
+    if is_late and planned > steps:  # else averages would begin anew
+        return
     train.iterations = planned
     train.refine_at = tuple(past[s] / planned if s in past else s for s in train.refine_at)

@@ -28,6 +28,7 @@ from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
 from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
+from pp_cl.progress import Progress
 from pp_cl.run import Run, load_run
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import (
@@ -66,7 +67,8 @@ class Training:
 
     info: what a checkpoint's header holds beside the model's. memory_plan: the available memory and
     the plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
-    views on which train.eval_every measures PSNR.
+    views on which train.eval_every measures PSNR. began: time.monotonic() when it was opened, from
+    which train.minutes count.
     """
 
     folder: RunFolder
@@ -76,6 +78,7 @@ class Training:
     memory_plan: MemoryPlan
     hull: HullFacts | None
     measured: list[View]
+    began: float
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
     _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
@@ -126,7 +129,7 @@ class Training:
         trainer, train = self.trainer, self.config.train
         with self.folder.open_log(trainer.step) as log:
             pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
-            seconds, budget = log.seconds, Budget(train, pixels)
+            seconds, budget, earlier = log.seconds, Budget(train, pixels), log.seconds
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < train.iterations:
@@ -140,7 +143,8 @@ class Training:
                 took = time.perf_counter() - start
                 seconds += took
                 is_planned = train.minutes and not trainer.begun
-                if is_planned and budget.plan(trainer.step, seconds, took):
+                passed = earlier + time.monotonic() - self.began
+                if is_planned and budget.plan(trainer.step, passed):
                     trainer.take_plan()
                     self.folder.configure(self.config.to_json())
                 if trainer.step == first and not any(self.folder.previews.glob("*.png")):
@@ -244,6 +248,7 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
     written, and for images in it that would be lost.
     """
+    began = time.monotonic()
     check_target(folder.config)
     folder.check_sheets(0)
     net = begin_network(dev, config)
@@ -253,9 +258,10 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     views, info = _read_views(dev, config, split_files)
 
     start = time.perf_counter()
-    agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
-    seconds = time.perf_counter() - start
-    sheet = sheet_of_masks(dev, views, hull, agreement.left_out)
+    with Progress("carving the visual hull"):
+        agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
+        seconds = time.perf_counter() - start
+        sheet = sheet_of_masks(dev, views, hull, agreement.left_out)
 
     cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
     model = Model(dev, hull.grid, depth_range, cloud, net=net)
@@ -264,7 +270,7 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     if agreement.left_out:
         info["left_out"] = list(agreement.left_out)
     facts, measured = HullFacts(hull.capped, seconds, sheet), _measured_views(dev, config)
-    return Training(folder, config, trainer, info, memory_plan, facts, measured)
+    return Training(folder, config, trainer, info, memory_plan, facts, measured, began)
 
 
 def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
@@ -274,7 +280,7 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     every schedule ends at the last step, so it is not what it would have been from its beginning.
     Raises UserError as begin_training() does, and for a checkpoint of another scene.
     """
-    header, arrays = stored
+    began, (header, arrays) = time.monotonic(), stored
     check_target(folder.config)
     folder.check_sheets(header["step"])
     begun = header["step"] if header["finished"] else header.get("extended_from", 0)
@@ -303,7 +309,7 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
     measured = _measured_views(dev, config)
-    return Training(folder, config, trainer, info, memory_plan, None, measured)
+    return Training(folder, config, trainer, info, memory_plan, None, measured, began)
 
 
 def _read_views(dev: Device, config: Config, split_files: SplitFiles):

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
+from pp_cl import track
 from pp_cl.engine import evenly
 from pp_studio.capture.packages import needed
 from pp_studio.capture.window import Window, dilated
@@ -47,7 +47,7 @@ def differences(
     """
     eyes = np.stack([one.camera.eye for one in windows])
     found = []
-    for i, one in enumerate(tqdm(windows, "backgrounds", unit="image", leave=False, disable=None)):
+    for i, one in enumerate(track(windows, "backgrounds", "image")):
         order = np.argsort(np.linalg.norm(eyes - one.camera.eye, axis=1), kind="stable")
         others = [windows[k] for k in order[1:]]
         if beside is not None:

@@ -6,8 +6,8 @@ the views with a forgiving hull.
 from collections.abc import Sequence
 
 import numpy as np
-from tqdm import tqdm
 
+from pp_cl import track
 from pp_cl.engine import Grid, smallest_voxel_size
 from pp_cl.errors import UserError
 from pp_studio.capture import backdrop
@@ -67,7 +67,7 @@ def cut_out_all(
 
     def cut(number):
         colours, text = _colours(windows, labels), f"cutting out, {number} of {2 + ROUNDS}"
-        for i in tqdm(left, text, unit="image", leave=False, disable=None):
+        for i in track(left, text, "image"):
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
 
     cut(1)

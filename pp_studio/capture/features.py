@@ -8,8 +8,7 @@ from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from pp_cl import Progress
 from pp_cl.errors import UserError, shown
 from pp_cl.files import mend
 from pp_studio.capture.packages import needed
@@ -80,7 +79,7 @@ def _camera(one):
 
 def _in_parts(items, count, what, unit):
     """Lists of so many of the items, under a progress bar. COLMAP leaves out what is done."""
-    with tqdm(total=len(items), desc=what, unit=unit, leave=False, disable=None) as bar:
+    with Progress(what, len(items), unit) as bar:
         for first in range(0, len(items), count):
             yield (some := items[first : first + count])
             bar.update(len(some))

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
-from tqdm import tqdm
 
+from pp_cl import track
 from pp_cl.errors import UserError, shown
 from pp_cl.files import (
     atomic_file,
@@ -123,7 +123,7 @@ def _photographs(folder, images):
         targets.append(images / name)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         made = pool.map(lambda file, target: _take(folder, file, target), files, targets)
-        yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
+        yield from track(made, "frames", "image", len(files))
     for file in listed(folder, RAW):
         source = file.relative_to(folder).as_posix()
         yield {"source": source, "reason": f"is raw ({file.suffix}): write JPEGs of it"}
@@ -229,8 +229,7 @@ def _frames(video, images):
     wanted = "+".join(f"({one})" for one in some)
     frames = _decoded(video, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
     next(frames)  # what is said of the video
-    bar = tqdm(chosen, "frames", unit="image", leave=False, disable=None)
-    for number, frame in zip(bar, frames, strict=False):
+    for number, frame in zip(track(chosen, "frames", "image"), frames, strict=False):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
         with atomic_file(images / name) as file:
             image.save(file, "JPEG", **QUALITY)
@@ -244,8 +243,8 @@ def _sharpest(video):
     meta = next(frames)
     # an estimate, for the bar alone: what browsers record states no length
     total = round(meta["duration"] * meta["fps"]) or None
-    bar = tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
-    sharpness = [_look(Image.fromarray(frame[..., 0]))["sharpness"] for frame in bar]
+    looking = track(frames, "looking at frames", "frame", total)
+    sharpness = [_look(Image.fromarray(frame[..., 0]))["sharpness"] for frame in looking]
     if not sharpness:
         raise UserError(f"{video}: holds no frames; give another video")
     count = len(sharpness)

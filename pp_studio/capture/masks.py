@@ -13,8 +13,8 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes
 from skimage.measure import label
 from skimage.segmentation import find_boundaries
-from tqdm import tqdm
 
+from pp_cl import track
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, few_names, shown
 from pp_cl.files import contact_sheet, read_mask, read_rgba, write_png
@@ -93,7 +93,7 @@ def write_masks(
     shown = [i for i, one in enumerate(image_files) if place_of(one, box)]
     shown = shown or list(range(len(image_files)))  # which window() refuses
     beside = {one.name for one in image_files} - {image_files[i].name for i in shown}
-    for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
+    for one in track(left, "masks", "image"):
         source, mask = _found(scene, one, given, sources or {}, fitted, words)
         if mask is None and one.name in beside:  # as videos have, where they begin or end
             source = "empty, as the object is outside"
@@ -104,8 +104,8 @@ def write_masks(
     if _without_mask(scene, image_files):
         inside = ((points > box[0]) & (points < box[1])).all(1)
         in_view, seen = [image_files[i] for i in shown], [seen[i] for i in shown]
-        bar = tqdm(in_view, "reading images", unit="image", leave=False, disable=None)
-        windows = [_window(scene, one, box) for one in bar]
+        reading = track(in_view, "reading images", "image")
+        windows = [_window(scene, one, box) for one in reading]
         of_object = [points[some[inside[some]]] for some in seen]
         how |= _uniform(scene, in_view, windows, box, of_object)
         if _without_mask(scene, in_view):
@@ -205,7 +205,7 @@ def _uniform(scene, image_files, windows, box, points):
     for i, mask in found.items():
         windows[i].mask = mask
     spots = _spots(windows, found, box) if with_holes and found else {}
-    for i in tqdm(found, "masks", unit="image", leave=False, disable=None):
+    for i in track(found, "masks", "image", len(found)):
         name, one = image_files[i].name, windows[i]
         mask, one.mask = uniform_mask(read_rgba(scene / name), name, with_holes), None
         if mask is None:
@@ -286,7 +286,7 @@ def _cut(scene, image_files, windows, box, points, inside, seen, turns, grows):
             break
         box = larger
         windows = [_window(scene, one, box) for one in image_files]
-    for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
+    for i in track(left, "masks", "image"):
         name = image_files[i].name
         mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
         write_png(mask_file(scene, name), mask)

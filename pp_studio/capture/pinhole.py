@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
+from pp_cl import track
 from pp_cl.engine import Device
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file, read_rgba, write_png
@@ -57,7 +57,7 @@ def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[
     threads = min(os.cpu_count() or 1, MOST_DECODED // (DECODED * most))
     with ThreadPoolExecutor(max(1, threads)) as pool:
         made = pool.map(write, left)
-        list(tqdm(made, "images", len(left), unit="image", leave=False, disable=None))
+        list(track(made, "images", "image", len(left)))
     return len(left)
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from pp_cl import Camera
+from pp_cl import Camera, Progress
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_folder
 from pp_cl.scene import ImageFile, LensDistortion
@@ -52,7 +51,8 @@ def place(
             best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()))
             for folder in list(unfinished.iterdir()):
                 shutil.rmtree(folder)
-            refine(best)
+            with Progress("refining all poses"):
+                refine(best)
             best.write(unfinished)
         placed = {image.name for image in best.images.values() if image.has_pose} if found else ()
         reasons = _reasons(database, taken, placed)
@@ -88,9 +88,9 @@ def _mapped(database, images, folder, count, turns):
             options.min_num_matches = max(options.min_num_matches, int(FEW * usual))
             options.mapper.init_min_tri_angle = CLOSER
             options.ba_refine_extra_params = False  # refine() finds them
-        with tqdm(total=count, desc="poses", unit="image", leave=False, disable=None) as bar:
+        with Progress("poses", count, "image") as bar:
             models = colmap.incremental_mapping(
-                database, images, folder, options, next_image_callback=lambda: bar.update()
+                database, images, folder, options, next_image_callback=bar.update
             )
             return list(models.values())
 

@@ -3,7 +3,9 @@
 import argparse
 import importlib
 import shlex
+import time
 from pathlib import Path
+from typing import Any
 
 from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
@@ -13,15 +15,22 @@ from pp_studio.commands.capture import add_hints
 
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
 EPILOG = """FOLDER then holds
-  index.html           the result: the model to turn, views beside their photographs, the figures
+  index.html           the result: the model to turn, views beside their photographs, the figures;
+                       it is there from the cameras on, and grows
   model.html           the model alone, on one page
   video.mp4, splat.ply once around the object; 3D Gaussians for other viewers
   thumbnail.png        an image of it
   scene, run           what was captured of photographs; the training, which all other commands take
-Its parts are capture, train, eval, render and export. The same command goes on where it stopped."""
+Its parts are capture, train, eval, export and render. The same command goes on where it stopped."""
 MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
 # the preset of so many minutes: on two cores with AVX-512 the steps of `small` take 7, of `full` 25
 PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
+# Of the minutes, those that evaluation, splat and video take after the training: a share of what
+# the capture leaves, within these.
+AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
+LEAST_TRAINING = 0.6  # of what the capture leaves; after a long capture, 0.25 of all
+PER_PHOTOGRAPH = 0.05  # minutes that a capture takes, about: on two cores with AVX-512
+FPS, LEAST_FPS, SECONDS = 30, 8, 4  # of the video
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,14 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--minutes",
         type=shared.number(0.1, MOST_MINUTES),
         metavar="N",
-        help=f"minutes of training ({MINUTES:g}); finding cameras and masks and fitting the splat"
-        " come on top",
+        help=f"minutes for all of it ({MINUTES:g}); where finding cameras and masks takes most of"
+        " them, a quarter comes on top",
     )
     add(
         "--preset",
         choices=list(PRESET_FROM)[::-1],
-        help="of the training (by the minutes: tiny below 8, small below 30, so also without"
-        " --minutes, then full)",
+        help="of the training (by its minutes: tiny below 8, small below 30, then full)",
     )
     add_hints(parser)
     shared.add_device(parser)
@@ -49,36 +57,115 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Do the steps that are left, and say what to open."""
     from pp_cl import RunFolder, load
-    from pp_studio.export.result import INDEX, SPLAT, begin_result, write_result
+    from pp_studio.export.result import INDEX, SPLAT, begin_result, is_newer, write_result
+    from pp_studio.export.result import MINUTES as PASSED
 
     out, is_scene = Path(options.out), _is_scene(options.source)
     if is_scene:
         shared.refuse(options, ("turntable", "mask_command", "box"), "only of photographs")
     begin_result(out)
     device = ["--device", options.device] if options.device else []
-    folder, scene, masks, told = RunFolder(out / "run"), options.source, [], []
-    if is_scene:
-        masks = ["--masks", options.masks] if options.masks else []
-    else:
-        scene = str(out / "scene")
-        _step("capture", options.source, "--out", scene, *_hints(options))
-        told = _captured(Path(scene))
-    if not folder.config.exists():
-        minutes = options.minutes or MINUTES
-        chosen = next(name for name, least in PRESET_FROM.items() if minutes >= least)
-        preset = ["--preset", options.preset or chosen, "--minutes", f"{minutes:g}"]
-    else:  # as it began, unless told otherwise, which train refuses
-        preset = ["--preset", options.preset] if options.preset else []
-        preset += ["--minutes", f"{options.minutes:g}"] if options.minutes else []
-    _step("train", scene, "--out", str(folder), *preset, *masks, *device)
-    split = _held_out(scene)
-    _step("eval", str(folder), "--split", split, *device)
-    video = _video()
-    for name, file, words in (("render", video, []), ("export", SPLAT, ["--format", "splat"])):
-        if not _is_newer(out / file, folder.checkpoint):
-            _step(name, str(folder), "--out", str(out / file), *words, *device)
-    write_result(load(folder.path, options.device), split, out, video, told)
-    print(f"wrote {out / INDEX}: open it in a browser; `pp-cl view {folder}` shows the exact model")
+    folder, scene, masks = RunFolder(out / "run"), options.source, []
+    video, page = _video(), out / INDEX
+    told: list[str] = []
+
+    def show(split=""):
+        run = load(folder.path, options.device) if folder.checkpoint.exists() else None
+        write_result(run, split, out, video, told, scene)
+
+    with _Clock(out / PASSED, options.minutes) as clock:
+        if is_scene:
+            masks = ["--masks", options.masks] if options.masks else []
+        else:
+            scene = str(out / "scene")
+            if not (Path(scene) / "transforms.json").exists():
+                clock.tell_of_capture(options.source)
+            _step("capture", options.source, "--out", scene, *_hints(options))
+            told = _captured(Path(scene))
+        if not folder.checkpoint.exists():
+            show()
+            print(f"wrote {page}: open it in a browser; it grows as parts are done")
+        if not folder.config.exists():
+            training = clock.training()
+            chosen = next(name for name, least in PRESET_FROM.items() if training >= least)
+            preset = ["--preset", options.preset or chosen, "--minutes", f"{training:.3g}"]
+        else:  # as it began, unless told otherwise, which train refuses
+            preset = ["--preset", options.preset] if options.preset else []
+        _step("train", scene, "--out", str(folder), *preset, *masks, *device)
+        split = _held_out(scene)
+        show(split)
+        print(f"wrote {page}: with the model; figures, splat and video follow")
+        _step("eval", str(folder), "--split", split, *device)
+        show(split)
+        if not is_newer(out / SPLAT, folder.checkpoint):
+            words = ["--format", "splat"]
+            _step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
+            show(split)
+        if not is_newer(out / video, folder.checkpoint):
+            words = ["--fps", f"{_fps(folder, split, clock.left):d}"]
+            _step("render", str(folder), "--out", str(out / video), *words, *device)
+            show(split)
+    print(
+        f"wrote {page} in {clock.passed:.1f} minutes; `pp-cl view {folder}` shows the exact model"
+    )
+
+
+class _Clock:
+    """The minutes of all of it: those asked for, and those that have passed, which a file keeps for
+    the same command to go on. Raises UserError where others were asked for before.
+    """
+
+    def __init__(self, file: Path, asked: float | None) -> None:
+        from pp_cl.scene import read_json
+
+        known: dict[str, Any] = read_json(file) if file.exists() else {}
+        self.minutes = known.get("asked", asked or MINUTES)
+        if asked not in (None, self.minutes):
+            raise UserError(
+                f"{file.parent}: was begun with --minutes {self.minutes:g}; leave it out, or choose"
+                " another --out"
+            )
+        self._file, self._before = file, known.get("passed", 0.0)
+        self._began = time.monotonic()
+
+    def __enter__(self) -> "_Clock":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        from pp_cl.files import write_json
+
+        write_json(self._file, {"asked": self.minutes, "passed": round(self.passed, 2)})
+
+    @property
+    def passed(self) -> float:
+        """Minutes since the beginning, without those between two commands."""
+        return self._before + (time.monotonic() - self._began) / 60
+
+    @property
+    def left(self) -> float:
+        """Minutes that are left, a tenth of them if there are none."""
+        return max(self.minutes - self.passed, 0.1)
+
+    def tell_of_capture(self, source: str) -> None:
+        """Say how the minutes are divided, before the photographs are looked at."""
+        count = sum(1 for _ in Path(source).glob("*")) if Path(source).is_dir() else 0
+        capture = min(PER_PHOTOGRAPH * count or 3.0, self.minutes)
+        print(
+            f"{self.minutes:g} min: about {capture:.1f} for cameras and masks, a quarter of the"
+            " rest for evaluation, splat and video, and what is left for the training",
+            flush=True,
+        )
+
+    def training(self) -> float:
+        """Minutes of the training; says how the rest is divided."""
+        left = max(self.minutes - self.passed, LEAST_TRAINING * self.minutes / 2)
+        after = min(max(AFTER * left, LEAST_AFTER), MOST_AFTER, (1 - LEAST_TRAINING) * left)
+        print(
+            f"{self.minutes:g} min: {self.passed:.1f} have passed, {left - after:.1f} for the"
+            f" training, {after:.1f} for evaluation, splat and video",
+            flush=True,
+        )
+        return left - after
 
 
 def _is_scene(source):
@@ -131,16 +218,21 @@ def _video():
     return VIDEOS[0]
 
 
+def _fps(folder, split, minutes):
+    """Frames a second of a video that takes so many minutes, about: by the time that a frame of the
+    evaluation took.
+    """
+    from pp_cl.scene import read_json
+
+    seconds = read_json(folder.metrics(split))["seconds_per_frame"]
+    return int(min(max(LEAST_FPS, 60 * minutes / (SECONDS * seconds)), FPS))
+
+
 def _held_out(scene):
     """The split that is measured: train where no views are held out."""
     from pp_cl.scene import scene_splits
 
     return "test" if "test" in scene_splits(scene) else "train"
-
-
-def _is_newer(file, other):
-    """Whether a file is there, and was written after another one."""
-    return file.exists() and file.stat().st_mtime_ns > other.stat().st_mtime_ns
 
 
 def _step(name, *words):

@@ -94,9 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a video of them where one is asked for."""
-    from tqdm import tqdm
-
-    from pp_cl import load
+    from pp_cl import Progress, load
     from pp_cl.files import own
     from pp_studio.export.render_video import render_frames, render_video
     from pp_studio.video import check_video
@@ -117,7 +115,7 @@ def run(options: argparse.Namespace) -> None:
     if kind in VIDEOS and not options.out:
         own(out.parent, [out], "move it away, or choose another --out")
     seconds = []
-    with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
+    with Progress("rendering", len(cameras), "frame") as bar:
 
         def on_frame(took):
             bar.update()

@@ -8,17 +8,36 @@ The trainer does it, with the footprint "gaussian" and means of features in plac
 from __future__ import annotations
 
 import copy
+import hashlib
+import json
 import warnings
+import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
+from scipy.spatial.transform import Rotation
 
-from pp_cl import Config, Run
+from pp_cl import Config, Run, track
 from pp_cl.engine import MIN_SIDE, Crop, Crops, Means, Model, PointCloud, Trainer, View
 from pp_cl.errors import UserError
+from pp_cl.files import atomic_file
 from pp_studio.camera_path import between
-from pp_studio.export.harmonics import fit_harmonics
+from pp_studio.export import WINDOW
+from pp_studio.export.harmonics import COUNT, fit_harmonics
+
+FILE = "gaussians.npz"  # in the folder of a run
+# Of a Gaussian, see fitted_gaussians()
+GAUSSIAN = np.dtype(
+    [
+        ("position", "<f4", 3),
+        ("harmonics", "<f4", (COUNT, 3)),
+        ("opacity", "<f4"),
+        ("deviations", "<f4", 3),
+        ("turn", "<f4", 4),
+    ]
+)
+LEAST_OPAQUE = 1 / 255  # what viewers leave out
 
 STEPS = 7000
 # Of the steps of windows larger than the images, those that draw renderings as large as these, each
@@ -85,17 +104,90 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
     scale = min(int(samples), CROP // LEAST_CROP)
     config = _config(run.config, scale)
     trainer = Trainer(dev, config, model, views)
-    steps = tqdm(
-        range(config.train.iterations), "fitting Gaussians", unit="step", leave=False, disable=None
-    )
-    for step in steps:
-        if step in (0, round(COARSE * len(steps))):
+    steps = config.train.iterations
+    for step in track(range(steps), "fitting Gaussians", "step"):
+        if step in (0, round(COARSE * steps)):
             net.scale = scale if step else 1
             trainer.crops = LargeCrops(trainer.views, config, net.scale, samples)
         trainer.train_step()
     trainer.check()
     trainer.finish()
     return cloud, config.raster.radius * run.model.grid.voxel_size
+
+
+def fitted_gaussians(run: Run, window: int = WINDOW) -> tuple[np.ndarray, np.ndarray]:
+    """((M,) records of GAUSSIAN, (3,) float64 origin): the run as Gaussians that are drawn without
+    its network, in the axes and units of its scene, as 3D Gaussian splatting defines them.
+
+    position: (3,) float32, the mean, relative to the origin. deviations: (3,) float32, standard
+    deviations along a Gaussian's own axes (what files call scales, without a logarithm). turn: (4,)
+    float32, the unit quaternion (w, x, y, z) that turns these axes to the world's. opacity: float32
+    in (1/255, 0.99], after the sigmoid. harmonics: (9, 3) float32, coefficients of degrees 0 to 2
+    for the three channels of sRGB less 0.5, basis and signs of 3D Gaussian splatting, of the unit
+    direction from the eye to the mean.
+
+    Fitted once for a checkpoint and kept in the run's folder as FILE; later calls read that. Raises
+    UserError as check_drawable does.
+    """
+    check_drawable(run)
+    path, origin = run.folder.path / FILE, run.model.grid.centre
+    key = _key(run, window)
+    table = _kept(path, key)
+    if table is None:
+        table = _table(run, *fit_gaussians(run, window))
+        try:
+            with atomic_file(path) as file:
+                np.savez(file, key=np.array(key), gaussians=table)
+        except UserError as error:
+            warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
+    return table, origin
+
+
+def _key(run, window):
+    """What the Gaussians depend on, as text."""
+    cloud, digest = run.model.cloud, hashlib.sha256()
+    for array in (cloud.ids, cloud.offset, cloud.opacity):
+        digest.update(array.get().tobytes())
+    return json.dumps([digest.hexdigest(), run.header["step"], window, STEPS])
+
+
+def _kept(path: Path, key: str) -> np.ndarray | None:
+    """The Gaussians of a file that has this key, None where there is none or it is damaged."""
+    try:
+        with np.load(path) as stored:
+            table = stored["gaussians"] if str(stored["key"]) == key else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return table if table is not None and table.dtype == GAUSSIAN else None
+
+
+def _table(run, cloud, deviation):
+    """The visible ones as records of GAUSSIAN, relative to the centre of the run's grid."""
+    opacity, offset = cloud.opacity.get()[:, 0].clip(0, MOST_OPAQUE), cloud.offset.get()
+    rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
+    vertices = grid.positions(cloud.ids.get()[rows]) - grid.centre
+    table = np.zeros(len(rows), GAUSSIAN)
+    table["position"] = vertices + grid.voxel_size * offset[rows, :3]
+    table["harmonics"] = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
+    table["harmonics"][:, 0] -= 0.5 / CONSTANT
+    table["opacity"] = opacity[rows]
+    axes, table["deviations"], _ = np.linalg.svd(deviation * triangles(offset[rows]))
+    axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
+    table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
+    return table
+
+
+def check_drawable(run: Run) -> None:
+    """Raise UserError unless the run's points are composited by alpha, with soft footprints: no
+    others are drawn without the network.
+    """
+    raster = run.config.raster
+    if (raster.blend, raster.footprint) != ("alpha", "soft"):
+        raise UserError(
+            f"{run.folder.config}: raster.blend {raster.blend} with raster.footprint"
+            f" {raster.footprint} can only be drawn by the run itself, unlike alpha with soft;"
+            " choose another --format"
+        )
 
 
 def triangles(offset: np.ndarray) -> np.ndarray:

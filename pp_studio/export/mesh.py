@@ -9,9 +9,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
-from tqdm import tqdm
 
-from pp_cl import Run
+from pp_cl import Run, track
 from pp_cl.errors import UserError
 from pp_studio.export.fusion import box_around, fuse
 from pp_studio.export.gltf import gltf_colours, write_glb
@@ -45,7 +44,7 @@ def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.nda
     UserError where there is none.
     """
     grid = box_around(run.model.grid, run.model.cloud.ids.get())
-    cameras = tqdm(run.cameras("train"), "depths", unit="view", leave=False, disable=None)
+    cameras = track(run.cameras("train"), "depths", "view")
     distances = fuse(grid, ((camera, run.render(camera)) for camera in cameras))
     outside = np.pad(distances, 1, constant_values=1)  # closes what no view shows
     if outside.min() >= 0:

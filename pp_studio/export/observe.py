@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from tqdm import tqdm
 
-from pp_cl import Camera, Run
+from pp_cl import Camera, Run, track
 from pp_cl.engine import RenderResult
 
 COLOURS = slice(3)  # of the 16 features that are blended here; that behind them is 0 in all points
@@ -72,7 +71,7 @@ def observe(
 
 def progress(cameras: list[Camera], text: str) -> Iterable[Camera]:
     """The cameras, with a progress bar on a terminal."""
-    return tqdm(cameras, desc=text, unit="view", leave=False, disable=None)
+    return track(cameras, text, "view")
 
 
 def look(run: Run, camera: Camera, *, blending: bool = False) -> Observation:

@@ -13,10 +13,11 @@ import numpy as np
 
 from pp_cl import Camera, Run
 from pp_cl.engine import Grid
-from pp_cl.errors import UserError, name_of
+from pp_cl.errors import name_of
 from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
 from pp_cl.scene import up_of
 from pp_studio.camera_path import level
+from pp_studio.export.gaussians import check_drawable
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 # Bytes of a point: place (3, uint16), opacity (uint16), coefficients (27, uint8), logarithm of the
@@ -119,19 +120,6 @@ def still(run: Run) -> np.ndarray:
     focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     camera = Camera.look_at(eye, centre, up, fx=focal, width=width, height=height)
     return to_8bit(run.render(camera).colour)
-
-
-def check_drawable(run: Run) -> None:
-    """Raise UserError unless the run's points are composited by alpha, with soft footprints: no
-    others are drawn without the network.
-    """
-    raster = run.config.raster
-    if (raster.blend, raster.footprint) != ("alpha", "soft"):
-        raise UserError(
-            f"{run.folder.config}: raster.blend {raster.blend} with raster.footprint"
-            f" {raster.footprint} can only be drawn by the run itself, unlike alpha with soft;"
-            " choose another --format"
-        )
 
 
 def _header(run, low, span):

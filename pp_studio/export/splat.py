@@ -11,20 +11,11 @@ from scipy.spatial.transform import Rotation
 from pp_cl import Run
 from pp_cl.files import atomic_path, to_8bit
 from pp_cl.scene import up_of
-from pp_studio.export.gaussians import (
-    CONSTANT,
-    FACTORS,
-    MOST_OPAQUE,
-    ORDER,
-    fit_gaussians,
-    triangles,
-)
+from pp_studio.export.gaussians import CONSTANT, FACTORS, ORDER, fitted_gaussians
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.harmonics import COUNT, basis
-from pp_studio.export.page import check_drawable
 from pp_studio.export.points import in_world, inside, table_of, write_elements
 
-LEAST_OPAQUE = 1 / 255  # what viewers leave out
 # In a .spz: steps of a place in the widest deviation of the smallest Gaussian, and of harmonics
 # above degree 0, half of all bytes: a multiple of 1/128, of which its bytes are. With 1/16 they are
 # 4 % more, and lego loses 0.05 dB less; two steps, one a degree, take more bytes than their mean.
@@ -33,45 +24,25 @@ STEP_OF_HARMONICS = 5 / 64
 STORED = 16  # functions in a .ply: many programs read no file but of degree 3
 Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in glTF
 
-SPLAT = np.dtype(
-    [
-        ("position", "<f4", 3),
-        ("harmonics", "<f4", (COUNT, 3)),
-        ("opacity", "<f4"),
-        ("deviations", "<f4", 3),
-        ("turn", "<f4", 4),
-    ]
-)
-
 
 def splats(
     run: Run, turn: np.ndarray, window: int, box: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of SPLAT, (3,) origin): the run as Gaussians, fitted to renderings of `window`
-    pixels, in the world of its scene turned by (3, 3), those in a box (2, 3) or all. Positions are
-    relative to the origin, which is 0 unless float32 is too coarse there. harmonics: in the order
-    and with the signs of 3D Gaussian splatting, of colours less 0.5; opacity: after the sigmoid;
-    deviations: along a Gaussian's own axes, which the quaternion turn (w, x, y, z) turns to the
-    world's.
-    Raises UserError as check_drawable and inside() do.
+    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() for a `window` in the world
+    turned by (3, 3), those in a box (2, 3) of the scene or all. Positions are relative to the
+    origin, which is 0 unless float32 is too coarse there. Raises UserError as fitted_gaussians and
+    inside() do.
     """
-    check_drawable(run)
-    cloud, deviation = fit_gaussians(run, window)
-    opacity, offset = cloud.opacity.get()[:, 0].clip(0, MOST_OPAQUE), cloud.offset.get()
-    rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
-    positions = grid.positions(cloud.ids.get()[rows]) + grid.voxel_size * offset[rows, :3]
+    table, centre = fitted_gaussians(run, window)
+    positions = table["position"] + centre
     held = inside(positions, box)
-    rows, positions = rows[held], positions[held] @ turn.T
-    coefficients = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
-    near = in_world(positions, grid.voxel_size).dtype == np.float32
+    table, positions = table[held], positions[held] @ turn.T
+    near = in_world(positions, run.model.grid.voxel_size).dtype == np.float32
     origin = np.zeros(3) if near else np.rint(positions.mean(0))
-    table = np.zeros(len(rows), SPLAT)
     table["position"] = positions - origin
-    table["harmonics"] = _turned(coefficients, turn)
-    table["opacity"] = opacity[rows]
-    axes, table["deviations"], _ = np.linalg.svd(deviation * turn @ triangles(offset[rows]))
-    axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
-    table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
+    table["harmonics"] = _turned(table["harmonics"], turn)
+    axes = Rotation.from_matrix(turn) * Rotation.from_quat(np.roll(table["turn"], -1, axis=1))
+    table["turn"] = np.roll(axes.as_quat(), 1, axis=1)
     return table, origin
 
 
@@ -81,14 +52,12 @@ def upright(run: Run, up: tuple[float, float, float]) -> np.ndarray:
 
 
 def _turned(coefficients, turn):
-    """Coefficients (M, 9, 3) of colours, of turned directions and of colours less 0.5."""
+    """Coefficients (M, 9, 3) of turned directions."""
     seen = np.random.default_rng(0).normal(size=(64, 3))
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
     matrix = np.linalg.lstsq(after, before, rcond=None)[0]
-    found = np.einsum("jk,nkc->njc", matrix, coefficients)
-    found[:, 0] -= 0.5 / CONSTANT
-    return found
+    return np.einsum("jk,nkc->njc", matrix, coefficients)
 
 
 def write_splat_ply(path: Path | str, table: np.ndarray) -> None:

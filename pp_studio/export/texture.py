@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from pp_cl import Camera, RenderedView, Run
+from pp_cl import Camera, Progress, RenderedView, Run
 from pp_cl.errors import require
 from pp_cl.files import atomic_file, to_8bit
 from pp_studio.export.fusion import COVERED
@@ -40,10 +40,12 @@ def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> 
     middle = vertices.mean(0, dtype=np.float64)
     vertices = (vertices - middle).astype(np.float32)
     if len(faces) > FACES:
-        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=FACES)
+        with Progress("simplifying the surface"):
+            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=FACES)
     solid = trimesh.Trimesh(vertices, faces, process=False)
     normals = solid.vertex_normals.astype(np.float32)
-    rows, faces, uv = xatlas.parametrize(vertices, faces)
+    with Progress("unwrapping the surface"):
+        rows, faces, uv = xatlas.parametrize(vertices, faces)
     vertices, normals, faces = vertices[rows], normals[rows], faces.astype(np.int64)
     row, column, face, shares = texels(uv, faces, SIDE)
 

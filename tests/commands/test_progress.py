@@ -1,11 +1,13 @@
-"""What a training shows while it runs, on a terminal and elsewhere."""
+"""What long stages and a training show while they run, on a terminal and elsewhere."""
 
 import io
+import time
 from types import SimpleNamespace
 
 import pytest
 
-from pp_cl.commands import progress
+from pp_cl import progress
+from pp_cl.commands.progress import TrainingProgress
 
 ROW = {"psnr": 27.314, "points": 1200}
 
@@ -17,45 +19,79 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def training():
-    """A training of 400 steps of which 100 are done, on a device that uses 1.5 GiB."""
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    """What takes seconds takes hundredths."""
+    monkeypatch.setattr(progress, "REDRAWN", 0.02)
+    monkeypatch.setattr(progress, "LINES_APART", 0.02)
+    monkeypatch.setattr(progress, "_told", 0.0)
+    monkeypatch.setenv("COLUMNS", "120")
+
+
+def until(stream, text):
+    """Wait until the stream shows the text."""
+    end = time.monotonic() + 10
+    while text not in stream.getvalue():
+        assert time.monotonic() < end, stream.getvalue()
+        time.sleep(0.01)
+
+
+def test_in_a_log_a_stage_has_lines_also_within_one_long_call():
+    stream = io.StringIO()
+    for pair in progress.track([1, 2, 3], "matching", "pair", stream=stream):
+        until(stream, f"matching: {pair - 1} of 3 pairs, ")
+    lines = stream.getvalue().splitlines()
+    assert "\r" not in stream.getvalue() and "\x1b" not in stream.getvalue()
+    assert lines[0].endswith(" so far") and lines[-1].endswith(" left")
+
+
+def test_a_stage_of_unknown_length_tells_its_time():
+    stream = io.StringIO()
+    with progress.Progress("carving the visual hull", stream=stream):
+        until(stream, "carving the visual hull: 00:00 so far\n")
+
+
+def test_lines_of_all_stages_have_their_distance(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(progress, "LINES_APART", 0.5)
+    monkeypatch.setattr(progress, "_told", time.monotonic())
+    for _ in range(20):  # none of these is as long as that
+        with progress.Progress("reading", stream=stream):
+            time.sleep(0.06)
+    assert 1 <= stream.getvalue().count("\n") <= 3
+
+
+def test_a_stream_that_fails_ends_no_stage():
+    stream = io.StringIO()
+    stream.close()
+    stream.isatty = lambda: False
+    with progress.Progress("reading", 2, "image", stream=stream) as bar:
+        time.sleep(0.1)
+        bar.update()
+
+
+def test_on_a_terminal_a_bar_moves_by_itself():
+    stream = Terminal()
+    with progress.Progress("matching", 3, "pair", stream=stream) as bar:
+        bar.update()
+        until(stream, "matching:  33%")
+        bar.note = "all well"
+        until(stream, "all well")
+    assert "\n" not in stream.getvalue()
+
+
+@pytest.mark.parametrize("kind", [io.StringIO, Terminal])
+def test_a_training_tells_its_rate_points_and_memory(kind):
+    """Of 400 steps, 100 are done before."""
     trainer = SimpleNamespace(step=100, dev=SimpleNamespace(bytes=3 * 2**29))
     config = SimpleNamespace(train=SimpleNamespace(iterations=400))
-    return SimpleNamespace(trainer=trainer, config=config)
-
-
-def shown(training, stream, monkeypatch):
-    """What 300 steps print that take a second each, the first two of them a minute, and of which
-    every tenth has a row.
-    """
-    now = [1000.0]
-    monkeypatch.setattr("pp_cl.commands.progress.time.monotonic", lambda: now[0])
-    monkeypatch.setenv("COLUMNS", "120")  # the rate, as tqdm measures it, has any number of digits
-    with progress.Progress(training, stream) as follower:
-        for step in range(101, 401):
-            now[0] += 1 if step > 102 else 60
-            test = {"test_psnr": 25.5} if step == 200 else {}
-            follower(step, ROW | test if step % 10 == 0 else None)
-    return stream.getvalue()
-
-
-def test_elsewhere_there_is_a_plain_line_every_30_seconds(training, monkeypatch):
-    text = shown(training, io.StringIO(), monkeypatch)
-    lines = text.splitlines()
-    assert "\r" not in text and "\x1b" not in text
-    assert lines.pop(0) == "building kernels (once)"
-    assert [int(line.split()[1]) for line in lines] == list(range(110, 401, 30))
-    assert lines[0] == ("step 110 of 400, 1 steps/s, 04:50 left, PSNR 27.31, 1200 points, 1.50 GiB")
-    assert "PSNR 27.31 (test 25.50), 1200" in lines[3]
-    assert "00:20 left" in lines[-1]
-
-
-def test_a_terminal_has_one_line(training, monkeypatch):
-    monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
-    text = shown(training, Terminal(), monkeypatch)
-    assert text.startswith("building kernels (once)\n")
-    assert text.count("\n") == 2 and text.endswith("\n")
-    last = text.rstrip("\n").rpartition("\r")[2]
-    assert last.startswith("100%|") and " 400/400, " in last and "step/s, 00:00 left" in last
-    assert last.rstrip().endswith(", PSNR 27.31 (test 25.50), 1200 points, 1.50 GiB")
+    stream = kind()
+    with TrainingProgress(SimpleNamespace(trainer=trainer, config=config), stream) as follower:
+        until(stream, "building kernels (once): 00:0")
+        follower(101, None)
+        follower(102, None)
+        until(stream, "102 of 400" if kind is io.StringIO else "102/400")
+        follower(103, ROW | {"test_psnr": 25.5})
+        follower(104, ROW)
+        until(stream, "PSNR 27.31 (test 25.50), 1200 points, 1.50 GiB")
+        until(stream, "training: 104 of 400 steps" if kind is io.StringIO else "104/400")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError, quoted, shown
@@ -22,6 +21,7 @@ from pp_cl.files.untrusted import (
     read_regular,
     refusal,
 )
+from pp_cl.progress import track
 from pp_cl.scene.found import Fail, LeftOut, numbered, usable
 from pp_cl.scene.image_file import ImageFile
 
@@ -51,8 +51,8 @@ def hold_out(items: Sequence[Item], split: str) -> list[Item]:
 
 
 def progress(items: Sequence[Item]) -> Iterable[Item]:
-    """The items, of which a progress bar shows on a terminal where there are thousands."""
-    return tqdm(items, "listing", unit="image", leave=False, disable=None, delay=2)
+    """The items, under a bar: there may be thousands."""
+    return track(items, "listing", "image")
 
 
 # Images -------------------------------------------------------------------------------------------

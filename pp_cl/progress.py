@@ -1,0 +1,117 @@
+"""How a long stage shows that it goes on: by a bar on a terminal, elsewhere by a line now and then.
+
+It moves by itself, too, where the stage is in one long call of a library or a driver.
+"""
+
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from typing import Any, TextIO, TypeVar
+
+from tqdm import tqdm
+
+REDRAWN = 1.0  # seconds between two states of the bar
+LINES_APART = 30.0  # seconds between two lines, those of all stages
+# tqdm's, with little beside what follows; it is cut off at the right border
+FORMAT = (
+    "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"
+)
+ENDLESS = "{desc}: {elapsed}{postfix}"  # where nobody knows how much there is to do
+# of a terminal that does not tell its size, where tqdm would show nothing
+SIZE = 100, 20
+
+Item = TypeVar("Item")
+_told = time.monotonic()  # when the last line was due
+
+
+class Progress:
+    """A stage that is running: to be entered while it does. what: it does, such as `matching`;
+    total: how many units it takes, None where nobody knows; done: units that were done before.
+    stream: sys.stderr if not given. The text of `note` follows what is done.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        total: int | None = None,
+        unit: str = "",
+        *,
+        done: int = 0,
+        stream: TextIO | None = None,
+    ) -> None:
+        self.total, self.note = total, ""
+        self._what, self._unit, self._stream = what, unit, stream or sys.stderr
+        self._first = self._done = done
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._follow, daemon=True)
+
+    def __enter__(self) -> "Progress":
+        self._start, self._bar = time.monotonic(), None
+        if self._stream.isatty():
+            columns, rows = shutil.get_terminal_size(SIZE)
+            self._bar = tqdm(
+                desc=self._what,
+                total=self.total,
+                initial=self._first,
+                unit=self._unit or "it",
+                leave=False,
+                bar_format=FORMAT if self.total else ENDLESS,
+                ncols=columns,
+                nrows=rows,
+                file=self._stream,
+            )
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        if self._bar is not None:
+            self._bar.close()
+
+    def update(self, done: int = 1) -> None:
+        """Units that have been done since the last call."""
+        self._done += done
+
+    def _follow(self):
+        while not self._ended.wait(min(REDRAWN, LINES_APART)):
+            with suppress(OSError, ValueError):  # of a full disk, or a stream that was closed
+                self._show()
+
+    def _show(self):
+        global _told
+        now = time.monotonic()
+        if self._bar is not None:
+            self._bar.n, self._bar.total = self._done, self.total
+            self._bar.set_postfix_str(self.note)
+        elif now - _told >= LINES_APART:
+            _told = now
+            print(self._line(now - self._start), file=self._stream, flush=True)
+
+    def _line(self, seconds):
+        """What a file shows after so many seconds of the stage."""
+        done, passed = self._done - self._first, tqdm.format_interval(seconds)
+        parts = [f"{self._done} of {self.total} {self._unit}s"] if self.total else []
+        if self.total and done:
+            left = tqdm.format_interval((self.total - self._done) * seconds / done)
+            parts += [f"{done / seconds:.3g} a second", f"{left} left"]
+        else:
+            parts.append(f"{passed} so far")
+        return f"{self._what}: {', '.join(parts + [self.note] * bool(self.note))}"
+
+
+def track(
+    items: Iterable[Item], what: str, unit: str, total: int | None = None, **options: Any
+) -> Iterator[Item]:
+    """The items in turn, each of which is done when the next is asked for. total: their number,
+    where they do not tell it. options: of Progress.
+    """
+    if total is None and isinstance(items, Sequence):
+        total = len(items)
+    with Progress(what, total, unit, **options) as progress:
+        for item in items:
+            yield item
+            progress.update()
