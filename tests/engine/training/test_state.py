@@ -175,4 +175,4 @@ def test_refined_points_let_as_much_light_through(dev, scene, tmp_path, blend):
     trainer._refine()
     for old, new in zip(before, (opacities[0].opacity, opacities[1]["opacity"]), strict=True):
         expected = old[0] / (1 + np.sqrt(1 - old[0, 0])) if blend == "alpha" else old[0]
-        np.testing.assert_allclose(new.get(), expected, rtol=1e-5)
+        np.testing.assert_allclose(new.get(), np.tile(expected, (len(new), 1)), rtol=1e-5)
