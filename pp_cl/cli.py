@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
 
 from pp_cl import __version__
-from pp_cl.commands import COMMANDS
+from pp_cl.commands import COMMANDS, signals
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
 from pp_cl.files.atomic import mend
 
@@ -65,16 +65,18 @@ class _Parser(argparse.ArgumentParser):
 
 
 def program(argv: Sequence[str] | None = None) -> int:
-    """main() of a process of its own: a further Ctrl-C ends what Python does after it, and streams
-    may be as shells give them: closed, full, without a reader.
+    """main() of a process of its own: it ends soon after Ctrl-C or SIGTERM whatever it is doing, a
+    further Ctrl-C ends what Python does after it, and streams may be as shells give them: closed,
+    full, without a reader.
     """
+    signals.watch()
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     try:
         return main(argv)
-    except KeyboardInterrupt:  # a second one, where main() told of the first
-        return 128 + signal.SIGINT
+    except KeyboardInterrupt as second:  # where main() told of the first
+        return 128 + (second.args or [signal.SIGINT])[0]
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         for stream in (sys.stdout, sys.stderr):
@@ -90,27 +92,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # letters that its encoding lacks
             stream.reconfigure(errors="backslashreplace")
+    with signals.interrupting() as caught:
+        try:
+            words = sys.argv[1:] if argv is None else list(argv)
+            options = _parser(words[:1]).parse_args(words)
+            json_alone = getattr(options, "json", None) is sys.stdout
+            with redirect_stdout(sys.stderr) if json_alone else nullcontext():
+                options.run(options)
+            sys.stdout.flush()
+            return 0
+        except Stopped as stopped:
+            return _fail(str(stopped), stopped.status)
+        except BaseException as error:
+            if caught:  # whatever came of it: an import, say, or the end of another process
+                return _fail(signals.INTERRUPTED, 128 + caught[0])
+            return _told(error)
+
+
+def _told(error):
+    """The exit status after an exception, which is told in a line; what is a bug is raised."""
     try:
-        words = sys.argv[1:] if argv is None else list(argv)
-        options = _parser(words[:1]).parse_args(words)
-        json_alone = getattr(options, "json", None) is sys.stdout
-        with redirect_stdout(sys.stderr) if json_alone else nullcontext():
-            options.run(options)
-        sys.stdout.flush()
-        return 0
-    except _UsageError as error:
+        raise error
+    except _UsageError:
         _show(str(error))
         return 2
-    except UserError as error:
+    except UserError:
         return _fail(str(error))
-    except Stopped as stopped:
-        return _fail(str(stopped), stopped.status)
     except BrokenPipeError:  # as in `pp-cl train ... | head`
         return _fail("nobody reads the output any more", 128 + SIGPIPE)
-    except OSError as error:
+    except OSError:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
         return _fail(f"{what}; {mend(error)}")
-    except BuildError as error:
+    except BuildError:
         print(error.log.rstrip(), file=sys.stderr)
         return _fail(
             f"{error}; update the driver, choose another device with --device, or report the lines"
@@ -118,12 +131,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     except MemoryError:
         return _fail("the host has no memory left; lower --points or raise --downscale")
-    except ImportError as error:
+    except ImportError:
         if "failed to map segment" not in str(error):  # as the loader says it
             raise
         return _fail(f"no memory to load a library ({error}); raise its limit (ulimit -v)")
     except KeyboardInterrupt:
-        return _fail("interrupted", 128 + signal.SIGINT)
+        return _fail(signals.INTERRUPTED, 128 + signal.SIGINT)
 
 
 def _show_warning(message, *_args, **_kwargs):
@@ -138,6 +151,7 @@ def _show(line):
 
 def _fail(message, status=2):
     _show_warning(message)
+    signals.told.set()
     return status
 
 

@@ -319,7 +319,7 @@ def run_config(
     for key in stored.automatic:
         assign(stored, key, field_of(key).default, "preset")
     if "train.iterations" in [key for key, _, _ in given]:
-        stored.train.minutes = 0
+        stored.train.minutes = 0.0
     return configure(stored, scene, given)
 
 
@@ -358,7 +358,7 @@ def _resumed(folder, stored, scene, given):
         with opened_run(folder, stored) as run:
             if run.header["finished"]:
                 free |= {*LENGTH}
-                config.train.minutes = 0
+                config.train.minutes = 0.0
     for key, section, item in every_setting(config):
         there = getattr(getattr(stored, key.partition(".")[0]), item.name)
         asked = getattr(section, item.name)

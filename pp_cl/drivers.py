@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,20 +27,24 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
+from platformdirs import user_cache_dir
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.kernel import quiet_compiler
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import cache_folder, make_cache_folder, write_json
+from pp_cl.speeds import Listed, by_speed, identity, is_gpu
 
 RUNTIME = "intel-opencl-rt"  # Intel's CPU runtime, which the extra `cpu` brings
 RUNTIME_LIBRARIES = ("libintelocl.so", "intelocl64.dll")
 CHOSEN = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH")  # where users name drivers
 REST = "the system's OpenCL drivers"  # where nobody tells them apart before they are loaded
 SECONDS = 20  # of a driver: a first build takes 1 to 2, several times as long on a busy machine
+STALE = 20  # seconds; pyopencl keeps its cache locked for milliseconds
 BEGINS = "pp-cl begins with "  # the line of report() before it tries a driver
 TEMPORARY_CACHE = "pp-cl-cache-"
 UNSEEN = "was not seen when its driver was tried"
+NONE = 4  # of what does not match a choice
 
 LEAST_CONSTANT = 64  # bytes of constant memory, which the kernels' tables take
 
@@ -56,20 +61,23 @@ _tried: dict[str, Found] = {}  # {_kept_in() of the drivers: what this process k
 
 
 def open_device(choice: str | None = None) -> Device:
-    """Device chosen by `choice`, else PP_DEVICE, else the first GPU that works, else the first
-    other device that works.
+    """Device chosen by `choice`, else PP_DEVICE, else the one that was the fastest of those that
+    work.
 
     choice: "platform:device" as printed by `pp-cl devices`, or a part of the platform's or device's
     name; a platform's comes first, as PoCL's devices carry the name of the processor ("intel" means
-    Intel's driver wherever there is one), then the whole of a device's. Raises UserError when
-    nothing matches or nothing works; never takes another device than the one asked for.
+    Intel's driver wherever there is one), then the whole of a device's; of several the fastest.
+    Raises UserError when nothing matches or nothing works; never takes another device than the one
+    asked for.
     """
     choice = choice or os.environ.get("PP_DEVICE")
     found = list_devices()
-    wanted = sorted((f for f in found if _rank(f, choice)[0] < 4), key=lambda f: _rank(f, choice))
-    for _, device, problem in wanted:
-        if problem is None:
-            return Device(device)
+    matches = [_match(one, choice) for one in found]
+    working = [m for m, one in zip(matches, found, strict=True) if one[2] is None and m < NONE]
+    if working:
+        best = min(working)
+        alike = [one for m, one in zip(matches, found, strict=True) if m == best]
+        return Device(by_speed(alike)[0][1])
     listed = "; ".join(
         [
             f"{i} {d.name.strip()} ({d.platform.name.strip()}) {problem or 'works'}"
@@ -77,29 +85,29 @@ def open_device(choice: str | None = None) -> Device:
         ]
         + [f"{driver} {problem}" for driver, problem in list_left_out()]
     )
-    if choice and not wanted and found:
+    if choice and found and min(matches) == NONE:
         raise UserError(f"device {choice!r}: no such OpenCL device; found {listed}")
     asked = f"device {choice!r}: " if choice else ""
     raise UserError(f"{asked}no working OpenCL device (found {listed or 'none'}): {mend()}")
 
 
-def _rank(found, choice):
-    """Sort key of one list_devices() entry: (0-3 how it matches `choice`, 4 not at all; GPUs
-    first).
-    """
+def device_line(device: Device, choice: str | None) -> str:
+    """What a command says of a device, and why it is this one. choice: of open_device()."""
+    chosen = choice or os.environ.get("PP_DEVICE")
+    others = 0 if chosen else len(by_speed(list_devices())) - 1
+    why = f", the fastest of {others + 1}" if others > 0 else ""
+    return f"device: {device.name} [{device.info['platform']}]{why}"
+
+
+def _match(found, choice):
+    """How one of list_devices() matches `choice`, 0 the best, NONE not at all."""
     index, device, _ = found
-    if not choice or choice == index:
-        match = 0
-    elif choice.lower() in device.platform.name.lower():
-        match = 1
-    elif choice.lower() == device.name.strip().lower():
-        match = 2
-    else:
-        match = 3 if choice.lower() in device.name.lower() else 4
-    return match, not device.type & cl.device_type.GPU
+    word, name = (choice or index).lower(), device.name.strip().lower()
+    ways = word == index, word in device.platform.name.lower(), word == name, word in name
+    return next((n for n, matches in enumerate(ways) if matches), NONE)
 
 
-def list_devices(*, again: bool = False) -> list[tuple[str, cl.Device, str | None]]:
+def list_devices(*, again: bool = False) -> list[Listed]:
     """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices whose drivers
     neither crash nor hang. again: drivers are tried anew, not only those that are not known yet.
     """
@@ -109,7 +117,7 @@ def list_devices(*, again: bool = False) -> list[tuple[str, cl.Device, str | Non
     for *name, problem in tried["devices"]:
         known.setdefault(tuple(name), []).append(problem)
     usable = {n: lib for n, lib in find_drivers().items() if n not in tried["left_out"]}
-    found: list[tuple[str, cl.Device, str | None]] = []
+    found: list[Listed] = []
     for p, (_, owner) in enumerate(load_drivers(usable)):
         for d, device in enumerate(devices_of(owner)):
             problems = known.get(identity(device))
@@ -126,22 +134,23 @@ def list_left_out() -> list[tuple[str, str]]:
 
 def separate_devices() -> list[str]:
     """Indices "platform:device" of the devices that can work side by side: PP_DEVICE alone if it is
-    set, else the GPUs that work, else one other device. What two platforms list under one name is
-    taken for one. Raises UserError where nothing works.
+    set, else the one that open_device() takes, and where it is a GPU the others that work. What two
+    platforms list under one name is taken for one. Raises UserError where nothing works.
     """
     if os.environ.get("PP_DEVICE"):
         return [os.environ["PP_DEVICE"]]
-    working = [(i, device) for i, device, problem in list_devices() if problem is None]
-    gpus: dict[str, dict[str, list[str]]] = {}  # name: {platform: indices}
-    for index, device in working:
-        if device.type & cl.device_type.GPU:
-            platforms = gpus.setdefault(device.name.strip(), {})
-            platforms.setdefault(device.platform.name, []).append(index)
-    if gpus:
-        return [index for platforms in gpus.values() for index in next(iter(platforms.values()))]
+    working = by_speed(list_devices())
     if not working:
         open_device()  # says what is wrong
-    return [working[0][0]]
+    if not is_gpu(working[0][1]):
+        return [working[0][0]]
+    owners: dict[str, str] = {}  # {name of a GPU: the platform that it is taken of}
+    return [
+        index
+        for index, device, _ in working
+        if is_gpu(device)
+        and owners.setdefault(device.name.strip(), device.platform.name) == device.platform.name
+    ]
 
 
 def mend() -> str:
@@ -162,9 +171,8 @@ def mend() -> str:
     return f"install a driver with `{command}`; docs/install.md names those of GPUs"
 
 
-def identity(device: cl.Device) -> tuple[str, str, str]:
-    """Platform, name and version, by which a device is known again."""
-    return device.platform.name.strip(), device.name.strip(), device.driver_version.strip()
+def _is_gpu(device):
+    return bool(device.type & cl.device_type.GPU)
 
 
 def devices_of(platform: cl.Platform) -> list[cl.Device]:
@@ -195,10 +203,15 @@ def find_problem(device: cl.Device) -> str | None:
 
 def _give_cache():
     """Drivers and pyopencl fail where the user's cache cannot be written (containers, service
-    accounts): a temporary one.
+    accounts): a temporary one. And with the lock of a process that was killed in it, pyopencl waits
+    a minute at each build.
     """
     # pyopencl 2026.1 reads this variable, unset or not, where its cache cannot be written: KeyError
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
+    for lock in Path(user_cache_dir("pyopencl", "pyopencl")).glob("*/lock"):
+        with suppress(OSError):  # of another process that was faster
+            if time.time() - lock.stat().st_mtime > STALE:
+                lock.unlink()
     if sys.platform == "win32":
         return  # which has caches elsewhere
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

@@ -56,6 +56,10 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
+# Steps below which a training of a preset says that they are few: with as many, lego has about
+# 31 dB.
+FEW = {"tiny": 300, "small": 1_000, "full": 1_500, "paper": 10_000}
+
 # Pixels of the longer side that a preset reduces larger images to. full is made for 800, but those
 # of 1600 gain by it, too; with 4000 memory leaves points ten pixels apart. None: as they are.
 IMAGE_SIZES = {"tiny": 200, "small": 400, "full": 1600, "paper": None}

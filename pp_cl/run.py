@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,12 @@ from pp_cl.engine.raster.depth import depth_forward
 from pp_cl.engine.render import Renderer
 from pp_cl.engine.training.schedule import gamma_at
 from pp_cl.engine.views import View
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, few_names
 from pp_cl.files.image import to_8bit
 from pp_cl.files.rendered_view import RenderedView, mean_rendered_view
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.progress import track
+from pp_cl.scene.hull import misplaced
 from pp_cl.scene.identity import difference, unpacked_views
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.load import DEMO, Scene, list_split, open_scene, scene_format, scene_frames
@@ -59,13 +60,23 @@ class Run:
         return gamma_at(steps if self.header["finished"] else self.header["step"], steps)
 
     def scene(self, split: str) -> Scene:
-        """The run's scene with one split. Raises UserError where it is missing, broken or another
+        """The run's scene with one split, without views that the training has left out or that
+        show another place than the model's. Raises UserError where it is missing, broken or another
         one than the run has learned.
         """
         check_scene(self.config.scene.path)
         scene = open_scene(self.dev, self.config, (split,))
         self._compare(lambda: scene.splits.get("train") or self._some_views())
-        return scene
+        views, gone = scene.splits[split], set(self.header.get("left_out", []))
+        gone |= {v.name for v in misplaced(self.model.grid, self.model.cloud.ids.get(), views)}
+        left = [view for view in views if view.name not in gone]
+        if len(left) == len(views):
+            return scene
+        names = few_names([view.name for view in views if view.name in gone])
+        told = f"{split}: {len(views) - len(left)} of {len(views)} views left out: their masks"
+        told += f" are beside the model ({names})"
+        warnings.warn(f"{self.config.scene.path}: {told}", stacklevel=2)
+        return replace(scene, splits={split: left}, notes=[*scene.notes, told])
 
     def _some_views(self):
         if not self.header["pixels"]:

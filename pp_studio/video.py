@@ -19,6 +19,7 @@ MOST_FRAMES = 100_000  # of a video for pages
 CONVERTED = "scale=out_color_matrix=bt709:out_range=tv"
 TAGGED = "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 COLOURS = ["-vf", f"{CONVERTED},{TAGGED}"]
+AT_ONCE = ["-movflags", "+faststart"]  # the index comes first: browsers play it as it arrives
 MISSING = (
     "videos need imageio and imageio-ffmpeg; install them with `pip install imageio imageio-ffmpeg`"
 )
@@ -92,7 +93,7 @@ def _options(suffix, frame, fps):
     }
     if suffix == "mp4":
         coded = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
-        return options | coded | {"output_params": COLOURS}
+        return options | coded | {"output_params": [*COLOURS, *AT_ONCE]}
     pixels = "yuva420p" if alpha else "yuv420p"
     quality = ["-crf", "24", "-b:v", "0", "-auto-alt-ref", "0", *COLOURS]
     return options | {

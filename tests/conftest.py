@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 from pp_cl.scene import hull
-from pp_studio.export import gaussians, texture
+from pp_studio.export import QUALITIES, QUICK, texture
 
 # of Hypothesis: the same few examples each time, or as many as `make fuzz` is told
 settings.register_profile(
@@ -52,18 +53,23 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
     """What drivers showed the user stays unread: a cache folder for the session, with nothing in
-    it but the weights of LPIPS.
+    it but the weights of LPIPS. All processes share it, as they take the same device.
     """
     cached = cache_folder() / WEIGHTS_FILE
-    folder = tmp_path_factory.mktemp("cache")
-    lent = folder / WEIGHTS_FILE
+    folder = tmp_path_factory.getbasetemp()
+    if os.environ.get("PYTEST_XDIST_WORKER"):  # whose folder is inside that of all
+        folder = folder.parent
+    lent = folder / "cache" / WEIGHTS_FILE
+    lent.parent.mkdir(exist_ok=True)
     if cached.exists():
-        lent.symlink_to(cached.resolve())
+        with suppress(FileExistsError):
+            lent.symlink_to(cached.resolve())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PP_CACHE", str(folder))
+        patch.setenv("PP_CACHE", str(lent.parent))
         yield
     if lent.exists() and not lent.is_symlink() and not cached.exists():  # fetched by a test
-        shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
+        with suppress(FileNotFoundError):  # another process was first
+            shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -73,7 +79,7 @@ def small_work():
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hull, "COMPARED_POINTS", 8000)
-        patch.setattr(gaussians, "STEPS", 40)
+        patch.setitem(QUALITIES, QUICK, (40, 0.0))
         patch.setattr(texture, "SIDE", 256)
         yield
 

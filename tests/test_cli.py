@@ -109,4 +109,5 @@ def test_a_command_imports_its_own_module_alone():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     *_, last = done.stdout.splitlines()
-    assert set(json.loads(last)) == {"pp_cl.commands.devices", "pp_cl.commands.options"}
+    expected = {f"pp_cl.commands.{name}" for name in ("devices", "options", "signals")}
+    assert set(json.loads(last)) == expected

@@ -4,9 +4,18 @@ import json
 
 import pytest
 
-from pp_cl.config import assign, configure, help_lines, load_config, preset, validate
+from pp_cl.config import (
+    assign,
+    configure,
+    help_lines,
+    load_config,
+    preset,
+    run_config,
+    validate,
+)
 from pp_cl.engine.training import schedule
 from pp_cl.errors import UserError
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.presets import PRESETS
 from pp_cl.settings import Config
 
@@ -183,3 +192,11 @@ def test_masks_in_the_folder_of_a_scene_move_with_it(tmp_path):
     assert configure(config, there).scene.masks == str(there / "masks")
     config = configure(config, there, [("scene.masks", tmp_path / "masks", "--masks")])
     assert configure(config, here).scene.masks == str(tmp_path / "masks")
+
+
+def test_a_training_that_begins_again_writes_the_same_settings(scene, tmp_path):
+    """It was stopped before its first checkpoint; a time of 0 minutes stays a time."""
+    folder, given = RunFolder(tmp_path), [("train.iterations", "30", "--iterations")]
+    written = run_config(folder, scene, None, given).to_json()
+    folder.configure(written)
+    assert run_config(folder, scene, None, given).to_json() == written

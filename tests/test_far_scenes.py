@@ -91,7 +91,7 @@ def test_exported_points_keep_their_places_in_the_world(far_run, tmp_path):
 
 
 def test_exported_splats_keep_their_places_in_the_world(far_run, tmp_path):
-    table, origin = splats(far_run, np.eye(3), 60)
+    table, origin = splats(far_run, np.eye(3))
     write_splat_glb(tmp_path / "a.glb", table, origin)
     voxel_size = far_run.model.grid.voxel_size
     vertices = far_run.model.grid.positions(far_run.model.cloud.ids.get())

@@ -175,3 +175,17 @@ def test_a_broken_evaluation_is_one_line(finished, tmp_path):
     file.unlink()
     file.mkdir()
     assert "metrics.json: " in failure("info", run)
+
+
+def test_small_units_have_their_digits(tmp_path, capsys):
+    scene = write_ball_scene(tmp_path / "ball")
+    for file in (tmp_path / "ball").glob("*.json"):
+        data = json.loads(file.read_text())
+        for frame in data["frames"]:
+            frame["transform_matrix"] = (
+                np.array(frame["transform_matrix"]) * [1, 1, 1, 1e-6]
+            ).tolist()
+            frame["transform_matrix"][3] = [0, 0, 0, 1]
+        file.write_text(json.dumps(data))
+    assert main(["info", scene]) == 0
+    assert "cameras     0.000004000 from" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""What the mesh and the page of a run on demo lose: python tools/export_quality.py RUN."""
+"""What the mesh of a run on demo loses: python tools/export_quality.py RUN."""
 
 import argparse
 import json
@@ -11,15 +11,10 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from pp_cl.engine.grid import Grid
-from pp_cl.engine.training.target import Target
 from pp_cl.errors import UserError
-from pp_cl.files.image import to_8bit
-from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import Run, load
 from pp_cl.scene.demo import demo_mesh, distances
 from pp_studio.export.fusion import HIDDEN, box_around, fuse
-from pp_studio.export.harmonics import STEPS, basis, fit_harmonics
-from pp_studio.export.observe import directions, observe
 
 SAMPLES = 60_000  # of a surface
 EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances are asked for
@@ -71,41 +66,6 @@ def _measured(field, grid, exact, surface):
     }
 
 
-def page_rows(run: Run) -> list[dict]:
-    """PSNR of harmonics against the run's images and the photographs, in dB, means of the test
-    views.
-    """
-    views = run.scene("test").splits["test"]
-    target = Target(run.dev)
-    truths = [to_8bit(target.whole(view)) for view in views]
-    cameras = [view.camera for view in views]
-    images = [to_8bit(run.render(camera).colour) for camera in cameras]
-    network = np.mean([psnr(*pair) for pair in zip(images, truths, strict=True)])
-    rows = [{"what": "the network", "truth": round(float(network), 2)}]
-    tried = [(9, steps) for steps in (0, 1, STEPS, 7)] + [(1, STEPS), (4, STEPS)]
-    for count, steps in tried:
-        drawn = _drawn(run, fit_harmonics(run, steps, count), cameras)
-        against = {
-            name: round(float(np.mean([psnr(*p) for p in zip(drawn, others, strict=True)])), 2)
-            for name, others in (("run", images), ("truth", truths))
-        }
-        exported = ", as exported" if (count, steps) == (9, STEPS) else ""
-        rows.append({"what": f"{count} functions, {steps} more steps{exported}"} | against)
-    return rows
-
-
-def _drawn(run, coefficients, cameras):
-    """The images (H, W, 3) uint8 that a page would draw of coefficients (N, count, 3)."""
-    positions = run.model.positions()
-    drawn = []
-    for seen in observe(run, cameras, "drawing", blending=True):
-        at = basis(directions(positions[seen.visible], seen.camera))[:, : coefficients.shape[1]]
-        colours, rest = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[seen.visible]))
-        image = colours + rest[:, None]
-        drawn.append(to_8bit(image.reshape(seen.camera.height, seen.camera.width, 3)))
-    return drawn
-
-
 def main() -> int:
     """Print the rows; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -119,8 +79,8 @@ def main() -> int:
     except UserError as error:
         print(f"export_quality: {error}", file=sys.stderr)
         return 2
-    result = {"mesh": mesh_rows(run), "page": page_rows(run)}
-    for row in result["mesh"] + result["page"]:
+    result = {"mesh": mesh_rows(run)}
+    for row in result["mesh"]:
         print(row)
     if options.json:
         with open(options.json, "w", encoding="utf-8") as file:

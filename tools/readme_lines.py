@@ -40,6 +40,11 @@ def drivers() -> dict[str, int]:
     return {one.platform.name: one.native_vector_width_float for one in found}
 
 
+def machine() -> str:
+    """The processor whose lines README shows."""
+    return f"{os.cpu_count()} cores of {processor()}"
+
+
 def typed(driver: str) -> list[str]:
     """What README's commands print on a driver, in an empty folder."""
     said = []
@@ -75,7 +80,7 @@ def main() -> int:
     about = {
         "commit": git("log", "-1", "--format=%h"),
         "date": date.today().isoformat(),
-        "machine": f"{os.cpu_count()} cores of {processor()}",
+        "machine": machine(),
         "decides": digest(),
     }
     write_json(FILE, about | {"rows": rows})

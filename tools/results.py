@@ -279,7 +279,7 @@ def memory(store: Path) -> list[dict]:
 
 
 def demo(store: Path) -> list[dict]:
-    """Rows of DEMO: depth, mesh and page of the demo's runs."""
+    """Rows of DEMO: depth and mesh of the demo's runs."""
     rows = []
     short, long = (store / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
@@ -289,10 +289,8 @@ def demo(store: Path) -> list[dict]:
         rows.append({"what": f"IoU of alpha, {steps} steps", "result": f"{found['overlap']:.3f}"})
     found = read_found(store, *TOOL, "tools.export_quality", short)
     mesh = next(row for row in found["mesh"] if "as exported" in row["field"])
-    page = next(row for row in found["page"] if "as exported" in row["what"])
     near = f"{mesh['mean']} on average, median {mesh['median']}"
     rows.append({"what": "exported mesh, spacings from the surface", "result": near})
-    rows.append({"what": "exported page against the run's images", "result": f"{page['run']} dB"})
     return rows
 
 

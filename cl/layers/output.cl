@@ -46,43 +46,30 @@ kernel void residual_backward(
         grad_features[channels * i + c] += share * grad_image[3 * i + c];
 }
 
-// Without a network: the image is the mean of the first three features of scale x scale pixels.
+// Without a network: the image is the first three features.
 
-// One work-item per pixel of the image: reads the features of its pixels, writes its colours.
-kernel void mean_forward(
-    const uint height,
-    const uint width,  // of the image
-    const uint scale,
-    const uint channels,
-    global const float *features,  // (height*scale, width*scale, channels)
-    global float *image)           // (height, width, 3)
+// One work-item per pixel: reads its features, writes its colours.
+kernel void first_features_forward(
+    const uint n,                  // pixels
+    const uint channels,           // of the features
+    global const float *features,  // (H, W, channels)
+    global float *image)           // (H, W, 3)
 {
-    const uint x = get_global_id(0), y = get_global_id(1);
-    if (x >= width || y >= height) return;
-    for (uint c = 0; c < 3; c++) {
-        float sum = 0.0f;
-        for (uint j = 0; j < scale * scale; j++) {
-            const size_t row = y * scale + j / scale, column = x * scale + j % scale;
-            sum += features[(row * width * scale + column) * channels + c];
-        }
-        image[3 * ((size_t)y * width + x) + c] = sum / (scale * scale);
-    }
+    const size_t i = get_global_id(0);
+    if (i >= n) return;
+    for (size_t c = 0; c < 3; c++)
+        image[3 * i + c] = features[channels * i + c];
 }
 
-// One work-item per pixel of the features: reads the gradient of its pixel of the image, writes that
-// of its features.
-kernel void mean_backward(
-    const uint height,
-    const uint width,  // of the image
-    const uint scale,
-    const uint channels,
-    global const float *grad_image,  // (height, width, 3)
-    global float *grad_features)     // (height*scale, width*scale, channels)
+// One work-item per pixel: reads the gradient of its colours, writes that of its features.
+kernel void first_features_backward(
+    const uint n,                    // pixels
+    const uint channels,             // of the features
+    global const float *grad_image,  // (H, W, 3)
+    global float *grad_features)     // (H, W, channels)
 {
-    const uint x = get_global_id(0), y = get_global_id(1);
-    if (x >= width * scale || y >= height * scale) return;
-    const size_t from = 3 * ((size_t)(y / scale) * width + x / scale);
-    const size_t to = ((size_t)y * width * scale + x) * channels;
-    for (uint c = 0; c < channels; c++)
-        grad_features[to + c] = c < 3 ? grad_image[from + c] / (scale * scale) : 0.0f;
+    const size_t i = get_global_id(0);
+    if (i >= n) return;
+    for (size_t c = 0; c < channels; c++)
+        grad_features[channels * i + c] = c < 3 ? grad_image[3 * i + c] : 0.0f;
 }

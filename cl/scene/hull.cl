@@ -3,6 +3,8 @@
 // b.
 #include "common.h"
 
+#define NONE 0x8000  // so that doubts do not borrow from the views that reject
+
 // One work-item per word of a mask's row: reads the alpha of its 32 pixels, writes the set of those
 // above `threshold`.
 kernel void pack_mask(
@@ -47,14 +49,16 @@ kernel void widen_mask(
 // other until all are rejected too often, writes the set of those that at least `least` images see
 // and that no more masks reject than `forgiven` of all views, or the same share of those that see
 // it; those of the last word that are beyond the row say nothing. A vertex outside of an image is
-// not seen by it; where the mask ends within the image, the
-// object does, and that rejects the vertex.
+// not seen by it. Where the mask ends within the image, the object does, and that rejects the
+// vertex; where the pixel of the border that is nearest to the vertex is beside the mask, the image
+// may doubt it, which counts as one image less that sees it.
 kernel void carve(
     const uint ny,     // grid vertices
     const uint rows,   // grid rows: ny * nz
     const uint words,  // words per grid row
     const uint views,
     const uint least,                  // images
+    const uint doubts,                 // 1: images doubt what lies beside them
     const uint forgiven,               // masks
     global const float4 *projections,  // (views, 3, 4) (i, j, k, 1) -> (u w, v w, w)
     global const uint4 *view_masks,    // (views, 4) width, height, words per row, first word
@@ -65,9 +69,9 @@ kernel void carve(
     const uint word = get_global_id(0), row = get_global_id(1);
     if (word >= words || row >= rows) return;
     const float4 first = (float4)(32.0f * word, row % ny, row / ny, 1.0f);
-    uint tally[32];  // views that see the vertex, and from bit 16 on those that reject it
+    uint tally[32];  // below bit 16 NONE and the views that see the vertex, above those that reject
     for (uint b = 0; b < 32; b++)
-        tally[b] = 0;
+        tally[b] = NONE;
     uint alive = 1;
     for (uint view = 0; view < views && alive; view++) {
         const float4 pu = projections[3 * view], pv = projections[3 * view + 1],
@@ -80,17 +84,20 @@ kernel void carve(
             const float w = w0 + pw.x * b;
             const float u = (u0 + pu.x * b) / w, v = (v0 + pv.x * b) / w;
             const uint in = w > 0 && u >= 0 && u < width && v >= 0 && v < height;
-            const uint x = in ? (uint)u : 0, y = in ? (uint)v : 0;
-            const uint on = masks[mask.w + y * mask.z + (x >> 5)] >> (x & 31);
+            const uint x = w > 0 ? clamp(u, 0.0f, width - 1) : 0;
+            const uint y = w > 0 ? clamp(v, 0.0f, height - 1) : 0;
+            const uint on = masks[mask.w + y * mask.z + (x >> 5)] >> (x & 31) & 1;
             const uint counts = in | view_is_whole[view];
             tally[b] += counts + ((counts & ~(in & on)) << 16);
+            tally[b] -= doubts & ~counts & ~on & (w > 0);
             alive |= tally[b] >> 16 <= forgiven;
         }
     }
     uint in_hull = 0;
     for (uint b = 0; b < 32; b++) {
-        const uint seen = tally[b] & 0xffff, rejected = tally[b] >> 16;
-        in_hull |= (uint)(seen >= least && views * rejected <= forgiven * seen) << b;
+        const int seen = (int)(tally[b] & 0xffff) - NONE;
+        const uint rejected = tally[b] >> 16;
+        in_hull |= (uint)(seen >= (int)least && views * rejected <= forgiven * seen) << b;
     }
     bits[row * words + word] = in_hull;
 }

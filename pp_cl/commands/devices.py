@@ -14,21 +14,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the devices. Raises UserError if none works."""
+    """Print the devices, and which one is taken. Raises UserError if none works."""
     from pp_cl.drivers import list_devices, list_left_out, mend
     from pp_cl.engine.device.device import describe
+    from pp_cl.speeds import by_speed
 
-    found = [(i, describe(d), problem) for i, d, problem in list_devices(again=True)]
-    harmful = list_left_out()
-    rows = [{"index": i, **info, "problem": problem} for i, info, problem in found]
-    rows += [{"index": None, "name": name, "problem": problem} for name, problem in harmful]
-    lines = [
-        f"{i}  {info['name']}  [{info['platform']}]  "
-        f"{info['compute_units']} units, {info['memory_bytes'] / 2**30:.1f} GiB: "
-        f"{problem or 'works'}"
-        for i, info, problem in found
+    found, harmful = list_devices(again=True), list_left_out()
+    taken = [index for index, _, _ in by_speed(found)]
+    rows = [
+        {"index": i, **describe(device), "problem": problem, "default": [i] == taken[:1]}
+        for i, device, problem in found
     ]
+    lines = [
+        f"{row['index']}  {row['name']}  [{row['platform']}]  "
+        f"{row['compute_units']} units, {row['memory_bytes'] / 2**30:.1f} GiB: "
+        f"{row['problem'] or 'works'}{', taken by default' if row['default'] else ''}"
+        for row in rows
+    ]
+    rows += [{"index": None, "name": name, "problem": problem} for name, problem in harmful]
     lines += [f"left out  {name}: {problem}" for name, problem in harmful]
     shared.tell(options.json, rows, lines)
-    if not any(problem is None for _, _, problem in found):
+    if not taken:
         raise UserError(f"no working OpenCL device: {mend()}")

@@ -1,6 +1,7 @@
 """`pp-cl info`: facts about a run or a scene."""
 
 import argparse
+import math
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import few_names
@@ -110,6 +111,10 @@ def _scene_rows(facts):
     splits = ", ".join(f"{name} {count}" for name, count in facts["splits"].items())
     angle_x, angle_y = (_range(facts["field_of_view"][axis], ".1f") for axis in "xy")
     masks, stated, dropped = facts["masks"], facts["depth_range"], facts["dropped"]
+    # of world units: those that show four digits of how far the cameras are
+    distances = facts["distances"]
+    places = max(0, 3 - math.floor(math.log10(max(distances) or 1)))
+    form = f".{places}f"
     share = "" if masks["object"] is None else f", {masks['object']:.1%} of the image is object"
     rejecting = [
         f"{one['view']}: its mask rejects {one['share']:.0%} of what others agree on"
@@ -131,12 +136,12 @@ def _scene_rows(facts):
         ("view", f"{angle_x} x {angle_y} degrees"),
         ("masks", f"{masks['with_alpha']:.0%} of the training views have one{share}"),
         *(("", text) for text in rejecting),
-        ("depth range", _range(stated, ".3f") if stated else "none stated"),
-        ("cameras", f"{_range(facts['distances'], '.3f')} from {_vector(facts['looked_at'])}"),
+        ("depth range", _range(stated, form) if stated else "none stated"),
+        ("cameras", f"{_range(distances, form)} from {_vector(facts['looked_at'], places)}"),
         ("up", f"{_vector(facts['up'])} (estimated)"),
     ]
     if facts["box"]:
-        rows.append(("given box", " to ".join(map(_vector, facts["box"]))))
+        rows.append(("given box", _box(facts["box"], places)))
     if dropped:
         rows.append(("dropped", f"{few_names(dropped)} (pp_cl.json)"))
     hull = facts["hull"]
@@ -152,7 +157,7 @@ def _scene_rows(facts):
     if masks["forgiven"]:
         many = f"up to {masks['forgiven']} masks may reject a point"
         rows.append(("", f"{many}, as they contradict each other"))
-    return [*rows, ("box", " to ".join(map(_vector, hull["box"])))]
+    return [*rows, ("box", _box(hull["box"], places))]
 
 
 def _sizes(images):
@@ -174,6 +179,10 @@ def _range(values, form):
     return low if low == high else f"{low} to {high}"
 
 
-def _vector(values):
+def _vector(values, places=3):
     """(x, y, z), without the sign of -0.000."""
-    return "(" + ", ".join(f"{round(value, 3) + 0.0:.3f}" for value in values) + ")"
+    return "(" + ", ".join(f"{round(value, places) + 0.0:.{places}f}" for value in values) + ")"
+
+
+def _box(corners, places):
+    return " to ".join(_vector(corner, places) for corner in corners)

@@ -17,10 +17,10 @@ from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run, scene_is_there, stored_config
-from pp_cl.scene.agreement import Disagreement, disagreements
+from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.gaze import looked_at, up_of
-from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
+from pp_cl.scene.hull import Hull, agreeing, contradicting, spacing_pixels
 from pp_cl.scene.identity import unpacked_views
 from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits
 from pp_cl.scene.outline import SHOWN_VIEWS, outline_sheet
@@ -125,15 +125,16 @@ def describe_scene(
     frames = {split: scene_frames(path, split) for split in names}
     opened = open_scene(dev, config, ("train",))
     views = opened.splits["train"]
-    hull, problem, box = None, None, scene_box(config)
+    hull, problem, box, right = None, None, scene_box(config), views
     try:
         agreement = agreeing(dev, views, box)
         hull, shares = first_hull(dev, config, agreement)
+        right = agreement.views
     except UserError as error:
         problem = str(error)
-    found = disagreements(views, hull.grid.box) if hull else []
-    ranges = np.array([view.depth_range for view in views if view.depth_range])
-    cameras, stored = ([getattr(v, name) for v in views] for name in ("camera", "stored_camera"))
+    found = contradicting(views, hull, agreement) if hull else []
+    ranges = np.array([view.depth_range for view in right if view.depth_range])
+    cameras, stored = ([getattr(v, name) for v in right] for name in ("camera", "stored_camera"))
     centre = looked_at(stored)
     facts = {
         "scene": path,
@@ -141,8 +142,8 @@ def describe_scene(
         "splits": {split: len(listed) for split, listed in frames.items()},
         "notes": list(opened.notes),
         "images": _image_sizes([frame for listed in frames.values() for frame in listed]),
-        **_lenses([view.file_camera for view in views]),
-        "masks": _masks(views)
+        **_lenses([view.file_camera for view in right]),
+        "masks": _masks(right)
         | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]}
         | ({"left_out": agreement.left_out, "forgiven": agreement.forgiven} if hull else {}),
         "depth_range": [float(ranges.min()), float(ranges.max())] if len(ranges) else None,

@@ -6,6 +6,7 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 from pp_cl.config import preset
+from pp_cl.presets import FEW
 from pp_cl.progress import Progress
 from pp_cl.session.training import Training
 
@@ -59,9 +60,14 @@ class TrainingProgress:
         """Take up the steps that train.minutes allow; the first time, tell of them."""
         name, train = self._config.preset, self._config.train
         if not self._is_told:
-            own = preset(name).train.iterations
-            minutes = f"{train.minutes:g} min"
-            text = f"{minutes}: {name}, about {train.iterations} steps (its own are {own})"
+            own, steps, few = preset(name).train.iterations, train.iterations, FEW[name]
+            text = f"{train.minutes:g} min: {name}, about {steps} steps (its own are {own})"
+            if steps < few:
+                more = train.minutes * few / max(steps, 1)
+                text += (
+                    f"; below {few} it stays blurred: give --minutes {more:.0f}, a smaller"
+                    " --preset, or fewer --points"
+                )
             tqdm.write(text, self._stream)
         self._steps, self._is_told = train.iterations, True
         self._shown.total = self._steps

@@ -1,33 +1,113 @@
-"""How Ctrl-C and SIGTERM stop a long command in good order."""
+"""How Ctrl-C and SIGTERM end a command: with one line, within seconds, a training in good order."""
 
+import os
 import signal
-from collections.abc import Iterator
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
+PATIENCE = 3.0  # seconds after a signal until a process ends, whatever it is doing
+INTERRUPTED = "interrupted"
+
+# the line about the end of this process was printed
+told = threading.Event()
+# set but while a training may end its step after a signal, however long that takes
+_in_haste = threading.Event()
+_in_haste.set()
 
 
 @contextmanager
-def first_signal() -> Iterator[list[int]]:
-    """A list that is empty until Ctrl-C or SIGTERM comes, and then holds its number. A second one
-    does what it did before. To be entered in the main thread.
+def interrupting() -> Iterator[list[int]]:
+    """Ctrl-C and SIGTERM raise KeyboardInterrupt(number) while the block runs; a list of those that
+    came. In another thread than the main one nothing changes.
     """
-    caught = []
-    before = {number: signal.getsignal(number) for number in STOPPING}
-    # nohup, and & in a script, leave signals ignored; None is a handler that is not Python's
-    before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    caught: list[int] = []
 
-    def restore():
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    def interrupt(number: int, _frame: FrameType | None) -> None:
+        caught.append(number)
+        raise KeyboardInterrupt(number)
 
-    def note(number, _frame):
+    with _handled_by(interrupt):
+        yield caught
+
+
+@contextmanager
+def first_signal(*, in_haste: bool = False) -> Iterator[list[int]]:
+    """A list that is empty until Ctrl-C or SIGTERM comes, and then holds its number. A second one
+    does what it did before. in_haste: the process ends PATIENCE seconds later in any case, else as
+    long after the block. To be entered in the main thread.
+    """
+    caught: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
         caught.append(number)
         restore()
 
-    for number in before:
-        signal.signal(number, note)
+    with _handled_by(note) as restore:
+        if not in_haste:
+            _in_haste.clear()
+        try:
+            yield caught
+        finally:
+            _in_haste.set()
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Ctrl-C and SIGTERM are answered after the block; processes that start in it get none."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
     try:
-        yield caught
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
+    """Gives a function that makes signals do again what they did before the block."""
+    before = {number: signal.getsignal(number) for number in STOPPING}
+    # nohup, and & in a script, leave signals ignored; None is a handler that is not Python's
+    before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    if threading.current_thread() is not threading.main_thread():
+        before = {}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    for number in before:
+        signal.signal(number, handle)
+    try:
+        yield restore
     finally:
         restore()
+
+
+def watch() -> None:
+    """From now on a signal that is handled ends this process PATIENCE seconds later. Handlers run
+    between two steps of Python's alone, and not while a driver's compiler or a thread that is
+    waited for takes its time; what is on the disk is whole at any moment.
+    """
+    try:
+        reader, writer = socket.socketpair()
+    except OSError:  # no file may be opened any more: handlers alone
+        return
+    writer.setblocking(False)
+    signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+
+    def end(_open: socket.socket) -> None:
+        [number] = reader.recv(1)
+        _in_haste.wait()
+        time.sleep(PATIENCE)
+        if not told.is_set():
+            os.write(2, f"pp-cl: {INTERRUPTED}\n".encode())
+        os._exit(128 + number)
+
+    threading.Thread(target=end, args=(writer,), daemon=True).start()

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.config import run_config
-    from pp_cl.drivers import open_device
+    from pp_cl.drivers import device_line, open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
         )
         return
     dev = open_device(options.device)
-    print(f"device: {dev.name} [{dev.info['platform']}]")
+    print(device_line(dev, options.device))
     training = open_training(dev, folder, config, stored)
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
@@ -95,28 +95,25 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _first_line(training):
-    """A line of text: the grid that the training starts from, or the step it resumes at."""
+    """A line of text: the points that the training starts from, or the step it resumes at."""
     from pp_cl.scene.hull import CELL_CAP, spacing_pixels
 
     hull, trainer = training.hull, training.trainer
     points = trainer.model.cloud.count
     if hull is None:
         return f"resuming at step {trainer.step} with {points} points"
-    grid, (near, far) = trainer.model.grid, trainer.model.depth_range
-    spacing = spacing_pixels(grid, [view.camera for view in trainer.views])
+    spacing = spacing_pixels(trainer.model.grid, [view.camera for view in trainer.views])
     asked = training.config.points.count
     capped = (
-        f"\nhull: only {points} of the {asked} points asked for, since a finer grid would have"
-        f" more than {CELL_CAP} cells"
+        f"\npoints: only {points} of the {asked} asked for, since a finer grid would have more than"
+        f" {CELL_CAP} cells"
     )
     finer = "".join(
-        f", then {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
+        f", later {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
     )
     return (
-        f"hull: {points} points on a {'x'.join(map(str, grid.dims))} grid, voxel size"
-        f" {grid.voxel_size:.6g} ({spacing:.2f} pixels{finer}), depth {near:.3f} to {far:.3f}"
-        f" ({hull.seconds:.1f} s)"
-        f"{capped if hull.capped else ''}"
+        f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
+        f" the object ({hull.seconds:.1f} s){capped if hull.capped else ''}"
     )
 
 
@@ -152,13 +149,7 @@ def _images_line(training, chosen):
     if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
-    k = view.downscale
-    jitter = f"{k}x{k} offsets" if k > 1 else "at most an eighth of a pixel"
-    reduced = f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter {jitter}"
-    return (
-        f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
-        f"{reduced if view.shrunk > 1 else ''}"
-    )
+    return f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
 
 
 def _sizes(cameras):
@@ -168,7 +159,9 @@ def _sizes(cameras):
 
 
 def _run(training, options):
-    """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
+    """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM: at once in
+    the first step, which builds kernels, else at the end of the step.
+    """
     from pp_cl.commands.progress import TrainingProgress
     from pp_cl.commands.signals import first_signal
     from pp_cl.errors import Stopped
@@ -183,23 +176,28 @@ def _run(training, options):
         if options.view:
             viewer = importlib.import_module(COMMANDS["view"])
             followers.append(stack.enter_context(viewer.following(training)))
-        caught = stack.enter_context(first_signal())
+        first, caught = trainer.step + 1, []
 
         def on_step(step, row):
+            nonlocal caught
+            if step == first:
+                caught = stack.enter_context(first_signal())
             for follower in followers:
                 follower(step, row)
 
         try:
             seconds = training.run(on_step, lambda: bool(caught))
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as signalled:
+            number, *_ = signalled.args or [signal.SIGINT]
             resumes = "goes on from" if folder.checkpoint.exists() else "starts over, there is no"
             raise Stopped(
-                f"stopped at once; the same command {resumes} {folder.checkpoint}",
-                128 + signal.SIGINT,
+                f"stopped at once; the same command {resumes} {folder.checkpoint}", 128 + number
             ) from None
-    if trainer.step < training.config.train.iterations:
+    if caught:
+        is_finished = trainer.step == training.config.train.iterations
+        goes_on = "the training is finished" if is_finished else "the same command goes on"
         raise Stopped(
-            f"stopped at step {trainer.step}; wrote {folder.checkpoint}; the same command goes on",
+            f"stopped at step {trainer.step}; wrote {folder.checkpoint}; {goes_on}",
             128 + caught[0],
         )
     return seconds

@@ -3,7 +3,7 @@ from .device.device import Device as Device
 from .grid import Grid as Grid
 from .grid import smallest_voxel_size as smallest_voxel_size
 from .model import Model as Model
-from .network.means import Means as Means
+from .network.first_features import FirstFeatures as FirstFeatures
 from .network.unet import UNet as UNet
 from .raster.points import PointCloud as PointCloud
 from .render import Renderer as Renderer

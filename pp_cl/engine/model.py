@@ -11,7 +11,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
-from pp_cl.engine.network.means import Means
+from pp_cl.engine.network.first_features import FirstFeatures
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 
@@ -33,7 +33,7 @@ class Model:
         depth_range: tuple[float, float],
         cloud: PointCloud,
         *,
-        net: UNet | Means,
+        net: UNet | FirstFeatures,
     ):
         self.dev = dev
         self.grid = grid

@@ -1,5 +1,6 @@
 """Opens files of other programs, after checking that they are regular files and small enough."""
 
+import codecs
 import errno
 import json
 import os
@@ -13,6 +14,7 @@ from typing import Any, BinaryIO
 from pp_cl.errors import UserError, shown
 
 MOST_REASON = 120  # characters
+UTF_16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 MOST_VALUES = 2**22  # of a JSON file: 100,000 cameras of 40; with its text they take 1 GiB at most
 # bytes of a zip's directory: each file in it takes about ten times its part of it as zipfile keeps
 # it
@@ -50,14 +52,14 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def read_regular(path: Path | str, most: int, encoding: str = "utf-8") -> str:
-    """The text of a file of at most so many bytes. Raises OSError as opened_regular, ValueError for
-    a larger one and for what is no such text.
+    """The text of a file of at most so many bytes; UTF-16 is known by its byte order mark. Raises
+    OSError as opened_regular, ValueError for a larger one and for what is no such text.
     """
     with opened_regular(path) as file:
         content = file.read(most + 1)
     if len(content) > most:
         raise ValueError(f"larger than {most} bytes")
-    return content.decode(encoding)
+    return content.decode("utf-16" if content.startswith(UTF_16) else encoding)
 
 
 def read_json_text(path: Path | str, most: int, encoding: str = "utf-8") -> str:
@@ -87,10 +89,13 @@ def refusal(
     """
     if isinstance(error, FileNotFoundError):
         return UserError(f"{path}: no such file; copy it there")
-    # EINVAL: the content names a place before the file's beginning
-    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+    # the content names a place that no file has
+    is_content = (None, errno.EINVAL, errno.EOVERFLOW)
+    if isinstance(error, OSError) and error.errno not in is_content:
         return UserError(
             f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
         )
+    if isinstance(error, UnicodeDecodeError) and error.encoding == "utf-8":
+        return UserError(f"{path}: is no text in UTF-8; save it as UTF-8, or {mend}")
     reason = shown(str(error), MOST_REASON) or type(error).__name__
     return UserError(f"{path}: cannot be read as {kind} ({reason}); {mend}")

@@ -27,11 +27,18 @@ def dilated_mask(alpha: np.ndarray, threshold: int, margin: int) -> np.ndarray:
 
 
 def in_hull(
-    views: Sequence[Any], positions: np.ndarray, threshold: int, *, least: int, forgiven: int
+    views: Sequence[Any],
+    positions: np.ndarray,
+    threshold: int,
+    *,
+    least: int,
+    forgiven: int,
+    doubts: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """((N,) bool in the hull: seen by `least` views and rejected by no larger share of them than
     `forgiven` of all, (N,) pixels to the nearest pixel border of any view that has the position
-    before it).
+    before it). With doubts, a view that does not see it takes one away from those that do, if its
+    nearest pixel is beside its mask.
     """
     seen, rejecting = np.zeros((2, len(positions)), int)
     border = np.full(len(positions), np.inf)
@@ -47,6 +54,10 @@ def in_hull(
         away = np.minimum(np.abs(u - np.round(u)), np.abs(v - np.round(v)))
         border[front] = np.minimum(border[front], away)
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        row, column = (
+            np.clip(a, 0, n - 1).astype(int) for a, n in zip((v, u), mask.shape, strict=True)
+        )
+        doubting = front[~inside & ~mask[row, column]]
         front, u, v = front[inside], u[inside].astype(int), v[inside].astype(int)
         held = np.zeros(len(positions), bool)
         held[front] = mask[v, u]
@@ -55,6 +66,8 @@ def in_hull(
         alpha = view.image[..., 3]
         if max(alpha[[0, -1]].max(), alpha[:, [0, -1]].max()) <= threshold:
             counted[:] = True  # the object ends within the image
+            doubting = doubting[:0]
+        seen[doubting] -= doubts
         seen += counted
         rejecting += counted & ~held
     return (seen >= least) & (rejecting * len(views) <= forgiven * seen), border

@@ -2,6 +2,7 @@
 cannot be used is left out.
 """
 
+import hashlib
 import os
 import posixpath
 import re
@@ -18,6 +19,7 @@ from pp_cl.files.image import ENDINGS
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
 MASK_FOLDERS = ("masks", "mask")
 IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says nothing
+PIECE = 2**20  # bytes of a file that are read at once
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -79,6 +81,27 @@ def find_image(folder: Path, given: str, fail: Fail, kind: str = "image") -> str
         raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
     text = f"no {kind} at {given[:80]!r} in {folder}; copy it there or remove the frame"
     raise Unusable(fail(text), f"no {kind}")
+
+
+def pictures_of(files: Sequence[Path]) -> list[object]:
+    """What is the same for files that are copies of one picture, and differs for others: the path,
+    or the digest where two have one size.
+    """
+    sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
+    often = Counter(sizes)
+    return [
+        _digest(file) if size >= 0 and often[size] > 1 else file
+        for file, size in zip(files, sizes, strict=True)
+    ]
+
+
+def _digest(file):
+    """The digest of a file."""
+    digest = hashlib.sha256()
+    with file.open("rb") as opened:
+        while piece := opened.read(PIECE):
+            digest.update(piece)
+    return digest.digest()
 
 
 def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:

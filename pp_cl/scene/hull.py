@@ -14,7 +14,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.engine.views import MASK_THRESHOLD, View, border
 from pp_cl.errors import UserError
-from pp_cl.scene.agreement import explain_empty_hull
+from pp_cl.scene.agreement import Disagreement, disagreements, explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
@@ -38,6 +38,7 @@ MOST_LEFT_OUT = 1 / 8  # of the views
 # views gain 1.4 dB where 12 of 60 masks may reject, in place of 4.
 MOST_MISSED, MOST_FORGIVEN = 0.0002, 1 / 4
 COMPARED_POINTS, COMPARED_SIZE = 60_000, 128  # pixels of the images in which this is looked up
+SAMPLED_POINTS = 1000
 VERTEX_WORK = 10  # multiply-adds that project a vertex into a view, and find its pixel
 CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size of the eyes' box
 
@@ -60,7 +61,9 @@ class Carver:
 
     Masks are widened by a pixel, which keeps vertices that touch the silhouette, and by one of the
     reduced image: by so much are poses and masks of images wrong. least: images that must see a
-    vertex.
+    vertex. doubts: 1 where so few masks end within their image that an image takes one of these
+    away from what lies beside it, if the nearest pixel of its border is beside the mask: so images
+    that are cropped to the object bound it, and those that it leaves do not cut it off.
     """
 
     def __init__(self, dev: Device, views: Sequence[View]):
@@ -79,6 +82,8 @@ class Carver:
         self.view_masks = dev.upload(table, np.uint32)
         is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
         self.view_is_whole = dev.upload(is_whole, np.uint32)
+        # else these bound the object, and close-ups must not take away what lies beside them
+        self.doubts = int(sum(is_whole) < self.least)
 
     def _add_mask(self, view, words, first):
         """Write the widened mask of a view from word `first` on."""
@@ -124,6 +129,7 @@ class Carver:
             words=words,
             views=len(self.cameras),
             least=self.least,
+            doubts=self.doubts,
             forgiven=forgiven,
             projections=self.dev.upload(projections, np.float32),
             view_masks=self.view_masks,
@@ -148,8 +154,8 @@ def build_grid(
 
     views: of any sizes; their stored images and cameras are used. box: (2, 3), which holds all
     vertices; None: what the masks allow, and where no view has one what all cameras see. A vertex
-    is inside if LEAST_SEEING images see it and it lies in the mask of each one that does, widened
-    as Carver has it, but for `forgiven` of all views (agreeing()). The search starts from the box
+    is inside if LEAST_SEEING images see it and it lies in the mask of each one that does, both as
+    Carver has it, but for `forgiven` of all views (agreeing()). The search starts from the box
     that the masks allow and rescales the voxel size from the measured count, until the count is
     `points` to 1.02 points. At CELL_CAP vertices of the grid, or after 8 rounds, the best carving
     is taken: the smallest with enough points, else the largest. Raises UserError for an impossible
@@ -253,10 +259,11 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
 
     The hull lies between them for every view: near is the distance to the ball around it,
     DEPTH_MARGIN times enlarged, but at least half the distance to its box and one voxel size. A
-    range stated by the dataset is kept, but widened to the ball itself, since points outside of it
-    would be missing.
+    range stated by the dataset, for most views, is kept, but widened to the ball itself, since
+    points outside of it would be missing.
     """
     stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
+    stated = stated if 2 * len(stated) > len(views) else []
     half = grid.voxel_size * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
     offsets = np.stack([view.camera.eye for view in views]) - grid.centre
     from_centre = np.linalg.norm(offsets, axis=1)
@@ -331,6 +338,29 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
         key=lambda forgiven: _shares_beside(dev, left, box, forgiven).mean() <= MOST_MISSED,
     )
     return Agreement(left, left_out, least)
+
+
+def contradicting(views: Sequence[View], hull: Hull, agreement: Agreement) -> list[Disagreement]:
+    """disagreements() around a hull of views of which those of the agreement are left. Where no
+    mask need be forgiven, only those left out disagree: what one alone carves away, no other shows.
+    """
+    found = disagreements(views, hull.grid.box)
+    return [one for one in found if agreement.forgiven or one.view.name in agreement.left_out]
+
+
+def misplaced(grid: Grid, ids: np.ndarray, views: Sequence[View]) -> list[View]:
+    """The views with a mask on which a share of the points with these ids (N,) falls that is
+    several times smaller than usual, of those that their image shows: their cameras, or masks, are
+    of another place.
+    """
+    places = grid.positions(ids[:: max(1, len(ids) // SAMPLED_POINTS)])
+    masked, shares = [view for view in views if view.has_mask], []
+    for view in masked:
+        column, row, is_shown = view.stored_camera.pixels(places)
+        is_on = view.hull_alpha[row, column] > MASK_THRESHOLD
+        shares.append((is_on & is_shown).sum() / max(is_shown.sum(), 1))
+    least = np.median(shares or [0]) / TIMES_USUAL
+    return [view for view, share in zip(masked, shares, strict=True) if share < least]
 
 
 def _shares_beside(dev, views, box, forgiven):

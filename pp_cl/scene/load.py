@@ -30,13 +30,14 @@ from pp_cl.scene.found import (
     LeftOut,
     find_masks,
     folder_named,
+    pictures_of,
     usable,
 )
-from pp_cl.scene.image_file import ImageFile, read_view, shrink_factor
+from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
-from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, read_mask_of_size
+from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, half_transparent, read_mask_of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
-from pp_cl.scene.readers.common import read_json
+from pp_cl.scene.readers.common import SPLITS, read_json
 from pp_cl.scene.silhouette import within_silhouettes
 from pp_cl.settings import Config
 
@@ -57,10 +58,21 @@ READING_BYTES = 3 * 2**28  # of the images that are read side by side
 
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
 
+MEASURED = 12  # views whose masks are looked at for soft edges
+# of what masks hold: sharp ones have 0 at any size, those blurred with a sigma of 5 pixels 0.4
+SOFT = 0.05
 INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
 BESIDE = 0.5  # of what is transparent, that a mask which is not of the object holds
 WRONG = "what the scene's files say of it is wrong"  # of a view whose error is no Unusable
 OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
+OF_TRAINING = "pictures that are in training, too, so that figures flatter"
+# {what lies in the folder of a program or dataset that is not read: which of its exports is}
+EXPORTS = {
+    "*.xml": 'Metashape\'s, maybe; use its Export Cameras with the type "Colmap"',
+    "*.csv": "RealityCapture's, maybe; use its export of registration for COLMAP",
+    "cams/*_cam.txt": "BlendedMVS's; use its scenes as NeuS ships them, with cameras_sphere.npz",
+    "keyframes/*cameras/*.json": "Polycam's; make a transforms.json by `ns-process-data polycam`",
+}
 LEAST_VIEWS = 8  # for training that are left where some are left out
 NEARBY = 100  # files of a folder without a scene in which one is looked for
 
@@ -80,8 +92,8 @@ class Scene:
     """Views of one object.
 
     folder: None for a scene that the program makes itself. splits: views by split name ("train",
-    "val", "test"). Either all views have a depth range or none has. notes: a line for each kind of
-    thing that was done to use them, such as views that were left out.
+    "val", "test"). notes: a line for each kind of thing that was done to use them, such as views
+    that were left out.
     """
 
     name: str
@@ -114,6 +126,13 @@ def open_scene(
         warnings.warn(
             f"{path}: most masks hold the border of their image, as if they were inverted: they"
             " must be white on the object and black around it",
+            stacklevel=2,
+        )
+    alphas = [shrink(view.image, view.downscale)[..., 3] for view in evenly(masked, MEASURED)]
+    if masked and (soft := np.mean([half_transparent(alpha) for alpha in alphas])) > SOFT:
+        warnings.warn(
+            f"{path}: {soft:.0%} of what the masks hold is half transparent, edges not counted:"
+            " where the object is opaque, sharp masks give a sharper model",
             stacklevel=2,
         )
     if views and not masked and most is None and config.scene.mask_from != "box":
@@ -209,6 +228,12 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     image_files = _ignoring(folder, IGNORE_FOLDERS, image_files, split)
     ignored = "pixels are ignored where the masks in ignore are white"
     done += [(one.name, ignored) for one in image_files if one.ignore and not one.ignores_black]
+    if split != "train" and present is not SPLITS:  # else hold_out() has dealt out pictures
+        trained = reader.read_split(folder, "train", [])
+        pictures = pictures_of([folder / one.name for one in (*trained, *image_files)])
+        known = set(pictures[: len(trained)])
+        found = zip(image_files, pictures[len(trained) :], strict=True)
+        done += [(one.name, OF_TRAINING) for one, picture in found if picture in known]
     return SplitFiles(image_files, left_out, done)
 
 
@@ -394,6 +419,9 @@ def _found_instead(folder):
         with suppress(UserError):
             if isinstance(data := read_json(file), dict) and "frames" in data:
                 return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
+    for pattern, export in EXPORTS.items():
+        if file := next(folder.glob(pattern), None):
+            return f": {quoted(file.name, 40)} is {export}"
     found = few_names([quoted(path.name, 40) for path in inside]) or "nothing"
     return (
         f": {found}, but no file of cameras that is known, such as transforms.json or sparse/0;"
@@ -427,17 +455,25 @@ def load_scene(
     for option, given in (("--masks", masks.folder), ("--ignore", masks.ignore)):
         if given and not os.path.isdir(given):
             raise UserError(f"{given}: no such folder; {option} takes one of masks")
-    chosen = {}
+    chosen, left_out = {}, {}
+
+    def reducible(image_file):
+        if downscale:
+            check_downscale(image_file.name, image_file.camera, downscale)
+        return image_file
+
     for split in splits:
         found = (listed or {}).get(split) or list_split(folder, split)
         lines += _lines(split, *found)
-        chosen[split] = _by_rule(masks, evenly(found.image_files, most), split)
+        some = _by_rule(masks, evenly(found.image_files, most), split)
+        gone: LeftOut = []
+        chosen[split] = list(usable(some, reducible, lambda one: one.name, gone))
+        _check_left(chosen[split], gone, 1)
+        left_out[split] = gone
     image_files = [one for some in chosen.values() for one in some]
-    _check_alike(folder, image_files, downscale)
     if dev is None and any(one.lens for one in image_files):
         raise UserError(f"{folder}: its images have distortion, which only a device removes")
     factor = shrink_factor([(p.camera.width, p.camera.height) for p in image_files], downscale or 1)
-    left_out: dict[str, LeftOut] = {split: [] for split in chosen}
     views = {
         split: _read_views(folder, some, masks, dev, factor, left_out[split])
         for split, some in chosen.items()
@@ -471,19 +507,6 @@ def _by_rule(rule, image_files, split):
     if rule.ignore:
         image_files = _ignoring(Path(rule.ignore), ["."], image_files, split)
     return image_files
-
-
-def _check_alike(folder, image_files, downscale):
-    """Raise UserError if only some images have a depth range, or one cannot be reduced."""
-    first = image_files[0]
-    for one in image_files:
-        if (one.depth_range is None) != (first.depth_range is None):
-            raise UserError(
-                f"{folder}: near and far are given for only one of {first.name} and {one.name}; "
-                "give them for all views or for none"
-            )
-        if downscale:
-            check_downscale(one.name, one.camera, downscale)
 
 
 def _read_views(folder, image_files, masks, dev, factor, left_out):

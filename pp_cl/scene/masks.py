@@ -9,8 +9,9 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from skimage.color import rgb2lab
 from skimage.measure import label
+from skimage.morphology import erosion
 
-from pp_cl.engine.views import border
+from pp_cl.engine.views import MASK_THRESHOLD, border
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import read_mask, same_shape
 from pp_cl.scene.found import find_mask
@@ -19,6 +20,7 @@ BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = 255
 BAD_MASK = "a mask that cannot be used"
 HOLE = 5e-5  # of the image: smaller regions are none
+HALF = 16, 239  # alphas between which a pixel is half transparent
 EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
 
@@ -113,6 +115,14 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
     straight = (colour - (1 - alpha[..., None]) * behind) / np.maximum(alpha, 1 / 255)[..., None]
     rgba = np.dstack([np.clip(straight, 0, 1), alpha])
     return (255 * rgba + 0.5).astype(np.uint8)
+
+
+def half_transparent(alpha: np.ndarray) -> float:
+    """The share of what a mask (H, W) uint8 holds that is half transparent, and so is all around
+    it, as edges of an object are not that are sharp, nor thin parts of it.
+    """
+    within = erosion((alpha > HALF[0]) & (alpha < HALF[1]), np.ones((3, 3)))
+    return float(within.sum() / max((alpha > MASK_THRESHOLD).sum(), 1))
 
 
 def _regions(places, with_holes):

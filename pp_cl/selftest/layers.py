@@ -12,11 +12,11 @@ from pp_cl.engine.layers.simple import (
     SHARE,
     avgpool2_backward,
     avgpool2_forward,
+    first_features_backward,
+    first_features_forward,
     gate_backward,
     gate_forward,
     maxpool2_forward,
-    mean_backward,
-    mean_forward,
     output_backward,
     output_forward,
     residual_backward,
@@ -201,18 +201,16 @@ def _output(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(grad_features.get(), expected, 2 * EPS)
 
 
-def _means(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Colours that are means of features, and the gradient."""
-    for height, width, scale in ((1, 1, 1), (31, 33, 1), (3, 257, 2), (5, 11, 3)):
-        features = _normal(rng, height * scale, width * scale, 16)
-        grad, image = _normal(rng, height, width, 3), dev.empty((height, width, 3))
-        mean_forward(dev, dev.upload(features), image, scale)
-        blocks = features.astype(np.float64).reshape(height, scale, width, scale, 16)
-        yield relative(image.get(), blocks.mean((1, 3))[..., :3], 2 * EPS)
-        grad_features = dev.empty(features.shape)
-        mean_backward(dev, dev.upload(grad), grad_features, scale)
+def _first_features(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Colours that are features, and the gradient."""
+    for height, width in ((1, 1), (31, 33), (3, 257)):
+        features, grad = _normal(rng, height, width, 16), _normal(rng, height, width, 3)
+        image, grad_features = dev.empty(grad.shape), dev.empty(features.shape)
+        first_features_forward(dev, dev.upload(features), image)
+        yield relative(image.get(), features[..., :3].astype(np.float64), EPS)
+        first_features_backward(dev, dev.upload(grad), grad_features)
         expected = np.zeros(features.shape)
-        expected[..., :3] = grad.repeat(scale, 0).repeat(scale, 1) / scale**2
+        expected[..., :3] = grad
         yield relative(grad_features.get(), expected, EPS)
 
 
@@ -285,7 +283,7 @@ CASES = (
     Case("layers: max pooling", _max_pool),
     Case("layers: upsampling", _upsample),
     Case("layers: output", _output),
-    Case("layers: means in place of a network", _means),
+    Case("layers: features in place of a network", _first_features),
     Case("layers: gate", _gate),
     Case("layers: tiles", _tiles),
 )

@@ -70,7 +70,7 @@ def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Which vertices enough images see and few enough masks reject, and their numbers."""
     views = _views(rng, 0.05)
     carver = Carver(dev, views)
-    for nx, forgiven in itertools.product(SIZES, (0, 1, 2)):
+    for nx, forgiven, carver.doubts in itertools.product(SIZES, (0, 1, 2), (0, 1)):
         voxel_size, ny, nz = 2 / nx, 7, 5
         grid = Grid(
             (-voxel_size * nx / 2, -voxel_size * ny / 2, -voxel_size * nz / 2 + 0.1),
@@ -79,7 +79,12 @@ def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         )
         positions = grid.lattice()
         expected, border = in_hull(
-            views, positions, MASK_THRESHOLD, least=carver.least, forgiven=forgiven
+            views,
+            positions,
+            MASK_THRESHOLD,
+            least=carver.least,
+            forgiven=forgiven,
+            doubts=bool(carver.doubts),
         )
         found = carver.carve(grid, forgiven).ravel()
         yield exact(found[border > BORDER], expected[border > BORDER])

@@ -233,8 +233,8 @@ def _size(size):
 def memory_line(memory_plan: MemoryPlan) -> str:
     """The memory that the last check found to be needed, in words."""
     need, dev = memory_plan.need, memory_plan.dev
-    return (
-        f"memory: about {need.device / MIB:.0f} of {dev.info['memory_bytes'] / MIB:.0f} MiB of"
-        f" {dev.name} (with {need.points} points), {need.host / MIB:.0f} MiB of the host"
-        + (", the device's among them" if dev.is_cpu else "")
-    )
+    has, on_host = _size(dev.info["memory_bytes"]), f"{_size(need.host)} of the computer's"
+    if dev.is_cpu:
+        return f"memory: up to {on_host} {has}, with {need.points} points"
+    on_device = f"{_size(need.device)} of the {has} of {dev.name}"
+    return f"memory: up to {on_device}, with {need.points} points, and {on_host}"

@@ -15,8 +15,15 @@ from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError, few_names
 from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
-from pp_cl.scene.agreement import disagreements
-from pp_cl.scene.hull import Agreement, Hull, agreeing, build_grid, depth_range, spacing_pixels
+from pp_cl.scene.hull import (
+    Agreement,
+    Hull,
+    agreeing,
+    build_grid,
+    contradicting,
+    depth_range,
+    spacing_pixels,
+)
 from pp_cl.scene.load import DEMO, scene_box
 from pp_cl.scene.outline import outline_sheet
 from pp_cl.session.memory import MemoryPlan
@@ -129,10 +136,10 @@ def fitting_hull(
 
 
 def sheet_of_masks(
-    dev: Device, views: list[View], hull: Hull, left_out: dict[str, float]
+    dev: Device, views: list[View], hull: Hull, agreement: Agreement
 ) -> np.ndarray | None:
     """Warn of masks that disagree with the others; return their image, None if all agree."""
-    found = disagreements(views, hull.grid.box)
+    found, left_out = contradicting(views, hull, agreement), agreement.left_out
     rejecting = {one.view.name: one.share for one in found if one.view.name not in left_out}
     for what, shares in (
         ("lie beside what the other views agree on, and are left out of the training", left_out),

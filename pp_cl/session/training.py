@@ -261,7 +261,7 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
     with Progress("carving the visual hull"):
         agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
         seconds = time.perf_counter() - start
-        sheet = sheet_of_masks(dev, views, hull, agreement.left_out)
+        sheet = sheet_of_masks(dev, views, hull, agreement)
 
     cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
     model = Model(dev, hull.grid, depth_range, cloud, net=net)

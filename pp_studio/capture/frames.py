@@ -238,17 +238,25 @@ def _frames(video, images):
 
 
 def _sharpest(video):
-    """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR)."""
+    """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR).
+    Frames that repeat the one before, as films of a constant rate have them, lengthen none.
+    """
     frames = _decoded(video, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
     meta = next(frames)
     # an estimate, for the bar alone: what browsers record states no length
     total = round(meta["duration"] * meta["fps"]) or None
     looking = track(frames, "looking at frames", "frame", total)
-    sharpness = [_look(Image.fromarray(frame[..., 0]))["sharpness"] for frame in looking]
+    sharpness, pictures, shown = [], [], None  # pictures: that each frame shows, numbered
+    for frame in looking:
+        look = _look(Image.fromarray(frame[..., 0]))
+        is_new = shown is None or _difference(shown, look) >= SAME
+        shown = look if is_new else shown
+        sharpness.append(look["sharpness"])
+        pictures.append(pictures[-1] + is_new if pictures else 0)
     if not sharpness:
         raise UserError(f"{video}: holds no frames; give another video")
-    count = len(sharpness)
-    intervals = groupby(range(count), lambda number: number * FRAMES // max(count, FRAMES))
+    count = max(pictures[-1] + 1, FRAMES)
+    intervals = groupby(range(len(pictures)), lambda number: pictures[number] * FRAMES // count)
     is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)
     return [max(numbers, key=sharpness.__getitem__) for _, numbers in intervals], is_hdr
 

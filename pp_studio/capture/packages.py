@@ -10,13 +10,14 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from PIL import Image  # noqa: F401  before pycolmap, whose zlib would otherwise be taken for Pillow's
 
+from pp_cl.commands.signals import deferred
 from pp_cl.errors import UserError
 
 DISTRIBUTIONS = {
@@ -32,7 +33,7 @@ def needed(module: str) -> ModuleType:
     missing.
     """
     try:
-        return importlib.import_module(module)
+        return _imported(module)
     except ImportError as error:
         raise UserError(
             f"capture needs the package {DISTRIBUTIONS[module]} ({error});"
@@ -45,9 +46,16 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
     end their process. Raises UserError naming the folder where that happens.
     """
     needed("pycolmap")
+    before = active_children()
     with ProcessPoolExecutor(1, get_context("spawn"), _begin) as pool:
         try:
-            return pool.submit(function, *arguments).result()
+            with deferred():
+                found = pool.submit(function, *arguments)
+            return found.result()
+        except KeyboardInterrupt:  # the pool would wait for what goes on
+            for one in {*active_children()} - {*before}:
+                one.kill()
+            raise
         except BrokenProcessPool:
             raise UserError(
                 f"{folder}: pycolmap ended in the middle of its work; free some space on the disk,"
@@ -55,11 +63,25 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
             ) from None
 
 
+def _imported(module):
+    """The module; pycolmap would else answer SIGTERM itself, with a stack trace."""
+    if module in sys.modules or threading.current_thread() is not threading.main_thread():
+        return importlib.import_module(module)
+    answer = signal.getsignal(signal.SIGTERM)
+    with deferred():
+        try:
+            return importlib.import_module(module)
+        finally:
+            signal.signal(signal.SIGTERM, answer)
+
+
 def _begin():
-    """Ctrl-C ends the process at once, and so does the end of its parent; only Python writes to
+    """The process ends with its parent, which alone answers signals; only Python writes to
     stderr.
     """
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # NumPy's threads beside ours would wait for each other, long where the machine is busy
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stderr = os.fdopen(os.dup(2), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 

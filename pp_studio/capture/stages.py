@@ -134,8 +134,9 @@ class Capture:
             for stage in left:
                 start = time.monotonic()
                 found = getattr(self, f"_{stage}")()
-                write_json(self._file(stage), found)
-                self.tell(f"{stage}: {found['line']} ({time.monotonic() - start:.0f} s)")
+                seconds = time.monotonic() - start
+                write_json(self._file(stage), found | {"seconds": round(seconds, 1)})
+                self.tell(f"{stage}: {found['line']} ({seconds:.0f} s)")
 
     def _is_done(self, stage):
         return self._file(stage).is_file()
@@ -294,8 +295,7 @@ class Capture:
         return folder if any(folder.iterdir()) else None
 
     def _matches(self):
-        is_video = not self.source.is_dir()
-        pairs = isolated(self.work, features.match, self.database, is_video)
+        pairs = isolated(self.work, features.match, self.database)
         turntable = self.options["turntable"]
         turns = isolated(self.work, still.remove_still, self.database, self.turns, turntable)
         line = f"{pairs} pairs of images"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import coo_matrix
 
+from pp_cl import Progress
 from pp_studio.capture.features import quiet, verification
 
 SAMPLED = 30  # matches of a pair
@@ -61,7 +62,8 @@ def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
                 db.delete_matches(*ids)
                 db.write_matches(*ids, left)
             db.clear_two_view_geometries()
-        colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
+        with Progress("checking pairs without what stands still"):
+            colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
     return True
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from pp_cl.commands import options as shared
 from pp_cl.config import load_config
 from pp_cl.errors import UserError
-from pp_studio.export import AXES, AXES_OF, FORMATS, WINDOW
+from pp_studio.export import AXES, AXES_OF, FORMATS, QUALITIES, QUICK
 
 HELP = "write a run in a format that other programs open"
 EPILOG = "\n".join(
@@ -37,11 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " view (0: points that no view shows)",
     )
     add(
-        "--window",
-        type=shared.integer(16, 16384),
-        metavar="PIXELS",
-        help="splats: fit the Gaussians for renderings of so many pixels on the longer side"
-        f" ({WINDOW})",
+        "--quality",
+        choices=QUALITIES,
+        help=f"splats: how long the Gaussians are fitted ({QUICK}: a minute or two; best: some ten"
+        " times as long)",
     )
     add(
         "--length",
@@ -77,7 +76,7 @@ def run(options: argparse.Namespace) -> None:
     if name not in OF_POINTS:
         shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
     if name not in OF_SPLATS:
-        shared.refuse(options, ("window",), f"only {', '.join(OF_SPLATS)} are fitted to a window")
+        shared.refuse(options, ("quality",), f"only {', '.join(OF_SPLATS)} are fitted")
     if name not in AXES_OF:
         shared.refuse(options, ("box", "axes"), f"only {', '.join(AXES_OF)} hold coordinates")
     if name != "gallery" and len(options.run_folders) > 1:
@@ -107,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
         name,
         path,
         min_weight=options.min_weight or 0.0,
-        window=options.window or WINDOW,
+        quality=options.quality or QUICK,
         box=options.box,
         axes=options.axes,
         others=map(loaded, others),

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import shlex
 import time
 from pathlib import Path
@@ -30,7 +31,8 @@ PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
 LEAST_TRAINING = 0.6  # of what the capture leaves; after a long capture, 0.25 of all
 PER_PHOTOGRAPH = 0.05  # minutes that a capture takes, about: on two cores with AVX-512
-FPS, LEAST_FPS, SECONDS = 30, 8, 4  # of the video
+OF_SPLAT = 0.6  # of what is left after the evaluation
+LEAST_FPS = 8  # of the video
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,10 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Do the steps that are left, and say what to open."""
     from pp_cl import RunFolder, load
+    from pp_studio.export.gaussians import fitted_gaussians
     from pp_studio.export.result import INDEX, SPLAT, begin_result, is_newer, write_result
     from pp_studio.export.result import MINUTES as PASSED
 
-    out, is_scene = Path(options.out), _is_scene(options.source)
+    share, out, is_scene = _share(), Path(options.out), _is_scene(options.source)
     if is_scene:
         shared.refuse(options, ("turntable", "mask_command", "box"), "only of photographs")
     begin_result(out)
@@ -87,7 +90,7 @@ def run(options: argparse.Namespace) -> None:
             print(f"wrote {page}: open it in a browser; it grows as parts are done")
         if not folder.config.exists():
             training = clock.training()
-            chosen = next(name for name, least in PRESET_FROM.items() if training >= least)
+            chosen = next(n for n, least in PRESET_FROM.items() if share * training >= least)
             preset = ["--preset", options.preset or chosen, "--minutes", f"{training:.3g}"]
         else:  # as it began, unless told otherwise, which train refuses
             preset = ["--preset", options.preset] if options.preset else []
@@ -98,11 +101,13 @@ def run(options: argparse.Namespace) -> None:
         _step("eval", str(folder), "--split", split, *device)
         show(split)
         if not is_newer(out / SPLAT, folder.checkpoint):
+            # of which export makes the file
+            fitted_gaussians(load(folder.path, options.device), minutes=OF_SPLAT * clock.left)
             words = ["--format", "splat"]
             _step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
             show(split)
         if not is_newer(out / video, folder.checkpoint):
-            words = ["--fps", f"{_fps(folder, split, clock.left):d}"]
+            words = ["--fps", f"{_fps(load(folder.path, options.device), split, clock.left):d}"]
             _step("render", str(folder), "--out", str(out / video), *words, *device)
             show(split)
     print(
@@ -168,6 +173,12 @@ class _Clock:
         return left - after
 
 
+def _share():
+    """Of the processor, what others leave: what is running already goes on beside the training."""
+    cores = os.cpu_count() or 1
+    return cores / (cores + (os.getloadavg()[0] if hasattr(os, "getloadavg") else 0))
+
+
 def _is_scene(source):
     """Whether it is one that `pp-cl train` reads; else there is no pose yet."""
     from pp_cl.scene import scene_format
@@ -218,14 +229,19 @@ def _video():
     return VIDEOS[0]
 
 
-def _fps(folder, split, minutes):
+def _fps(run, split, minutes):
     """Frames a second of a video that takes so many minutes, about: by the time that a frame of the
-    evaluation took.
+    evaluation took, of which larger ones are woven.
     """
     from pp_cl.scene import read_json
+    from pp_studio.commands.render import FPS, LEAST_HEIGHT, SECONDS
+    from pp_studio.large import parts
 
-    seconds = read_json(folder.metrics(split))["seconds_per_frame"]
-    return int(min(max(LEAST_FPS, 60 * minutes / (SECONDS * seconds)), FPS))
+    camera = run.cameras("train")[0]
+    times = max(1, LEAST_HEIGHT / camera.height)
+    larger = camera.resized(round(times * camera.width), round(times * camera.height))
+    seconds = read_json(run.folder.metrics(split))["seconds_per_frame"] * parts(run, larger) ** 2
+    return round(min(max(LEAST_FPS, 60 * minutes / (SECONDS * seconds)), FPS))
 
 
 def _held_out(scene):

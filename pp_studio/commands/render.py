@@ -22,6 +22,7 @@ MADE = ("orbit", "spiral")  # paths that the program makes
 SECONDS, FPS = 4, 30
 FASTEST_GIF = 50  # frames per second; browsers show faster ones slowly
 MOST_FRAMES = 100_000
+LEAST_HEIGHT = 720  # of an orbit or spiral; an even number, as the width beside it, for mp4
 
 
 def _colour(text):
@@ -53,7 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(*VIDEOS, *IMAGES),
         help="a video (mp4, webm, webp, gif) or frames (png, exr); by --out, else mp4",
     )
-    add("--size", type=shared.size, metavar="WxH", help="pixels (default: those of the training)")
+    add(
+        "--size",
+        type=shared.size,
+        metavar="WxH",
+        help="pixels (default: those of the training; an orbit or spiral is at least"
+        f" {LEAST_HEIGHT} high)",
+    )
     add(
         "--fov",
         type=shared.number(1, 150),
@@ -214,5 +221,8 @@ def _cameras(run, path, count, *, size, fov):
         return [shaped(camera) for camera in run.cameras(path)]
     training = run.cameras("train")
     around, first = Surroundings(training, run.model.positions()), shaped(training[0])
+    if not size and first.height < LEAST_HEIGHT:
+        width = 2 * round(first.width / first.height * LEAST_HEIGHT / 2)
+        first = first.resized(width, LEAST_HEIGHT)
     make = around.orbit if path == "orbit" else around.spiral
     return make(first, count)

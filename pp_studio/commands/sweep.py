@@ -138,7 +138,7 @@ def _run(options, jobs, total):
 
     rows, devices = {}, [] if options.scheduler else separate_devices()
     with ExitStack() as stack:
-        caught = stack.enter_context(first_signal())
+        caught = stack.enter_context(first_signal(in_haste=True))
         if options.scheduler:
             client = stack.enter_context(client_of(options.scheduler))
         else:

@@ -2,12 +2,11 @@
 
 import argparse
 import os
-import signal
 import sys
 import threading
 import webbrowser
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from pp_cl.commands import options as shared
@@ -71,13 +70,7 @@ def run(options: argparse.Namespace) -> None:
             " steers it; nothing is encrypted",
             file=sys.stderr,
         )
-    # a job in the background ignores Ctrl-C
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    with (
-        suppress(KeyboardInterrupt),
-        started(name_of(folder), options.host, options.port) as (server, address),
-    ):
+    with started(name_of(folder), options.host, options.port) as (server, address):
         view: ScenePage | RunView
         if is_scene:
             view = ScenePage(server, folder, options.device)

@@ -1,7 +1,9 @@
 """Exports a run to other programs: videos, point clouds, meshes, a web page, rendered views."""
 
-# Pixels on the longer side of the renderings for which splats are fitted: of a viewer's window
-WINDOW = 800
+QUICK, BEST = "quick", "best"
+# {quality of a splat: (steps that fit it, voxel sizes of the cells whose points begin as one, 0:
+# each alone)}
+QUALITIES = {QUICK: (500, 1.5), BEST: (7000, 0.0)}
 SCENE, VIEWER = AXES = "scene", "viewer"
 # {format of coordinates: whose axes they have, unless others are asked for}
 AXES_OF = dict.fromkeys(("splat", "splat-spz", "splat-glb", "textured"), VIEWER)

@@ -15,15 +15,16 @@ from pp_cl.engine import View
 from pp_cl.errors import UserError, require
 from pp_cl.files import check_file, check_new_folder, check_ours, image_paths, own, write_text
 from pp_cl.scene import write_scene
-from pp_studio.export import AXES_OF, FORMATS, VIEWER, WINDOW
+from pp_studio.export import AXES_OF, FORMATS, QUICK, VIEWER
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.length import metres_per_unit
 from pp_studio.export.mesh import coloured_mesh, write_mesh
-from pp_studio.export.page import page_text, write_gallery
+from pp_studio.export.page import fitted, page_text, write_gallery
 from pp_studio.export.points import coloured_points, in_world, inside, write_ply
 from pp_studio.export.splat import (
     Y_DOWN,
     Y_UP,
+    in_spz,
     splats,
     upright,
     write_splat_glb,
@@ -57,13 +58,13 @@ def export_run(
     path: Path | str,
     *,
     min_weight: float = 0.0,
-    window: int = WINDOW,
+    quality: str = QUICK,
     box: Sequence[float] | None = None,
     axes: str | None = None,
     others: Iterable[Run] = (),
 ) -> str:
     """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
-    min_weight, window, box, axes: as the options. others: further runs of a gallery. Raises
+    min_weight, quality, box, axes: as the options. others: further runs of a gallery. Raises
     UserError for what cannot be written, before which nothing is.
     """
     if name not in FORMATS:
@@ -84,18 +85,20 @@ def export_run(
         mesh = coloured_mesh(run, within)
         _begin_default(name, path)
         write_mesh(path, replace(mesh, vertices=placed(mesh.vertices)))
-        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unit}"
+        unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
+        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unlit}{unit}"
     if name == "textured":
         solid = textured_mesh(run, turn, within)
         solid.apply_scale(metres)
         _begin_default(name, path)
         write_textured(path, solid)
-        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces{unit}"
+        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
     if name == "html":
-        text = page_text(run)
+        gaussians = fitted(run)
+        text = page_text(run, gaussians)
         _begin_default(name, path)
         write_text(path, text)
-        return f"{count} points, {len(text) / 1e6:.1f} MB"
+        return f"{len(gaussians.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     if name == "gallery":
         return f"{write_gallery(path, chain([run], others))} pages and their index"
     if name == "scene":
@@ -105,14 +108,16 @@ def export_run(
     if name in ("splat", "splat-spz", "splat-glb"):
         if name == "splat-spz":
             require("splat-spz", "gsply")
-        table, origin = splats(run, turn, window, within)
+        table, origin = splats(run, turn, quality, within)
         table["position"] *= metres
         table["deviations"] *= metres
         _begin_default(name, path)
         if name == "splat":
             write_splat_ply(path, table)
         elif name == "splat-spz":
+            table, times = in_spz(table)
             write_splat_spz(path, table)
+            unit += "" if times == 1 else f", times {times:g}"
         else:
             write_splat_glb(path, table, metres * origin)
         moved = f", less {', '.join(f'{x:g}' for x in metres * origin)}" if origin.any() else ""
@@ -126,7 +131,7 @@ def export_run(
         axes = "turned upright, y up" if axes == VIEWER else "its scene's"
         write_ply(path, points, run.model.cloud, f"{axes}{unit}")
     else:
-        colours = gltf_colours(points.colours)
+        colours = gltf_colours(points.colours / 255)
         write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})
     return f"{len(points.rows)} of {count} points{unit}"
 

@@ -1,6 +1,7 @@
 """Gaussians of three axes fitted to a run's images, and where these are few to its renderings
 of as many views between them, as viewers of 3D Gaussian splatting draw them: without a network,
-each widened by a third of a pixel^2, and colours below 0 taken for black.
+each widened by a third of a pixel^2, and colours below 0 taken for black. A step draws them for a
+window of another size, so that they look the same in all of them.
 
 The trainer does it, with the footprint "gaussian" and means of features in place of the network.
 """
@@ -10,6 +11,8 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import math
+import time
 import warnings
 import zipfile
 from dataclasses import replace
@@ -18,12 +21,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl import Config, Run, track
-from pp_cl.engine import MIN_SIDE, Crop, Crops, Means, Model, PointCloud, Trainer, View
+from pp_cl import Config, Progress, Run
+from pp_cl.engine import MIN_SIDE, Crop, Crops, FirstFeatures, Model, PointCloud, Trainer, View
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
 from pp_studio.camera_path import between
-from pp_studio.export import WINDOW
+from pp_studio.export import BEST, QUALITIES, QUICK
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 FILE = "gaussians.npz"  # in the folder of a run
@@ -38,16 +41,22 @@ GAUSSIAN = np.dtype(
     ]
 )
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
+FIRST_VIEWS = 40  # of which the points have their colours before the fit
+LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
 
-STEPS = 7000
-# Of the steps of windows larger than the images, those that draw renderings as large as these, each
-# pixel as if it were the mean of a viewer's: nearly right, and they see as much more of an image.
-COARSE = 0.7
+# Pixels on the longer side of the smallest window for which splats are made; in smaller ones
+# viewers widen Gaussians by more than points are apart, and to try costs all others some dB.
+WINDOW = 600
+DOUBLINGS = 2.0  # from there to the largest
 # Images that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
 # to the 57 of ethiopian_head.
 ENOUGH = 200
-CROP, LEAST_CROP = 192, 16  # pixels on each side of a step's crop: of what is drawn, of an image
+LARGEST = 800  # pixels to which images are reduced, about: of more, a crop would show too little
+CROP = 192  # pixels on each side of a step's crop
 EARLY_STOP = 1e-4  # of viewers
+# Steps that build the kernels, after which the time of the others is known, and that a fit in some
+# minutes has in any case.
+BUILDING, TIMED, FEWEST = 3, 10, 40
 # Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
 # rim: the root of its second moment. With the disc's opacity it covers 0.91 of the disc.
 DEVIATION = 0.39
@@ -65,31 +74,41 @@ FACTORS = np.array(
 )
 
 
-class LargeCrops(Crops):
-    """Crops whose cameras have `scale` times the pixels each way, each the mean of as many of a
-    window's as make `samples` of them a pixel of the image.
-    """
+class WindowCrops(Crops):
+    """Crops as windows of any size show them: a pixel is the mean of several of a window's."""
 
-    def __init__(self, views: list[View], config: Config, scale: int, samples: float):
-        super().__init__(views, replace(config.train, crop=CROP // scale), 0)
-        self.scale, self.samples = scale, samples / scale
+    def __init__(self, views: list[View], config: Config):
+        super().__init__(views, config.train, 0)
+        longest = max(max(view.camera.width, view.camera.height) for view in views)
+        self._least, self._most = windows(longest)
 
     def draw(self, step: int) -> Crop:
         """See Crops."""
-        crop = super().draw(step)
-        size = crop.camera.width * self.scale, crop.camera.height * self.scale
-        camera = replace(crop.camera.resized(*size), samples=self.samples)
-        return crop._replace(camera=camera)
+        crop, rng = super().draw(step), np.random.default_rng((self._seed, step, 1))
+        samples = self._least * (self._most / self._least) ** rng.random()
+        return crop._replace(camera=replace(crop.camera, samples=samples))
 
 
-def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
-    """(the points that training views show, as Gaussians, the deviation of one without offsets):
-    fitted to renderings of about `window` pixels on the longer side. Of the features of their SH,
-    which are 3D Gaussian splatting's, the first three are sRGB colour.
+def windows(longest: float) -> tuple[float, float]:
+    """Least and most pixels of a window, for one pixel of images of `longest` ones, each way, of
+    the windows for which Gaussians are made.
     """
+    least = min(max(WINDOW / longest, 1.0), 2.0)  # from the images' own pixels to a quarter of them
+    return least, least * 2**DOUBLINGS
+
+
+def fit_gaussians(
+    run: Run, steps: int, cell: float, minutes: float = math.inf
+) -> tuple[PointCloud, float]:
+    """(Gaussians, the deviation of one without offsets): fitted in so many steps, or as many as
+    take these minutes, from the points that training views show, those in a cubic `cell`, in voxel
+    sizes, as one; 0: each point. Of the features of their SH, which are 3D Gaussian splatting's,
+    the first three are sRGB colour.
+    """
+    end = time.monotonic() + 60 * minutes
     dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
-    cloud, net = _cloud(run, coefficients), Means(dev)
-    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=net)
+    cloud = begun(run, coefficients, cell)
+    model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:
         listed = run.image_files("train")
@@ -97,25 +116,29 @@ def fit_gaussians(run: Run, window: int) -> tuple[PointCloud, float]:
         more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
     sides = [side for view in views for side in (view.camera.width, view.camera.height)]
-    factor = max(1, min(round(max(sides) / window), min(sides) // MIN_SIDE))
+    factor = max(1, min(round(max(sides) / LARGEST), min(sides) // MIN_SIDE))
     views = [view.reduced(factor * view.downscale) for view in views]
-    longest = max(sides) / factor
-    samples = max(1.0, window / longest)
-    scale = min(int(samples), CROP // LEAST_CROP)
-    config = _config(run.config, scale)
+    config = config_of(run, steps)
     trainer = Trainer(dev, config, model, views)
-    steps = config.train.iterations
-    for step in track(range(steps), "fitting Gaussians", "step"):
-        if step in (0, round(COARSE * steps)):
-            net.scale = scale if step else 1
-            trainer.crops = LargeCrops(trainer.views, config, net.scale, samples)
-        trainer.train_step()
+    trainer.crops = WindowCrops(trainer.views, config)
+    with Progress("fitting Gaussians", steps, "step") as progress:
+        while trainer.step < config.train.iterations:
+            trainer.train_step()
+            progress.update()
+            if trainer.step == BUILDING:
+                first = time.monotonic()
+            if trainer.step == TIMED and minutes < math.inf:
+                now = time.monotonic()
+                fitting = TIMED + int((end - now) * (TIMED - BUILDING) / (now - first))
+                progress.total = config.train.iterations = min(max(fitting, FEWEST), steps)
     trainer.check()
     trainer.finish()
     return cloud, config.raster.radius * run.model.grid.voxel_size
 
 
-def fitted_gaussians(run: Run, window: int = WINDOW) -> tuple[np.ndarray, np.ndarray]:
+def fitted_gaussians(
+    run: Run, quality: str = QUICK, minutes: float = math.inf
+) -> tuple[np.ndarray, np.ndarray]:
     """((M,) records of GAUSSIAN, (3,) float64 origin): the run as Gaussians that are drawn without
     its network, in the axes and units of its scene, as 3D Gaussian splatting defines them.
 
@@ -126,15 +149,16 @@ def fitted_gaussians(run: Run, window: int = WINDOW) -> tuple[np.ndarray, np.nda
     for the three channels of sRGB less 0.5, basis and signs of 3D Gaussian splatting, of the unit
     direction from the eye to the mean.
 
-    Fitted once for a checkpoint and kept in the run's folder as FILE; later calls read that. Raises
-    UserError as check_drawable does.
+    Fitted once for a checkpoint and kept in the run's folder as FILE; later calls read that.
+    quality: one of QUALITIES. minutes: at most, which costs steps. Raises UserError as
+    check_drawable does.
     """
     check_drawable(run)
     path, origin = run.folder.path / FILE, run.model.grid.centre
-    key = _key(run, window)
+    key = _key(run, quality)
     table = _kept(path, key)
     if table is None:
-        table = _table(run, *fit_gaussians(run, window))
+        table = _table(run, *fit_gaussians(run, *QUALITIES[quality], minutes))
         try:
             with atomic_file(path) as file:
                 np.savez(file, key=np.array(key), gaussians=table)
@@ -143,12 +167,31 @@ def fitted_gaussians(run: Run, window: int = WINDOW) -> tuple[np.ndarray, np.nda
     return table, origin
 
 
-def _key(run, window):
+def kept_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray] | None:
+    """What fitted_gaussians() has kept for the run's checkpoint, of the last quality that was
+    asked for; None where there is nothing.
+    """
+    found = (_kept(run.folder.path / FILE, _key(run, quality)) for quality in QUALITIES)
+    table = next((one for one in found if one is not None), None)
+    return None if table is None else (table, run.model.grid.centre)
+
+
+def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
+    the colours that the network gives them. Raises UserError as check_drawable does.
+    """
+    check_drawable(run)
+    radius = run.config.raster.radius * run.model.grid.voxel_size
+    cloud = begun(run, fit_harmonics(run, steps=0, most=FIRST_VIEWS), 0)
+    return _table(run, cloud, DEVIATION * radius), run.model.grid.centre
+
+
+def _key(run, quality):
     """What the Gaussians depend on, as text."""
     cloud, digest = run.model.cloud, hashlib.sha256()
     for array in (cloud.ids, cloud.offset, cloud.opacity):
         digest.update(array.get().tobytes())
-    return json.dumps([digest.hexdigest(), run.header["step"], window, STEPS])
+    return json.dumps([digest.hexdigest(), run.header["step"], *QUALITIES[quality]])
 
 
 def _kept(path: Path, key: str) -> np.ndarray | None:
@@ -215,40 +258,77 @@ def _fitted_views(run):
     return [view for view in views if view.name not in run.header.get("left_out", ())]
 
 
-def _cloud(run, coefficients):
-    """A copy of the run's points, those that have no coefficients (N, 9, 3) of basis() left out."""
-    dev, cloud = run.dev, run.model.cloud
+def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
+    """The run's points as Gaussians, without those that have no coefficients (N, 9, 3) of basis().
+    cell: voxel sizes; the points in a cube of them become one of their mean, covariance and colour
+    that absorbs as much light. 0: none do.
+    """
+    dev, cloud, grid = run.dev, run.model.cloud, run.model.grid
     rows = np.flatnonzero(coefficients.any((1, 2)))
     if not len(rows):
         raise UserError(f"{run.folder}: the training views show no points; train it longer")
-    offset = np.zeros((len(rows), 9), np.float32)
-    given = cloud.offset.get()[rows]
-    offset[:, :3], offset[:, 3:6] = given[:, :3], given[:, 3:]  # round, as large as the points
-    sh = np.zeros((len(rows), 9, 16), np.float32)
-    sh[..., :3] = coefficients[rows][:, ORDER] / FACTORS[:, None]
+    ids, moved = cloud.ids.get()[rows], cloud.offset.get()[rows]
     opacity = cloud.opacity.get()[rows, 0].clip(0, MOST_OPAQUE)
-    return PointCloud.of_gaussians(dev, cloud.ids.get()[rows], offset, opacity, sh)
+    vertices = (grid.positions(ids) - grid.origin) / grid.voxel_size
+    places, unit = vertices + moved[:, :3], DEVIATION * run.config.raster.radius
+    area = (unit * np.exp(moved[:, 3])) ** 2  # of a round one, in voxel sizes, over 2 pi
+    one = np.arange(len(rows))  # the Gaussian of a point
+    if cell:
+        one = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
+    count = one.max() + 1
+    weight = area * opacity + 1e-6  # of those that are invisible, too, if they are alone
+    total = np.bincount(one, weight, count)[:, None]
+
+    def mean(values):
+        columns = values.reshape(len(values), -1).T
+        return np.stack([np.bincount(one, weight * each, count) for each in columns], 1) / total
+
+    middle = mean(places)
+    apart = places - middle[one]
+    spread = mean(apart[:, :, None] * apart[:, None]).reshape(-1, 3, 3)
+    spread += mean(area)[..., None] * np.eye(3)
+    lengths = np.linalg.eigvalsh(spread)
+    seen = np.sqrt(lengths[:, 1] * lengths[:, 2])  # as area
+    absorbed = np.bincount(one, -np.log1p(-opacity) * area, count) / seen
+    # Each is kept at the vertex of the first of its points, which no other has.
+    first = np.unique(one, return_index=True)[1]
+    order = np.argsort(ids[first])
+    first, lower = first[order], np.linalg.cholesky(spread)[order] / unit
+    offset = np.zeros((count, 9), np.float32)
+    offset[:, :3] = middle[order] - vertices[first]
+    offset[:, 3:6] = np.log(lower[:, range(3), range(3)])
+    offset[:, 6:9] = lower[:, [1, 2, 2], [0, 0, 1]]
+    sh = np.zeros((count, 9, 16), np.float32)
+    colours = mean(coefficients[rows]).reshape(-1, 9, 3)
+    sh[..., :3] = colours[order][:, ORDER] / FACTORS[:, None]
+    opacity = (1 - np.exp(-absorbed[order])).clip(0, MOST_OPAQUE)
+    return PointCloud.of_gaussians(dev, ids[first], offset, opacity, sh)
 
 
-def _config(given: Config, scale: int) -> Config:
-    """What the trainer follows here, for renderings of about `scale` times the images each way."""
-    config = copy.deepcopy(given)
+def config_of(run: Run, steps: int) -> Config:
+    """What the trainer follows here, and how the Gaussians are drawn."""
+    config = copy.deepcopy(run.config)
     raster, train = config.raster, config.train
     raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
     raster.radius *= DEVIATION
-    train.iterations = STEPS
+    train.iterations = steps
     train.crop, train.refine_at, train.ema = CROP, (), True
     train.mask_weight = train.distortion_weight = train.sh_smoothing = 0.0
     train.exposure, train.ssim_weight = "off", 0.0
-    # Colours, which begin nearly right, would diverge with their default rates, seventeen times
-    # these and more; shapes have the longest way. In renderings as large as the images colours must
-    # be fast, since they sharpen what viewers widen; in larger ones slower colours and faster
-    # opacities are better (0.4 dB on lego by the colours alone).
+    train.prune_weight = 0.0  # points are judged in images, where larger windows show more
+    # Colours, which begin nearly right, would diverge with their default rates, many times these;
+    # shapes have the longest way. In few steps both must go faster.
+    faster = (QUALITIES[BEST][0] / steps) ** 0.25
     train.rate_steps = 0
+<<<<<<< HEAD
     if scale == 1:
         train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (7.6e-3, 2.3e-3)
     else:
         train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
         train.prune_weight = 0.0  # points are judged in images, where larger renderings show more
     train.offset_rate, train.lobe_rate = (4e-2, 4e-3), 0.0
+=======
+    train.sh_rate = (1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster)
+    train.opacity_rate, train.offset_rate = (2.3e-2, 6.8e-3), (4e-2 * faster, 4e-3 * faster)
+>>>>>>> main
     return config

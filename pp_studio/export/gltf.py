@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.files import atomic_file, srgb_to_linear, to_8bit
+from pp_cl.files import atomic_file, srgb_to_linear
 
 POINTS, TRIANGLES = 0, 4  # of a primitive
-TYPES = {np.dtype("f4"): 5126, np.dtype("u1"): 5121, np.dtype("u4"): 5125}
+UNLIT = "KHR_materials_unlit"  # the light of the photographs is in the colours
+TYPES = {np.dtype("f4"): 5126, np.dtype("u2"): 5123, np.dtype("u4"): 5125}
 
 
 def write_glb(
@@ -22,7 +23,7 @@ def write_glb(
     faces: np.ndarray | None = None,
     extension: tuple[str, dict[str, Any]] | None = None,
 ) -> None:
-    """Write vertices. attributes: {name: (M,) or (M, K) array of float32, or of uint8 for 0 to 1},
+    """Write vertices. attributes: {name: (M,) or (M, K) array of float32, or of uint16 for 0 to 1},
     POSITION (M, 3) among them, in world coordinates. faces: (F, 3) vertices of triangles; None:
     points. extension: of the primitive, its name and JSON. Raises UserError as atomic_file does.
 
@@ -40,7 +41,7 @@ def write_glb(
         {
             "bufferView": i,
             "componentType": TYPES[array.dtype],
-            "normalized": array.dtype == np.uint8,
+            "normalized": array.dtype == np.uint16,
             "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
             "count": len(array),
         }
@@ -68,6 +69,7 @@ def write_glb(
     }
     if faces is not None:  # without a material it would be metal
         gltf["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
+        make_unlit(gltf)
     if extension:
         primitive["extensions"] = dict([extension])
         gltf["extensionsUsed"] = [extension[0]]
@@ -81,9 +83,18 @@ def write_glb(
         file.writelines(array.tobytes() for array in stored)
 
 
-def gltf_colours(colours: np.ndarray) -> np.ndarray:
-    """(M, 4) uint8 linear RGBA of (M, 3) uint8 sRGB: glTF 2.0 keeps vertex colours in linear
-    light.
+def make_unlit(gltf: dict[str, Any]) -> None:
+    """Have viewers show the materials of a glTF document without lamps; those that do not know how
+    light them as before.
     """
-    linear = to_8bit(srgb_to_linear(colours / np.float32(255)))
-    return np.column_stack([linear, np.full(len(colours), 255, np.uint8)])
+    for material in gltf.get("materials", ()):
+        material["extensions"] = {UNLIT: {}}
+    gltf["extensionsUsed"] = [*gltf.get("extensionsUsed", ()), UNLIT]
+
+
+def gltf_colours(colours: np.ndarray) -> np.ndarray:
+    """(M, 4) uint16 linear RGBA of sRGB (M, 3) in [0, 1], clipped to it: glTF 2.0 keeps vertex
+    colours in linear light, of which 8 bits would hold 6 of the 40 darkest levels of sRGB.
+    """
+    linear = np.rint(65535 * srgb_to_linear(colours.clip(0, 1))).astype(np.uint16)
+    return np.column_stack([linear, np.full(len(colours), 65535, np.uint16)])

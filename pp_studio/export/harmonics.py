@@ -12,11 +12,10 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
 from pp_cl import Run
+from pp_cl.engine import evenly
 from pp_studio.export.observe import directions, look, observe, progress
 
 COUNT = 9  # functions of basis()
-# Two steps more fit the training views better and the test views worse.
-STEPS = 3
 # Ridge on all but the constant function, per blend weight: a point that few views show has no
 # slopes. On the demo's test views, 0.003 is 0.8 dB better than 0.03.
 RIDGE = 0.003
@@ -30,22 +29,22 @@ def basis(towards: np.ndarray) -> np.ndarray:
     return np.stack(rows, 1).astype(np.float32)
 
 
-def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarray:
-    """(N, count, 3) float32: coefficients of the first functions of basis(), of the sRGB colour of
-    each of the run's points.
+def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
+    """(N, 9, 3) float32: coefficients of basis(), of the sRGB colour of each of the run's points, 0
+    of those that no view shows. most: of the training views, spread evenly; None: all.
 
     Colours are blended as the features are, over white, and clamped at last: one point's may lie
     outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
     gradients, preconditioned by A's blocks of a point. Views are weighed anew in each, since the
     weights of all would fill the memory.
     """
-    cameras, n = run.cameras("train"), run.model.cloud.count
+    cameras, n = evenly(run.cameras("train"), most), run.model.cloud.count
     positions = run.model.positions()
 
     def functions(seen):
-        return basis(directions(positions[seen.visible], seen.camera))[:, :count]
+        return basis(directions(positions[seen.visible], seen.camera))
 
-    b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
+    b, blocks = np.zeros((n, COUNT, 3), np.float32), np.zeros((n, COUNT, COUNT), np.float32)
     for camera in progress(cameras, "colours"):
         rendered = run.render(camera)
         colours = np.float32(rendered.colour - (1 - rendered.alpha)[..., None]).reshape(-1, 3)
@@ -55,8 +54,8 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
         b[rows] += at[:, :, None] * seen.gathered(colours)[:, None]
         blocks[rows] += (weights * at)[:, :, None] * at[:, None]
         del seen
-    ridge = RIDGE * blocks[:, :1, 0] * (np.arange(count) > 0) + LEAST
-    diagonal = np.arange(count)
+    ridge = RIDGE * blocks[:, :1, 0] * (np.arange(COUNT) > 0) + LEAST
+    diagonal = np.arange(COUNT)
     blocks[:, diagonal, diagonal] += ridge
     inverse = np.linalg.inv(blocks)
 

@@ -88,7 +88,7 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
         attributes = {
             "POSITION": mesh.vertices,
             "NORMAL": normals.astype(np.float32),
-            "COLOR_0": gltf_colours(mesh.colours),
+            "COLOR_0": gltf_colours(mesh.colours / 255),
         }
         write_glb(path, attributes, faces=mesh.faces)
         return

@@ -1,6 +1,7 @@
 "use strict";
-// Draws the points of #points as pp-cl's rasteriser does (cl/raster/footprint/soft.h, alpha.cl), with
-// colours from harmonics instead of the network. Axes of a camera: x right, y down, z forward.
+// Draws the Gaussians of #gaussians, whose bytes page.py's GAUSSIAN describes, as viewers of 3D
+// Gaussian splatting do (cl/raster/footprint/gaussian.h), those far away first. Axes of a camera: x
+// right, y down, z forward.
 
 const header = JSON.parse(document.getElementById("header").textContent);
 const canvas = document.querySelector("canvas");
@@ -19,119 +20,134 @@ const turned = (a, axis, angle) => {
   return add(add(scaled(a, c), cross(axis, a), s), axis, dot(axis, a) * (1 - c));
 };
 
-// ---- points ----
-const text = atob(document.getElementById("points").textContent);
-const bytes = new Uint8Array(header.count * header.stride);
-for (let i = 0; i < bytes.length; i++) bytes[i] = text.charCodeAt(i);
-// from the grid's origin, which may be too far from the world's for float32
+// ---- Gaussians ----
+const text = atob(document.getElementById("gaussians").textContent);
+const ROW = 400, TEXELS = 5;  // Gaussians in a row of the texture that holds them; texels of one
+const rows = Math.max(1, Math.ceil(header.count / ROW));
+const bytes = new Uint8Array(rows * ROW * TEXELS * 8);
+for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+// from the box's corner, which may be too far from the world's origin for float32
 const positions = new Float32Array(3 * header.count);
-const words = new Uint16Array(bytes.buffer);
+const halves = new Uint16Array(bytes.buffer);
 for (let i = 0; i < header.count; i++)
   for (let k = 0; k < 3; k++)
-    positions[3 * i + k] = header.unit * words[i * header.stride / 2 + k];
+    positions[3 * i + k] = header.unit * halves[i * TEXELS * 4 + k];
 
-const BUCKETS = 1 << 16;
-const order = new Uint32Array(header.count);
-const keys = new Uint16Array(header.count);
-const starts = new Uint32Array(BUCKETS + 1);
-
-// Fills order with the points, farthest from the eye, which is relative to the grid's origin, first:
-// one counting sort of the distances.
-function sortPoints(eye) {
-  const n = header.count, distances = new Float32Array(n);
-  let least = Infinity, most = 0;
-  for (let i = 0; i < n; i++) {
-    const x = positions[3 * i] - eye[0], y = positions[3 * i + 1] - eye[1];
-    const z = positions[3 * i + 2] - eye[2], t = Math.sqrt(x * x + y * y + z * z);
-    distances[i] = t;
-    if (t < least) least = t;
-    if (t > most) most = t;
-  }
-  const scale = (BUCKETS - 1) / Math.max(most - least, 1e-30);
-  starts.fill(0);
-  for (let i = 0; i < n; i++) {
-    keys[i] = (most - distances[i]) * scale;
-    starts[keys[i] + 1]++;
-  }
-  for (let b = 0; b < BUCKETS; b++) starts[b + 1] += starts[b];
-  for (let i = 0; i < n; i++) order[starts[keys[i]]++] = i;
+// Gives a function that sorts positions by their depth along an axis, farthest first: one counting
+// sort. It is text for a worker, too, so it uses nothing around it.
+function makeSorter(positions) {
+  const BUCKETS = 1 << 16, n = positions.length / 3;
+  const depths = new Float32Array(n), keys = new Uint16Array(n);
+  const starts = new Uint32Array(BUCKETS + 1);
+  return (axis) => {
+    const [x, y, z] = axis, order = new Uint32Array(n);
+    let least = Infinity, most = -Infinity;
+    for (let i = 0; i < n; i++) {
+      const depth = x * positions[3 * i] + y * positions[3 * i + 1] + z * positions[3 * i + 2];
+      depths[i] = depth;
+      if (depth < least) least = depth;
+      if (depth > most) most = depth;
+    }
+    const scale = (BUCKETS - 1) / Math.max(most - least, 1e-30);
+    starts.fill(0);
+    for (let i = 0; i < n; i++) {
+      keys[i] = (most - depths[i]) * scale;
+      starts[keys[i] + 1]++;
+    }
+    for (let b = 0; b < BUCKETS; b++) starts[b + 1] += starts[b];
+    for (let i = 0; i < n; i++) order[starts[keys[i]]++] = i;
+    return order;
+  };
 }
-
-// No network fills the gaps between points that pixels finer than the training's show. So a
-// footprint keeps the size in world units that it has in the finest training view, and grows up to
-// this factor. At the training's own pixels all is as it was fitted.
-const GROWN = 1.6;
-
-// How many times larger the camera shows the object than the training views do, at least 1.
-function magnification(camera, eye) {
-  const distance = Math.hypot(...add(eye, header.centre, -1));
-  return Math.max(1, header.pixel * Math.min(camera.fx, camera.fy) / Math.max(distance, 1e-9));
-}
+const sorted = makeSorter(positions);
 
 // ---- shaders ----
 const VERTEX = `#version 300 es
 precision highp float;
-layout(location = 0) in vec3 place;     // in units
-layout(location = 1) in float opacity;
-// coefficients, three colours of each function
-layout(location = 2) in vec4 b0;
-layout(location = 3) in vec4 b1;
-layout(location = 4) in vec4 b2;
-layout(location = 5) in vec4 b3;
-layout(location = 6) in vec4 b4;
-layout(location = 7) in vec4 b5;
-layout(location = 8) in vec4 b6;        // w: log of the radius over the uniform one, plus 0.5
-uniform vec3 eye;                       // from the grid's origin
-uniform float unit, radius, nearest, low[9], span[9];
-uniform float least;                    // half the width of the smallest footprint, in pixels
-uniform float grown;                    // footprints that fill the gaps between points
+precision highp usampler2D;
+layout(location = 0) in uint row;       // of the Gaussian
+uniform usampler2D gaussians;
+uniform vec3 eye;                       // from the box's corner
+uniform float unit, low[9], span[9], nearest;
+uniform vec2 logarithms;                // of deviations: the least, and the span
+uniform float widened, low_pass;        // pixels^2 on the screen: in all, of what was fitted
 uniform mat3 axes;                      // columns: right, down, forward
 uniform vec4 focal;                     // fx, fy, cx, cy
 uniform vec2 size;
-flat out vec3 centre;
-flat out float t, reach;
+out vec2 deviation;                     // from the centre, in standard deviations
 flat out vec4 colour;
-vec3 value(int k, vec3 stored) { return low[k] + span[k] * stored; }
+flat out float reach;
+uint at(uvec2 two[5], int k) {          // the byte k
+  uint word = (k & 4) == 0 ? two[k >> 3].x : two[k >> 3].y;
+  return (word >> uint(8 * (k & 3))) & 255u;
+}
 void main() {
-  vec3 towards = unit * place - eye;
-  centre = towards * axes;
-  t = length(towards);
-  float own = radius * exp(b6.w - 0.5);
-  reach = grown * max(own, least * t / min(focal.x, focal.y));
+  uvec2 two[5];
+  for (int i = 0; i < 5; i++)
+    two[i] = texelFetch(gaussians, ivec2(5u * (row % ${ROW}u) + uint(i), row / ${ROW}u), 0).xy;
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside
-  gl_PointSize = 1.0;
-  float scale = centre.z * centre.z - reach * reach;
-  if (t - own < nearest || centre.z <= reach) return;
-  vec2 at = focal.xy * centre.xy / centre.z + focal.zw;
-  // the ellipse that the footprint covers, and how far its middle is from the centre's pixel
-  vec2 half_width = focal.xy * reach * sqrt(centre.xy * centre.xy + scale) / scale;
-  vec2 aside = abs(focal.xy * centre.xy * (centre.z / scale - 1.0 / centre.z));
-  gl_PointSize = 2.0 * max(half_width.x + aside.x, half_width.y + aside.y) + 1.0;
-  gl_Position = vec4(2.0 * at.x / size.x - 1.0, 1.0 - 2.0 * at.y / size.y, 0.0, 1.0);
-  vec3 d = towards / t;
-  colour = vec4(
-      value(0, b0.xyz) + value(1, vec3(b0.w, b1.xy)) * d.x
-          + value(2, vec3(b1.zw, b2.x)) * d.y + value(3, b2.yzw) * d.z
-          + value(4, b3.xyz) * d.x * d.y + value(5, vec3(b3.w, b4.xy)) * d.y * d.z
-          + value(6, vec3(b4.zw, b5.x)) * d.x * d.z
-          + value(7, b5.yzw) * (3.0 * d.z * d.z - 1.0)
-          + value(8, b6.xyz) * (d.x * d.x - d.y * d.y),
-      opacity);
+  vec3 place = unit * vec3(two[0].x & 65535u, two[0].x >> 16, two[0].y & 65535u);
+  vec3 towards = place - eye, centre = towards * axes;
+  if (centre.z < nearest) return;
+  vec3 own = vec3(at(two, 7), at(two, 8), at(two, 9)) / 255.0;
+  own = exp(logarithms.x + logarithms.y * own);
+  vec3 q = (vec3(at(two, 10), at(two, 11), at(two, 12)) - 128.0) / 240.0;
+  float w = sqrt(max(0.0, 1.0 - dot(q, q)));
+  // the Gaussian's axes, as long as its deviations, in those of the camera
+  mat3 turn = mat3(
+      1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + w * q.z), 2.0 * (q.x * q.z - w * q.y),
+      2.0 * (q.x * q.y - w * q.z), 1.0 - 2.0 * (q.x * q.x + q.z * q.z), 2.0 * (q.y * q.z + w * q.x),
+      2.0 * (q.x * q.z + w * q.y), 2.0 * (q.y * q.z - w * q.x), 1.0 - 2.0 * (q.x * q.x + q.y * q.y));
+  mat3 form = transpose(axes) * mat3(own.x * turn[0], own.y * turn[1], own.z * turn[2]);
+  mat3 by_row = transpose(form);
+  vec2 across = centre.xy / centre.z;
+  // far outside of the image the derivative of the projection says nothing
+  vec2 most = 1.3 * max(focal.zw, size - focal.zw) / focal.xy, bent = clamp(across, -most, most);
+  vec3 a = focal.x / centre.z * (by_row[0] - bent.x * by_row[2]);
+  vec3 b = focal.y / centre.z * (by_row[1] - bent.y * by_row[2]);
+  // the covariance on the screen, and what it was before pixels larger than the fit's widened it
+  float xx = dot(a, a), yy = dot(b, b), xy = dot(a, b);
+  vec3 normal = cross(a, b);
+  float wide = dot(normal, normal), sum = xx + yy;
+  float determinant = wide + widened * sum + widened * widened;
+  float before = wide + low_pass * sum + low_pass * low_pass;
+  float opacity = float(at(two, 6)) / 255.0 * sqrt(before / determinant);
+  if (opacity * 255.0 < 1.0) return;
+  reach = sqrt(2.0 * log(255.0 * opacity));
+  float middle = 0.5 * sum + widened;
+  float half_way = sqrt(max(0.0, 0.25 * (xx - yy) * (xx - yy) + xy * xy));
+  float major = middle + half_way, minor = determinant / major;
+  vec2 along = abs(xy) > 1e-9 * sum ? normalize(vec2(xy, major - widened - xx))
+      : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  vec2 deviations = sqrt(vec2(major, minor));
+  deviation = corner * reach;
+  vec2 pixel = focal.xy * across + focal.zw
+      + deviation.x * deviations.x * along + deviation.y * deviations.y * vec2(-along.y, along.x);
+  gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
+  vec3 d = normalize(towards);
+  float basis[9] = float[9](
+      0.28209479, -0.48860251 * d.y, 0.48860251 * d.z, -0.48860251 * d.x,
+      1.09254843 * d.x * d.y, -1.09254843 * d.y * d.z, 0.31539157 * (3.0 * d.z * d.z - 1.0),
+      -1.09254843 * d.x * d.z, 0.54627422 * (d.x * d.x - d.y * d.y));
+  vec3 seen = vec3(0.5);
+  for (int k = 0; k < 9; k++) {
+    int first = 13 + 3 * k;
+    vec3 stored = vec3(at(two, first), at(two, first + 1), at(two, first + 2)) / 255.0;
+    seen += basis[k] * (low[k] + span[k] * stored);
+  }
+  colour = vec4(max(seen, 0.0), opacity);
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
-uniform vec4 focal;
-uniform vec2 size;
-flat in vec3 centre;
-flat in float t, reach;
+in vec2 deviation;
 flat in vec4 colour;
+flat in float reach;
 out vec4 result;
 void main() {
-  vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
-  vec3 ray = normalize(vec3((pixel - focal.zw) / focal.xy, 1.0));
-  float falloff = 1.0 - length(centre - t * ray) / reach;
-  if (falloff <= 0.0) discard;
-  float alpha = colour.a * falloff;
+  float square = dot(deviation, deviation);
+  if (square > reach * reach) discard;
+  float alpha = min(0.99, colour.a * exp(-0.5 * square));
   result = vec4(colour.rgb * alpha, alpha);
 }`;
 const COPY_VERTEX = `#version 300 es
@@ -158,6 +174,13 @@ function compiled(gl, ...sources) {
   return program;
 }
 
+// How many of the canvas's pixels one is wide of the nearest window for which the Gaussians are made.
+function magnification(camera, eye) {
+  const distance = Math.hypot(...add(eye, header.centre, -1));
+  const finer = header.pixel * Math.min(camera.fx, camera.fy) / Math.max(distance, 1e-9);
+  return finer / Math.min(Math.max(finer, header.windows[0]), header.windows[1]);
+}
+
 function makeDrawer(gl) {
   // 8 bits would round away the many faint layers of a pixel; where half floats cannot be drawn
   // into, the canvas must do
@@ -165,69 +188,79 @@ function makeDrawer(gl) {
     || gl.getExtension("EXT_color_buffer_half_float");
   const program = compiled(gl, VERTEX, FRAGMENT), copy = compiled(gl, COPY_VERTEX, COPY_FRAGMENT);
   const place = (name) => gl.getUniformLocation(program, name);
-  const points = gl.createVertexArray(), nothing = gl.createVertexArray();
-  gl.bindVertexArray(points);
+  const instances = gl.createVertexArray(), nothing = gl.createVertexArray();
+  gl.bindVertexArray(instances);
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ARRAY_BUFFER, bytes, gl.STATIC_DRAW);
-  const attribute = (index, count, type, normalized, offset) => {
-    gl.enableVertexAttribArray(index);
-    gl.vertexAttribPointer(index, count, type, normalized, header.stride, offset);
-  };
-  attribute(0, 3, gl.UNSIGNED_SHORT, false, 0);
-  attribute(1, 1, gl.UNSIGNED_SHORT, true, 6);
-  for (let i = 0; i < 7; i++) attribute(2 + i, 4, gl.UNSIGNED_BYTE, true, 8 + 4 * i);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.enableVertexAttribArray(0);
+  gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+  gl.vertexAttribDivisor(0, 1);
+  const stored = nearestTexture(gl, gl.RG32UI, ROW * TEXELS, rows);
+  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW * TEXELS, rows, gl.RG_INTEGER, gl.UNSIGNED_INT,
+    new Uint32Array(bytes.buffer));
   gl.useProgram(program);
+  gl.uniform1f(place("unit"), header.unit);
+  gl.uniform1f(place("nearest"), header.nearest);
   gl.uniform1fv(place("low"), header.low);
   gl.uniform1fv(place("span"), header.span);
-  for (const name of ["unit", "radius", "nearest"]) gl.uniform1f(place(name), header[name]);
+  gl.uniform2fv(place("logarithms"), header.logarithms);
   const target = deep ? gl.createFramebuffer() : null;
-  let texture = null, targetSize = "";
+  let texture = null, targetSize = "", uploaded = null;
 
   function resize(width, height) {
     if (!deep || targetSize === `${width}x${height}`) return;
     targetSize = `${width}x${height}`;
     gl.deleteTexture(texture);
-    texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    texture = nearestTexture(gl, gl.RGBA16F, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.framebufferTexture2D(
       gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
   }
 
-  // camera: pose (12 numbers, camera to world, by rows), fx, fy, cx, cy, width, height in pixels
-  return (camera) => {
+  // camera: pose (12 numbers, camera to world, by rows), fx, fy, cx, cy, width, height in pixels.
+  // order: of the Gaussians
+  return (camera, order) => {
     const p = camera.pose, world = [p[3], p[7], p[11]], eye = add(world, header.origin, -1);
-    sortPoints(eye);
     resize(camera.width, camera.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, camera.width, camera.height);
     gl.clearColor(1, 1, 1, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(program);
-    gl.bindVertexArray(points);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
+    gl.bindVertexArray(instances);
+    if (uploaded !== order) gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
+    uploaded = order;
+    gl.bindTexture(gl.TEXTURE_2D, stored);
     gl.uniform3fv(place("eye"), eye);
     gl.uniformMatrix3fv(
       place("axes"), false, [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]]);
     gl.uniform4f(place("focal"), camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform2f(place("size"), camera.width, camera.height);
-    const larger = magnification(camera, world);
-    gl.uniform1f(place("least"), 0.75 * larger);
-    gl.uniform1f(place("grown"), Math.min(larger, GROWN));
+    // Gaussians look as they do in that window: what viewers widen them by grows with them, and a
+    // pixel that shows several of the window's is their mean
+    const square = magnification(camera, world) ** 2, fitted = header.low_pass * square;
+    gl.uniform1f(place("low_pass"), fitted);
+    gl.uniform1f(place("widened"), fitted + Math.max(0, 1 - square) / 12);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.drawElements(gl.POINTS, header.count, gl.UNSIGNED_INT, 0);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, header.count);
     if (!deep) return;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.disable(gl.BLEND);
     gl.useProgram(copy);
     gl.bindVertexArray(nothing);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   };
+}
+
+// A new texture, which is bound.
+function nearestTexture(gl, format, width, height) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  return texture;
 }
 
 // ---- cameras ----
@@ -268,29 +301,90 @@ function hashOf(look) {
 const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
 if (!gl) hint.textContent = "This page needs WebGL2, which this browser or device does not have.";
 const draw = gl && makeDrawer(gl);
-let look = lookOf(location.hash), waiting = false;
+const FAST = 20, SLOW = 40, COARSEST = 0.4, REST = 200;  // milliseconds, but for COARSEST
+let look = lookOf(location.hash), waiting = false, rests = 0;
+let order = null, wanted = null, sortedAxis = "";  // of the last sort; the next axis, and this one
+let last = 0, fineness = 1;  // of the last frame of a movement; of its pixels, each way
+
+const axisOf = (camera) => [2, 6, 10].map((i) => camera.pose[i]);
 
 // Draws at once. camera: as cameraOf gives it.
 function setCamera(camera) {
   canvas.width = camera.width;
   canvas.height = camera.height;
   canvas.style.width = canvas.style.height = "";
-  draw(camera);
+  order = sorted(axisOf(camera));
+  sortedAxis = String(axisOf(camera));
+  draw(camera, order);
 }
 
-function show() {
-  waiting = false;
-  if (!gl) return;
-  const fixed = look.w && look.h, ratio = fixed ? 1 : window.devicePixelRatio || 1;
+// The camera of the window, in pixels of which `fine` are one of the screen's each way.
+function windowCamera(fine) {
+  const fixed = look.w && look.h, ratio = fixed ? 1 : fine * (window.devicePixelRatio || 1);
   const width = fixed ? look.w : innerWidth, height = fixed ? look.h : innerHeight;
   document.body.classList.toggle("bare", Boolean(fixed));
-  setCamera(cameraOf(look, Math.round(width * ratio), Math.round(height * ratio)));
+  return [cameraOf(look, Math.round(width * ratio), Math.round(height * ratio)), width, height];
+}
+
+// Draws the window as finely as it can be.
+function show() {
+  if (!gl) return;
+  const [camera, width, height] = windowCamera(1);
+  setCamera(camera);
   canvas.style.width = `${width}px`;
   canvas.style.height = `${height}px`;
 }
 
+// Draws a movement, in the order that the worker found last, and as coarsely as the machine needs.
+function frame(now) {
+  waiting = false;
+  if (!gl) return;
+  const took = now - last;
+  if (took < 4 * SLOW) {
+    if (took > SLOW) fineness = Math.max(COARSEST, 0.8 * fineness);
+    else if (took < FAST) fineness = Math.min(1, 1.05 * fineness);
+  }
+  last = now;
+  const [camera, width, height] = windowCamera(fineness);
+  canvas.width = camera.width;
+  canvas.height = camera.height;
+  canvas.style.width = `${width}px`;
+  canvas.style.height = `${height}px`;
+  sortSoon(axisOf(camera));
+  draw(camera, order);
+  clearTimeout(rests);
+  rests = setTimeout(show, REST);
+}
+
+// Has a worker sort, the newest axis after the one it is at; where there is none, this thread does.
+let worker = null, isSorting = false;
+try {
+  const source = `let sorted = null; onmessage = ({ data }) => {
+    if (!sorted) sorted = (${makeSorter})(data); else postMessage(sorted(data)); };`;
+  worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
+  worker.postMessage(positions);
+  worker.onmessage = ({ data }) => {
+    isSorting = false;
+    order = data;
+    if (wanted) sortSoon(wanted);
+    soon();
+  };
+  worker.onerror = () => { worker = null; isSorting = false; };
+} catch { worker = null; }
+
+function sortSoon(axis) {
+  wanted = isSorting ? axis : null;
+  if (isSorting) return;
+  if (!worker) order = sorted(axis);
+  else if (String(axis) !== sortedAxis) {
+    isSorting = true;
+    sortedAxis = String(axis);
+    worker.postMessage(axis);
+  }
+}
+
 function soon() {
-  if (!waiting) requestAnimationFrame(show);
+  if (!waiting) requestAnimationFrame(frame);
   waiting = true;
 }
 
@@ -359,5 +453,5 @@ addEventListener("keydown", (event) => {
 });
 addEventListener("hashchange", () => { look = lookOf(location.hash); soon(); });
 addEventListener("resize", soon);
-window.ppcl = { setCamera, show, sortPoints, order, positions, canvas };
+window.ppcl = { setCamera, show, sorted, positions, canvas };
 show();

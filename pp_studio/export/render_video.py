@@ -28,6 +28,7 @@ from pp_cl.files import (
     write_json,
     write_png,
 )
+from pp_studio.large import render_large
 from pp_studio.video import write_video
 
 MOST_IDENTITY = 1000  # bytes of it
@@ -89,7 +90,7 @@ def render_frames(
         for camera, path in zip(cameras, paths, strict=True):
             start, there = time.perf_counter(), path.exists()
             if not there:
-                rendered = run.render(camera, samples=style.samples, features=style.features)
+                rendered = render_large(run, camera, samples=style.samples, features=style.features)
                 if style.suffix == "exr":
                     write_exr(path, rendered.channels())
                 else:

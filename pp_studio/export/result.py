@@ -18,7 +18,7 @@ from pp_cl.errors import name_of
 from pp_cl.files import atomic_file, own, write_png, write_text
 from pp_cl.scene import scene_frames
 from pp_studio.capture.overview import overview
-from pp_studio.export.page import card, filled, page_text, still
+from pp_studio.export.page import card, filled, fitted, page_text, still, unfitted
 
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS, CAMERAS, MASKS = "thumbnail.png", "views.png", "cameras.png", "masks.png"
@@ -69,7 +69,8 @@ def write_result(
         shown = {name for name in (video, SPLAT) if is_newer(folder / name, done)}
         if not is_newer(folder / MODEL, folder / SPLAT if SPLAT in shown else done):
             write_png(folder / STILL, still(run))
-            write_text(folder / MODEL, page_text(run, title=title))
+            gaussians = fitted(run) if SPLAT in shown else unfitted(run)
+            write_text(folder / MODEL, page_text(run, gaussians, title=title))
         shown |= {MODEL, STILL}
         model = '<iframe src="model.html" title="The model; drag to turn it"></iframe>'
         rows, told = _figures(run, found), [*told, *_left_out(run)]

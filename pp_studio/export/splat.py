@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl import Run
-from pp_cl.files import atomic_path, to_8bit
+from pp_cl.files import atomic_path
 from pp_cl.scene import up_of
+from pp_studio.export import QUICK
 from pp_studio.export.gaussians import CONSTANT, FACTORS, ORDER, fitted_gaussians
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.harmonics import COUNT, basis
@@ -21,19 +22,22 @@ from pp_studio.export.points import in_world, inside, table_of, write_elements
 # 4 % more, and lego loses 0.05 dB less; two steps, one a degree, take more bytes than their mean.
 STEPS_OF_PLACE = 1
 STEP_OF_HARMONICS = 5 / 64
+# What a .spz holds: places below 2^19, and deviations of 8 bits from e^-10 to 380; of Gaussians
+# that are usually as wide as the least here, what it makes thicker is hardly seen.
+MOST_PLACE, LEAST_WIDTH, MOST_WIDTH = 5e5, 2e-4, 380.0
 STORED = 16  # functions in a .ply: many programs read no file but of degree 3
 Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in glTF
 
 
 def splats(
-    run: Run, turn: np.ndarray, window: int, box: np.ndarray | None = None
+    run: Run, turn: np.ndarray, quality: str = QUICK, box: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() for a `window` in the world
+    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() of a quality in the world
     turned by (3, 3), those in a box (2, 3) of the scene or all. Positions are relative to the
     origin, which is 0 unless float32 is too coarse there. Raises UserError as fitted_gaussians and
     inside() do.
     """
-    table, centre = fitted_gaussians(run, window)
+    table, centre = fitted_gaussians(run, quality)
     positions = table["position"] + centre
     held = inside(positions, box)
     table, positions = table[held], positions[held] @ turn.T
@@ -79,8 +83,24 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
 
 
+def in_spz(table: np.ndarray) -> tuple[np.ndarray, float]:
+    """(splats() in units that a .spz holds, how many of these a unit was): 1, or a power of ten for
+    what is far too large or too small.
+    """
+    widest = table["deviations"].max(axis=1)
+    too_large = max(np.abs(table["position"]).max() / MOST_PLACE, widest.max() / MOST_WIDTH, 1)
+    too_small = max(LEAST_WIDTH / np.median(widest), 1)
+    times = 10.0 ** (math.ceil(math.log10(too_small)) - math.ceil(math.log10(too_large)))
+    scaled = table.copy()
+    for name in ("position", "deviations"):
+        scaled[name] *= times
+    return scaled, times
+
+
 def write_splat_spz(path: Path, table: np.ndarray) -> None:
-    """Write splats() with y up as Niantic's .spz. Raises UserError as atomic_path does."""
+    """Write splats() with y up, as in_spz() gives them, as Niantic's .spz. Raises UserError as
+    atomic_path does.
+    """
     from gsply import GSData, write_spz
 
     place = table["position"]
@@ -94,12 +114,12 @@ def write_splat_spz(path: Path, table: np.ndarray) -> None:
         rest,
         format="ply",
     )
-    # places are numbers of 24 bits with a sign
-    bits_left = 23 - math.ceil(math.log2(np.abs(place).max(initial=1e-6) * 1.001))
+    # places are numbers of 24 bits with a sign, 4 to 23 of them behind the point
+    bits = 4, min(23, 23 - math.ceil(math.log2(np.abs(place).max(initial=1e-6) * 1.001)))
     widest = table["deviations"].max(axis=1)
     wanted = math.ceil(math.log2(STEPS_OF_PLACE / widest.min(initial=1)))
     with atomic_path(path) as temporary:
-        write_spz(temporary, data, fractional_bits=max(0, min(bits_left, wanted)))
+        write_spz(temporary, data, fractional_bits=int(np.clip(wanted, *bits)))
         with temporary.open("r+b") as file:  # gzip's time of writing, the one byte that differs
             file.seek(4)
             file.write(bytes(4))
@@ -113,7 +133,7 @@ def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> 
     attributes = {
         "POSITION": place + origin if origin.any() else place,
         # of programs that draw points instead
-        "COLOR_0": gltf_colours(to_8bit(0.5 + CONSTANT * table["harmonics"][:, 0])),
+        "COLOR_0": gltf_colours(0.5 + CONSTANT * table["harmonics"][:, 0]),
         f"{extension}:ROTATION": np.roll(table["turn"], -1, axis=1),  # x, y, z, w
         f"{extension}:SCALE": table["deviations"].copy(),
         f"{extension}:OPACITY": table["opacity"],

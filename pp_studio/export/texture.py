@@ -18,6 +18,7 @@ from pp_cl import Camera, Progress, RenderedView, Run
 from pp_cl.errors import require
 from pp_cl.files import atomic_file, to_8bit
 from pp_studio.export.fusion import COVERED
+from pp_studio.export.gltf import make_unlit
 from pp_studio.export.mesh import surface
 from pp_studio.export.observe import progress
 
@@ -141,13 +142,13 @@ def _looked_up(rendered: RenderedView, camera: Camera, positions, normals, behin
 
 
 def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:
-    """Write a GLB, whose positions are float32: relative to the middle, to which its node moves
-    them. Raises UserError as atomic_file does.
+    """Write a GLB, unlit, whose positions are float32: relative to the middle, to which its node
+    moves them. Raises UserError as atomic_file does.
     """
     middle = np.rint(mesh.vertices.mean(0))
     near, scene = mesh.copy(), trimesh.Scene()
     near.apply_translation(-middle)
     scene.add_geometry(near, transform=trimesh.transformations.translation_matrix(middle))
-    data: Any = scene.export(file_type="glb", include_normals=True)
+    data: Any = scene.export(file_type="glb", include_normals=True, tree_postprocessor=make_unlit)
     with atomic_file(path) as file:
         file.write(data)

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 import os
 import signal
 import threading
@@ -33,6 +34,7 @@ except ImportError as error:
 LOOPBACK = "127.0.0.1"
 ANSWER = 20  # seconds that a scheduler, and its first worker, have to answer
 TICK = 0.5  # seconds between two looks at the runs
+ENDING = 2.0  # seconds that trainings have for their checkpoints when a sweep is stopped
 SETTINGS = {
     "distributed.scheduler.worker-saturation": 1.0,  # a worker has its one run, none in line
     "distributed.nanny.pre-spawn-environ": {},  # Dask's one thread for numpy is too few
@@ -156,18 +158,23 @@ def run_jobs(
     client: Client, jobs: Sequence[Job], devices: Sequence[str], is_stopped: Callable[[], bool]
 ) -> Iterator[dict[str, Any]]:
     """The row of each job, as they end. devices: see run_task(). Where is_stopped() is true,
-    trainings write their checkpoints and end, and the rows that are left say so.
+    trainings write their checkpoints and end, and the rows that are left say so; what has not ended
+    ENDING seconds later is left alone.
     """
     for job in jobs:
         job.log.parent.mkdir(parents=True, exist_ok=True)
     stop = Event(client=client)
     pending = {client.submit(run_task, job, devices, stop.name, pure=False): job for job in jobs}
-    while pending:
-        if is_stopped():
+    until = math.inf
+    while pending and time.monotonic() < until:
+        if until == math.inf and is_stopped():
             stop.set()
+            until = time.monotonic() + ENDING
         for future in [future for future in pending if future.done()]:
             yield _row(future, pending.pop(future))
         time.sleep(TICK)
+    for job in pending.values():
+        yield failed_row(job, "stopped")
 
 
 def _row(future, job):

@@ -2,6 +2,7 @@
 beside them.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from pp_cl import Camera, Run
 from pp_cl.engine import Model, Renderer, Target, View
 from pp_cl.errors import UserError
 from pp_cl.files import linear_to_srgb, srgb_to_linear, to_8bit
+from pp_studio.large import render_large
 
 SHOWN = ("colour", "alpha", "depth", "normals", "fragments", "error", "photograph")
 OWN_CAMERA = SHOWN[5:]  # are shown from the nearest training view's own camera
@@ -33,11 +35,13 @@ def draw(
     early_stop: float | None = None,
     share: float = 1.0,
     exposure: float = 0.0,
+    on_part: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, str]:
     """((H, W, 3) uint8, a line on what it shows). views: the run's training views, none where its
     photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. share: of
-    the points, the most opaque ones, in (0, 1]. exposure: in stops. Raises UserError where there is
-    no photograph to show, and where the model computes NaN.
+    the points, the most opaque ones, in (0, 1]. exposure: in stops. on_part: called before each
+    part of the work. Raises UserError where there is no photograph to show, and where the model
+    computes NaN.
     """
     truth, line = np.empty(0), ""
     if show in OWN_CAMERA:
@@ -49,7 +53,7 @@ def draw(
         image = to_8bit(truth)
     else:
         shown = most_opaque(run, share) if share < 1 else run
-        image, scale = _rendered(shown, camera, show, early_stop, truth)
+        image, scale = _rendered(shown, camera, show, early_stop, truth, on_part)
         line += scale
     if exposure:
         light = srgb_to_linear(np.arange(256) / 255) * 2.0**exposure
@@ -57,14 +61,14 @@ def draw(
     return image, line
 
 
-def _rendered(run, camera, show, early_stop, truth):
+def _rendered(run, camera, show, early_stop, truth, on_part):
     """(image, its scale) of what is rendered."""
     if show == "fragments":
         # the whole view, as until="weights" would change the buffers that a training goes on with
         options = {"early_stop": early_stop, "depth_range": run.depth_range(camera)}
         counts = run.renderer.forward(camera, run.gamma, **options).fragments()
         return colour_scale(counts, 0, counts.max(), counts > 0), f"0 to {counts.max()} fragments"
-    rendered = run.render(camera, early_stop=early_stop)
+    rendered = render_large(run, camera, early_stop=early_stop, on_part=on_part)
     is_known = rendered.alpha >= LEAST_ALPHA
     if show == "alpha":
         return to_8bit(np.repeat(rendered.alpha[..., None], 3, axis=2)), ""

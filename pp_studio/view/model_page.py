@@ -14,19 +14,24 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from pp_cl import Camera, Run
 from pp_cl.engine import MIN_SIDE, View
 from pp_cl.errors import UserError, name_of
 from pp_cl.scene import frame_keys, up_of
 from pp_studio.camera_path import through
+from pp_studio.export.gaussians import CONSTANT, kept_gaussians
 from pp_studio.view.drawing import DARK, OWN_CAMERA, SHOWN, draw
+from pp_studio.view.server import switches
 from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 
 STILL = 0.2  # seconds without movement until the full resolution is drawn
 DRAFT = 4  # times fewer pixels each way while the camera moves
+SLOW = 0.25  # seconds of a draft, above which the browser draws the fitted Gaussians instead
+WAITING = "/waiting"  # the label in the middle of a page that shows nothing yet
+WHITE = np.full((1, 1, 3), 255, np.uint8)
 MOST_PIXELS = 2**23  # of a rendering
-SIZES = {"half": 0.5, "as trained": 1.0, "double": 2.0}
 FPS = 30  # of a path, as `pp-cl render` has it
 MOST_ROWS = 500  # of the curve
 LOGGED = ("step", "psnr", "loss")
@@ -36,7 +41,8 @@ BLUE, ORANGE, GREY = "#7fb4ff", "#ffb86b", "#a0a4ab"
 @dataclass
 class Tab:
     """A tab of a browser: its camera, with the tab's pixels; when (time.monotonic()) that or a
-    switch last changed; when the last draft was drawn, and the last rendering of full size.
+    switch last changed; when the last draft was drawn, and the last rendering of full size. splat:
+    the handle of the Gaussians that its browser draws, if the run has any.
     """
 
     client: Any
@@ -44,10 +50,15 @@ class Tab:
     moved: float = 0.0
     drafted: float = 0.0
     drawn: float = 0.0
+    splat: Any = None
+
+
+class _MovedError(Exception):
+    """A rendering is not wanted any more."""
 
 
 class ModelPage:
-    """run: may be replaced by that of another checkpoint. views: its training views, none where the
+    """run: that of the last take(). views: its training views, none where the
     photographs are gone. most_pixels: of a rendering. is_training: the model changes while it is
     shown, and has no memory for a copy. woken: is set when a tab wants something.
     """
@@ -68,7 +79,9 @@ class ModelPage:
         self._keys: list[Camera] = []  # of the path
         self._space = Space(*run.ball)
         cameras = [view.camera for view in views] or run.cameras("train")
-        self._focal = float(np.median([camera.fy for camera in cameras]))
+        self._is_drawn = False  # for any tab
+        self._took = 0.0  # seconds, the last draft
+        self._splat = None if is_training else self._gaussians()
         server.scene.set_up_direction(up_of(cameras))
         self._space.look_through(cameras[0], server.initial_camera)
         # who looks through a frustum sees the model, not the photograph in the frustum
@@ -80,14 +93,15 @@ class ModelPage:
             frustum.on_click(
                 lambda event, c=camera: self._space.look_through(c, event.client.camera)
             )
-        self._add_switches(run.config.raster.early_stop, is_training)
-        self._add_path_and_curve()
+        self._status = server.gui.add_markdown("")
+        with switches(server):
+            self._add_switches(run.config.raster.early_stop, is_training)
+            self._add_path_and_curve()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._disconnected)
 
     def _add_switches(self, early_stop, is_training):
         gui = self._server.gui
-        self._status = gui.add_markdown("")
         self._show = gui.add_dropdown("Show", SHOWN, hint="keys 1 to 7")
         for i, show in enumerate(SHOWN):
             command = gui.add_command(f"Show {show}", hotkey=str(i + 1))
@@ -101,11 +115,8 @@ class ModelPage:
         self._exposure = gui.add_slider(
             "Exposure, stops", min=-3.0, max=3.0, step=0.1, initial_value=0.0
         )
-        self._size = gui.add_dropdown("Image size", tuple(SIZES), initial_value="as trained")
         self._shown = gui.add_checkbox("Training views", True, hint="click one to go there")
-        trained = [
-            (one, one.value) for one in (self._stop, self._share, self._exposure, self._size)
-        ]
+        trained = [(one, one.value) for one in (self._stop, self._share, self._exposure)]
         for handle in (self._show, self._shown, *(one for one, _ in trained)):
             handle.on_update(self._switched)
         gui.add_button("As trained").on_click(
@@ -142,12 +153,32 @@ class ModelPage:
     async def _connected(self, client):
         async def moved(seen):
             if camera := self._space.camera(seen):
-                tab = self._tabs.setdefault(client.client_id, Tab(client, camera))
+                if client.client_id not in self._tabs:
+                    self._tabs[client.client_id] = Tab(
+                        client, camera, splat=self._add_splat(client)
+                    )
+                tab = self._tabs[client.client_id]
                 tab.camera, tab.moved = camera, time.monotonic()
+                splat = self._by_browser(tab)
+                if splat and not splat.visible:
+                    splat.visible = True
+                    client.scene.set_background_image(WHITE)
                 self.woken.set()
 
         client.camera.on_update(moved)
         await moved(client.camera)
+
+    def _add_splat(self, client):
+        """Have a tab's browser draw the Gaussians, at first until there is a rendering."""
+        if self._splat is None:
+            return None
+        client.scene.set_background_image(WHITE)
+        return client.scene.add_gaussian_splats("/splat", **self._splat)
+
+    def _by_browser(self, tab):
+        """The Gaussians that the tab's browser draws while its camera moves, if it does."""
+        is_wanted = self._took > SLOW and self._show.value == SHOWN[0]
+        return tab.splat if is_wanted else None
 
     async def _disconnected(self, client):
         self._tabs.pop(client.client_id, None)
@@ -182,6 +213,15 @@ class ModelPage:
 
     # ---- what the thread that has the device calls
 
+    def take(self, run: Run) -> None:
+        """Show another checkpoint of the run, to which no Gaussians are fitted yet."""
+        self.run, self._splat = run, None
+        for tab in list(self._tabs.values()):
+            splat, tab.splat = tab.splat, None
+            if splat:
+                splat.remove()
+        self.renew()
+
     def renew(self) -> None:
         """Have all tabs that rest drawn again, as the model has changed."""
         for tab in list(self._tabs.values()):
@@ -203,7 +243,8 @@ class ModelPage:
         for tab in sorted(self._tabs.values(), key=lambda tab: max(tab.drafted, tab.drawn)):
             now = time.monotonic()
             is_moving = now - tab.moved < STILL
-            if is_moving and tab.drafted < tab.moved and self._show.value not in OWN_CAMERA:
+            has_drafts = self._show.value not in OWN_CAMERA and not self._by_browser(tab)
+            if is_moving and tab.drafted < tab.moved and has_drafts:
                 tab.drafted = now
             elif not is_moving and tab.drawn < tab.moved:
                 tab.drawn = now
@@ -220,41 +261,69 @@ class ModelPage:
         self._status.content = f"step {step} of {steps}, {points} points\n\n{line}"
 
     def _camera(self, tab):
-        """Of the rendering that fills a tab, with the focal length of the training's images times
-        the size that is chosen; less where the rendering would be too large.
-        """
-        camera = tab.camera
-        width, height = camera.width, camera.height
-        scale = min(
-            SIZES.get(self._size.value, 1.0) * self._focal / camera.fy,
-            (self._most_pixels / (width * height)) ** 0.5,
-        )
-        width, height = (max(MIN_SIDE, round(scale * side)) for side in (width, height))
-        return camera.resized(width, height)
+        """Of the rendering that fills a tab, in its pixels, or fewer where these are too many."""
+        width, height = tab.camera.width, tab.camera.height
+        scale = min(1.0, (self._most_pixels / (width * height)) ** 0.5)
+        return tab.camera.resized(*(max(MIN_SIDE, round(scale * side)) for side in (width, height)))
 
-    def _image(self, camera):
+    def _gaussians(self):
+        """Arguments of viser's add_gaussian_splats: those that were fitted to the run, if any; of
+        their colours the mean of all directions.
+        """
+        if (found := kept_gaussians(self.run)) is None:
+            return None
+        table, origin = found
+        turn = Rotation.from_quat(np.roll(table["turn"], -1, axis=1)).as_matrix()
+        axes = turn * table["deviations"][:, None] / self._space.radius
+        return {
+            "centers": self._space.page(table["position"] + origin).astype(np.float32),
+            "covariances": (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
+            "rgbs": (0.5 + CONSTANT * table["harmonics"][:, 0]).clip(0, 1),
+            "opacities": table["opacity"][:, None],
+        }
+
+    def _image(self, camera, on_part=lambda: None):
         """What draw() makes of it, as the switches say; None where it refuses, and told why."""
         stop, share, exposure = map(_value, (self._stop, self._share, self._exposure))
         options = {"early_stop": stop, "share": share / 100, "exposure": exposure}
         try:
-            return draw(self.run, self._views, camera, self._show.value, **options)
+            return draw(self.run, self._views, camera, self._show.value, on_part=on_part, **options)
         except UserError as error:
             self.tell(str(error))
             return None
 
     def _send(self, tab, is_draft):
-        """Draw the rendering that a tab shows behind its frustums."""
-        start, camera = time.perf_counter(), self._camera(tab)
+        """Draw the rendering that a tab shows behind its frustums; what takes longer than a draft
+        is given up when the tab's camera moves.
+        """
+        start, moved, camera = time.perf_counter(), tab.moved, self._camera(tab)
         if is_draft:
             most = min(camera.width, camera.height) // MIN_SIDE
             camera = camera.downscaled(max(1, min(DRAFT, most)))
-        if found := self._image(camera):
+
+        def on_part():
+            if tab.moved != moved and not is_draft:
+                raise _MovedError
+
+        try:
+            found = self._image(camera, on_part)
+        except _MovedError:
+            return
+        if found:
             image, line = found
             if self._show.value in OWN_CAMERA:
                 image = framed(image, tab.camera.width / tab.camera.height)
             tab.client.scene.set_background_image(image, "jpeg", jpeg_quality=90)
-            if not is_draft:
-                took = f"{1e3 * (time.perf_counter() - start):.0f} ms on {self.run.dev.name}"
+            if tab.splat:
+                tab.splat.visible = False
+            if not self._is_drawn:
+                self._is_drawn = True
+                self._server.scene.remove_by_name(WAITING)
+            took = time.perf_counter() - start
+            if is_draft:
+                self._took = took
+            else:
+                took = f"{1e3 * took:.0f} ms on {self.run.dev.name}"
                 self.tell(f"{line}\n\n{image.shape[1]}x{image.shape[0]}, {took}")
 
     def _send_image(self, tab):
@@ -265,6 +334,11 @@ class ModelPage:
             run = name_of(self.run.folder.path)
             name = f"{run}_step_{self.run.header['step']}_{self._show.value}.png"
             tab.client.send_file_download(name, file.getvalue(), save_immediately=True)
+
+
+def announce(server: Any, text: str) -> None:
+    """Say in the middle of the page what it waits for, until a ModelPage shows a rendering."""
+    server.scene.add_label(WAITING, text)
 
 
 def framed(image: np.ndarray, aspect: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 from pp_cl import OnStep, Run, RunFolder, Training, load
 from pp_cl.engine import Device
 from pp_cl.errors import UserError, name_of
-from pp_studio.view.model_page import ModelPage
+from pp_studio.view.model_page import ModelPage, announce
 from pp_studio.view.server import started
 
 POLL = 1.0  # seconds between two looks at checkpoint and log
@@ -30,6 +30,7 @@ class RunView:
         self.told = server.gui.add_markdown("")
         self._server, self._dev, self._folder, self._scene = server, dev, folder, scene
         self._seen: dict[Any, Any] = {}  # by file: what differs when it is replaced or grows
+        announce(server, f"reading {folder}")
 
     def serve(self) -> None:
         """Draw for ever what tabs want, and take up new checkpoints and rows of the log."""
@@ -54,6 +55,7 @@ class RunView:
                 self.told.content = str(error)
         elif self.page is None and not self._folder.checkpoint.exists():
             self.told.content = f"{self._folder}: no checkpoint yet; waiting for the first one"
+            announce(self._server, "waiting for the first checkpoint")
         if self.page and self._is_new(self._folder.log):
             self.page.set_rows(logged(self._folder))
 
@@ -69,14 +71,14 @@ class RunView:
     def _take(self, run):
         self.told.content = ""
         if self.page:
-            self.page.run = run
-            self.page.renew()
+            self.page.take(run)
             return
         views = []
         try:
             views = run.scene("train").splits["train"]
         except UserError as error:
             self.told.content = f"no photographs: {error}"
+        announce(self._server, "building kernels, which takes a while the first time")
         self.page = ModelPage(self._server, run, views)
 
 
@@ -103,6 +105,7 @@ def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
     with started(name_of(training.folder.path)) as (server, address):
         page = ModelPage(server, run, trainer.views, most_pixels=most, is_training=True)
         page.tell("the first step builds kernels")
+        announce(server, "the first step builds kernels")
         rows, free, renewed = logged(training.folder), 0.0, 0.0
         page.set_rows(rows)
 

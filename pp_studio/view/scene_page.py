@@ -26,6 +26,7 @@ from pp_cl.scene import (
     up_of,
     write_edits,
 )
+from pp_studio.view.server import switches
 from pp_studio.view.space import CHOSEN, VIEW, Space, thumbnail
 
 SHOWN_POINTS = 20_000  # that a browser draws while it turns
@@ -91,6 +92,10 @@ class ScenePage:
     def _add_switches(self, names):
         gui = self._server.gui
         self._status = gui.add_markdown("")
+        with switches(self._server):
+            self._add_box_and_view(gui, names)
+
+    def _add_box_and_view(self, gui, names):
         with gui.add_folder("Box"):
             step = 1e-3 * self._space.radius
             self._corners = [gui.add_vector3(n, (0.0,) * 3, step=step) for n in ("From", "To")]

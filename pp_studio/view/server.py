@@ -41,8 +41,17 @@ def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterat
     name = socket.gethostname() if host in ANY else host
     try:
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        server.gui.main_panel.dock_right()
+        server.gui.main_panel.float(x=15, y=-15)
         yield server, f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
+
+
+def switches(server: Any) -> Any:
+    """A context in which what is added to server.gui lies in a panel of its own, beside that of the
+    page's lines; on a phone, where it would cover the picture, it is closed at first.
+    """
+    panel = server.gui.add_panel()
+    panel.dock_right()
+    return panel.add_tab("Switches")

@@ -17,7 +17,7 @@ def test_too_little_memory_makes_the_finest_grid_coarser(tmp_path, capsys):
     for name, gib in (("enough", 0), ("less", 0.03)):
         words = arguments(scene, tmp_path / name, 1, **AUTOMATIC, train__memory_gib=gib)
         assert main(words) == 0
-        hull = re.search(r"\((\S+) pixels, then (\S+)\),", capsys.readouterr().out)
+        hull = re.search(r"(\S+) pixels apart, later (\S+), ", capsys.readouterr().out)
         told.append([float(pixels) for pixels in hull.groups()])
     assert told[0] == pytest.approx([3, 1.5], rel=0.05)
     assert 1.1 < told[1][1] / told[0][1] < 3

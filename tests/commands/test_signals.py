@@ -1,14 +1,19 @@
-"""Ctrl-C and SIGTERM: the step is finished and a checkpoint written."""
+"""Ctrl-C and SIGTERM: one line, soon; a training ends its step and writes a checkpoint."""
 
 import signal
+import subprocess
+import sys
+import time
+from textwrap import dedent
 
 import pytest
 from support.checkpoints import load_checkpoint
 from support.runs import arguments
 
 from pp_cl.cli import main
-from pp_cl.commands.signals import first_signal
+from pp_cl.commands.signals import PATIENCE, STOPPING, first_signal
 from pp_cl.engine.step import Trainer
+from pp_cl.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -48,15 +53,23 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_to_the_same_bytes(
     assert (out / "checkpoint.npz").read_bytes() == whole
 
 
-def test_a_signal_in_the_last_step_changes_nothing(scene, whole, tmp_path, monkeypatch):
+def test_a_signal_in_the_last_step_changes_nothing_but_the_status(
+    scene, whole, tmp_path, capsys, monkeypatch
+):
+    """A command that trains first, as make, ends there."""
     signalling(monkeypatch, 60, signal.SIGINT)
-    assert main(arguments(scene, tmp_path / "run")) == 0
+    assert main(arguments(scene, tmp_path / "run")) == 130
+    assert "; the training is finished" in capsys.readouterr().err.splitlines()[-1]
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
 
 
-@pytest.mark.parametrize("at, saved", [(25, 20), (1, None)])
-def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch, at, saved):
-    """Both come in a step; what is promised is the last checkpoint, where there is one."""
+@pytest.mark.parametrize("at, saved, status", [(25, 20, 130), (1, None, 143)])
+def test_a_second_signal_stops_at_once_and_so_does_one_in_the_first_step(
+    scene, tmp_path, capsys, monkeypatch, at, saved, status
+):
+    """What is promised is the last checkpoint, where there is one; the first step builds kernels,
+    for half a minute, and a process that waited for them would wait for nothing.
+    """
     train_step, file = Trainer.train_step, tmp_path / "run" / "checkpoint.npz"
 
     def stepping(self):
@@ -66,7 +79,7 @@ def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch, at,
         return train_step(self)
 
     monkeypatch.setattr(Trainer, "train_step", stepping)
-    assert main(arguments(scene, tmp_path / "run")) == 130
+    assert main(arguments(scene, tmp_path / "run")) == status
     *_, line = capsys.readouterr().err.splitlines()
     assert ("goes on from" if saved else "starts over") in line
     assert load_checkpoint(file)[0]["step"] == saved if saved else not file.exists()
@@ -79,6 +92,54 @@ def test_other_commands_promise_nothing(capsys, monkeypatch):
     monkeypatch.setattr("pp_cl.commands.compare.run", interrupted)
     assert main(["compare", "a", "b"]) == 130
     assert capsys.readouterr().err == "pp-cl: interrupted\n"
+
+
+@pytest.mark.parametrize("number", STOPPING)
+def test_what_follows_from_a_signal_is_not_told(capsys, monkeypatch, number):
+    """Another process was ended by it, too, or a module was half imported."""
+
+    def broken(*_):
+        try:
+            signal.raise_signal(number)
+        finally:
+            raise UserError("ffmpeg ended")
+
+    before = signal.getsignal(number)
+    monkeypatch.setattr("pp_cl.commands.compare.run", broken)
+    assert main(["compare", "a", "b"]) == 128 + number
+    assert capsys.readouterr().err == "pp-cl: interrupted\n"
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.unix
+@pytest.mark.parametrize("number", STOPPING)
+def test_a_process_ends_soon_whatever_it_is_doing(number):
+    """Handlers do not run while a lock is waited for, which no signal interrupts, or a compiler."""
+    code = """
+        import ctypes, sys
+        from pp_cl import cli
+        from pp_cl.commands import compare
+        def run(_):
+            print(flush=True)
+            while True:
+                try:
+                    ctypes.CDLL(None).sleep(1000)
+                except KeyboardInterrupt:
+                    pass
+        compare.run = run
+        sys.exit(cli.program(["compare", "a", "b"]))
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", dedent(code)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout.readline() == "\n"
+        start = time.monotonic()
+        process.send_signal(number)
+        assert process.stderr.read() == "pp-cl: interrupted\n"
+        assert process.wait() == 128 + number and time.monotonic() - start < PATIENCE + 2
 
 
 def test_ignored_signals_stay_ignored(monkeypatch):

@@ -6,11 +6,11 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import pyopencl as cl
 import pytest
+from support.devices import fake
 from support.refused import refusing
 
-from pp_cl import drivers
+from pp_cl import drivers, speeds
 from pp_cl.drivers import (
     LEAST_CONSTANT,
     find_problem,
@@ -23,22 +23,13 @@ from pp_cl.engine.device.device import kernel_folder
 from pp_cl.engine.training.loss import TAPS
 
 
-def fake(platform, name, gpu=False, problem=None, index="0:0"):
-    """An item of list_devices() that is never opened."""
-    kind = cl.device_type.GPU if gpu else cl.device_type.CPU
-    return (
-        index,
-        SimpleNamespace(name=name, platform=SimpleNamespace(name=platform), type=kind),
-        problem,
-    )
-
-
 @pytest.fixture
 def listed(monkeypatch):
     """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a
-    Device.
+    Device. No speed is kept.
     """
     monkeypatch.setattr(drivers, "Device", lambda d: d)
+    monkeypatch.setattr(speeds, "kept_speeds", lambda _: {})
     monkeypatch.delenv("PP_DEVICE", raising=False)
     return lambda *listed_devices: monkeypatch.setattr(
         drivers, "list_devices", lambda **_: list(listed_devices)
@@ -52,7 +43,7 @@ def test_listed_devices_are_probed(session_device):
     assert open_device(index).device == session_device.device
 
 
-def test_a_gpu_that_works_comes_first(listed):
+def test_without_speeds_a_gpu_that_works_comes_first(listed):
     cpu, gpu = fake("PoCL", "cpu"), fake("NVIDIA CUDA", "H200", gpu=True, index="1:0")
     listed(cpu, gpu)
     assert open_device() is gpu[1]
@@ -62,7 +53,7 @@ def test_a_gpu_that_works_comes_first(listed):
 
 CHOICES = {"0:0": 0, "1:0": 1, "1:1": 2, "intel": 1, "Portable": 0, "h200": 2, "cuda": 2}
 # PoCL's devices carry the name of the processor: a whole name goes before a part of another
-CHOICES |= {"Intel(R) Xeon(R)": 1, "xeon": 0}
+CHOICES |= {"Intel(R) Xeon(R)": 1, "xeon": 1}  # of several the one that is taken by default
 
 
 @pytest.mark.parametrize("choice", CHOICES)

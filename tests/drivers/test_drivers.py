@@ -156,3 +156,16 @@ def test_without_a_driver_nothing_is_listed(monkeypatch):
 
     monkeypatch.setattr(cl, "get_platforms", none)
     assert drivers.load_drivers({drivers.REST: ""}) == []
+
+
+def test_a_lock_of_a_killed_process_keeps_nobody_waiting(tmp_path, monkeypatch):
+    """In pyopencl's cache; one that is held stays."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    old, held = (tmp_path / "pyopencl" / name / "lock" for name in ("old", "held"))
+    for lock in (old, held):
+        lock.parent.mkdir(parents=True)
+        lock.touch()
+    past = time.time() - 2 * drivers.STALE
+    os.utime(old, (past, past))
+    drivers.list_devices()
+    assert held.exists() and not old.exists()

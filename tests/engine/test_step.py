@@ -150,7 +150,7 @@ def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
     """The ball fills about half of its box, so 1500 cells hold some 750 points."""
     monkeypatch.setattr("pp_cl.scene.hull.CELL_CAP", 1500)
     assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
-    told = re.search(r"^hull: only (\d+) of the 1500 points .*$", capsys.readouterr().out, re.M)
+    told = re.search(r"^points: only (\d+) of the 1500 asked .*$", capsys.readouterr().out, re.M)
     assert 500 < int(told[1]) < 1500
 
 

@@ -83,3 +83,17 @@ def test_the_mend_fits_the_reason():
     assert said.startswith("a.npz: cannot be read as arrays (two lines xxx")
     assert said.endswith("...); write it again") and len(said) < MOST_REASON + 60
     assert "(EOFError)" in str(refusal("a", EOFError(), "JSON"))
+    beyond = OSError(errno.EOVERFLOW, "Value too large for defined data type")
+    assert str(refusal("a.bin", beyond, "COLMAP's")).endswith("copy it again")
+
+
+def test_texts_of_windows(tmp_path):
+    """UTF-16 with its mark is read; what is no UTF-8 is to be saved anew, not copied."""
+    file = tmp_path / "a.json"
+    for encoding in ("utf-16", "utf-8"):
+        file.write_text('"caf\u00e9"', encoding=encoding)
+        assert read_json_text(file, 1000) == '"caf\u00e9"'
+    file.write_text('"caf\u00e9"', encoding="cp1252")
+    with pytest.raises(UnicodeDecodeError) as caught:
+        read_json_text(file, 1000)
+    assert str(refusal(file, caught.value, "JSON")).endswith("save it as UTF-8, or copy it again")

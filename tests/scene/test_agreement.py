@@ -14,7 +14,7 @@ from pp_cl.cli import main
 from pp_cl.commands.info_facts import describe_scene
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import disagreements
-from pp_cl.scene.hull import agreeing, build_grid
+from pp_cl.scene.hull import agreeing, build_grid, contradicting
 from pp_cl.scene.outline import REJECTED, outline_sheet
 
 BOX = np.stack([CENTRE - RADIUS, CENTRE + RADIUS])
@@ -118,6 +118,41 @@ def test_without_masks_nothing_disagrees():
     views = ball_views(12)
     views[0] = replace(views[0], image=np.full_like(views[0].image, 255))
     assert disagreements(views, BOX) == []
+
+
+def wires(count):
+    """Views of the edges of a cube, of wires 1.5 pixels wide, with masks of all pixels that show
+    them.
+    """
+    along = np.column_stack([np.linspace(-0.45, 0.45, 700), *np.zeros((2, 700))])
+    ends = np.stack(np.meshgrid(0, (-0.45, 0.45), (-0.45, 0.45)), -1).reshape(-1, 1, 3)
+    edges = np.concatenate([np.roll(along + ends, axis, -1) for axis in range(3)]).reshape(-1, 3)
+    places = CENTRE + np.concatenate([edges + 0.012 * direction for direction in directions(8)])
+    views = []
+    for view in ball_views(count, (96, 96)):
+        column, row, _ = view.camera.pixels(places)
+        image = np.zeros_like(view.image)
+        image[row, column] = 255
+        views.append(replace(view, image=image))
+    return views
+
+
+def test_exact_masks_are_not_accused(dev):
+    """Each view carves a little that no other does, of thin parts much."""
+    views = wires(60)
+    agreement = agreeing(dev, views)
+    hull = build_grid(dev, agreement.views, 20_000)
+    assert disagreements(views, hull.grid.box)
+    assert contradicting(views, hull, agreement) == []
+
+
+def test_a_mask_that_lacks_a_part_is_named(dev):
+    views = ball_views(60)
+    views[3] = bitten(views[3], 0.25)
+    agreement = agreeing(dev, views)
+    hull = build_grid(dev, agreement.views, 20_000, None, agreement.forgiven)
+    [found] = contradicting(views, hull, agreement)
+    assert found.view is views[3] and not agreement.left_out
 
 
 @pytest.fixture

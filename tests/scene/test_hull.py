@@ -161,6 +161,36 @@ def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
     assert nearest.max() < 0.2 * RADIUS
 
 
+def cropped(view):
+    """The view cropped to its mask, which touches all borders."""
+    used = [np.flatnonzero((view.image[..., 3] > 0).any(axis)) for axis in (0, 1)]
+    (x0, x1), (y0, y1) = ((int(u[0]), int(u[-1]) + 1) for u in used)
+    camera = view.camera.crop(x0, y0, x1 - x0, y1 - y0)
+    return replace(view, stored_camera=camera, image=view.image[y0:y1, x0:x1].copy())
+
+
+def test_images_cropped_to_the_object_bound_it(dev):
+    """Without doubts their hull has ten times the volume."""
+    views = ball_views(24, (200, 200))
+    whole, tight = (build_grid(dev, v, 3000) for v in (views, [cropped(v) for v in views]))
+    assert tight.grid.voxel_size**3 < 1.4 * whole.grid.voxel_size**3
+
+
+@pytest.mark.parametrize("whole", (2, 3))
+def test_close_ups_bound_the_object_only_where_no_image_shows_it_whole(dev, whole):
+    """A vertex of the ball that lies beside ten close-ups, whose borders are free but for a
+    corner.
+    """
+    views = ball_views()
+    image = np.zeros((8, 8, 4), np.uint8)
+    image[0, 0] = 255
+    near = replace(views[0], stored_camera=views[0].camera.crop(28, 28, 8, 8), image=image)
+    vertex = CENTRE + 0.8 * RADIUS * views[0].camera.pose[:, 0]
+    carver = Carver(dev, [*views[:whole], *[near] * 10])
+    carver.least = 1
+    assert carver.carve(Grid(tuple(vertex), 0.1, (1, 1, 1))).all() == (whole == 3)
+
+
 @pytest.mark.large
 @pytest.mark.parametrize("stated", [None, (1.0, 9.0), (3.9, 4.1)])
 def test_depth_range_holds_every_point(dev, stated):

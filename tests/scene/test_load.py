@@ -1,16 +1,26 @@
 """Loading scenes: what is missing or contradictory is one line."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 from support.same_scene import views
-from support.transforms_scenes import refused, write_scene
+from support.transforms_scenes import SIZE, refused, write_scene
 
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.lens import BAND_BYTES, LensDistortion
-from pp_cl.scene.load import BAND_COPIES, load_scene, reading_cost, scene_frames, scene_splits
+from pp_cl.scene.load import (
+    BAND_COPIES,
+    list_split,
+    load_scene,
+    reading_cost,
+    scene_frames,
+    scene_splits,
+)
 from pp_cl.scene.masks import MaskRule
 from tools.scene_formats import nerfstudio
 
@@ -86,7 +96,56 @@ def test_as_many_images_are_read_at_once_as_memory_holds(
 
 def test_depth_range_of_some_views_only(tmp_path):
     write_scene(tmp_path, edit=lambda data: data["frames"][2].update(near=1, far=2))
-    refused(tmp_path, "near and far", "train_0.png", "train_2.png")
+    ranges = [view.depth_range for view in load_scene(tmp_path).splits["train"]]
+    assert ranges == [None, None, (1, 2)]
+
+
+def test_an_image_that_cannot_be_reduced_costs_its_view(tmp_path):
+    write_scene(tmp_path, count=10)
+    write_png(tmp_path / "train_4.png", np.ones((SIZE[1] // 2, SIZE[0] // 2, 4)))
+    with pytest.warns(UserWarning, match=r"train: 1 of 10 views left out.*train_4\.png"):
+        assert len(load_scene(tmp_path, downscale=1).splits["train"]) == 9
+
+
+@pytest.mark.parametrize("listed", (True, False))
+def test_pictures_that_are_there_twice(tmp_path, listed):
+    """Where the scene has no lists no picture is in both splits; where it has, that is told."""
+    (tmp_path / "images").mkdir()
+    data = write_scene(tmp_path / "images", count=20)
+    frames = data["frames"]
+    for i, frame in enumerate(frames):
+        frame["file_path"] = f"images/{i:02d}_a.png"
+        (tmp_path / f"images/train_{i}.png").rename(tmp_path / frame["file_path"])
+        shutil.copy(tmp_path / frame["file_path"], tmp_path / f"images/{i:02d}_b.png")
+    data["frames"] = frames + [f | {"file_path": f["file_path"][:-5] + "b.png"} for f in frames]
+    if listed:
+        data["train_filenames"] = [f"images/{i:02d}_a.png" for i in range(20)]
+        data["test_filenames"] = ["images/03_b.png", "images/05_b.png"]
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    splits = [
+        {one.name.partition("_")[0] for one in list_split(tmp_path, split).image_files}
+        for split in ("train", "test")
+    ]
+    if listed:
+        with pytest.warns(UserWarning, match=r"test: .*in training, too.*03_b\.png, .*05_b\.png"):
+            scene_frames(tmp_path, "test")
+    else:
+        assert not splits[0] & splits[1] and len(splits[1]) == 3
+
+
+EXPORTED = {
+    "doc.xml": "Metashape's",
+    "cameras.csv": "RealityCapture's",
+    "cams/00000000_cam.txt": "BlendedMVS's",
+    "keyframes/corrected_cameras/1.json": "Polycam's",
+}
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_files_of_other_programs_are_named(tmp_path, name):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("{}")
+    refused(tmp_path, f"is {EXPORTED[name]}", "; ")
 
 
 @pytest.mark.parametrize(

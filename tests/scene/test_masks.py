@@ -246,6 +246,19 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
     )
 
 
+@pytest.mark.parametrize("sigma", (0, 3))
+def test_masks_that_are_half_transparent_are_told(dev, tmp_path, sigma, recwarn):
+    """Sharp ones, whose edges are not counted, are not."""
+    scene = write_ball_scene(tmp_path / "ball", views=6, size=40)
+    for file in (tmp_path / "ball").rglob("*.png"):
+        rgba = read_rgba(file)
+        rgba[..., 3] = gaussian_filter(rgba[..., 3], sigma or 0.5)
+        write_png(file, rgba)
+    open_scene(dev, configure(preset("tiny"), scene), ("train",))
+    told = [str(one.message) for one in recwarn if "half transparent" in str(one.message)]
+    assert len(told) == bool(sigma)
+
+
 def test_inverted_masks_are_told(dev, tmp_path):
     scene = write_ball_scene(tmp_path / "ball", views=6, size=40)
     for file in (tmp_path / "ball").rglob("*.png"):

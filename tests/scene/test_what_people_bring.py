@@ -12,8 +12,9 @@ from PIL import Image
 from support.checkpoints import load_checkpoint
 from support.runs import SETTINGS, set_words, spoken
 from support.same_scene import held_out
-from support.scenes import ball_image, ring_cameras
+from support.scenes import ball_image, ring_cameras, write_ball_scene
 
+from pp_cl.commands.info_facts import describe_scene
 from pp_cl.engine.views import View
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import ORIENTATION
@@ -430,3 +431,26 @@ def test_axes_that_the_user_has_stated(tmp_path):
     (Path(folder) / "pp_cl.json").write_text(edits)
     status, lines = train(folder, tmp_path / "run")
     assert status == 0, lines
+
+
+def test_a_test_view_of_another_place_is_not_measured(tmp_path):
+    """Of the four test views one has a pose that is far off."""
+    folder = write_ball_scene(tmp_path / "ball", views=12)
+    file = tmp_path / "ball/transforms_train.json"
+    data = json.loads(file.read_text())
+    data["frames"] = data["frames"][::3]
+    data["frames"][2]["transform_matrix"][0][3] += 1e6
+    (tmp_path / "ball/transforms_test.json").write_text(json.dumps(data))
+    assert train(folder, tmp_path / "run")[0] == 0
+    status, lines = spoken(["eval", tmp_path / "run"])
+    told = "test: 1 of 4 views left out: their masks are beside the model (train/r_6.png)"
+    assert status == 0 and any(told in line for line in lines), lines
+    measured = json.loads((tmp_path / "run/eval/metrics.json").read_text())["per_image"]
+    assert [one["name"] for one in measured] == ["train/r_0.png", "train/r_3.png", "train/r_9.png"]
+
+
+def test_figures_of_a_scene_count_no_view_that_is_left_out(dev, tmp_path):
+    change = frame_by_frame("transform_matrix", far_off)
+    change(a_ball(tmp_path / "scene", "nerfstudio"))
+    facts, *_ = describe_scene(dev, str(tmp_path / "scene"), "tiny")
+    assert len(facts["masks"]["left_out"]) == 1 and max(facts["distances"]) < 10

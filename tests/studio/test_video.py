@@ -41,6 +41,13 @@ def test_a_video_is_read_back(tmp_path, suffix, size):
         assert difference.mean() < 6
 
 
+def test_a_page_plays_a_video_before_it_is_there_as_a_whole(tmp_path):
+    """Its index stands before the frames."""
+    write_video(tmp_path / "video.mp4", frames(), 10)
+    content = (tmp_path / "video.mp4").read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+
+
 @pytest.mark.parametrize("suffix", ["mp4", "webm"])
 @pytest.mark.parametrize("size", [(48, 64)])
 def test_colours_come_back_as_players_show_them(tmp_path, suffix, size):

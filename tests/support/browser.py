@@ -188,7 +188,7 @@ def ask(file, script, fragment=""):
     async def scenario():
         async with new_page() as page:
             await page.open(f"{file.as_uri()}{fragment}")
-            return await page.evaluate(f"(() => {{ {script} }})()")
+            return await page.evaluate(f"(async () => {{ {script} }})()")
 
     return asyncio.run(scenario())
 

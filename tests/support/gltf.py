@@ -19,10 +19,10 @@ def glb(path):
     for name, i in gltf["meshes"][0]["primitives"][0]["attributes"].items():
         accessor = gltf["accessors"][i]
         view = gltf["bufferViews"][accessor["bufferView"]]
-        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        dtype = {5126: "<f4", 5123: "<u2"}[accessor["componentType"]]
         width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
         assert view["byteOffset"] % 4 == 0
-        assert accessor.get("normalized", False) == (dtype == "u1")
+        assert accessor.get("normalized", False) == (dtype == "<u2")
         found = np.frombuffer(
             body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], dtype
         )

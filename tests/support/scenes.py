@@ -39,7 +39,10 @@ def write_ball_scene(folder, views=8, size=48, splits=("train", "test")):
     for split in splits:
         (folder / split).mkdir(exist_ok=True)
         frames = []
-        for i, camera in enumerate(ring_cameras(views if split == "train" else 2, size)):
+        cameras = ring_cameras(views, size)
+        if split != "train":
+            cameras = ring_cameras(37, size)[5::16][:2]  # none of which is one of training
+        for i, camera in enumerate(cameras):
             Image.fromarray(ball_image(camera)).save(folder / split / f"r_{i}.png")
             pose = np.vstack([camera.pose * [1, -1, -1, 1], [0, 0, 0, 1]])  # OpenGL axes
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})

@@ -2,6 +2,7 @@
 
 import numpy as np
 import plyfile
+from scipy.spatial.transform import Rotation
 
 LOW_PASS, LEAST, MOST, NEAR = 0.3, 1 / 255, 0.99, 0.2
 
@@ -45,8 +46,23 @@ def colours(harmonics, towards):
     return np.maximum(0.5 + np.einsum("kn,nkc->nc", basis, harmonics[:, :9]), 0)
 
 
-def draw_splats(splats, camera):
-    """(H, W, 3): what a Camera sees of read_splats() before white."""
+def splats_of(table, origin):
+    """What read_splats() gives, of records of GAUSSIAN."""
+    turn = Rotation.from_quat(np.roll(table["turn"], -1, axis=1)).as_matrix()
+    axes = turn * table["deviations"].astype(np.float64)[:, None]
+    return {
+        "positions": table["position"].astype(np.float64) + origin,
+        "harmonics": table["harmonics"].astype(np.float64),
+        "opacity": table["opacity"].astype(np.float64),
+        "covariance": axes @ axes.transpose(0, 2, 1),
+    }
+
+
+def draw_splats(splats, camera, low_pass=LOW_PASS, widened=LOW_PASS):
+    """(H, W, 3): what a Camera sees of read_splats() before white. low_pass: pixels^2 by which
+    their variances were widened where they were fitted; widened: by which they are now, with peaks
+    as much lower.
+    """
     axes = camera.pose[:, :3].T
     at = (splats["positions"] - camera.eye) @ axes.T
     order = np.argsort(at[:, 2], kind="stable")
@@ -59,7 +75,9 @@ def draw_splats(splats, camera):
         jacobian[:, axis, axis], jacobian[:, axis, 2] = focal / z, -focal * slope / z
     jacobian = jacobian @ axes
     flat = jacobian @ splats["covariance"][order] @ jacobian.transpose(0, 2, 1)
-    spread = flat + LOW_PASS * np.eye(2)
+    spread = flat + widened * np.eye(2)
+    before = np.linalg.det(flat + low_pass * np.eye(2))
+    opacity = splats["opacity"][order] * np.sqrt(before / np.linalg.det(spread))
     inverse = np.linalg.inv(spread)
     centre = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
     size = np.array([camera.width, camera.height])
@@ -72,7 +90,7 @@ def draw_splats(splats, camera):
     column, row = first[rank].T + np.stack([place % sides[rank, 0], place // sides[rank, 0]])
     away = np.stack([column, row], 1) + 0.5 - centre[rank]
     falloff = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, inverse[rank], away))
-    alpha = np.minimum(MOST, splats["opacity"][order][rank] * falloff)
+    alpha = np.minimum(MOST, opacity[rank] * falloff)
     hit = alpha >= LEAST
     pixel, rank, alpha = (row * camera.width + column)[hit], rank[hit], alpha[hit]
     sort = np.lexsort((rank, pixel))

@@ -7,7 +7,9 @@ from __future__ import annotations
 import atexit
 import math
 import os
+import signal
 import sys
+import threading
 import time
 import weakref
 from collections import defaultdict, deque
@@ -162,6 +164,14 @@ class QueuedArray(Array):
         """Nothing."""
 
 
+def _ignore_full_files():
+    """Leave a write beyond what a file may hold to its error, as Python does: LLVM in drivers
+    catches its signal, asks for a bug report and ends the program.
+    """
+    if hasattr(signal, "SIGXFSZ") and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
@@ -178,6 +188,7 @@ class Device:
         self.context = cl.Context([device])
         profiling: Any = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=profiling)
+        _ignore_full_files()
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
         self.bytes = self.peak_bytes = 0
         self._sent: deque[Any] = deque()  # events of send()

@@ -143,35 +143,27 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
     )
 
 
-def mean_forward(dev: Device, features: Array, image: Array, scale: int) -> None:
-    """image (H, W, 3) = means of the first three features of scale x scale pixels, of features
-    (scale H, scale W, C).
-    """
-    height, width, _ = image.shape
+def first_features_forward(dev: Device, features: Array, image: Array) -> None:
+    """image (H, W, 3) = the first three of the features (H, W, C)."""
+    channels = features.shape[2]
     dev.program("layers/output").launch(
-        "mean_forward",
-        (width, height),
-        height=height,
-        width=width,
-        scale=scale,
-        channels=features.shape[2],
+        "first_features_forward",
+        features.size // channels,
+        n=features.size // channels,
+        channels=channels,
         features=features,
         image=image,
     )
 
 
-def mean_backward(dev: Device, grad_image: Array, grad_features: Array, scale: int) -> None:
-    """Write grad_features (scale H, scale W, C), 0 beyond the first three, from grad_image (H, W,
-    3).
-    """
-    height, width, _ = grad_image.shape
+def first_features_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
+    """Write grad_features (H, W, C), 0 beyond the first three, from grad_image (H, W, 3)."""
+    channels = grad_features.shape[2]
     dev.program("layers/output").launch(
-        "mean_backward",
-        (width * scale, height * scale),
-        height=height,
-        width=width,
-        scale=scale,
-        channels=grad_features.shape[2],
+        "first_features_backward",
+        grad_features.size // channels,
+        n=grad_features.size // channels,
+        channels=channels,
         grad_image=grad_image,
         grad_features=grad_features,
     )

@@ -20,12 +20,14 @@ from scipy.spatial.transform import Rotation
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
 from pp_cl.files.image import image_size
-from pp_cl.files.untrusted import opened_regular, refusal
+from pp_cl.files.untrusted import UTF_16, opened_regular, refusal
 from pp_cl.scene.found import LeftOut, find_image, folder_named, holds_images, usable
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.readers.common import (
+    CUT_UP,
     MOST,
+    PANORAMIC,
     fail_at,
     fitted,
     hold_out,
@@ -38,7 +40,7 @@ FILES = "a sparse model of COLMAP beside images"
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", ".")
 IMAGES = "images"
 
-# number of parameters of every model of COLMAP that has a focal length, in the order of their ids
+# number of parameters of every model of COLMAP, in the order of their ids
 MODELS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -57,10 +59,11 @@ MODELS = {
     "SIMPLE_FISHEYE": 3,
     "FISHEYE": 4,
     "EUCM": 6,
+    PANORAMIC: 2,
 }
 NOT_READ = (
     *("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
-    *("SIMPLE_DIVISION", "DIVISION", "EUCM"),
+    *("SIMPLE_DIVISION", "DIVISION", "EUCM", PANORAMIC),
 )
 ONE_FOCAL = ("SIMPLE_", "RADIAL")  # how models with one focal length begin
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
@@ -111,15 +114,18 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
         text = f"of {count} models the largest beside images is read ({model})"
         warnings.warn(f"{folder}: {text}", stacklevel=1)
     lenses, images = read_model(model)
-    for lens in lenses.values():
+    undistort = (
+        f"is not read; convert with `colmap image_undistorter --image_path {folder / IMAGES}"
+        f" --input_path {model} --output_path NEW` and give NEW"
+    )
+    for identity, lens in lenses.items():
         if isinstance(lens, Lens) and lens.model in NOT_READ:
-            raise UserError(
-                f"{model}: camera model {lens.model} is not read; convert with `colmap"
-                f" image_undistorter --image_path {folder / IMAGES} --input_path {model}"
-                " --output_path NEW` and give NEW"
-            )
-    chosen = hold_out(sorted(images, key=lambda image: image.name), split)
+            why = CUT_UP if lens.model == PANORAMIC else undistort
+            text = f"{model}: camera model {lens.model} {why}"
+            lenses[identity] = Unusable(text, "a lens that is not modelled")
     near = _images_of(folder, model) or folder / IMAGES
+    images.sort(key=lambda image: image.name)
+    chosen = hold_out(images, split, [near / image.name for image in images])
     read = partial(_image_file, folder, near.relative_to(folder).as_posix(), model, lenses)
     return list(usable(progress(chosen), read, lambda image: image.name, left_out))
 
@@ -171,7 +177,10 @@ def _suffix(folder):
 
 def _image_file(folder, near, model, lenses, image):
     fail = fail_at(model, image.name)
-    name, lens = find_image(folder, f"{near}/{image.name}", fail), lenses[image.camera]
+    name, lens = find_image(folder, f"{near}/{image.name}", fail), lenses.get(image.camera)
+    if lens is None:
+        text = f"its camera {image.camera} is not in cameras; copy both files from one model"
+        raise Unusable(fail(text), BROKEN_CAMERA)
     if isinstance(lens, Unusable):
         raise lens
     numbers = list(lens.parameters)
@@ -205,11 +214,12 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
         model, width, height, parameters = lens
         if model not in MODELS:
             raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
-        if not 1 <= min(width, height) <= max(width, height) < MOST_PIXELS:
-            raise UserError(f"{where}: {width}x{height} pixels is no size; copy the file again")
         if identity in lenses:
             raise UserError(f"{file}: camera {identity} stands there twice; remove one")
-        if len(parameters) != MODELS[model] or not _are_numbers(parameters):
+        if not 1 <= min(width, height) <= max(width, height) < MOST_PIXELS:
+            text = f"{where}: {width}x{height} pixels is no size; copy the file again"
+            lens = Unusable(text, BROKEN_CAMERA)
+        elif len(parameters) != MODELS[model] or not _are_numbers(parameters):
             text = f"{MODELS[model]} parameters, finite and not huge; copy the file again"
             lens = Unusable(f"{where}: {model} has {text}", BROKEN_CAMERA)
         lenses[identity] = lens
@@ -219,11 +229,6 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
         has_controls = any(unicodedata.category(letter) == "Cc" for letter in image.name)
         if has_controls or not 1 <= len(image.name) <= MOST_NAME:
             raise UserError(f"{where}: {image.name[:80]!r} is no name of an image; rename it")
-        if image.camera not in lenses:
-            raise UserError(
-                f"{file}: {image.name}: its camera {image.camera} is not in cameras{suffix}; copy"
-                " both files from one model"
-            )
         name = PurePosixPath(image.name)  # ./a.png is a.png
         if name in images:
             raise UserError(f"{file}: {image.name}: stands there twice; remove one")
@@ -273,7 +278,9 @@ POINT = "POINT3D_ID X Y Z R G B"
 
 
 def _text_entries(file, form, parse):
-    with file.open(encoding="utf-8-sig") as opened:
+    with opened_regular(file) as binary:
+        encoding = "utf-16" if binary.read(2) in UTF_16 else "utf-8-sig"
+    with file.open(encoding=encoding) as opened:
         lines = enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1)
         for number, line in lines:
             if len(line) == MOST_LINE:

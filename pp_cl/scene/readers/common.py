@@ -22,7 +22,7 @@ from pp_cl.files.untrusted import (
     refusal,
 )
 from pp_cl.progress import track
-from pp_cl.scene.found import Fail, LeftOut, numbered, usable
+from pp_cl.scene.found import Fail, LeftOut, numbered, pictures_of, usable
 from pp_cl.scene.image_file import ImageFile
 
 HELD_OUT = 8  # one image of so many, the first among them, as LLFF and 3DGS do
@@ -31,6 +31,8 @@ MOST_JSON = 2**26  # bytes of a JSON file: 100,000 frames of 670
 MOST_ARRAYS = 2**25  # bytes of all arrays of a file, as float64: 100,000 cameras need 25 million
 MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+PANORAMIC = "EQUIRECTANGULAR"  # what COLMAP and nerfstudio call a lens that sees all around
+CUT_UP = "is panoramic; cut perspective images out of the panoramas and find their cameras"
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of numpy's savez and savez_compressed
 
 Item = TypeVar("Item")
@@ -44,10 +46,18 @@ def two_splits(folder: Path) -> list[str]:
     return SPLITS
 
 
-def hold_out(items: Sequence[Item], split: str) -> list[Item]:
-    """The items of split train or test, of a format without splits: test is every eighth."""
+def hold_out(items: Sequence[Item], split: str, files: Sequence[Path] = ()) -> list[Item]:
+    """The items of split train or test, of a format without splits: test is every eighth picture.
+    files: of the items' images, which are one picture where they are copies.
+    """
+    pictures = pictures_of(files) if files else range(len(items))
+    place = {picture: index for index, picture in enumerate(dict.fromkeys(pictures))}
     is_test = split == "test"
-    return [item for index, item in enumerate(items) if (index % HELD_OUT == 0) == is_test]
+    return [
+        item
+        for item, picture in zip(items, pictures, strict=True)
+        if (place[picture] % HELD_OUT == 0) == is_test
+    ]
 
 
 def progress(items: Sequence[Item]) -> Iterable[Item]:
@@ -96,7 +106,8 @@ def in_order(
             raise Unusable(f"{file}: {cameras[index]}: its image is gone", "no image")
         return read(index, places[index])
 
-    chosen = hold_out(range(len(cameras)), split)
+    files = [file.parent / places.get(index, "") for index in range(len(cameras))]
+    chosen = hold_out(range(len(cameras)), split, files)
     return list(usable(chosen, read_one, cameras.__getitem__, left_out))
 
 

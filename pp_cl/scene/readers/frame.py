@@ -12,19 +12,21 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
 from pp_cl.scene.found import Fail, find_image
 from pp_cl.scene.lens import LensDistortion
-from pp_cl.scene.readers.common import MOST, numbers
+from pp_cl.scene.readers.common import CUT_UP, MOST, PANORAMIC, numbers
 
 # values of camera_model: perspective lenses, and fisheyes
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+PANORAMAS = ("latlong", "equirectangular")
 # keys by which nerfstudio and instant-ngp name lenses, and the values that are modelled; null,
 # false and 0 are too
 LENS_KEYS = {
     "camera_model": PINHOLES + FISHEYES,
     "camera_type": ("PERSPECTIVE",),
     "is_fisheye": ("TRUE", "1"),
-    **dict.fromkeys(("ftheta_p0", "latlong", "equirectangular", "orthographic"), ()),
+    **dict.fromkeys(("ftheta_p0", *PANORAMAS, "orthographic"), ()),
 }
+CALIBRATE = "undistort the images with the program that found it, or let it fit the lens without"
 UNDISTORT = "undistort the images to PINHOLE, as `colmap image_undistorter` does"
 
 # largest eigenvalue of R^T R - 1 that is taken for rounding; NeRF-synthetic has 1e-6
@@ -143,13 +145,15 @@ def lens_distortion(frame: Frame) -> LensDistortion:
     """
     for key, known in LENS_KEYS.items():
         value = frame.get(key)
+        if value and (key in PANORAMAS or str(value).upper() == PANORAMIC):
+            raise frame.error(key, CUT_UP)
         if value and str(value).upper() not in known:
             raise frame.error(key, f"{quoted(value, 40)} is not modelled; {UNDISTORT}")
     is_fisheye = bool(frame.get("is_fisheye"))
     is_fisheye |= str(frame.get("camera_model")).upper() in FISHEYES
     for key in ("p1", "p2") if is_fisheye else ("k4",):
         if frame.number(key):
-            raise frame.error(key, f"is not modelled with this lens; {UNDISTORT}")
+            raise frame.error(key, f"is not modelled with this lens; {CALIBRATE}")
     numbers = {key: frame.number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4")}
     return LensDistortion(**numbers, fisheye=is_fisheye)
 

@@ -4,6 +4,7 @@ and a writer of the former.
 """
 
 import math
+import warnings
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -65,6 +66,9 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
         if name in frames:
             raise frame.error("file_path", f"{name!r} stands there twice; remove one")
         frames[name] = frame
+    if len({str(frame.get("time")) for frame in frames.values()}) > 1:
+        what = "frames differ in time, but motion is not modelled: what moves will be blurred"
+        warnings.warn(f"{file}: {what}", stacklevel=1)
     chosen = list(frames) if files else _of_split(file, data, frames, split)
     return list(usable(chosen, lambda name: _image_file(folder, frames[name]), str, left_out))
 
@@ -139,7 +143,7 @@ def _of_split(file, data, frames, split):
     ordered = sorted(frames)
     names = data.get(f"{split}_filenames")
     if names is None:
-        return hold_out(ordered, split)
+        return hold_out(ordered, split, [file.parent / name for name in ordered])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{file}: {split}_filenames: must be a list of images' paths")
     wanted, paths = set(map(_plain, names)), {name: _path(frames[name]) for name in ordered}

@@ -3,7 +3,9 @@
 import atexit
 import gc
 import re
+import signal
 import weakref
+from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
@@ -271,3 +273,13 @@ def test_debug_3_takes_infinity_where_the_kernel_says_so(debugged, tiny):
 
 
 # ---- stages
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="only Unix has the signal")
+def test_a_file_that_grows_too_large_is_an_error_alone(dev):
+    """Drivers catch the signal when they are loaded, unknown to Python; the device sets it back."""
+    own = Path("/proc/self/status")
+    if not own.exists():
+        pytest.skip("no /proc")
+    ignored = next(line for line in own.read_text().splitlines() if line.startswith("SigIgn"))
+    assert int(ignored.split()[1], 16) >> (signal.SIGXFSZ - 1) & 1

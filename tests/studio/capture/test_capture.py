@@ -79,8 +79,9 @@ def shot(captured):
 
 
 def capture(source, scene, *more):
-    """(exit status, lines on stderr) of the command."""
-    return spoken(["capture", source, "--out", scene, *more])
+    """(exit status, lines on stderr) of the command, but for those of its progress."""
+    status, lines = spoken(["capture", source, "--out", scene, *more])
+    return status, [line for line in lines if line.startswith("pp-cl")]
 
 
 def refused(source, scene, *more, named):

@@ -303,3 +303,11 @@ def test_photographs_of_several_rounds(shots, tmp_path):
     assert len({one["lens"] for one in taken["images"]}) == 3, "a lens each"
     [raw] = taken["left_out"]
     assert raw["source"] == "low/7.DNG" and "is raw" in raw["reason"]
+
+
+def test_what_a_film_repeats_takes_the_place_of_no_other_picture(tmp_path, rng):
+    """A film that was made constant: the camera moved for 40 frames, then one of them stands."""
+    shown = rng.integers(0, 256, (40, *SIZE[::-1], 3), np.uint8)
+    write_video(tmp_path / "film.webm", [*shown, *[shown[-1]] * 260], 24)
+    found = take_images(tmp_path / "film.webm", tmp_path / "images")
+    assert len(found["images"]) == 40

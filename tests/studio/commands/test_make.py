@@ -1,12 +1,15 @@
 """`pp-cl make`: what is left is done, and a folder tells of it."""
 
+import importlib
 import re
 import shutil
+import signal
 
 import pytest
 from support.runs import spoken
 
 from pp_cl.cli import main
+from pp_cl.commands import COMMANDS
 from pp_cl.files.atomic import own, write_json
 from pp_cl.files.image import read_rgba
 from pp_studio.capture import STAGES
@@ -67,6 +70,25 @@ def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, mo
     assert shown[0].path == folder / "run"
 
 
+@pytest.mark.parametrize("stage, number", [("eval", signal.SIGTERM), ("render", signal.SIGINT)])
+def test_a_signal_ends_it_and_the_same_command_goes_on(made, capsys, monkeypatch, stage, number):
+    """20 moments of a process: test_make_stopped.py."""
+    scene, folder = made
+    words, real = ["make", scene, "--out", str(folder)], importlib.import_module(COMMANDS[stage])
+    for name in ("index.html", "video.mp4"):
+        (folder / name).unlink(missing_ok=True)
+
+    def signalled(options):
+        signal.raise_signal(number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(real, "run", signalled)
+        assert main(words) == 128 + number
+    assert capsys.readouterr().err.splitlines()[-1] == "pp-cl: interrupted"
+    assert main(words) == 0
+    assert (folder / "index.html").exists() and (folder / "video.mp4").exists()
+
+
 def test_what_is_not_its_own_stays(made, tmp_path):
     scene, folder = made
     (tmp_path / "mine.txt").write_text("mine")
@@ -104,6 +126,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
             raise Enough
 
     monkeypatch.setattr(make, "_step", step)
+    monkeypatch.setattr(make, "_share", lambda: 1.0)
     monkeypatch.setattr("pp_studio.export.result.write_result", lambda *given: None)
     photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()

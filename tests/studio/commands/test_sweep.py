@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from support.checkpoints import load_checkpoint
 from support.scenes import write_ball_scene
@@ -129,6 +130,26 @@ def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkey
     table = (out / "sweep.md").read_text()
     assert main(words) == 0
     assert (out / "sweep.md").read_text() == table
+
+
+@pytest.mark.unix
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_sweep_and_its_workers_soon(scenes, tmp_path, number):
+    out = tmp_path / "out"
+    words = words_of(scenes, out, "--workers", "2", changes={"train.iterations": 100_000})
+    with start(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as sweep:
+        first(lambda: checkpoints(out))
+        workers = psutil.Process(sweep.pid).children(recursive=True)
+        begun = time.monotonic()
+        sweep.send_signal(number)
+        sweep.wait()
+        took, told = time.monotonic() - begun, sweep.stderr.read().splitlines()
+    assert sweep.returncode == 128 + number and took < 5
+    assert len([line for line in told if line.startswith("pp-cl: ")]) == 1
+    assert psutil.wait_procs(workers, timeout=20)[1] == []
+    (header, _) = load_checkpoint(checkpoints(out)[0])
+    assert not header["finished"]
 
 
 @pytest.fixture

@@ -45,22 +45,23 @@ def status(address):
 
 
 @pytest.mark.unix
-def test_the_address_works_and_a_signal_ends_it_cleanly(begun):
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_the_address_works_and_a_signal_ends_it_cleanly(begun, number, code):
     process = started(begun, "--port", "0")
     try:
         address = process.stdout.readline().split()[1]
         assert address.startswith("http://127.0.0.1:")
         assert status(address) == 200
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         out, err = process.communicate(timeout=SECONDS)
     finally:
         process.kill()
-    assert process.returncode == 0 and err == "" and out == ""
+    assert (process.returncode, err, out) == (code, "pp-cl: interrupted\n", "")
 
 
 @pytest.mark.unix
 def test_a_scene_is_shown_from_the_background_of_a_shell(tmp_path):
-    """Where Ctrl-C is ignored."""
+    """Where Ctrl-C is ignored, and SIGTERM is not."""
     scene = write_ball_scene(tmp_path / "ball")
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -70,7 +71,9 @@ def test_a_scene_is_shown_from_the_background_of_a_shell(tmp_path):
     try:
         assert status(process.stdout.readline().split()[1]) == 200
         process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=SECONDS) == ("", "")
+        process.send_signal(signal.SIGTERM)
+        assert process.communicate(timeout=SECONDS) == ("", "pp-cl: interrupted\n")
+        assert process.returncode == 143
     finally:
         process.kill()
 

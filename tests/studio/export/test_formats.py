@@ -43,7 +43,7 @@ def test_a_box_holds_a_part_and_axes_turn_it(name, run, tmp_path):
     suffix = FORMATS[name][1][0]
     for axes in AXES:
         path = tmp_path / f"{axes}{suffix}"
-        export_run(run, name, path, window=60, box=box, axes=axes)
+        export_run(run, name, path, box=box, axes=axes)
         read = trimesh.load(path, process=False)
         [some] = read.geometry.values() if suffix == ".glb" else [read]
         places[axes] = some.vertices

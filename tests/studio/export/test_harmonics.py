@@ -43,14 +43,14 @@ def test_images_of_known_harmonics_are_reproduced(run, rng, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(run, "render", rendered)
-        found = fit_harmonics(run)
+        found = fit_harmonics(run, 3)
     for seen in observe(run, run.cameras("train")[::4], ""):
         error = np.abs(drawn(run, found, seen) - drawn(run, known, seen))
         assert error.mean() < 0.0016 and error.max() < 0.035  # 0.0008 and 0.017 by the ridge
 
 
 def test_points_that_no_view_shows_keep_zero(run):
-    found = fit_harmonics(run)
+    found = fit_harmonics(run, 3)
     weights = sum(seen.point_weights() for seen in observe(run, run.cameras("train"), ""))
     hidden = weights == 0
     assert found[hidden] == pytest.approx(0)

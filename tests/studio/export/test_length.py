@@ -61,7 +61,7 @@ def test_pixels_are_those_of_the_image_as_the_lens_has_it(mine, monkeypatch):
 @pytest.mark.parametrize("name", ["mesh", "splat", "ply"])
 def test_exports_are_in_metres(mine, tmp_path, name):
     def spans(path):
-        export_run(mine, name, path, window=60)
+        export_run(mine, name, path)
         if name == "mesh":
             return trimesh.load(path).extents
         vertex = plyfile.PlyData.read(str(path))["vertex"]
@@ -75,7 +75,7 @@ def test_exports_are_in_metres(mine, tmp_path, name):
     assert spans(tmp_path / "b.ply") == pytest.approx(np.multiply(before, 0.24 / apart), rel=1e-3)
     stored = json.loads((mine.folder.path / "length.json").read_text())
     assert stored["between"] == [first, second] and stored["metres"] == 0.24
-    assert export_run(mine, name, tmp_path / "c.ply", window=60).endswith(", in metres")
+    assert export_run(mine, name, tmp_path / "c.ply").endswith(", in metres")
 
 
 def test_what_tells_no_length_is_refused(mine):

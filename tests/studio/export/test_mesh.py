@@ -40,11 +40,17 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
     if suffix == "glb":
         (read,) = read.geometry.values()
         colours = read.visual.vertex_attributes["color"]
-        assert np.array_equal(colours, gltf_colours(mesh.colours))
+        assert np.array_equal(colours, gltf_colours(mesh.colours / 255))
         header, stored = glb(path)
         outwards = read.vertices / np.linalg.norm(read.vertices, axis=1)[:, None]
         assert np.median((stored["NORMAL"] * outwards).sum(1)) > 0.9
-        assert header["materials"] == [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
+        assert header["extensionsUsed"] == ["KHR_materials_unlit"]
+        assert header["materials"] == [
+            {
+                "pbrMetallicRoughness": {"metallicFactor": 0},
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ]
     else:
         assert np.array_equal(read.visual.vertex_colors[:, :3], mesh.colours)
     assert np.array_equal(np.float32(read.vertices), mesh.vertices)

@@ -6,6 +6,7 @@ import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
+from pp_cl.files.srgb import linear_to_srgb
 from pp_studio.export.gltf import gltf_colours
 from pp_studio.export.observe import observe
 from pp_studio.export.points import coloured_points, write_ply
@@ -74,8 +75,16 @@ def test_the_ply_reads_back_by_plyfile(run, written):
 
 
 def test_colours_are_in_linear_light():
-    srgb = np.repeat(np.uint8([[0], [10], [128], [255]]), 3, axis=1)
+    srgb = np.repeat(np.array([[0], [10], [128], [255]]), 3, axis=1) / 255
     # IEC 61966-2-1: 10 is on its straight part
-    expected = [0, round(10 / 12.92), round(255 * ((128 / 255 + 0.055) / 1.055) ** 2.4), 255]
-    assert gltf_colours(srgb)[:, 0].tolist() == expected
-    assert (gltf_colours(srgb)[:, 3] == 255).all()
+    expected = np.array([0, 10 / 255 / 12.92, ((128 / 255 + 0.055) / 1.055) ** 2.4, 1])
+    assert gltf_colours(srgb)[:, 0].tolist() == np.rint(65535 * expected).tolist()
+    assert (gltf_colours(srgb)[:, 3] == 65535).all()
+    assert gltf_colours(np.array([[-0.1, 1.1, 0.0]])).tolist() == [[0, 65535, 0, 65535]]
+
+
+def test_no_level_of_a_dark_colour_is_lost():
+    levels = np.arange(256)
+    stored = gltf_colours(np.repeat(levels[:, None] / 255, 3, axis=1))
+    read = 255 * linear_to_srgb(stored[:, :3] / 65535)
+    assert np.array_equal(np.rint(read), np.repeat(levels[:, None], 3, axis=1))

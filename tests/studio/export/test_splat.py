@@ -16,11 +16,20 @@ from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.scene.gaze import up_of
-from pp_studio.export import gaussians
-from pp_studio.export.gaussians import DEVIATION, fit_gaussians
+from pp_studio.export import QUALITIES, QUICK, gaussians
+from pp_studio.export.gaussians import (
+    CONSTANT,
+    DEVIATION,
+    WindowCrops,
+    begun,
+    fit_gaussians,
+    fitted_gaussians,
+)
+from pp_studio.export.harmonics import fit_harmonics
 from pp_studio.export.splat import (
     Y_DOWN,
     Y_UP,
+    in_spz,
     splats,
     upright,
     write_splat_glb,
@@ -38,20 +47,20 @@ LAYOUT += [f"rot_{i}" for i in range(4)]
 def steps():
     """As many as make them look like the run."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaussians, "STEPS", 400)
+        patch.setitem(QUALITIES, QUICK, (400, 0.0))
         yield
 
 
 @pytest.fixture(scope="module")
 def y_up(run, steps):
     """(table, origin)."""
-    return splats(run, upright(run, Y_UP), 90)
+    return splats(run, upright(run, Y_UP))
 
 
 @pytest.fixture(scope="module")
 def ply(run, steps, tmp_path_factory):
     path = tmp_path_factory.mktemp("splat") / "a.ply"
-    write_splat_ply(path, splats(run, upright(run, Y_DOWN), 90)[0])
+    write_splat_ply(path, splats(run, upright(run, Y_DOWN))[0])
     return path
 
 
@@ -101,11 +110,52 @@ def likeness(run, path, scale):
     return np.mean(measured)
 
 
-def test_gaussians_look_like_the_run_in_the_window_that_they_are_for(run, ply, tmp_path):
-    small = tmp_path / "small.ply"
-    write_splat_ply(small, splats(run, upright(run, Y_DOWN), 30)[0])
-    assert likeness(run, ply, 3) > 37
-    assert likeness(run, small, 1) > 37 and likeness(run, ply, 1) < 30
+def test_gaussians_look_like_the_run_in_windows_of_any_size(run, ply):
+    assert min(likeness(run, ply, scale) for scale in (2, 3, 5)) > 35
+
+
+def test_points_of_a_cell_begin_as_one_that_looks_like_them(run):
+    coefficients = fit_harmonics(run, steps=1)
+    places = run.model.positions()
+    for cell in (0.0, 1.5):
+        cloud = begun(run, coefficients, cell)
+        ids, offset = cloud.ids.get(), cloud.offset.get()
+        assert (np.diff(ids.astype(np.int64)) > 0).all()
+        positions = run.model.grid.positions(ids) + run.model.grid.voxel_size * offset[:, :3]
+        away = cKDTree(places).query(positions, p=np.inf)[0] / run.model.grid.voxel_size
+        assert away.max() < 1e-4 if cell == 0 else cloud.count < 0.7 * len(places)
+        assert away.max() <= cell
+    # what a cell holds of one colour stays of that colour
+    sh = cloud.sh[0].get()[:, 0, :3] * CONSTANT
+    assert coefficients[:, 0].min() - 1e-5 < sh.min() and sh.max() < coefficients[:, 0].max() + 1e-5
+
+
+@pytest.mark.parametrize(("size", "least", "most"), [(30, 2, 8), (400, 1.5, 6), (1600, 1, 4)])
+def test_windows_are_as_large_as_people_have_them(run, size, least, most):
+    (view, *_) = run.rendered(run.image_files("train")[:1], opaque=True)
+    large = replace(view, stored_camera=view.stored_camera.resized(size, size))
+    crops = WindowCrops([replace(large, image=np.zeros((size, size, 4), np.uint8))], run.config)
+    drawn = [crops.draw(step).camera.samples for step in range(200)]
+    assert least <= min(drawn) < 1.1 * least and 0.9 * most < max(drawn) <= most
+
+
+def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
+    table, origin = fitted_gaussians(run)
+    monkeypatch.setattr(gaussians, "Trainer", Mock(side_effect=InterruptedError))
+    again, _ = fitted_gaussians(run)
+    assert np.array_equal(table, again)
+    positions = table["position"] + origin
+    assert cKDTree(run.model.positions()).query(positions)[0].max() < 4 * run.model.grid.voxel_size
+    path = run.folder.path / "gaussians.npz"
+    whole = path.read_bytes()
+    for changed in (whole[:1000], b"", b"no archive"):
+        path.write_bytes(changed)
+        with pytest.raises(InterruptedError):
+            fitted_gaussians(run)
+    path.write_bytes(whole)
+    monkeypatch.setitem(QUALITIES, QUICK, (401, 0.0))
+    with pytest.raises(InterruptedError):
+        fitted_gaussians(run)
 
 
 def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatch):
@@ -114,19 +164,20 @@ def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatc
     """
     monkeypatch.setattr(gaussians, "Trainer", fitted := Mock(side_effect=InterruptedError))
 
-    def views(window=30):
+    def views():
         with pytest.raises(InterruptedError):
-            fit_gaussians(run, window)
+            fit_gaussians(run, 1, 0.0)
         return fitted.call_args[0][3]
 
     images, found = run.scene("train").splits["train"], views()
     assert len(found) == 2 * len(images)
-    with monkeypatch.context() as patch:  # for a window that is smaller than the images
-        for module in ("pp_cl.engine.views", "pp_studio.export.gaussians"):
-            patch.setattr(f"{module}.MIN_SIDE", 8)
-        assert {view.camera.width for view in views(15)} == {15}
     for one, other in zip(images, found, strict=False):
         assert one.name == other.name and (one.image == other.image).all()
+    with monkeypatch.context() as patch:  # as if they were large
+        patch.setattr("pp_cl.engine.views.MIN_SIDE", 8)
+        patch.setattr(gaussians, "MIN_SIDE", 8)
+        patch.setattr(gaussians, "LARGEST", 15)
+        assert {view.camera.width for view in views()} == {15}
     rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
     assert [view.image.shape for view in found[len(images) :]] == rendered
     with monkeypatch.context() as patch:
@@ -159,6 +210,24 @@ def test_the_spz_says_the_same_with_y_up(y_up, ply, tmp_path):
     rest = table["harmonics"][:, 1:].clip(-127 / 128, 127 / 128)  # what 8 bits hold
     assert np.abs(found.shN - rest).max() < 0.0392
     assert (tmp_path / "a.spz").stat().st_size < ply.stat().st_size / 9
+
+
+@pytest.mark.parametrize(("unit", "sign"), [(100, 0), (1e7, -1), (1e-6, 1), (0.1, 0)])
+def test_the_spz_holds_objects_of_any_size(y_up, unit, sign, tmp_path):
+    """In millimetres too, where its places have fewest bits; what is far too large or too small for
+    it is scaled.
+    """
+    table = y_up[0].copy()
+    table["position"] *= unit
+    table["deviations"] *= unit
+    scaled, times = in_spz(table)
+    write_splat_spz(tmp_path / "a.spz", scaled)
+    found = gsply.read_spz(tmp_path / "a.spz")
+    widest = table["deviations"].max(1)
+    assert np.sign(np.log10(times)) == sign
+    away = np.abs(found.means / times - table["position"]).max(1)
+    assert (away < 0.6 * widest).all()
+    assert np.exp(found.scales).max(1) / times == pytest.approx(widest, rel=0.04)
 
 
 def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):

@@ -43,9 +43,12 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
     said = export_run(run, "textured", tmp_path / "a.glb")
     solid = trimesh.load(tmp_path / "a.glb", force="mesh")
-    assert said == f"{len(solid.vertices)} vertices, {len(solid.faces)} faces"
+    assert said == f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit"
     assert 300 < len(solid.faces) <= 600 and solid.visual.uv.shape == (len(solid.vertices), 2)
-    _, stored = glb(tmp_path / "a.glb")
+    gltf, stored = glb(tmp_path / "a.glb")
+    # the light of the photographs is in the texture: lamps would be a second one
+    assert gltf["materials"][0]["extensions"] == {"KHR_materials_unlit": {}}
+    assert gltf["extensionsUsed"] == ["KHR_materials_unlit"]
     outwards = stored["POSITION"] - stored["POSITION"].mean(0)
     assert np.mean((stored["NORMAL"] * outwards).sum(1) > 0) > 0.9
     image = np.asarray(solid.visual.material.baseColorTexture.convert("RGB")) / 255

@@ -15,21 +15,23 @@ from support.viewing import drawing, tab, wait
 from pp_cl.config import load_config
 from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import load_run
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.session.training import open_training
+from pp_studio.export.gaussians import fitted_gaussians
+from pp_studio.large import render_large
 from pp_studio.view.drawing import draw
 from pp_studio.view.model_page import STILL, ModelPage
 from pp_studio.view.run_view import RunView, shown_training
 
-CAMERA = ring_cameras(3, 48)[2]
+CAMERA = ring_cameras(3, 96)[2]  # of tabs, finer than the training, as JPEG loses less then
 
 
 @pytest.fixture
 def view(served, dev, copied):
-    """The small run, loaded; its renderings are larger than it was trained, as JPEG loses less."""
+    """The small run, loaded."""
     found = RunView(served[0], dev, RunFolder(copied))
     found.look()
-    found.page._focal = 2 * CAMERA.fy
     return found
 
 
@@ -62,13 +64,12 @@ def test_a_moving_camera_gets_drafts_and_one_at_rest_the_full_image(view, served
         assert opened.image().shape == (24, 24, 3)
         monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
         assert view.page.draw_next() and not view.page.draw_next()
-        opened.image(like(view, CAMERA.resized(96, 96)))
+        opened.image(like(view, CAMERA))
         view.page.renew()
         assert view.page.draw_next()
 
 
 def test_switches_change_what_is_drawn(view, served):
-    camera = CAMERA.resized(96, 96)
     changes = (
         ("Show depth", True, {"show": "depth"}),
         ("Exposure, stops", -2.0, {"show": "depth", "exposure": -2.0}),
@@ -77,7 +78,7 @@ def test_switches_change_what_is_drawn(view, served):
         ("Points kept, %", 20, {"share": 0.2}),
         ("Points kept, %", -7, {"share": 0.01}),  # what no slider says
     )
-    checks = [like(view, camera, **look) for _, _, look in changes]
+    checks = [like(view, CAMERA, **look) for _, _, look in changes]
     with looking(view, served[1]) as opened, drawing(view.page):
         for (label, value, _), check in zip(changes, checks, strict=True):
             if label == "Show depth":  # a key
@@ -93,7 +94,7 @@ def test_the_image_is_saved_as_it_is(view, served):
         name, content = opened.file()
     image = np.array(Image.open(io.BytesIO(content)))
     assert name == f"{view._folder.path.name}_step_40_colour.png"
-    rendering = to_8bit(view.page.run.render(CAMERA.resized(96, 96)).colour)
+    rendering = to_8bit(render_large(view.page.run, CAMERA).colour)
     assert np.abs(image - rendering.astype(int)).max() <= 1  # the camera came by float64 words
 
 
@@ -119,7 +120,7 @@ def test_a_path_is_one_that_render_takes(view, served, tmp_path):
     np.testing.assert_allclose(cameras[0].pose, keys[0].pose, atol=1e-6)
     np.testing.assert_allclose(cameras[-1].pose, keys[2].pose, atol=1e-6)
     assert {(c.width, c.height) for c in cameras} == {(cameras[0].width,) * 2}
-    np.testing.assert_allclose(cameras[30].fx / cameras[30].width, CAMERA.fx / 48)
+    np.testing.assert_allclose(cameras[30].fx / cameras[30].width, CAMERA.fx / 96)
 
 
 def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
@@ -130,6 +131,57 @@ def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
         other.look(CAMERA, view.page._space)
     wait(lambda: not view.page._tabs)
     assert not view.page.draw_next()
+
+
+def test_the_page_says_what_it_waits_for_until_there_is_a_picture(served, dev, copied):
+    def said(opened):
+        node = opened.nodes.get("/waiting")
+        return node and node["props"]["text"]
+
+    found = RunView(served[0], dev, RunFolder(copied))
+    with tab(served[1]) as opened:
+        assert said(opened) == f"reading {copied}"
+    found.look()
+    with looking(found, served[1]) as opened:
+        assert "kernels" in said(opened)
+        drawn(found)
+        opened.receive("RemoveSceneNodeMessage", lambda message: message["name"] == "/waiting")
+
+
+def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monkeypatch):
+    with looking(view, served[1]) as opened:
+        [seen] = view.page._tabs.values()
+
+        def move(*_, on_part, **__):
+            seen.moved = time.monotonic()
+            on_part()
+
+        monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
+        with monkeypatch.context() as patch:
+            patch.setattr("pp_studio.view.model_page.draw", move)
+            assert view.page.draw_next()
+        assert view.page.draw_next()  # the next one
+        opened.image(like(view, CAMERA))
+
+
+def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copied, monkeypatch):
+    table, _ = fitted_gaussians(load_run(dev, copied))
+    view = RunView(served[0], dev, RunFolder(copied))
+    view.look()
+    monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)
+    with looking(view, served[1]):
+        [seen] = view.page._tabs.values()
+        assert seen.splat.visible  # until there is a rendering
+        assert seen.splat.buffer.shape[0] == len(table)
+        assert view.page.draw_next() and not seen.splat.visible
+        view.page._took = 1e9
+        seen.moved = time.monotonic()
+        assert not view.page.draw_next(), "no draft is drawn"
+        monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
+        assert view.page.draw_next() and not seen.splat.visible
+        os.utime(copied / "checkpoint.npz", ns=(1, 1))
+        view.look()
+        assert seen.splat is None, "they are of the checkpoint before"
 
 
 def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copied):

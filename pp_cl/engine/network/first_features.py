@@ -7,18 +7,16 @@ from collections.abc import Callable
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.simple import mean_backward, mean_forward
+from pp_cl.engine.layers.simple import first_features_backward, first_features_forward
 
 
-class Means:
-    """Has what a model's network has, see UNet, but no parameters. A pixel of the image is the mean
-    of scale x scale pixels of the features; scale may change between two images.
-    """
+class FirstFeatures:
+    """Has what a model's network has, see UNet, but no parameters."""
 
     multiple = 1  # of which the sides of images are
 
-    def __init__(self, dev: Device, scale: int = 1):
-        self.dev, self.scale = dev, scale
+    def __init__(self, dev: Device):
+        self.dev = dev
         self.parameters: dict[str, Array] = {}
         self.all_parameters, self.all_gradients = dev.zeros((1,)), dev.zeros((1,))
         self._shape: tuple[int, ...] = ()  # of the features of the last forward()
@@ -45,14 +43,14 @@ class Means:
         return lambda: None
 
     def forward(self, x: Array, training: bool = True, plan: None = None) -> Array:
-        """(H, W, 3) float32 image of the features x (scale H, scale W, C)."""
-        height, width, _ = self._shape = x.shape
-        image = self.dev.empty((height // self.scale, width // self.scale, 3))
-        mean_forward(self.dev, x, image, self.scale)
+        """(H, W, 3) float32 image of the features x (H, W, C)."""
+        self._shape = x.shape
+        image = self.dev.empty((*x.shape[:2], 3))
+        first_features_forward(self.dev, x, image)
         return image
 
     def backward(self, grad_image: Array) -> Array:
-        """(scale H, scale W, C) float32 gradient of the features of the last forward()."""
+        """(H, W, C) float32 gradient of the features of the last forward()."""
         grad_features = self.dev.empty(self._shape)
-        mean_backward(self.dev, grad_image, grad_features, self.scale)
+        first_features_backward(self.dev, grad_image, grad_features)
         return grad_features

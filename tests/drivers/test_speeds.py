@@ -1,0 +1,152 @@
+"""The device that was the fastest when measured is taken: once for all commands and processes, and
+anew for another version of a driver.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+from support.devices import fake
+
+from pp_cl import drivers, speeds
+from pp_cl.cli import main
+from pp_cl.speeds import CLEARLY
+
+POCL, INTEL = "Portable Computing Language", "Intel(R) OpenCL"
+
+
+@pytest.fixture
+def measured(monkeypatch, tmp_path):
+    """Sets {name of a device: its speed} that the next measurement finds; a list of how many of
+    them there were.
+    """
+    monkeypatch.setenv("PP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("PP_DEVICE", raising=False)
+    counts, now = [], {}
+
+    def measure():
+        counts.append(len(counts) + 1)
+        return now
+
+    monkeypatch.setattr(speeds, "_measured", measure)
+
+    def sets(found, *values):
+        now.clear()
+        now.update(zip(map(speeds._key, [one[1] for one in found]), values, strict=True))
+        return counts
+
+    return sets
+
+
+def first(found):
+    """The index of the device that is taken."""
+    return speeds.by_speed(found)[0][0]
+
+
+def test_the_fastest_is_taken_and_measured_once(measured):
+    found = [fake("A", "cpu"), fake("B", "gpu", gpu=True, index="1:0"), fake("C", "c", index="2:0")]
+    counts = measured(found, 5.0, 7.0, 6.0)
+    assert first(found) == "1:0"
+    measured(found, 9.0, 1.0, 1.0)  # on a busy day
+    assert first(found) == first(found[::-1]) == "1:0" and counts == [1]
+    assert first(found[:1]) == "0:0" and first([found[0], found[2]]) == "2:0" and counts == [1]
+
+
+def test_another_version_is_measured_anew(measured):
+    found = [fake("A", "a"), fake("B", "b", index="1:0")]
+    counts = measured(found, 5.0, 1.0)
+    assert first(found) == "0:0"
+    newer = [found[0], fake("B", "b", index="1:0", version="2")]
+    measured(newer, 5.0, 6.0)
+    assert first(newer) == "1:0" and counts == [1, 2]
+    assert first(found) == "0:0" and counts == [1, 2]  # another environment, with the older one
+
+
+def test_intels_driver_goes_before_another_of_cpus_that_is_not_clearly_faster(measured):
+    found = [fake(POCL, "cpu-Xeon"), fake(INTEL, "Xeon", index="1:0")]
+    measured(found, 99.0 * CLEARLY, 100.0)
+    assert first(found) == "1:0"
+    newer = [found[0], fake(INTEL, "Xeon", index="1:0", version="2")]
+    measured(newer, 101.0 * CLEARLY, 100.0)
+    assert first(newer) == "0:0"
+    gpu = fake("A", "gpu", gpu=True, index="2:0")
+    measured([*found, gpu], 1.0, 100.0, 101.0)
+    assert first([*found, gpu]) == "2:0"
+
+
+def test_what_does_not_work_or_cannot_be_measured_is_not_taken(measured):
+    found = [fake("A", "a"), fake("B", "b", index="1:0", problem="does not run: x")]
+    counts = measured(found, 1.0, 2.0)
+    assert first(found) == "0:0" and counts == []  # there is nothing to choose
+    found = [fake("A", "a", gpu=True), fake("B", "b", index="1:0")]
+    measured(found[1:], 2.0)  # the first gives up
+    assert first(found) == "1:0" and first(found) == "1:0" and counts == [1]
+
+
+@pytest.mark.parametrize("content", ["", "[]", "1", '{"A, a, 1": "x"}', '{"A, a, 1": null}'])
+def test_a_damaged_file_is_measured_anew(measured, tmp_path, content):
+    found = [fake("A", "a"), fake("B", "b", index="1:0")]
+    counts = measured(found, 1.0, 2.0)
+    first(found)
+    (tmp_path / "cache" / speeds.SPEEDS).write_text(content)
+    assert first(found) == "1:0" and counts == [1, 2]
+
+
+def test_without_a_cache_nothing_is_measured(measured, tmp_path, monkeypatch):
+    """Each command would choose anew."""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("PP_CACHE", str(tmp_path / "file" / "cache"))
+    found = [fake(POCL, "a"), fake(INTEL, "b", index="1:0"), fake("B", "g", gpu=True, index="2:0")]
+    counts = measured(found, 3.0, 1.0, 2.0)
+    assert [one[0] for one in speeds.by_speed(found)] == ["2:0", "1:0", "0:0"] and counts == []
+
+
+def test_commands_say_which_one_and_why(measured, monkeypatch, capsys):
+    found = [fake("A", "a"), fake("B", "b", index="1:0")]
+    measured(found, 1.0, 2.0)
+    monkeypatch.setattr(drivers, "list_devices", lambda **_: found)
+    monkeypatch.setattr("pp_cl.engine.device.device.describe", lambda d: dict.fromkeys(NAMES, 1))
+    assert main(["devices", "--json"]) == 0
+    assert [row["default"] for row in json.loads(capsys.readouterr().out)] == [False, True]
+    assert main(["devices"]) == 0
+    assert [line.endswith(", taken by default") for line in capsys.readouterr().out.splitlines()]
+    device = SimpleNamespace(name="b", info={"platform": "B"})
+    assert drivers.device_line(device, None) == "device: b [B], the fastest of 2"
+    assert drivers.device_line(device, "B") == "device: b [B]"
+    monkeypatch.setenv("PP_DEVICE", "B")
+    assert drivers.device_line(device, None) == "device: b [B]"
+
+
+NAMES = ("name", "platform", "compute_units", "memory_bytes")
+
+
+def test_processes_measure_once_and_choose_alike(session_device, tmp_path):
+    """Four at the same time, with the kept speed of the first; one device counts as two."""
+    code = """
+        import sys
+        from pp_cl import drivers, speeds
+        listed = [one for one in drivers.list_devices() if one[2] is None]
+        measured = speeds._measured
+        speeds._measured = lambda: print("measured", file=sys.stderr) or measured()
+        print(speeds.kept_speeds([device for _, device, _ in listed]))
+    """
+    environment = {**os.environ, "PP_CACHE": str(tmp_path)}
+    lines = "\n".join(line.strip() for line in code.splitlines())
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", lines],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(4)
+    ]
+    told = [process.communicate() for process in started]
+    assert len({out for out, _ in told}) == 1 and [p.returncode for p in started] == [0] * 4
+    assert sum(err.count("measured") for _, err in told) == 1
+    kept = json.loads((tmp_path / speeds.SPEEDS).read_text())
+    assert kept[speeds._key(session_device.device)] > 0.1
