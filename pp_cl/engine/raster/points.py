@@ -117,13 +117,17 @@ class PointCloud:
 
     @classmethod
     def create(
-        cls, dev: Device, ids: np.ndarray, degree: int = SH_DEGREES[-1], opacity: float = 1.0
+        cls,
+        dev: Device,
+        ids: np.ndarray,
+        degree: int = SH_DEGREES[-1],
+        opacity: float | np.ndarray = 1.0,
     ) -> PointCloud:
-        """Points of one opacity on their vertices, SH coefficients of 0 of a degree, 0 to 2. ids:
-        (N), ascending.
+        """Points on their vertices, with opacities that are the same from all sides and SH
+        coefficients of 0 of a degree, 0 to 2. ids: (N), ascending. opacity: one for all or (N,).
         """
         n = len(ids)
-        opacities = _from_all_sides(np.full(n, opacity))
+        opacities = _from_all_sides(np.broadcast_to(opacity, n))
         sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]
         return cls(dev.upload(ids, np.uint32), dev.zeros((n, 4)), dev.upload(opacities), sh)
 
