@@ -45,7 +45,7 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     }
     yield {
         "scene": config.scene.path,
-        "points": count,
+        "points": cloud.count,
         "size": max(max(view.camera.width, view.camera.height) for view in views),
         "blend": config.raster.blend,
         "ms": sum(stages.values()),

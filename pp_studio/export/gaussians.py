@@ -320,15 +320,7 @@ def config_of(run: Run, steps: int) -> Config:
     # shapes have the longest way. In few steps both must go faster.
     faster = (QUALITIES[BEST][0] / steps) ** 0.25
     train.rate_steps = 0
-<<<<<<< HEAD
-    if scale == 1:
-        train.sh_rate, train.opacity_rate = (3e-2, 1.5e-2, 7.5e-3), (7.6e-3, 2.3e-3)
-    else:
-        train.sh_rate, train.opacity_rate = (1.2e-2, 6e-3, 3e-3), (2.3e-2, 6.8e-3)
-        train.prune_weight = 0.0  # points are judged in images, where larger renderings show more
-    train.offset_rate, train.lobe_rate = (4e-2, 4e-3), 0.0
-=======
     train.sh_rate = (1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster)
     train.opacity_rate, train.offset_rate = (2.3e-2, 6.8e-3), (4e-2 * faster, 4e-3 * faster)
->>>>>>> main
+    train.lobe_rate = 0.0  # splats have one opacity
     return config
