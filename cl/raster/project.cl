@@ -169,8 +169,8 @@ kernel void project_grid(
     global const float4 *opacity,      // (N, 4) cloud.h
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
     global float *point_shape,         // (N, SHAPE) footprint.h
-    global ushort4 *point_box,    // (N, 4) first x, first y, last x, last y; none where last < first
-    global uint *point_count,     // (N)
+    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
+    global uint *point_count,   // (N)
     global float *point_opacity)  // (N) from the eye
 {
     const uint first = get_global_id(0) * LANES;

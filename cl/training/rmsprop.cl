@@ -63,7 +63,7 @@ kernel void rmsprop_move(
     const float point_eps,  // of offset and opacity, as the next two
     const float rate_offset,
     const float rate_opacity,
-    const float rate_lobe,  // of the opacity's vector
+    const float rate_lobe,                        // of the opacity's vector
     global const uint *visible,                   // (S) their indices
     global const float *camera,                   // (21) camera.h
     global const float4 *point_camera,            // (N, 4) x, y, z, distance
@@ -105,8 +105,8 @@ kernel void rmsprop_move(
         const bool stays = a < 0.0f ? seen >= 1.0f : seen <= 0.0f;
         const float moved = before - rate_opacity * move;
         const float3 turned = lobe - (stays ? 0.0f : rate_lobe * move) * along;
-        opacity[i] = (float4)(
-            BOUNDED(moved, 0.0f, 1.0f), BOUNDED(turned, (float3)(-1.0f), (float3)(1.0f)));
+        opacity[i] =
+            (float4)(BOUNDED(moved, 0.0f, 1.0f), BOUNDED(turned, (float3)(-1.0f), (float3)(1.0f)));
         if (MOVES_OFFSET) {
             const Offsets u = decay * OFFSETS_AT(v_offset, i) + DECAY2 * o * o, most = MOST_OFFSET;
             OFFSETS_AT(v_offset, i) = u;
