@@ -18,11 +18,7 @@ from pp_studio.export import FORMATS
 VIDEO = ["render", "run", "--seconds", "0.2", "--fps", "10"]
 OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
 RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--blend", "alpha"]
-# of a small window, for which splats are fitted faster
-EXPORT = {
-    name: ["export", "run", "--format", name, *(("--window", "100") if "splat" in name else ())]
-    for name in FORMATS
-}
+EXPORT = {name: ["export", "run", "--format", name] for name in FORMATS}
 # what writes by a mechanism of its own: a run, an evaluation, a file, a folder, a page, a table
 ONE_EACH = (
     *("train", "eval", "eval elsewhere", "video elsewhere", "frames", "export html"),

@@ -229,7 +229,9 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     ignored = "pixels are ignored where the masks in ignore are white"
     done += [(one.name, ignored) for one in image_files if one.ignore and not one.ignores_black]
     if split != "train" and present is not SPLITS:  # else hold_out() has dealt out pictures
-        trained = reader.read_split(folder, "train", [])
+        trained: list[ImageFile] = []
+        with suppress(UserError):
+            trained = reader.read_split(folder, "train", []) if "train" in present else []
         pictures = pictures_of([folder / one.name for one in (*trained, *image_files)])
         known = set(pictures[: len(trained)])
         found = zip(image_files, pictures[len(trained) :], strict=True)

@@ -69,7 +69,8 @@ def find_features(
             # numbers them by name; later COLMAP would, as their features happen to be found, and
             # matches and poses depend on the numbers
             names = [one["name"] for one in of_camera]
-            colmap.import_images(database, images, colmap.CameraMode.SINGLE, names, options)
+            with Progress("reading what EXIF tells of lenses"):
+                colmap.import_images(database, images, colmap.CameraMode.SINGLE, names, options)
         found = db.read_all_images()
         left = [image for image in found if not db.exists_descriptors(image.image_id)]
         needed("cv2").setNumThreads(1)

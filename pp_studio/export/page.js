@@ -187,7 +187,8 @@ function makeDrawer(gl) {
   const deep = gl.getExtension("EXT_color_buffer_float")
     || gl.getExtension("EXT_color_buffer_half_float");
   const program = compiled(gl, VERTEX, FRAGMENT), copy = compiled(gl, COPY_VERTEX, COPY_FRAGMENT);
-  const place = (name) => gl.getUniformLocation(program, name);
+  const places = {};
+  const place = (name) => places[name] ??= gl.getUniformLocation(program, name);
   const instances = gl.createVertexArray(), nothing = gl.createVertexArray();
   gl.bindVertexArray(instances);
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
@@ -304,15 +305,21 @@ const draw = gl && makeDrawer(gl);
 const FAST = 20, SLOW = 40, COARSEST = 0.4, REST = 200;  // milliseconds, but for COARSEST
 let look = lookOf(location.hash), waiting = false, rests = 0;
 let order = null, wanted = null, sortedAxis = "";  // of the last sort; the next axis, and this one
-let last = 0, fineness = 1;  // of the last frame of a movement; of its pixels, each way
+let fineness = 1;  // of the pixels of a movement's frames, each way
 
 const axisOf = (camera) => [2, 6, 10].map((i) => camera.pose[i]);
 
+// The canvas is cleared by a size that is set, even where it is the one that it has.
+function resizeCanvas(camera, width, height) {
+  if (canvas.width !== camera.width) canvas.width = camera.width;
+  if (canvas.height !== camera.height) canvas.height = camera.height;
+  canvas.style.width = width;
+  canvas.style.height = height;
+}
+
 // Draws at once. camera: as cameraOf gives it.
 function setCamera(camera) {
-  canvas.width = camera.width;
-  canvas.height = camera.height;
-  canvas.style.width = canvas.style.height = "";
+  resizeCanvas(camera, "", "");
   order = sorted(axisOf(camera));
   sortedAxis = String(axisOf(camera));
   draw(camera, order);
@@ -331,27 +338,21 @@ function show() {
   if (!gl) return;
   const [camera, width, height] = windowCamera(1);
   setCamera(camera);
-  canvas.style.width = `${width}px`;
-  canvas.style.height = `${height}px`;
+  resizeCanvas(camera, `${width}px`, `${height}px`);
 }
 
 // Draws a movement, in the order that the worker found last, and as coarsely as the machine needs.
 function frame(now) {
   waiting = false;
   if (!gl) return;
-  const took = now - last;
-  if (took < 4 * SLOW) {
-    if (took > SLOW) fineness = Math.max(COARSEST, 0.8 * fineness);
-    else if (took < FAST) fineness = Math.min(1, 1.05 * fineness);
-  }
-  last = now;
   const [camera, width, height] = windowCamera(fineness);
-  canvas.width = camera.width;
-  canvas.height = camera.height;
-  canvas.style.width = `${width}px`;
-  canvas.style.height = `${height}px`;
+  resizeCanvas(camera, `${width}px`, `${height}px`);
   sortSoon(axisOf(camera));
   draw(camera, order);
+  requestAnimationFrame((then) => {  // when the machine is ready for another one
+    if (then - now > SLOW) fineness = Math.max(COARSEST, 0.8 * fineness);
+    else if (then - now < FAST) fineness = Math.min(1, 1.05 * fineness);
+  });
   clearTimeout(rests);
   rests = setTimeout(show, REST);
 }

@@ -35,7 +35,7 @@ def begun(scene, out):
     """The command that makes something of a scene in so many steps as no clock decides."""
     begin_result(out)
     folder = RunFolder(out / "run")
-    given = {**SETTINGS, "train.iterations": 600, "scene.downscale": 1}
+    given = {**SETTINGS, "train.iterations": 300, "scene.downscale": 1}
     config = run_config(folder, scene, "tiny", [(*one, "test") for one in given.items()])
     folder.create(config.to_json())
     return [sys.executable, "-c", COMMAND, "make", scene, "--out", str(out)]
