@@ -36,11 +36,4 @@ static inline float3 camera_ray(const Camera *cam, const int x, const int y) {
         (float3)((x + 0.5f - cam->cx) / cam->fx, (y + 0.5f - cam->cy) / cam->fy, 1.0f));
 }
 
-// Unit vector in world axes from the eye to a point: x, y, z in camera axes, distance.
-static inline float3 direction_of_point(global const float *camera, const float4 point) {
-    const Camera cam = camera_load(camera);
-    const float3 c = point.xyz / point.w;
-    return c.x * cam.right + c.y * cam.down + c.z * cam.forward;
-}
-
 #endif

@@ -16,7 +16,7 @@ import numpy as np
 from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.grid import MOST_IDS, Grid
 from pp_cl.engine.network.layers import parameter_table, unet_layers
-from pp_cl.engine.raster.points import SH_DEGREES
+from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.engine.training.schedule import ema_start
 from pp_cl.engine.training.state import PointState
@@ -268,7 +268,8 @@ def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> di
     sh_dtype = np.float16 if step is None else np.float32
     network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
     table: dict[str, Any] = {"points.ids": ((n,), np.uint32)}
-    table |= {f"points.{name}": ((n, 4), np.float32) for name in ("offset", "opacity")}
+    table["points.offset"] = (n, 4), np.float32
+    table["points.opacity"] = (n, OPACITIES), np.float32
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}
     if step is not None:

@@ -192,9 +192,9 @@ class TrainConfig:
         (3e-2, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
     )
     lobe_rate: float = setting(
-        0.25,
-        "learning rate of how opacities depend on the direction, times opacity_rate (0: they do"
-        " not)",
+        1.0,
+        "learning rate of the opacities' harmonics of degree 1, times opacity_rate; half of it of"
+        " degree 2 (0: opacities do not depend on the direction)",
         0,
         100,
     )

@@ -5,6 +5,7 @@
 #include "grid.h"
 #include "lanes.h"
 #include "cloud.h"
+#include "sh.h"
 #include "raster/footprint.h"
 
 // Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside
@@ -138,20 +139,19 @@ ALWAYS_INLINE void opacities_from_eye(
     const floats z,
     const uint first,
     const uint count,
-    global const float4 *opacity,
+    global const float *opacity,
     global float *point_opacity) {
-    float learned[4][LANES], found[LANES];
-    for (uint j = 0; j < LANES; j++) {
-        const float4 o = opacity[first + min(j, count - 1)];
-        learned[0][j] = o.x;
-        learned[1][j] = o.y;
-        learned[2][j] = o.z;
-        learned[3][j] = o.w;
+    const floats distance = sqrt(square(x, y, z));
+    floats basis[OPACITIES], seen = 0.0f;
+    SH_BASIS(basis, x / distance, y / distance, z / distance)
+    basis[0] = 1.0f;
+    float learned[LANES], found[LANES];
+    GPU_UNROLLED_FOR (uint k = 0; k < OPACITIES; k++) {
+        for (uint j = 0; j < LANES; j++)
+            learned[j] = opacity[OPACITIES * (size_t)(first + min(j, count - 1)) + k];
+        seen += basis[k] * LANES_FROM(learned);
     }
-    const floats along =
-        x * LANES_FROM(learned[1]) + y * LANES_FROM(learned[2]) + z * LANES_FROM(learned[3]);
-    const floats o = LANES_FROM(learned[0]) + along / sqrt(square(x, y, z));
-    LANES_INTO(found, BOUNDED(o, (floats)(0.0f), (floats)(1.0f)));
+    LANES_INTO(found, BOUNDED(seen, (floats)(0.0f), (floats)(1.0f)));
     for (uint j = 0; j < count; j++)
         point_opacity[first + j] = found[j];
 }
@@ -166,7 +166,7 @@ kernel void project_grid(
     global const uint *point_id,       // (N)
     const float radius,                // of a point without offsets, world units
     global const float *cloud_offset,  // (N, OFFSETS) cloud.h
-    global const float4 *opacity,      // (N, 4) cloud.h
+    global const float *opacity,       // (N, OPACITIES) cloud.h
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
     global float *point_shape,         // (N, SHAPE) footprint.h
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first

@@ -365,9 +365,13 @@ def directions(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
 
 
 def opacities(positions: np.ndarray, eye: np.ndarray, learned: np.ndarray) -> np.ndarray:
-    """(N,) float64 from the eye, of PointCloud.opacity (N, 4)."""
-    along = (learned[:, 1:] * directions(positions, eye)).sum(1)
-    return np.clip(learned[:, 0] + along, 0, 1)
+    """(N,) float64 from the eye, of PointCloud.opacity (N, 9)."""
+    return np.clip(unbounded_opacities(directions(positions, eye), learned), 0, 1)
+
+
+def unbounded_opacities(towards: np.ndarray, learned: np.ndarray) -> np.ndarray:
+    """(N,) float64 in the unit directions (N, 3), of PointCloud.opacity (N, 9)."""
+    return learned[:, 0] + (learned[:, 1:] * sh_basis(towards)[:, 1:]).sum(1)
 
 
 def shade(positions: np.ndarray, eye: np.ndarray, coefficients: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ smoothing.
 
 import numpy as np
 
-from pp_cl.reference.dense import sh_basis
+from pp_cl.reference.dense import sh_basis, unbounded_opacities
 
 BETA2 = 0.999  # of both
 
@@ -29,7 +29,7 @@ class Adam:
 class RmsProp:
     """The step of cl/training/rmsprop.cl, written out for all points in every step.
 
-    values: {"sh": (N, count, 16), "offset": (N, 4), of Gaussians (N, 16), "opacity": (N, 4)}.
+    values: {"sh": (N, count, 16), "offset": (N, 4), of Gaussians (N, 16), "opacity": (N, 9)}.
     directions: (N, 3), from the eye, of length 1. most: of an offset; most_sh: of coefficients
     above degree 0. v: {"sh": (N, 16), "offset", "opacity": (N,)}.
     """
@@ -62,18 +62,18 @@ class RmsProp:
             moves[name] = grad / (np.sqrt(v / (1 - BETA2**t)) + eps[name])
         self.t = t
         sh, opacity = self.values["sh"], self.values["opacity"]
-        count = sh.shape[1]
-        by_basis = np.asarray(rates["sh"])[:count] * sh_basis(self.directions)[:, :count]
+        basis, count = sh_basis(self.directions), sh.shape[1]
+        by_basis = np.asarray(rates["sh"])[:count] * basis[:, :count]
         sh -= by_basis[:, :, None] * moves["sh"][:, None, :]
         sh[:, 1:] = np.clip(sh[:, 1:], -self.most_sh, self.most_sh)
         offset = self.values["offset"] - rates["offset"] * moves["offset"]
         self.values["offset"] = np.clip(offset, -self.most, self.most)
-        mean, vector = np.split(opacity, [1], axis=1)
-        seen, grad = (mean[:, 0] + (vector * self.directions).sum(1)), moves["opacity"]
-        grad_of_vector = np.where(np.where(grad < 0, seen >= 1, seen <= 0), 0, grad)[:, None]
-        vector = vector - rates["lobe"] * grad_of_vector * self.directions
-        mean = mean - rates["opacity"] * moves["opacity"][:, None]
-        self.values["opacity"] = np.hstack([np.clip(mean, 0, 1), np.clip(vector, -1, 1)])
+        seen, move = unbounded_opacities(self.directions, opacity), moves["opacity"]
+        inward = np.where(np.where(move < 0, seen >= 1, seen <= 0), 0, move)
+        by_degree = np.repeat([rates["lobe"], rates["lobe"] / 2], (3, 5))
+        opacity[:, 0] = np.clip(opacity[:, 0] - rates["opacity"] * move, 0, 1)
+        lobes = opacity[:, 1:] - by_degree * basis[:, 1:] * inward[:, None]
+        opacity[:, 1:] = np.clip(lobes, -1, 1)
 
 
 def neighbours(vertices: np.ndarray) -> list[list[int | None]]:

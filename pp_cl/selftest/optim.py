@@ -21,7 +21,7 @@ from pp_cl.engine.training.smooth import Smoother
 from pp_cl.engine.training.state import PointState, split_opacity
 from pp_cl.reference import dense, optim
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
-from pp_cl.selftest.points import some_ids
+from pp_cl.selftest.points import some_ids, some_opacities
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
 EPSILONS = {"sh": 4e-7, "offset": POINT_EPS, "opacity": POINT_EPS}  # of the tiny preset
@@ -34,7 +34,7 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 class Cloud:
     """n points on the grid, with random offsets, opacities and coefficients up to a degree, and
     their float64 twin. width: of an offset. positions: (N, 3) in the world. start, learned(): of
-    "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 4).
+    "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Cloud:
         self.start = {
             "sh": rng.standard_normal((n, count, 16)).astype(np.float32),
             "offset": rng.uniform(-most, most, (n, width)).astype(np.float32),
-            "opacity": rng.uniform([0, -1, -1, -1], 1, (n, 4)).astype(np.float32),
+            "opacity": some_opacities(rng, n),
         }
         most_sh = self.cloud.most_sh
         np.clip(self.start["sh"][:, 1:], -most_sh, most_sh, out=self.start["sh"][:, 1:])
@@ -235,10 +235,10 @@ def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         for _ in range(60):
             cloud.step(gradients(rng, 257, 1e4, width), np.arange(257))
         most, learned = cloud.cloud.most_offset, cloud.learned()
-        mean, vector = np.split(learned["opacity"], [1], axis=1)
+        mean, lobes = np.split(learned["opacity"], [1], axis=1)
         for values, bounds in ((learned["offset"], (-most, most)), (mean, (0.0, 1.0))):
             yield exact([values.min(), values.max()], bounds)
-        yield exact(abs(vector).max() <= 1, True)
+        yield exact(abs(lobes).max() <= 1, True)
         for name in ("offset", "opacity"):
             yield finite(learned[name])
             yield absolute(learned[name], cloud.twin.values[name], 1e-5)  # sixty moves
@@ -277,7 +277,7 @@ def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """1 - sqrt(1 - o), which cancels for small opacities; what depends on the direction alike."""
     for n in SIZES:
-        opacity = rng.uniform([0, -1, -1, -1], 1, (n, 4)).astype(np.float32)
+        opacity = some_opacities(rng, n)
         opacity[::5, 0], opacity[1::5, 0], opacity[2::5, 0] = 0, 1, 1e-7
         array = dev.upload(opacity)
         split_opacity(dev, array)

@@ -14,7 +14,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import shade_forward
 from pp_cl.engine.raster.depth import depth_forward
-from pp_cl.engine.raster.points import SH_DEGREES, sh_blocks
+from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES, sh_blocks
 from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
 from pp_cl.engine.raster.weights import BLENDS, list_weights, record_weights
 from pp_cl.reference import dense
@@ -28,6 +28,7 @@ from pp_cl.selftest.points import (
     make_camera,
     make_points,
     some_ids,
+    some_opacities,
 )
 
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
@@ -56,7 +57,7 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             dev.upload(GRID.packed()),
             point_id=dev.upload(ids, np.uint32),
             cloud_offset=dev.upload(offset),
-            opacity=dev.zeros((n, 4)),
+            opacity=dev.zeros((n, OPACITIES)),
             radius=0.01,
         )
         place, covers = dense.camera_space(camera, positions), points.point_count.get() > 0
@@ -81,19 +82,19 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _opacities(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Opacities in the direction from the eye: random ones; along the axes, where the vector takes
-    an opacity of 1 to 0, to beyond the bounds and to little more or less than these.
+    """Opacities in the direction from the eye: random ones; along the axes, where all harmonics
+    together take opacities to their bounds, beyond them and to little more or less than these.
     """
     for n in SIZES:
         ids = some_ids(rng, GRID, n)
-        learned = rng.uniform([0, -1, -1, -1], 1, (n, 4)).astype(np.float32)
-        yield from _check_opacities(dev, make_camera(), ids, learned)
+        yield from _check_opacities(dev, make_camera(), ids, some_opacities(rng, n))
     ids = GRID.ids(np.array([np.array(GRID.dims) // 2]))
     for axis, sign in product(np.eye(3), (-1, 1)):
         eye = GRID.positions(ids)[0] - 4 * sign * axis
         camera = replace(make_camera(), pose=look_at(eye, GRID.positions(ids)[0]))
+        basis = dense.sh_basis(sign * axis[None])[0, 1:]
         for mean, along in product((0, 1e-7, 0.5, 1 - 1e-7, 1), (0, 1e-7, -1e-7, 0.5, -0.5, 1, -1)):
-            learned = np.array([[mean, *(along * sign * axis)]], np.float32)
+            learned = np.array([[mean, *(along * basis / (basis @ basis))]], np.float32)
             yield from _check_opacities(dev, camera, ids, learned)
 
 
@@ -111,7 +112,7 @@ def _check_opacities(dev, camera, ids, learned):
     )
     covers = points.point_count.get() > 0
     expected = dense.opacities(GRID.positions(ids), camera.eye, learned)
-    # three products of at most 1 by a direction of four roundings
+    # eight products of about 1/2, by harmonics of a direction of four roundings
     yield absolute(points.point_opacity.get()[covers], expected[covers], 8 * EPS)
 
 

@@ -43,6 +43,7 @@ SH_BLOCKS = (
     ShBlock("sh_2b", 7, 2),
 )
 SH_DEGREES = (0, 1, 2)
+OPACITIES = 9  # numbers in a row of PointCloud.opacity
 MOST_OFFSET = 0.5  # voxel sizes each way: a point stays in its cell; radii times 0.61 to 1.65
 MOST_OF_GAUSSIANS = 2.0  # voxel sizes, logarithms and deviations
 MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: what a .spz can hold
@@ -77,10 +78,11 @@ class PointCloud:
     ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
     point in its cell, in voxel sizes, and the logarithm of its radius over point_radius() of the
     settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up to MOST_OF_GAUSSIANS:
-    see cl/cloud.h. opacity: (N, 4) float32, o in [0, 1] and a vector w in world axes, each number
-    of it in [-1, 1]: seen in a direction d, a unit vector from the eye, the point has the opacity
-    o + w . d, at least 0 and at most 1. sh: the SH coefficients, (N, count, 16) of each
-    block: float32, or float16 where they are not trained any more.
+    see cl/cloud.h. opacity: (N, 9) float32, o in [0, 1] and coefficients w_k in [-1, 1] of the
+    harmonics Y_k of degrees 1 and 2, as cl/sh.h has them: seen in a direction d, a unit vector from
+    the eye, the point has the opacity o + sum_k w_k Y_k(d), at least 0 and at most 1. sh: the SH
+    coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained any
+    more.
     """
 
     ids: Array
@@ -112,7 +114,7 @@ class PointCloud:
     def table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
         """The arrays of n points."""
         table: Table = {"ids": ((n,), np.uint32), "offset": ((n, 4), np.float32)}
-        table["opacity"] = (n, 4), np.float32
+        table["opacity"] = (n, OPACITIES), np.float32
         return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
 
     @classmethod
@@ -206,5 +208,5 @@ class PointCloud:
 
 
 def _from_all_sides(opacity):
-    """(N, 4) float32, PointCloud.opacity of opacities (N,) that are the same from all sides."""
-    return np.pad(np.asarray(opacity, np.float32)[:, None], ((0, 0), (0, 3)))
+    """(N, 9) float32, PointCloud.opacity of opacities (N,) that are the same from all sides."""
+    return np.pad(np.asarray(opacity, np.float32)[:, None], ((0, 0), (0, OPACITIES - 1)))

@@ -92,7 +92,7 @@ def project_grid(
     """Project the points, each in the cell of a grid's vertex, into a camera.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
-    PointCloud.offset; of Gaussians (N, 16). opacity: (N, 4) float32, PointCloud.opacity. radius: of
+    PointCloud.offset; of Gaussians (N, 16). opacity: (N, 9) float32, PointCloud.opacity. radius: of
     points without offsets, world units.
     """
     n = point_id.size

@@ -25,7 +25,7 @@ LEFT_BY_PRUNING = 0.6
 @dataclass(frozen=True)
 class Rates:
     """The learning rates of one step. sh: of the degrees 0, 1, 2. offset: 0 for points that stay
-    on the grid. lobe: of how opacities depend on the direction.
+    on the grid. lobe: of the opacities' harmonics of degree 1.
     """
 
     sh: tuple[float, ...]

@@ -89,7 +89,7 @@ class PointState:
 
 
 def split_opacity(dev: Device, opacity: Array) -> None:
-    """Replace every opacity o in [0, 1], (N, 4) float32 of PointCloud, by 1 - sqrt(1 - o), in
+    """Replace every opacity o in [0, 1], (N, 9) float32 of PointCloud, by 1 - sqrt(1 - o), in
     place, and scale what depends on the direction as o. On a refined grid a ray crosses two points
     where it crossed one, and their transmittances multiply to 1 - o.
     """

@@ -21,8 +21,8 @@ pytestmark = pytest.mark.kernels  # of refine.cl
 
 
 def rows(opacity):
-    """(N, 4) float32 of opacities that are the same from all sides."""
-    return np.pad(np.float32(opacity)[:, None], ((0, 0), (0, 3)))
+    """(N, 9) float32 of opacities that are the same from all sides."""
+    return np.pad(np.float32(opacity)[:, None], ((0, 0), (0, 8)))
 
 
 def survivors(dev, weights, least_weight, opacities, seen=None, least=1):
