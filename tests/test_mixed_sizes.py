@@ -29,9 +29,10 @@ def scene(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("mixed") / "ball"
     splits = {}
-    for split, count in (("train", 9), ("test", 3)):
+    of_test = ring_cameras(37, 48)[5::12][:3]  # none of which is one of training
+    for split, cameras in (("train", ring_cameras(9, 48)), ("test", of_test)):
         views = []
-        for i, camera in enumerate(ring_cameras(count, 48)):
+        for i, camera in enumerate(cameras):
             width, height = SIZES[i % 3]
             crop = camera.resized(width, height)
             views.append(View(f"{split}/r_{i}.png", crop, ball_image(crop)))

@@ -91,8 +91,6 @@ TRAININGS = [
         )
     ),
 ]
-# of README.md
-SHOWN = ("lego_15000", "lego_6000", "lego_8000", "ethiopian_head_6000", "dtu_scan37", "demo_1500")
 
 QUALITY = [
     {"head": "scene", "cell": "{name}"},
@@ -405,8 +403,6 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
         "medians of interleaved runs; GFLOP/s count the multiplications of the direct convolution"
     )
     rows = found | {"trainings": trained(found)}
-    if {*SHOWN} <= found.keys():
-        rows["scenes"] = [found[name] for name in SHOWN]
     steps = ""
     if "stages" in found:
         rows["stages"] = by_preset(found["stages"])
@@ -416,7 +412,6 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
             for preset, run in found["stages"].items()
         )
     parts = {
-        "scenes": (quality, QUALITY[:-2]),
         "trainings": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
         "network": (passes, NETWORK),

@@ -10,6 +10,7 @@ import numpy as np
 from pp_cl.checkpoint import opened_run
 from pp_cl.config import AUTOMATIC, RANDOM, load_config, text_of
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.engine.views import View
@@ -26,10 +27,11 @@ from pp_cl.scene.hull import (
 )
 from pp_cl.scene.load import DEMO, scene_box
 from pp_cl.scene.outline import outline_sheet
+from pp_cl.session.budget import NEVER
 from pp_cl.session.memory import MemoryPlan
 from pp_cl.settings import Config, NetworkConfig
 
-UNSET, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
+UNSET = (0.0, 0.0)  # train.refine_at
 # train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
@@ -98,6 +100,14 @@ def first_hull(
     return hull, REFINE_AT[times]
 
 
+def automatic_radius(grid: Grid, views: list[View], refinements_to_come: int) -> float:
+    """raster.radius of a grid that will be refined so often: one pixel of the images, within
+    bounds. Refining halves the spacing, and doubles the images.
+    """
+    spacing = spacing_pixels(grid, [view.camera for view in views]) / 2**refinements_to_come
+    return round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
+
+
 def fitting_hull(
     dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
 ) -> tuple[Agreement, Hull, tuple[float, float]]:
@@ -121,10 +131,8 @@ def fitting_hull(
     while True:
         hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
         if is_radius_automatic:
-            # refining halves the spacing, and doubles the images
-            pixels = spacing_pixels(hull.grid, [view.camera for view in agreement.views])
-            spacing = pixels / 2 ** len(refine_steps(train))
-            raster.radius = round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
+            to_come = len(refine_steps(train))
+            raster.radius = automatic_radius(hull.grid, agreement.views, to_come)
         near_far = depth_range(agreement.views, hull)
         try:
             memory_plan.check_points(hull.grid, len(hull.ids), near_far)

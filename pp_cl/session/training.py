@@ -37,9 +37,9 @@ from pp_cl.scene.load import (
     measured_split,
     open_scene,
 )
-from pp_cl.session.budget import Budget
+from pp_cl.session.budget import NEVER, Budget
 from pp_cl.session.memory import MemoryPlan
-from pp_cl.session.start import NEVER, begin_network, fitting_hull, sheet_of_masks
+from pp_cl.session.start import automatic_radius, begin_network, fitting_hull, sheet_of_masks
 from pp_cl.settings import Config
 
 PREVIEWS = 4  # of a training, besides an early one
@@ -129,7 +129,8 @@ class Training:
         trainer, train = self.trainer, self.config.train
         with self.folder.open_log(trainer.step) as log:
             pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
-            seconds, budget, earlier = log.seconds, Budget(train, pixels), log.seconds
+            budget = Budget(train, pixels, self._is_automatic("train.refine_at"))
+            seconds = earlier = log.seconds
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < train.iterations:
@@ -146,6 +147,10 @@ class Training:
                 passed = earlier + time.monotonic() - self.began
                 if is_planned and budget.plan(trainer.step, passed):
                     trainer.take_plan()
+                    if self._is_automatic("raster.radius"):
+                        self.config.raster.radius = automatic_radius(
+                            trainer.model.grid, trainer.views, trainer.refinements_to_come
+                        )
                     self.folder.configure(self.config.to_json())
                 if trainer.step == first and not any(self.folder.previews.glob("*.png")):
                     self._preview_by = time.monotonic() + FIRST_PREVIEW  # the kernels are built
@@ -164,6 +169,9 @@ class Training:
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
             self._save(finished=True)
         return seconds
+
+    def _is_automatic(self, key):
+        return key in self.config.automatic
 
     def _after_step(self, log, terms, seconds):
         """Write the log's row, the preview and the checkpoint that are due; return the row or None.

@@ -30,7 +30,7 @@ PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
 # the capture leaves, within these.
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
 LEAST_TRAINING = 0.6  # of what the capture leaves; after a long capture, 0.25 of all
-PER_PHOTOGRAPH = 0.05  # minutes that a capture takes, about: on two cores with AVX-512
+PER_PHOTOGRAPH = 0.03  # minutes that a capture takes, about: on two cores with AVX-512
 OF_SPLAT = 0.6  # of what is left after the evaluation
 LEAST_FPS = 8  # of the video
 

@@ -12,7 +12,7 @@ from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
 from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session.budget import Budget
+from pp_cl.session.budget import NEVER, Budget
 from pp_cl.settings import TrainConfig
 
 SMALL = {key: value for key, value in SETTINGS.items() if key != "train.iterations"}
@@ -66,6 +66,17 @@ def test_what_comes_before_the_first_step_is_in_the_minutes():
     for step in range(1, 11):
         budget.plan(step, 60 + 0.1 * step)  # of reading, carving and building
     assert 600 < train.iterations < 1000  # clearing fog makes later ones shorter
+
+
+@pytest.mark.parametrize("step, is_refined", [(0.05, True), (1.0, False)])
+def test_few_steps_are_better_without_refinement(step, is_refined):
+    train = TrainConfig(iterations=6000, minutes=5, refine_at=(0.35, 1.0))
+    budget = Budget(train, 48 * 200**2, may_stay_coarse=True)
+    for number in range(1, 200):
+        if budget.plan(number, number * step) and not is_refined:
+            assert train.refine_at == NEVER
+    assert bool(refine_steps(train)) == is_refined
+    assert train.iterations < 1000 or is_refined
 
 
 def test_a_training_without_time_ends_soon_and_in_order():
