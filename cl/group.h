@@ -15,6 +15,8 @@
 #define GROUP_ID ((uint)get_global_id(0) / GROUP)
 
 #if GROUP > 1
+// Before members read what others wrote to global memory.
+#define GROUP_BARRIER barrier(CLK_GLOBAL_MEM_FENCE);
 // Local memory of a kernel, `items` values of type T, at least as many as a work-group has items.
 #define SHARED(T, name, items) local T name[items]
 
@@ -57,6 +59,7 @@ ALWAYS_INLINE uint group_scan(const uint value, local uint *shared, uint *total)
     return before;
 }
 #else
+#define GROUP_BARRIER
 #define SHARED(T, name, items)
 #define group_sum(value, shared) (value)
 #define group_sum4(value, shared) (value)

@@ -1,4 +1,5 @@
-"""Time of a training's steps by stage, beside the time that its bytes and multiplications need.
+"""Time of a training's steps by stage, beside the time that its bytes and multiplications need; and
+what the host takes for a step.
 
     python -m tools.stages SCENE --out RUN [--preset P] [--json FILE]
 
@@ -15,6 +16,7 @@ import sys
 from pathlib import Path
 
 from pp_cl.bench.timing import interleave
+from pp_cl.bench.training import host_cost
 from pp_cl.config import run_config
 from pp_cl.drivers import open_device
 from pp_cl.engine.network.layers import multiplications
@@ -62,10 +64,10 @@ def counts(result) -> dict:
 
 
 def measure(scene: str, out: Path, preset: str | None) -> dict:
-    """{"points", "pixels", "copy_gbs", "gflops", "stages": rows of {"stage", "ms", "least_ms"}},
-    medians of the timed steps. Raises UserError as `pp-cl train`.
+    """{"points", "pixels", "copy_gbs", "gflops", "host_ms", "launches", "stages": rows of {"stage",
+    "ms", "least_ms"}}, medians of the timed steps. Raises UserError as `pp-cl train`.
     """
-    folder, steps, given = RunFolder(out), UNTIMED + TIMED, []
+    folder, steps, given = RunFolder(out), UNTIMED + 2 * TIMED, []
     if folder.checkpoint.exists():
         made = json.loads(folder.config.read_text("utf-8"))["train"]["iterations"]
         given = [("train.iterations", made + steps, "stages")]
@@ -83,6 +85,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     trainer.renderer.backward = watched
     for _ in range(UNTIMED):
         trainer.train_step()
+    host = host_cost(trainer, TIMED)
     seen.clear()
     with dev.timed_stages() as seconds:
         for _ in range(TIMED):
@@ -107,6 +110,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
         "size": f"{padded.width}x{padded.height}",
         "copy_gbs": copied * 1e-6,
         "gflops": computed * 1e-6,
+        **host,
         "stages": rows,
     }
 
@@ -125,6 +129,7 @@ def main() -> int:
         print(f"stages: {error}", file=sys.stderr)
         return 2
     print("{points:,} points, {size}: {copy_gbs:.1f} GB/s, {gflops:.0f} GFLOP/s".format_map(found))
+    print("host: {host_ms:.2f} ms a step, {launches} launches".format_map(found))
     for row in found["stages"]:
         least = f"{row['least_ms']:8.2f}" if "least_ms" in row else ""
         print(f"{row['stage']:18} {row['ms']:8.2f} {least}")

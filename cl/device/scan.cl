@@ -21,7 +21,7 @@ kernel void scan_sums(
     const uint n,               // values
     const uint b,               // blocks
     global const uint *values,  // (N)
-    global uint *block_sum)     // (B)
+    global uint *block_sum)     // (?) B
 {
     SHARED(uint, shared, 2 * GROUP);
     const uint block = GROUP_ID;
@@ -40,7 +40,7 @@ kernel void count_nonzero(
     const uint n,               // flags
     const uint b,               // blocks
     global const uchar *flags,  // (N)
-    global uint *block_sum)     // (B)
+    global uint *block_sum)     // (?) B
 {
     SHARED(uint, shared, 2 * GROUP);
     const uint block = GROUP_ID;
@@ -59,7 +59,7 @@ kernel void scan_offsets(
     const uint n,                  // values
     const uint b,                  // blocks
     global const uint *values,     // (N)
-    global const uint *block_sum,  // (B)
+    global const uint *block_sum,  // (?) B
     global uint *offsets)          // (N+1)
 {
     SHARED(uint, shared, 2 * GROUP);
@@ -85,7 +85,7 @@ kernel void scan_nonzero(
     const uint n,                  // flags
     const uint b,                  // blocks
     global const uchar *flags,     // (N)
-    global const uint *block_sum,  // (B) of count_nonzero
+    global const uint *block_sum,  // (?) B of count_nonzero
     global uint *indices,          // (N); the first `found` are written
     global uint *places,           // (N); not written where the flag is zero
     global uint *found)            // (1)

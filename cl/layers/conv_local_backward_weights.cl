@@ -49,42 +49,48 @@ ALWAYS_INLINE void stage(
 
 // One work-item per (4 input channels, 4 output channels, ky), a work-group per (CI_QUADS, QUADS, 3
 // of them, `run` tiles of the list): reads x and grad_out there, and writes its part of dL/dweight
-// in rows (ky, kx, channel) of partial. A gradient counts as often as its tile.
+// in rows (ky, kx, channel) of partial; those of the first input channels dL/dbias in the last row.
+// A gradient counts as often as its tile.
 kernel void conv_local_backward_weights(
-    const int c,
+    const int c1,
+    const int c2,  // channels of x2; 0 = x2 is not read
     const int co,
-    const int first,  // channel of the weights where x begins
-    const int ci,     // channels of the weights
     const int run,
     const int summed,                // tiles summed in registers
-    global const float *x,           // (height, width, c)
+    global const float *x,           // (height, width, c1)
+    global const float *x2,          // (height, width, ?)
     global const float *grad_out,    // (height, width, co)
     global const int *tile_list,     // (?) height, width, number, tiles
     global const float *tile_count,  // ((height+3)/4, (width+3)/4) of grad_out
-    global float4 *partial)  // (?, (co+15)/16, KERNEL_SIZE*KERNEL_SIZE*ci+1, 16) of each part
+    global float4 *partial)  // (?, (co+15)/16, KERNEL_SIZE*KERNEL_SIZE*(c1+c2)+1, 16) of each part
 {
     local float4 values[STAGE * SPAN * SPAN * CI_QUADS];
     local float4 grads[STAGE * SIDE * SIDE * QUADS];
     const int item = get_local_id(0), lane = item % CI_QUADS, quad = item / CI_QUADS % QUADS,
               ky = item / (CI_QUADS * QUADS);
-    const int c0 = get_global_id(0) / ITEMS * CI_QUADS * 4, o0 = get_group_id(1) * QUADS * 4,
-              part = get_global_id(2);
+    const int group = get_global_id(0) / ITEMS, groups = (c1 + CI_QUADS * 4 - 1) / (CI_QUADS * 4);
+    const bool second = group >= groups;  // of [x, x2], which is not made
+    const int c = second ? c2 : c1, first = second ? c1 : 0, ci = c1 + c2;
+    const int c0 = (second ? group - groups : group) * CI_QUADS * 4,
+              o0 = get_group_id(1) * QUADS * 4, part = get_global_id(2);
     const int block = o0 / 16 + quad / 4, blocks = (co + 15) / 16;
     const int begin = part * run, end = min(begin + run, tile_list[2]);
-    global float4 *out = partial +
-                         (((size_t)part * blocks + block) * (TAPS * ci + 1) +
-                          ky * KERNEL_SIZE * ci + first + c0 + lane * 4) *
-                             4 +
-                         quad % 4;
+    const bool with_bias = first + c0 == 0;  // of the work-group
+    global float4 *of_block =
+        partial + ((size_t)part * blocks + block) * (TAPS * ci + 1) * 4 + quad % 4;
+    global float4 *out = of_block + (ky * KERNEL_SIZE * ci + first + c0 + lane * 4) * 4,
+                  *bias = of_block + TAPS * ci * 4;
     for (int from = begin; from < end; from += summed) {
-        float4 acc[KERNEL_SIZE][4];
+        float4 acc[KERNEL_SIZE][4], of_bias = 0.0f;
         UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
             UNROLLED_FOR (int i = 0; i < 4; i++)
                 acc[kx][i] = 0.0f;
         const int to = min(from + summed, end);
         for (int t = from; t < to; t += STAGE) {
             barrier(CLK_LOCAL_MEM_FENCE);
-            stage(values, grads, x, grad_out, tile_list, tile_count, t, to, c0, c, o0, co);
+            stage(
+                values, grads, second ? x2 : x, grad_out, tile_list, tile_count, t, to, c0, c, o0,
+                co);
             barrier(CLK_LOCAL_MEM_FENCE);
 #pragma unroll 1
             for (int tile = 0; tile < STAGE; tile++)
@@ -99,6 +105,7 @@ kernel void conv_local_backward_weights(
                     float4 g[SIDE];
                     UNROLLED_FOR (int p = 0; p < SIDE; p++)
                         g[p] = grads[((tile * SIDE + row) * SIDE + p) * QUADS + quad];
+                    if (with_bias) of_bias += (g[0] + g[1]) + (g[2] + g[3]);
                     UNROLLED_FOR (int column = 0; column < SPAN; column++) {
                         const float4 v = seen[column * CI_QUADS];
                         UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++) {
@@ -118,33 +125,6 @@ kernel void conv_local_backward_weights(
                 global float4 *sum = out + (kx * ci + i) * 4;
                 if (c0 + lane * 4 + i < c) *sum = from == begin ? acc[kx][i] : *sum + acc[kx][i];
             }
+        if (with_bias && lane == 0 && ky == PAD) *bias = from == begin ? of_bias : *bias + of_bias;
     }
-}
-
-// One work-item per (output channel, `run` tiles of the list): reads grad_out there, and writes its
-// part of dL/dbias in the last row of partial; 0 for channels beyond co.
-kernel void conv_local_backward_bias(
-    const int co,
-    const int per_block,  // K * K * ci, rows of one block of weights
-    const int run,
-    const int parts,
-    global const float *grad_out,    // (height, width, co)
-    global const int *tile_list,     // (?) height, width, number, tiles
-    global const float *tile_count,  // ((height+3)/4, (width+3)/4) of grad_out
-    global float *partial)           // (?, (co+15)/16, per_block+1, 16)
-{
-    const int channel = get_global_id(0), part = get_global_id(1), blocks = (co + 15) / 16;
-    if (channel >= blocks * 16 || part >= parts) return;
-    const int height = tile_list[0], width = tile_list[1], begin = part * run;
-    float sum = 0.0f;
-    for (int t = begin; channel < co && t < min(begin + run, tile_list[2]); t++) {
-        const int2 at = tile_corner(tile_list[3 + t], width);
-        float of_tile = 0.0f;
-        for (int y = at.y; y < min(at.y + SIDE, height); y++)
-            for (int px = at.x; px < min(at.x + SIDE, width); px++)
-                of_tile += grad_out[((size_t)y * width + px) * co + channel];
-        sum += tile_count[tile_list[3 + t]] * of_tile;
-    }
-    const size_t row = ((size_t)part * blocks + channel / 16 + 1) * (per_block + 1) - 1;
-    partial[row * 16 + channel % 16] = sum;
 }

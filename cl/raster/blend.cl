@@ -17,6 +17,10 @@
 // pixel, w sum_ij b_i b_j |z_i - z_j| (Mip-NeRF 360, Eq. 15), adds its derivative with respect to
 // b_i to G.f_i in the same way.
 //
+// Offsets of points composited by alpha learn by the falloff d of their fragments, of which each
+// kind of point that has them has the derivatives in its header: dL/dd = o/d dL/do. How the order of
+// fragments and the harmonics change is left out.
+//
 // A kernel of each blend writes (b, s dL/db) of the fragments by pair, where each point finds its
 // own; that of the softmax (b, s), and the point multiplies by dL/db.
 #include "common.h"
@@ -24,6 +28,9 @@
 #include "raster/footprint.h"
 #include "reduce.h"
 
+#ifndef MOVES
+#define MOVES 0  // 1: the points' offsets have gradients
+#endif
 #ifndef DL_DB
 #define DL_DB 0  // 1: pair_gradient lacks dL/db: softmax_gradient wrote it
 #endif
@@ -166,10 +173,19 @@ kernel void alpha_gradient(
 }
 
 // One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes
-// the gradients of its features and, the first one, of its opacity, and s dL/db by pair with DL_DB.
+// the gradients of its features and, the first one, of its opacity, s dL/db by pair with DL_DB, and
+// with MOVES the gradient of its offset, in edges of the grid and as cloud.h has it.
 kernel void blend_backward(
     const uint s,                            // visible points
+    const float voxel_size,                  // of the grid, world units
+    const float radius,                      // of a point without offsets, world units
     global const uint *visible,              // (S) their indices
+    global const float *camera,              // (21) camera.h, read with MOVES, as the next five
+    global const float4 *point_camera,       // (N, 4) x, y, z, distance
+    global const float *point_shape,         // (N, SHAPE) footprint.h
+    global const float *cloud_offset,        // (?, OFFSETS) (N, OFFSETS), read of Gaussians
+    global const float *opacity,             // (N)
+    global const uint2 *pair_point_falloff,  // (P, 2) point, bits of d
     global const uint *point_offset,         // (N+1)
     global const uint *pair_pixel,           // (P)
     global float2 *pair_gradient,            // (P, 2) b, s dL/db; s is read with DL_DB
@@ -177,11 +193,16 @@ kernel void blend_backward(
     global const float16 *visible_features,  // (?, 16) a row for each, read with CLAMPED, DL_DB
     global const float16 *grad_features,     // (H, W, 16) G
     global float16 *grad_visible_features,   // (?, 16) alike
-    global float *grad_opacity)              // (?) alike
+    global float *grad_opacity,              // (?) alike
+    global float *grad_offset)               // (?, OFFSETS) alike, with MOVES
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = visible[g];
+#if MOVES
+    const Camera cam = camera_load(camera);
+    OffsetGradient moved = offset_begin(&cam, point_camera[i], point_shape + (size_t)SHAPE * i);
+#endif
     const float16 feature = DL_DB ? visible_features[g] : 0.0f;
     floats dL_df = 0.0f;
     float dL_do = 0.0f;
@@ -196,9 +217,19 @@ kernel void blend_backward(
         }
         dL_df += of_fragment.x * G;
         dL_do += of_fragment.y;
+#if MOVES
+        const float d = as_float(pair_point_falloff[pair].y);  // 0 at the very rim
+        if (ROW_PART == 0 && d > 0.0f && of_fragment.y != 0.0f)
+            offset_add(&moved, &cam, q, d, opacity[i] * of_fragment.y / d);
+#endif
     }
     // features that shade.cl has clamped to 0 have no gradient
     if (CLAMPED) dL_df = load_part(visible_features, g) == 0.0f ? 0.0f : dL_df;
     store_part(dL_df, grad_visible_features, g);
-    if (ROW_PART == 0) grad_opacity[g] = dL_do;
+    if (ROW_PART > 0) return;
+    grad_opacity[g] = dL_do;
+#if MOVES
+    const Offsets offset = FORM > 1 ? OFFSETS_AT(cloud_offset, i) : (Offsets)(0.0f);
+    OFFSETS_AT(grad_offset, g) = offset_end(&moved, &cam, voxel_size, radius, offset);
+#endif
 }

@@ -8,7 +8,7 @@
 //
 // Beside them a header has surface_range() for depth.cl, the distance from the eye where a ray
 // meets the surface for which a point stands, and constants of blending and shading; where points
-// learn offsets, also the gradients of these for offset.cl.
+// learn offsets, also the gradients of these for blend.cl.
 //
 // Counting (project.cl) and filling (pairs.cl) must find the same fragments, so no compiler may
 // round here in one way and there in another: FP_CONTRACT is OFF in what leads to a fragment.

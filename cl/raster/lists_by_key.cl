@@ -1,39 +1,25 @@
-// Lists of the keys of each pixel on GPUs: one work-item per key counts it at its pixel, writes it
-// into the list, and finds its place among the others of its run, then of runs of runs.
+// Lists of the keys of each pixel on GPUs: one work-item per key writes it into the list, and finds
+// its place among the others of its run, then of runs of runs.
 #include "common.h"
 
 #ifndef RUN
 #define RUN 64  // keys ranked at once by comparing all with all; longer lists are merged
 #endif
 
-// One work-item per pair: counts it at its pixel.
-kernel void pairs_count(
-    const uint n,                       // points
-    const uint p,                       // capacity, in pairs
-    global const uint *point_offset,    // (N+1)
-    global const uint *pair_pixel,      // (P)
-    global volatile uint *pixel_count)  // (HW) accumulates
-{
-    const uint pair = get_global_id(0);
-    if (pair >= p || point_offset[n] > p || pair >= point_offset[n]) return;
-    atomic_inc(&pixel_count[pair_pixel[pair]]);
-}
-
-// One work-item per pair: writes its key into the list of its pixel, at the place that the count,
-// as it falls to 0, says. Bits of floats >= 0 sort like the floats.
+// One work-item per pair: writes its key into the list of its pixel, at the place that pairs.cl found
+// for it. Bits of floats >= 0 sort like the floats.
 kernel void pairs_scatter(
-    const uint p,                       // capacity, in pairs
-    const uint hw,                      // pixels
-    global const uint *pair_pixel,      // (P)
-    global const uint *pixel_offset,    // (HW+1) first key of each pixel
-    global const ulong *point_key,      // (P) depth << 32 | pair, by point
-    global volatile uint *pixel_count,  // (HW) becomes 0
-    global ulong *pair_key)             // (P) the same, by pixel
+    const uint p,                     // capacity, in pairs
+    const uint hw,                    // pixels
+    global const uint *pair_pixel,    // (P)
+    global const uint *pixel_offset,  // (HW+1) first key of each pixel
+    global const ulong *point_key,    // (P) depth << 32 | place, by point
+    global ulong *pair_key)           // (P) depth << 32 | pair, by pixel
 {
     const uint pair = get_global_id(0);
     if (pair >= p || pair >= pixel_offset[hw]) return;
-    const uint pixel = pair_pixel[pair];
-    pair_key[pixel_offset[pixel] + atomic_dec(&pixel_count[pixel]) - 1] = point_key[pair];
+    const ulong key = point_key[pair];
+    pair_key[pixel_offset[pair_pixel[pair]] + (uint)key] = upsample((uint)(key >> 32), pair);
 }
 
 // One work-item per key: writes it at its place within its run, RUN keys of its pixel.

@@ -1,8 +1,15 @@
 // Pairs: every fragment of a point in a pixel, written point by point, each with a key (depth << 32
 // | pair). The keys then become lists, one for each pixel, sorted by depth, then by pair and so by
-// point: lists_by_bucket.cl on CPUs, lists_by_key.cl on GPUs.
+// point: lists_by_bucket.cl on CPUs, lists_by_key.cl on GPUs, where a key at first has its place in
+// the list, in any order, instead of the pair.
 #include "common.h"
 #include "raster/footprint.h"
+
+#if LANES > 1
+#define BESIDE_DEPTH(pixel, pair) (pair)
+#else
+#define BESIDE_DEPTH(pixel, pair) atomic_inc(&pixel_count[pixel])
+#endif
 
 // Pixels of a box that are tested before their fragments are written, at most 32 (bits of a uint).
 // With fewer, writing alternates more often between the pairs of 16 points, which lie far apart.
@@ -58,7 +65,8 @@ kernel void pairs_fill(
     global const uint *point_offset,    // (N+1) first pair of each point
     global uint *pair_pixel,            // (P)
     global uint2 *pair_point_falloff,   // (P, 2) point, bits of d in [0, 1]
-    global ulong *point_key)            // (P) depth << 32 | pair, by point
+    global ulong *point_key,            // (P) depth << 32 | pair, on GPUs place, by point
+    global volatile uint *pixel_count)  // (?) (HW) accumulates on GPUs, else untouched
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n || point_offset[n] > p) return;
@@ -95,9 +103,10 @@ kernel void pairs_fill(
         for (uint j = 0; j < count; j++)
             for (uint left = fragments[j]; left && next[j] < end[j]; left &= left - 1) {
                 const uint k = 31 - clz(left & -left), pair = next[j]++;
-                pair_pixel[pair] = corner[j] + offset[k];
+                const uint pixel = corner[j] + offset[k];
+                pair_pixel[pair] = pixel;
                 pair_point_falloff[pair] = (uint2)(first + j, as_uint(falloff[k][j]));
-                point_key[pair] = upsample(as_uint(depth[k][j]), pair);
+                point_key[pair] = upsample(as_uint(depth[k][j]), BESIDE_DEPTH(pixel, pair));
             }
     }
     for (uint j = 0; j < count; j++)
@@ -105,6 +114,6 @@ kernel void pairs_fill(
             const float depth = point_camera[first + j].w;
             pair_pixel[pair] = corner[j];
             pair_point_falloff[pair] = (uint2)(first + j, as_uint(0.0f));
-            point_key[pair] = upsample(as_uint(depth), pair);
+            point_key[pair] = upsample(as_uint(depth), BESIDE_DEPTH(corner[j], pair));
         }
 }

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.bench.timing import errors, variant_rows
+from pp_cl.engine.device.buffers import PackedArrays
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import (
     OFFERED,
@@ -118,6 +119,7 @@ class UploadedLayer:
         self.grad_weight, self.grad_bias = dev.empty(self.weight.shape), dev.empty(self.bias.shape)
         co, k = layer.weight.shape[0], layer.weight.shape[2]
         sources = [part.shape[2] for part in layer.parts]
+        self.table = PackedArrays(dev)
         self.variants = [v for v in OFFERED[device_class(dev)] if can_run(v, k, *sources, co)]
 
     def runner(self, variant: str, direction: str, blocking: Blocking) -> Callable:
@@ -154,7 +156,8 @@ class UploadedLayer:
                 kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
             elif direction == "weights":
                 count = kernels.backward_weights(conv, parts, grad_out, tiles=tiles)
-                sum_parts(dev, [(conv, count)], conv.work, self.grad_weight, self.grad_bias)
+                grads = self.grad_weight, self.grad_bias
+                sum_parts(dev, [(conv, count)], self.table, conv.work, *grads)
             else:
                 mask = parts[source] if self.relu else None
                 grad = self.grad_parts[source]

@@ -1,7 +1,8 @@
-"""`pp-cl bench train`: the stages of a training's last steps."""
+"""`pp-cl bench train`: the stages of a training's last steps, and what the host takes for one."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,7 +17,20 @@ from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import open_scene, scene_box
 from pp_cl.settings import Config
 
-STEPS = 5  # that are timed, after one that builds the kernels
+STEPS = 5  # that are timed each way, after one that builds the kernels
+
+
+def host_cost(trainer: Trainer, steps: int) -> dict[str, Any]:
+    """{"host_ms", "launches"} of a step, medians of some: the time of the processor that Python and
+    the driver take to enqueue it, without the waits for the device; and what is launched.
+    """
+    dev, ms, launches = trainer.dev, [], []
+    for _ in range(steps):
+        start, before = time.thread_time() - dev.waited, dev.launches
+        trainer.train_step()
+        ms.append((time.thread_time() - dev.waited - start) * 1e3)
+        launches.append(dev.launches - before)
+    return {"host_ms": float(np.median(ms)), "launches": int(np.median(launches))}
 
 
 def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
@@ -32,9 +46,12 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, opacity)
     model = Model(dev, hull.grid, near_far, cloud, net=net)
     trainer = Trainer(dev, config, model, views)
-    trainer.step = max(0, config.train.iterations - 1 - STEPS)
+    trainer.step = max(0, config.train.iterations - 1 - 2 * STEPS)
+    if trainer.exposure and not trainer.exposure.is_applied:
+        trainer.exposure = None  # it has been decided by then
     trainer.take_plan()
     trainer.train_step()
+    host = host_cost(trainer, STEPS)
     with dev.timed_stages() as seconds:
         for _ in range(STEPS):
             trainer.train_step()
@@ -50,5 +67,6 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
         "blend": config.raster.blend,
         "ms": sum(stages.values()),
         "stages_ms": stages,
+        **host,
         "peak_device_bytes": dev.peak_bytes,
     }

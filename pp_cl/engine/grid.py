@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -91,7 +92,7 @@ class Grid:
         low = np.asarray(self.origin)
         return np.stack([low, low + self.voxel_size * (np.asarray(self.dims) - 1)])
 
-    @property
+    @cached_property
     def diagonal(self) -> float:
         """From the first to the last vertex, world units; the voxel size where there is one
         vertex.

@@ -141,6 +141,7 @@ class Renderer:
 
     def release(self) -> None:
         """Free the buffers; the next view makes them anew."""
+        self.model.net.release()
         self._buffers = Buffers(self.dev)
 
     def forward(

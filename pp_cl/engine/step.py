@@ -13,7 +13,7 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.render import Renderer, RenderResult
 from pp_cl.engine.training.crops import Crop, Crops
 from pp_cl.engine.training.exposure import Exposure, decided_at
-from pp_cl.engine.training.loss import Loss, MaskLoss, ignore_gradient, ignore_target
+from pp_cl.engine.training.loss import Loss, ignore_gradient, ignore_target
 from pp_cl.engine.training.optim import Optimiser
 from pp_cl.engine.training.prune import (
     points_of_large_parts,
@@ -52,8 +52,7 @@ class Trainer:
         self.views = views
         self.step = self.begun = 0
         self.renderer = Renderer(dev, model, config.raster)
-        self.loss = Loss(dev, train.ssim_weight, train.smooth_l1)
-        self.mask_loss = MaskLoss(dev, train.mask_weight)
+        self.loss = Loss(dev, train.ssim_weight, train.smooth_l1, train.mask_weight)
         self.exposure: Exposure | None = None
         if train.exposure != "off":
             self.exposure = Exposure(dev, len(views), train.exposure == "on")
@@ -127,9 +126,7 @@ class Trainer:
             with_offsets=rates.offset > 0,
         )
         if distortion_weight > 0:
-            self.loss.add(
-                "distortion", gradients.pixel_distortion, distortion_weight, 1 / all_depths
-            )
+            self.loss.add_distortion(gradients.pixel_distortion, distortion_weight, 1 / all_depths)
 
         with self.dev.stage("update"):
             self.optimiser.update(
@@ -164,20 +161,15 @@ class Trainer:
         """(dL/dimage, dL/dalpha or None) of all terms but the distortion loss; their values go to
         self.loss, which stays on the device. ignored: (H, W) uint8, 1 where a pixel of the crop is.
         """
-        train, image, offset, grad_alpha = self.config.train, rendered.image, rendered.offset, None
+        image, offset = rendered.image, rendered.offset
         if ignored is not None:
             ignore_target(self.dev, ignored, image, target, alpha, offset)
-        grad_image = self.loss.forward_backward(image, target, *offset)
-        transmittance = rendered.weights.transmittance  # None of a softmax
-        if transmittance is not None and train.mask_weight > 0 and crop.view.has_mask:
-            squares, grad_alpha = self.mask_loss.forward_backward(
-                transmittance,
-                alpha,
-                size=rendered.size,
-                offset=offset,
-                shortfall=self._rising(1.0),
-            )
-            self.loss.add("mask", squares, train.mask_weight, 1 / alpha.size)
+        alphas, transmittance = None, rendered.weights.transmittance  # None of a softmax
+        if transmittance is not None and self.loss.mask_weight > 0 and crop.view.has_mask:
+            alphas = transmittance, alpha
+        grad_image, grad_alpha = self.loss.forward_backward(
+            image, target, *offset, alphas=alphas, shortfall=self._rising(1.0)
+        )
         if ignored is not None:
             ignore_gradient(self.dev, ignored, grad_image, offset)
         return grad_image, grad_alpha

@@ -1,12 +1,13 @@
 """Cases of the losses: L1 and SSIM, masks, exposure, and their sum."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.training.exposure import DECAY, PRIOR, Exposure
-from pp_cl.engine.training.loss import FURTHER, Loss, MaskLoss, ignore_gradient, ignore_target
+from pp_cl.engine.training.loss import Loss, ignore_gradient, ignore_target
 from pp_cl.reference import loss as reference_loss
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
 
@@ -36,10 +37,17 @@ def _loss_checks(dev, prediction, target, weights, *bounds):
     another.
     """
     loss = Loss(dev, *weights)
-    grad = loss.forward_backward(dev.upload(prediction), dev.upload(target)).get()
+    grad, _ = loss.forward_backward(dev.upload(prediction), dev.upload(target))
     terms, expected = reference_loss.loss(prediction, target, *weights)
-    yield each(loss.terms.get()[:4], terms, bounds[0], floor=1e-10 / bounds[0])
-    yield relative(grad, expected, bounds[-1])
+    yield each(four_terms(loss), terms, bounds[0], floor=1e-10 / bounds[0])
+    yield relative(grad.get(), expected, bounds[-1])
+
+
+def four_terms(loss: Loss) -> np.ndarray:
+    """(4,) of the last image: L, L1, 1 - SSIM and the mean squared error."""
+    found = loss.read(1).get()
+    mse = 10 ** (-found["psnr"] / 10)
+    return np.array([found["loss"], found["l1"], 1 - found["ssim"], mse])
 
 
 def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -58,32 +66,35 @@ def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _equal_images(dev, image):
     loss = Loss(dev, 0.2)
-    grad = loss.forward_backward(dev.upload(image), dev.upload(image)).get()
-    yield exact(loss.terms.get(), np.zeros(8))
-    yield exact(grad, np.zeros_like(image))
+    grad, _ = loss.forward_backward(dev.upload(image), dev.upload(image))
+    yield exact(four_terms(loss)[:3], np.zeros(3))
+    yield exact(grad.get(), np.zeros_like(image))
 
 
 def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """weight * mean (alpha - mask)^2 of a part of the image, where alpha is too low times the
-    shortfall's weight; nothing outside of it.
+    shortfall's weight, beside no other error; nothing outside of it.
     """
     weight, shortfall, width, left, top = 0.7, 0.3, 29, 3, 1
     for side in SIZES:
         size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
         transmittance, mask = rng.random(size), rng.random((side, width))
         ignored = rng.random(mask.shape) < 0.2
-        squares, grad = MaskLoss(dev, weight).forward_backward(
-            dev.upload(transmittance.ravel(), np.float32),
-            dev.upload(np.where(ignored, -1, mask), np.float32),
-            size=size,
-            offset=(left, top),
+        loss = Loss(dev, 0.0, mask_weight=weight)
+        rendered = dev.upload(transmittance.ravel(), np.float32)
+        grad: Any
+        _, grad = loss.forward_backward(
+            dev.zeros((*size, 3)),
+            dev.zeros((side, width, 3)),
+            left,
+            top,
+            alphas=(rendered, dev.upload(np.where(ignored, -1, mask), np.float32)),
             shortfall=shortfall,
         )
         difference = np.where(ignored, 0, 1 - transmittance[inside] - mask)
         weighted = np.where(difference < 0, shortfall, 1) * difference
-        sums = np.zeros(size[0])
-        sums[top : top + side] = (weighted * difference).sum(axis=1)
-        yield relative(squares.get(), sums, 8 * EPS)
+        found, mean = loss.read(1).get(), (weighted * difference).mean()
+        yield each([found["loss"], found["mask"]], [weight * mean, mean], 8 * EPS)
         expected = np.zeros(size)
         expected[inside] = 2 * weight * weighted / mask.size
         yield relative(grad.get().reshape(size), expected, 8 * EPS)
@@ -109,19 +120,18 @@ def _ignored(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The loss is that of the image and the weighted sums of all that is added."""
-    prediction, target = images(rng, 12, 33)
+    """The loss is that of the image and what is added."""
     for n in SIZES:
-        loss, expected = Loss(dev, 0.2), np.zeros(8)
-        expected[:4], _ = reference_loss.loss(prediction, target, 0.2)
+        prediction, target = images(rng, 12, n)
+        loss, (terms, _) = Loss(dev, 0.2), reference_loss.loss(prediction, target, 0.2)
         for _ in range(2):  # each time anew
             loss.forward_backward(dev.upload(prediction), dev.upload(target))
-            for i, name in enumerate(FURTHER):
-                values = rng.random(n).astype(np.float32)
-                loss.add(name, dev.upload(values), 0.5 + i, scale=1 / n)
-                expected[4 + i] = values.mean(dtype=np.float64)
-        expected[0] += expected[4:7] @ (0.5, 1.5, 2.5)
-        yield each(loss.terms.get(), expected, LOSS)
+            values = rng.random(12 * n).astype(np.float32)
+            loss.add_distortion(dev.upload(values), 1.5, scale=1 / n)
+            added = values.sum(dtype=np.float64) / n
+        found = loss.read(1).get()
+        expected = [terms[0] + 1.5 * added, added]
+        yield each([found["loss"], found["distortion"]], expected, LOSS)
 
 
 def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

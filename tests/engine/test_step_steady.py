@@ -11,11 +11,11 @@ from support.models import drawn_alone
 import pp_cl.engine.network.unet
 from pp_cl.config import configure, preset
 from pp_cl.engine.device.buffers import Pending
-from pp_cl.engine.device.device import Device, Program
+from pp_cl.engine.device.device import Device
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session.training import open_training
 
-MOST_LAUNCHES = 75  # of a step of tiny: each takes the host 30 us
+MOST_LAUNCHES = 64  # of a step of tiny: each takes the host 30 us
 COMPLETE = cl.command_execution_status.COMPLETE
 EVERY_STEP = {  # so that a step of any number does what most do
     "points.count": 300,
@@ -53,7 +53,7 @@ class Recorder:
         self._follow(monkeypatch, cl, "enqueue_copy", self._copies)
         self._follow(monkeypatch, Device, "_allocate", "allocations")
         self._follow(monkeypatch, Device, "finish", "waits")
-        self._follow(monkeypatch, Program, "launch", "launches")
+        self._follow(monkeypatch, Device, "enqueue", "launches")
         self._follow(monkeypatch, Pending, "get", self._gets)
 
     def _follow(self, monkeypatch, owner, name, counted):

@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from pp_cl.engine.device.device import FINISH, Device, QueuedArray
+from pp_cl.engine.device.device import Device, QueuedArray
 from pp_cl.engine.device.launch import row_parts
 
 # bytes of the scratch that rows are moved through: 1.4 % of a training with 4 million points
@@ -137,7 +137,7 @@ class Pending(Generic[T]):
     def get(self) -> T:
         """The value; waits for the download. Raises UserError as Device.attempt() does."""
         if self._event is not None:
-            self._dev.attempt(FINISH, self._event.wait)
+            self._dev.wait(self._event.wait)
             self._values = self._convert(self._values)
             self._event = None
         return self._values
@@ -149,17 +149,17 @@ def read_later(
     start: int = 0,
     convert: Callable[[np.ndarray], Any] = lambda values: values,
 ) -> Pending:
-    """array[start:], (N,), as the kernels enqueued so far will leave it. convert: applied once to
-    the numpy array, when it is asked for; what it raises, get() raises.
+    """array[start:], as the kernels enqueued so far will leave it. convert: applied once to the
+    numpy array, when it is asked for; what it raises, get() raises.
     """
-    values = np.empty(len(array) - start, array.dtype)
+    values = np.empty((len(array) - start, *array.shape[1:]), array.dtype)
     event = dev.attempt(
         "download a buffer",
         cl.enqueue_copy,
         dev.queue,
         values,
         array.base_data,
-        src_offset=array.offset + start * array.dtype.itemsize,
+        src_offset=array.offset + start * array.strides[0],
         is_blocking=False,
     )
     return Pending(dev, event, values, convert)

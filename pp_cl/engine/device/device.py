@@ -14,9 +14,9 @@ import time
 import weakref
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyopencl as cl
@@ -28,11 +28,11 @@ from pp_cl.engine.device.kernel import Kernel, cut, parse_signatures, quiet_comp
 from pp_cl.errors import BuildError, UserError
 
 SMALLER = "lower --points or raise --downscale"
-FINISH = "finish its work"  # what drivers of GPUs often fail at, for lack of memory
 HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
 # Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
 # multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
 MOST_MULTIPLY_ADDS = 25e9
+UNTIMED = nullcontext()  # a stage
 STANDARD = ("-cl-std=CL1.2",)  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
 INTEL_PLATFORM = "Intel(R) OpenCL"
@@ -164,6 +164,20 @@ class QueuedArray(Array):
         """Nothing."""
 
 
+class Launch(NamedTuple):
+    """A launch that has been checked. offset: of its first work-item, or None. values: in the
+    kernel's order; arguments: the same by name. watched: it may take too long for a watchdog.
+    """
+
+    kernel: Kernel
+    size: tuple[int, ...]
+    local: tuple[int, ...]
+    offset: tuple[int, ...] | None
+    values: list[Any]
+    arguments: dict[str, Any]
+    watched: bool
+
+
 def _ignore_full_files():
     """Leave a write beyond what a file may hold to its error, as Python does: LLVM in drivers
     catches its signal, asks for a bug report and ends the program.
@@ -175,7 +189,8 @@ def _ignore_full_files():
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
-    kernels are launched in parts.
+    kernels are launched in parts. launches: so far. waited: CPU seconds of threads that waited for
+    the device; drivers of CPUs have them compute meanwhile.
     """
 
     def __init__(self, device: cl.Device):
@@ -190,7 +205,9 @@ class Device:
         self.queue = cl.CommandQueue(self.context, properties=profiling)
         _ignore_full_files()
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
-        self.bytes = self.peak_bytes = 0
+        self.bytes = self.peak_bytes = self.launches = 0
+        self.waited = 0.0
+        self._recorded: list[Launch] | None = None  # what recorded() yields
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
@@ -348,7 +365,47 @@ class Device:
 
     def finish(self) -> None:
         """Wait until everything enqueued is done."""
-        self.attempt(FINISH, self.queue.finish)
+        self.wait(self.queue.finish)
+
+    def wait(self, function: Callable[[], Any]) -> None:
+        """Call a function of the driver that waits. Raises UserError as attempt(): drivers of GPUs
+        often fail there, for lack of memory.
+        """
+        start = time.thread_time()
+        self.attempt("finish its work", function)
+        self.waited += time.thread_time() - start
+
+    @contextmanager
+    def recorded(self) -> Iterator[list[Launch]]:
+        """Yields the list of the launches inside the block, which enqueue() repeats. They keep
+        their arguments alive.
+        """
+        launches: list[Launch] = []
+        self._recorded = launches
+        try:
+            yield launches
+        finally:
+            self._recorded = None
+
+    def enqueue(self, launch: Launch) -> None:
+        """Enqueue a launch, which has been checked. Raises UserError as attempt()."""
+        kernel = launch.kernel
+        event = self.attempt(
+            kernel.run,
+            kernel.kernel,
+            self.queue,
+            launch.size,
+            launch.local,
+            *launch.values,
+            global_offset=launch.offset,
+        )
+        self.launches += 1
+        if self._recorded is not None:
+            self._recorded.append(launch)
+        if launch.watched:  # what drivers hand to the system together is timed together
+            self.queue.flush()
+        if self.debug:
+            self.observe(kernel, event, launch.arguments)
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
         """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
@@ -366,20 +423,20 @@ class Device:
                 f"{'; the log of the system may say more' if unsaid else ''}"
             ) from error
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
+    def stage(self, name: str) -> AbstractContextManager[None]:
         """Times the part of a pass called `name` under PP_DEBUG >= 1 and timed_stages().
 
         When timed, the queue is drained before and after, so that stages do not overlap.
         """
-        if self._stage_seconds is None:
-            yield
-            return
+        return UNTIMED if self._stage_seconds is None else self._timed(name, self._stage_seconds)
+
+    @contextmanager
+    def _timed(self, name, seconds):
         self.finish()
         start = time.perf_counter()
         yield
         self.finish()
-        self._stage_seconds[name].append(time.perf_counter() - start)
+        seconds[name].append(time.perf_counter() - start)
 
     @contextmanager
     def timed_stages(self) -> Iterator[dict[str, list[float]]]:
@@ -519,16 +576,4 @@ class Program:
         watched = multiply_adds > 0 and self.device.has_watchdog
         parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if watched else 1
         for offset, part in cut(size, local, parts, along) if parts > 1 else [(None, size)]:
-            event = self.device.attempt(
-                f"run {kernel.label}",
-                kernel.kernel,
-                self.device.queue,
-                part,
-                local,
-                *values,
-                global_offset=offset,
-            )
-            if watched:  # what drivers hand to the system together is timed together
-                self.device.queue.flush()
-            if self.device.debug:
-                self.device.observe(kernel, event, arguments)
+            self.device.enqueue(Launch(kernel, part, local, offset, values, arguments, watched))

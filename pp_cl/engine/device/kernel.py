@@ -151,6 +151,7 @@ class Kernel:
         self.parameters = parameters
         self.names = {p.name for p in parameters}
         self.label = label
+        self.run = f"run {label}"  # what a device may fail to do
         self._device_name = device.name.strip()
         words = {word for p in parameters for word in p.shape or () if word != "?"}
         names = {name for word in words for name in compile_formula(word).co_names}

@@ -1,6 +1,12 @@
-"""How many values a work-item takes and how many work together, on CPUs and on GPUs."""
+"""How many values a work-item takes and how many work together, on CPUs and on GPUs; and launches
+that are prepared once.
+"""
 
-from pp_cl.engine.device.device import Device
+from collections.abc import Callable
+from operator import is_
+from typing import Any
+
+from pp_cl.engine.device.device import Device, Launch
 
 SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
 LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
@@ -57,8 +63,8 @@ def launch_groups(
     defines: dict[str, int] | None = None,
     **arguments,
 ) -> None:
-    """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times. A
-    GPU's compiler may allow fewer of one kernel than the device runs of others.
+    """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times, each
+    a work-group. A GPU's compiler may allow fewer of one kernel than the device runs of others.
 
     defines: of the program, beside GROUP. arguments: by parameter name.
     """
@@ -67,4 +73,28 @@ def launch_groups(
     while items > 1 and items > program.kernels[kernel].largest_group:
         items //= 2
         program = dev.program(name, GROUP=items, **defines)
-    program.launch(kernel, groups * items, None if dev.is_cpu else items, **arguments)
+    program.launch(kernel, groups * items, items, **arguments)
+
+
+class Prepared:
+    """The launches of a function, which are checked when it runs and repeated as they were from
+    then on.
+    """
+
+    def __init__(self, dev: Device):
+        self._dev = dev
+        self._given: tuple[Any, ...] = ()
+        self._launches: list[Launch] | None = None
+
+    def run(self, function: Callable[[], None], *given: Any) -> None:
+        """Enqueue what the function launches, which depends on these objects alone; what else it
+        does to the device must last.
+        """
+        if self._launches is not None and all(map(is_, given, self._given)):
+            for launch in self._launches:
+                self._dev.enqueue(launch)
+            return
+        self._given, self._launches = given, None
+        with self._dev.recorded() as launches:
+            function()
+        self._launches = launches

@@ -22,11 +22,11 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
 
 
 def _block_sums(dev, kernel, n, **arrays):
-    """(blocks,) what the kernel finds in each block of n numbers."""
+    """(blocks,) or longer: what the kernel finds in each block of n numbers."""
     # of a power of two: numbers of pairs differ from step to step
     held = dev.scratch("scan", 1 << (_blocks(n) - 1).bit_length(), np.uint32)
-    _launch(dev, kernel, n, block_sum=held[: _blocks(n)], **arrays)
-    return held[: _blocks(n)]
+    _launch(dev, kernel, n, block_sum=held, **arrays)
+    return held
 
 
 def _blocks(n):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.engine.device.buffers import PackedArrays
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.layers.tiles import VECTOR
@@ -149,6 +150,7 @@ def first_float(array: Array) -> int:
 def sum_parts(
     dev: Device,
     parts: Sequence[tuple[Conv, int]],
+    table: PackedArrays,
     work: Array,
     grad_weights: Array,
     grad_biases: Array,
@@ -156,8 +158,9 @@ def sum_parts(
     """Overwrite the gradients of weights and biases by the sums, in order, of their parts, those of
     all convolutions in one launch.
 
-    parts: [(convolution, number of parts that backward_weights() has left)]. work, grad_weights,
-    grad_biases: (?,) float32, in which Conv.work, Conv.weight and Conv.bias lie.
+    parts: [(convolution, number of parts that backward_weights() has left)]. table: for what the
+    kernel reads of them, until the next call with it. work, grad_weights, grad_biases: (?,)
+    float32, in which Conv.work, Conv.weight and Conv.bias lie.
     """
     rows, n = [], 0
     for conv, count in parts:
@@ -165,15 +168,13 @@ def sum_parts(
         places = [first_float(array) // VECTOR for array in (conv.work, conv.weight, conv.bias)]
         rows.append((n, sums, blocks, count, *places, 0))
         n += sums * blocks
-    table = dev.scratch("rows of conv_sum_parts", 8 * len(rows), np.int32)[: 8 * len(rows)]
-    table = table.reshape(len(rows), 8)
-    dev.send(table, np.array(rows, np.int32))
+    (sent,) = table.send([((len(rows), 8), np.int32)], [np.array(rows, np.int32)])
     dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
         "conv_sum_parts",
         n * row_parts(dev),
         n=n,
         rows=len(rows),
-        table=table,
+        table=sent,
         partial=work,
         grad_weights=grad_weights,
         grad_biases=grad_biases,

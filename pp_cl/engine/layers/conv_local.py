@@ -76,38 +76,25 @@ def backward_input(
 
 def backward_weights(conv: Conv, sources: Sequence[Array], grad_out: Array, *, tiles: Tiles) -> int:
     """See conv_direct."""
-    shape, first = conv.shape, 0
-    k, ci, co, (_, width) = shape.k, shape.ci, shape.co, shape.size
+    shape = conv.shape
+    k, co, (_, width) = shape.k, shape.co, shape.size
     run = max(SUMMED, -(-tiles.number // parts_of(shape)))
     parts = -(-tiles.number // run)
-    for source, c in zip(sources, shape.sources, strict=True):
-        program, in_group, items = _weights_program(conv, c)
-        program.launch(
-            "conv_local_backward_weights",
-            (-(-c // (QUAD * CI_QUADS[k])) * items, -(-co // (QUAD * in_group)), parts),
-            (items, 1, 1),
-            multiply_adds=tiles.number * SIDE**2 * k**2 * c * co,
-            along=2,
-            c=c,
-            co=co,
-            first=first,
-            ci=ci,
-            run=run,
-            summed=max(1, min(SUMMED, width // (2 * SIDE * SIDE))),
-            x=source,
-            grad_out=grad_out,
-            tile_list=tiles.list,
-            tile_count=tiles.count,
-            partial=conv.work,
-        )
-        first += c
+    program, in_group, items = _weights_program(conv)
+    groups = sum(-(-c // (QUAD * CI_QUADS[k])) for c in shape.sources)
     program.launch(
-        "conv_local_backward_bias",
-        (-(-co // VECTOR) * VECTOR, parts),
+        "conv_local_backward_weights",
+        (groups * items, -(-co // (QUAD * in_group)), parts),
+        (items, 1, 1),
+        multiply_adds=tiles.number * SIDE**2 * shape.products,
+        along=2,
+        c1=shape.sources[0],
+        c2=sum(shape.sources[1:]),
         co=co,
-        per_block=k * k * ci,
         run=run,
-        parts=parts,
+        summed=max(1, min(SUMMED, width // (2 * SIDE * SIDE))),
+        x=sources[0],
+        x2=sources[-1],
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
@@ -148,11 +135,9 @@ def _program(
     return program, (groups * items, -(-channels // (QUAD * in_group))), items
 
 
-def _weights_program(conv: Conv, c: int) -> tuple[Program, int, int]:
-    """(program, groups of four output channels and work-items of a work-group) for the weights of
-    c input channels.
-    """
-    k, aligned = conv.shape.k, _is_aligned(c, conv.shape.co)
+def _weights_program(conv: Conv) -> tuple[Program, int, int]:
+    """(program, groups of four output channels and work-items of a work-group)."""
+    k, aligned = conv.shape.k, _is_aligned(*conv.shape.sources, conv.shape.co)
     most = _quads(conv.shape.co, aligned)
     for in_group in (n for n in (16, 8, 4) if n <= most):
         items = CI_QUADS[k] * in_group * k

@@ -4,7 +4,7 @@ launches of winograd.cl, winograd_transform.cl and winograd_backward_weights.cl;
 depend on the number of compute units.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from pyopencl.array import Array
 
@@ -138,6 +138,13 @@ def transform_weights(dev: Device, convs: Sequence[Conv], weights: Array, work: 
         weights=weights,
         transformed=work,
     )
+
+
+def reserve_scratch(convs: Iterable[Conv]) -> None:
+    """Allocate the scratch for all of the convolutions at once, before launches hold it."""
+    transformed = [conv for conv in convs if conv.variant == "winograd"]
+    if transformed:
+        _scratch(max(transformed, key=scratch_floats))
 
 
 def scratch_floats(conv: Conv) -> int:

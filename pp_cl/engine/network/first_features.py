@@ -25,6 +25,9 @@ class FirstFeatures:
         """Nothing: there are no parameters."""
         return {}
 
+    def release(self) -> None:
+        """Do nothing: no arrays are held."""
+
     def freeze(self) -> None:
         """Do nothing: there are no parameters."""
 

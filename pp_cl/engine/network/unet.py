@@ -9,6 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import PackedArrays, Table, packed_arrays, table_bytes
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import Prepared
 from pp_cl.engine.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out, work_shape
 from pp_cl.engine.layers.conv import (
     Conv,
@@ -18,7 +19,7 @@ from pp_cl.engine.layers.conv import (
     pack_weights,
     sum_parts,
 )
-from pp_cl.engine.layers.conv_winograd import scratch_floats
+from pp_cl.engine.layers.conv_winograd import reserve_scratch, scratch_floats
 from pp_cl.engine.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
@@ -62,13 +63,15 @@ Convs = dict[tuple[str, str, int | None], Conv]  # {(layer, direction, source): 
 class Workspace:
     """What the forward pass over images of one size works in, or that and the backward pass.
 
-    size: of the images. arrays: {name: feature map}, gradients by gradient_of(name); some share a
-    buffer, one after the other. "x", the caller's, is there while a pass runs. convs: what computes
-    the convolutions, with their arrays, all of which lie in `work`. all_tiles: the plan that skips
-    nothing. is_laid_out: whether the weights in `work` are the network's.
+    size: of the images. arrays: {name: feature map} without "x", the caller's, gradients by
+    gradient_of(name); some share a buffer, one after the other. convs: what computes the
+    convolutions, with their arrays, all of which lie in `work`. all_tiles: the plan that skips
+    nothing. is_laid_out: whether the weights in `work` are the network's. launches: of laying these
+    out, and of the two passes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, dev: Device) -> None:
+        self._dev = dev
         self.size: Size = (0, 0)
         self.arrays: dict[str, Array] = {}
         self.convs: Convs = {}
@@ -76,6 +79,12 @@ class Workspace:
         self.all_tiles: Any = None
         self.is_laid_out = False
         self._buffers: list[Any] = []
+        self.part_table = PackedArrays(dev)
+        self.release()
+
+    def release(self) -> None:
+        """Forget the launches, which keep the caller's arrays alive."""
+        self.launches = {name: Prepared(self._dev) for name in ("weights", "forward", "backward")}
 
     def plan(self, net: "UNet", size: Size, training: bool) -> None:
         """Make room for images of this size, in the same buffers where they are large enough. The
@@ -84,6 +93,7 @@ class Workspace:
         self.size, self.is_laid_out = (0, 0), False
         # frees the old arrays first
         self.arrays, self.convs, self.work, self.all_tiles = {}, {}, None, None
+        self.release()
         maps = array_shapes(net.layers, size)
         shared = share_buffers(lifetimes(net.layers, training), maps)
         self._buffers += [None] * (len(shared) - len(self._buffers))
@@ -100,6 +110,7 @@ class Workspace:
         self.work = whole.view(np.float32)
         for key, array in zip(needed, arrays, strict=True):
             self.convs[key].work = array
+        reserve_scratch(self.convs.values())
         self.all_tiles = plan_all(net.dev, net.layers, size)
         self.size = size
 
@@ -152,7 +163,8 @@ class UNet:
         self.relu_outputs = {layer.name for layer in self.layers if layer.relu}
         self._workspaces: dict[bool, Workspace] = {}  # {training: Workspace}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
-        self._trained: Any = None  # plan of the last forward(training=True), until its backward()
+        # (plan, x) of the last forward(training=True), until its backward()
+        self._trained: Any = None
         self._is_frozen = False
 
     @classmethod
@@ -179,6 +191,11 @@ class UNet:
             start = first_float(parameter)
             parts[name] = whole[start : start + parameter.size].reshape(parameter.shape)
         return parts
+
+    def release(self) -> None:
+        """Hold the arrays of past passes no longer."""
+        for space in self._workspaces.values():
+            space.release()
 
     def freeze(self) -> None:
         """From now on the parameters do not change: their weights are laid out for the kernels
@@ -241,16 +258,26 @@ class UNet:
         taken = sum(self.layers[0].sources)
         if height % self.multiple or width % self.multiple or channels != taken:
             raise ValueError(f"the network takes (4n, 4m, {taken}) features, not {x.shape}")
-        space = self._workspaces.setdefault(training, Workspace())
+        if training not in self._workspaces:
+            self._workspaces[training] = Workspace(self.dev)
+        space = self._workspaces[training]
         if training:
             self._trained = None  # its arrays are overwritten
         if space.size != (height, width):
             space.plan(self, (height, width), training)
         if not (self._is_frozen and space.is_laid_out):
-            lay_out(self.dev, space.convs.values(), self.all_parameters, space.work)
+            space.launches["weights"].run(
+                lambda: lay_out(self.dev, space.convs.values(), self.all_parameters, space.work)
+            )
             space.is_laid_out = True
-        arrays, plan = space.arrays, plan or space.all_tiles
-        arrays["x"] = x
+        plan = plan or space.all_tiles
+        space.launches["forward"].run(lambda: self._forward(space, plan, x), plan, x)
+        if training:
+            self._trained = plan, x
+        return space.arrays[self.layers[-1].name]
+
+    def _forward(self, space, plan, x):
+        arrays = space.arrays | {"x": x}
         for layer in self.layers:
             sources, out = [arrays[name] for name in layer.inputs], arrays[layer.name]
             tiles = plan.tiles[layer.name]
@@ -262,11 +289,6 @@ class UNet:
                 SIMPLE[layer.kind](self.dev, sources[0], out, tiles=tiles)
             plan.copy_tiles(self.dev, layer.name, out)
         output_forward(self.dev, out, x if self._residual else None)
-        if training:
-            self._trained = plan
-        else:
-            del arrays["x"]  # so that the caller can free it
-        return out
 
     def backward(self, grad_y: Array) -> Array:
         """(H, W, 16) gradient of x in the last forward(x, training=True), given dL/dy (H, W, 3).
@@ -277,10 +299,15 @@ class UNet:
         """
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
-        dev, space, plan = self.dev, self._workspaces[True], self._trained
-        arrays, convs, self._trained = space.arrays, space.convs, None
-        output_backward(dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
+        space, (plan, x), self._trained = self._workspaces[True], self._trained, None
         plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
+        run = space.launches["backward"].run
+        run(lambda: self._backward(space, plan, x, grad_y), plan, x, grad_y)
+        return space.arrays[gradient_of("x")]
+
+    def _backward(self, space, plan, x, grad_y):
+        dev, arrays, convs = self.dev, space.arrays | {"x": x}, space.convs
+        output_backward(dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
         for name in sorted(plan.copies.keys() - plan.tiles.keys()):  # outputs that it reads
             plan.copy_tiles(dev, name, arrays[name])
         parts = []
@@ -313,9 +340,8 @@ class UNet:
         plan.copy_tiles(dev, gradient_of("x"), grad_x)
         if self._residual:
             residual_backward(dev, grad_y, grad_x)
-        sum_parts(dev, parts, space.work, self.all_gradients, self.all_gradients)
-        del arrays["x"]
-        return grad_x
+        all_gradients = self.all_gradients
+        sum_parts(dev, parts, space.part_table, space.work, all_gradients, all_gradients)
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its

@@ -148,7 +148,7 @@ def blend_backward(
         "pair_gradient": b.pair_gradient,
     }
     macros = footprint_macros(points.footprint)
-    program = _program(dev, DL_DB=int(not is_alpha), **macros)
+    program = _program(dev, DL_DB=int(not is_alpha), MOVES=int(moves), **macros)
     if is_alpha:
         program.launch(
             "alpha_gradient",
@@ -174,7 +174,15 @@ def blend_backward(
         "blend_backward",
         visible.size * row_parts(dev, ON_GPU),
         s=visible.size,
+        voxel_size=voxel_size,
+        radius=points.radius,
         visible=visible,
+        camera=points.camera_buffer,
+        point_camera=points.point_camera,
+        point_shape=points.point_shape,
+        cloud_offset=b.grad_offset if points.cloud_offset is None else points.cloud_offset,
+        opacity=opacity,
+        pair_point_falloff=pairs.pair_point_falloff,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_gradient=b.pair_gradient,
@@ -183,26 +191,8 @@ def blend_backward(
         grad_features=grad_features,
         grad_visible_features=b.grad_visible_features,
         grad_opacity=b.grad_opacity,
+        grad_offset=b.grad_offset,
     )
-    if moves:
-        dev.program("raster/offset", **macros).launch(
-            "offset_backward",
-            visible.size,
-            s=visible.size,
-            voxel_size=voxel_size,
-            radius=points.radius,
-            visible=visible,
-            camera=points.camera_buffer,
-            point_camera=points.point_camera,
-            point_shape=points.point_shape,
-            cloud_offset=b.grad_offset if points.cloud_offset is None else points.cloud_offset,
-            opacity=opacity,
-            point_offset=pairs.point_offset,
-            pair_pixel=pairs.pair_pixel,
-            pair_point_falloff=pairs.pair_point_falloff,
-            pair_gradient=b.pair_gradient,
-            grad_offset=b.grad_offset,
-        )
     return BlendGradients(
         b.grad_visible_features,
         b.grad_opacity,

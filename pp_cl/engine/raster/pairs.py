@@ -90,6 +90,9 @@ def find_pairs(
     b.require(pairs_table(n, pixels, capacity))
     exclusive_scan(dev, points.point_count, b.point_offset)
     count = read_total(dev, b.point_offset)
+    if not dev.is_cpu:
+        b.require({"pixel_count": ((pixels,), np.uint32)})
+        dev.fill(b.pixel_count, 0)
     dev.program("raster/pairs", LANES=lanes(dev), **footprint_macros(points.footprint)).launch(
         "pairs_fill",
         -(-n // lanes(dev)),
@@ -103,9 +106,12 @@ def find_pairs(
         pair_pixel=b.pair_pixel,
         pair_point_falloff=b.pair_point_falloff,
         point_key=b.pair_key if dev.is_cpu else b.pair_scratch,
+        pixel_count=b.pixel_offset if dev.is_cpu else b.pixel_count,
     )
-    list_keys = _list_by_bucket if dev.is_cpu else _list_by_key
-    list_keys(dev, b, n, pixels, capacity)
+    if dev.is_cpu:
+        _list_by_bucket(dev, b, n, pixels, capacity)
+    else:
+        _list_by_key(dev, b, pixels, capacity)
     return Pairs(
         points.footprint,
         count,
@@ -144,13 +150,9 @@ def _list_by_bucket(dev, b, n, pixels, capacity):
     )
 
 
-def _list_by_key(dev, b, n, pixels, capacity):
+def _list_by_key(dev, b, pixels, capacity):
     """Sort the keys in pair_scratch, which are by point, into pair_key, and write pixel_offset."""
     program = dev.program("raster/lists_by_key", RUN=RUN)
-    b.require({"pixel_count": ((pixels,), np.uint32)})
-    dev.fill(b.pixel_count, 0)
-    filled = {"n": n, "p": capacity, "point_offset": b.point_offset, "pair_pixel": b.pair_pixel}
-    program.launch("pairs_count", capacity, pixel_count=b.pixel_count, **filled)
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     shared = {
         "p": capacity,
@@ -159,8 +161,7 @@ def _list_by_key(dev, b, n, pixels, capacity):
         "pixel_offset": b.pixel_offset,
     }
     keys, other = b.pair_key, b.pair_scratch
-    counted = {"point_key": other, "pixel_count": b.pixel_count}
-    program.launch("pairs_scatter", capacity, pair_key=keys, **counted, **shared)
+    program.launch("pairs_scatter", capacity, point_key=other, pair_key=keys, **shared)
     program.launch("pairs_sort_runs", capacity, pair_key=keys, sorted=other, **shared)
 
     def merge(source, target, width, group, least):

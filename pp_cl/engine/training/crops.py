@@ -47,13 +47,17 @@ class Crops:
         self.halvings = halvings
         self.side = crop_side(train.crop, halvings)
         self._seed, self._jitters = train.seed, train.pixel_jitter
+        self._epoch, self._order = -1, [0]  # of views, in an epoch
         self._boxes = [view.object_bounds(BOX_MARGIN) for view in self.views]
 
     def draw(self, step: int) -> Crop:
         """The crop of a step: of views in a new random order every epoch, around the object."""
         rng, n = np.random.default_rng((self._seed, step)), len(self.views)
         epoch, place = divmod(step, n)
-        index = int(np.random.default_rng((self._seed, epoch, n)).permutation(n)[place])
+        if epoch != self._epoch:
+            order = np.random.default_rng((self._seed, epoch, n)).permutation(n)
+            self._epoch, self._order = epoch, order.tolist()
+        index = self._order[place]
         view = self.views[index]
         jitter = self._jitter(view, rng) if self._jitters else (0, 0)
         box = (0, 0, view.camera.width, view.camera.height)

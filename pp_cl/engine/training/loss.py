@@ -1,8 +1,9 @@
-"""The training loss: smooth L1 and SSIM of the rendered crop with their gradient, the mask term,
-and the sum of all terms, which stay on the device until they are read.
+"""The training loss: smooth L1 and SSIM of the rendered crop, and the mask term, with their
+gradients; and the sum of all terms, which stay on the device until they are read.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -14,7 +15,6 @@ from pp_cl.errors import Diverged
 
 TAPS = 11  # pixels, the side of an SSIM window
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
-FURTHER = ("mask", "distortion")  # terms that not every training has
 
 
 def loss_table(
@@ -29,162 +29,136 @@ def loss_table(
         "moments": ((window_rows, 4, blocks, values), np.float32),
         "derivatives": ((window_rows, 3, blocks, values), np.float32),
         "row_derivatives": ((window_rows, 3, blocks, values), np.float32),
-        "partial_terms": ((window_rows + height, blocks, 4), np.float32),
-        "row_terms": ((window_rows + height, 4), np.float32),
+        "terms": ((window_rows + 2 * padded[0], 4), np.float32),
         "grad_prediction": ((*padded, 3), np.float32),
+        "grad_alpha": ((math.prod(padded),), np.float32),
     }
 
 
 class Loss:
-    """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image, and what add() adds; holds
-    its scratch buffers.
+    """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image + mask_weight * mean
+    (alpha - mask)^2, and what add_distortion() adds; holds its scratch buffers.
 
     D is smooth L1 (Girshick 2015): d^2 / (2 beta) below beta, |d| - beta/2 from there on; L1 where
     beta is 0.
     SSIM (Wang et al. 2004): 11x11 Gaussian windows of sigma 1.5 inside the image, k1 .01, k2 .03,
     range 1, population variances, mean over channels and windows. It is off (its term reads 0)
-    where ssim_weight is 0 or a side of the target is below 11 pixels. terms: (8,) float32 on the
-    device: L, L1, 1 - SSIM, mean squared error, those of FURTHER, 0.
+    where ssim_weight is 0 or a side of the target is below 11 pixels.
     """
 
-    def __init__(self, dev: Device, ssim_weight: float, beta: float = 0.0):
+    def __init__(
+        self, dev: Device, ssim_weight: float, beta: float = 0.0, mask_weight: float = 0.0
+    ):
         self.dev = dev
         self.beta = beta
         self.ssim_weight = ssim_weight
-        self.terms = dev.zeros((8,))
-        self._added: list[str] = []  # of FURTHER, in this step
+        self.mask_weight = mask_weight
+        self._rows = 0, 0  # of windows and of the prediction
+        self._further: dict[str, tuple[float, float]] = {}  # {further term: (weight, scale)}
         self._buffers = Buffers(dev)
 
     def forward_backward(
-        self, prediction: Array, target: Array, left: int = 0, top: int = 0
-    ) -> Array:
-        """dL/dprediction, (PH, PW, 3) float32, valid until the next call; begins `terms` anew.
+        self,
+        prediction: Array,
+        target: Array,
+        left: int = 0,
+        top: int = 0,
+        *,
+        alphas: tuple[Array, Array] | None = None,
+        shortfall: float = 1.0,
+    ) -> tuple[Array, Array | None]:
+        """(dL/dprediction (PH, PW, 3), dL/dalpha (PH * PW,) or None), float32, valid until the next
+        call; begins the terms anew.
 
         prediction: (PH, PW, 3) float32, unclamped. target: (H, W, 3) float32, lies on the
-        prediction's columns left..left+W and rows top..top+H; the gradient is 0 elsewhere. Raises
-        ValueError where it reaches outside.
+        prediction's columns left..left+W and rows top..top+H; the gradients are 0 elsewhere.
+        alphas: of the mask term, if there is one: the transmittance (PH * PW,) of the prediction
+        and the target's alpha (H, W) in [0, 1], below 0 where a pixel is ignored. shortfall: 0 to
+        1, weight of pixels whose alpha is below the mask. Raises ValueError where the target
+        reaches outside.
         """
         corner = corner_of(prediction.shape, target.shape, left, top)
-        (height, width, _), pw, b = target.shape, prediction.shape[1], self._buffers
-        padded = prediction.shape[0], prediction.shape[1]
-        b.require(loss_table(self.dev, (height, width), padded, self.ssim_weight))
+        (height, width, _), (ph, pw, _), b = target.shape, prediction.shape, self._buffers
+        b.require(loss_table(self.dev, (height, width), (ph, pw), self.ssim_weight))
         window_rows, _, blocks, _ = b.moments.shape
-        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
-        program.launch(
-            "loss_moments",
-            (blocks, window_rows),
-            v=window_rows,
-            w=width,
-            pw=pw,
+        shared: dict[str, Any] = {"v": window_rows, "w": width, "pw": pw, "blocks": blocks}
+        shared |= {"prediction": prediction, "target": target, "terms": b.terms}
+        shared["row_derivatives"] = b.row_derivatives
+        self._launch(
+            "loss_windows",
+            window_rows,
             corner=corner,
-            blocks=blocks,
-            prediction=prediction,
-            target=target,
-            moments=b.moments,
-        )
-        program.launch(
-            "loss_similarity",
-            (blocks, window_rows),
-            v=window_rows,
-            w=width,
-            blocks=blocks,
             weight=self.ssim_weight,
             moments=b.moments,
             derivatives=b.derivatives,
-            partial_terms=b.partial_terms,
+            **shared,
         )
-        program.launch(
-            "loss_row_derivatives",
-            (blocks, window_rows),
-            v=window_rows,
-            blocks=blocks,
-            derivatives=b.derivatives,
-            row_derivatives=b.row_derivatives,
-        )
-        if prediction.shape != target.shape:
-            self.dev.fill(b.grad_prediction, 0)
-        program.launch(
+        transmittance, target_alpha = alphas or (b.grad_alpha, b.grad_alpha)
+        self._launch(
             "loss_gradient",
-            (blocks, height),
-            v=window_rows,
+            ph,
             h=height,
-            w=width,
-            pw=pw,
-            corner=corner,
-            blocks=blocks,
+            ph=ph,
+            left=left,
+            top=top,
             beta=self.beta,
-            prediction=prediction,
-            target=target,
-            row_derivatives=b.row_derivatives,
+            has_mask=alphas is not None,
+            mask_weight=self.mask_weight,
+            shortfall=shortfall,
+            transmittance=transmittance,
+            target_alpha=target_alpha,
             grad_prediction=b.grad_prediction,
-            partial_terms=b.partial_terms,
+            grad_alpha=b.grad_alpha,
+            **shared,
         )
-        self._sum(b.partial_terms, b.row_terms)
-        self._sum(b.row_terms.reshape(1, -1, 4), self.terms[:4].reshape(1, 4))
-        self._added = []
-        return b.grad_prediction
+        self._rows = window_rows, ph
+        self._further = {"mask": (self.mask_weight, 1 / (height * width))} if alphas else {}
+        return b.grad_prediction, b.grad_alpha if alphas else None
 
-    def add(self, name: str, values: Array, weight: float, scale: float = 1.0) -> None:
-        """Add weight times a term of FURTHER, which is scale * sum(values), to the loss.
-
-        values: (n,) float32.
+    def add_distortion(self, pixel_distortion: Array, weight: float, scale: float = 1.0) -> None:
+        """Add weight times the distortion loss: scale * sum(pixel_distortion), (PH * PW,)
+        float32.
         """
-        self._added.append(name)
-        launch_groups(
-            self.dev,
-            "training/loss",
-            "loss_add",
-            1,
-            defines=self._defines,
-            n=len(values),
-            term=4 + FURTHER.index(name),
-            scale=scale,
-            weight=weight,
-            values=values,
-            terms=self.terms,
-        )
+        self._further["distortion"] = weight, scale
+        (v, ph), pixels = self._rows, len(pixel_distortion)
+        arrays = {"pixel_distortion": pixel_distortion, "terms": self._buffers.terms}
+        self._launch("loss_distortion", ph, v=v, ph=ph, pw=pixels // ph, **arrays)
 
     def read(self, step: int) -> Pending[dict[str, float]]:
-        """{"loss", "l1", "ssim", "psnr"} of the crop of a step, from 1 on, and the terms that were
-        added. Asking for them raises Diverged if one is not finite.
+        """{"loss", "l1", "ssim", "psnr"} of the crop of a step, from 1 on, and the further terms.
+        Asking for them raises Diverged if one is not finite.
         """
-        added = list(self._added)
+        weight, further, (v, ph) = self.ssim_weight, self._further, self._rows
 
-        def by_name(values: np.ndarray) -> dict[str, float]:
-            total, l1, dissimilarity, mse, *further = map(float, values)
+        def by_name(rows: np.ndarray) -> dict[str, float]:
+            sums = [part.sum(0, dtype=np.float64) for part in np.split(rows, (v, v + ph))]
+            dissimilarity, (smooth, l1, mse, mask) = sums[0][0], sums[1]
+            found = {"mask": mask, "distortion": sums[2][0]}
+            more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
+            total = smooth + weight * dissimilarity
+            total += sum(more[name] * weight for name, (weight, _) in further.items())
             terms = {
-                "loss": total,
-                "l1": l1,
-                "ssim": 1 - dissimilarity,
+                "loss": float(total),
+                "l1": float(l1),
+                "ssim": float(1 - dissimilarity),
                 "psnr": -10 * math.log10(max(mse, 1e-10)),
-                **{name: further[FURTHER.index(name)] for name in added},
+                **more,
             }
             broken = [name for name, value in terms.items() if not math.isfinite(value)]
             if broken:
                 raise Diverged(f"the loss is not finite at step {step} ({', '.join(broken)})")
             return terms
 
-        return read_later(self.dev, self.terms, convert=by_name)
+        return read_later(self.dev, self._buffers.terms, convert=by_name)
 
-    def _sum(self, terms, sums):
-        """Write sums (ROWS, 4) of terms (ROWS, M, 4)."""
-        rows, m, _ = terms.shape
-        launch_groups(
-            self.dev,
-            "training/loss",
-            "loss_sum",
-            rows,
-            defines=self._defines,
-            rows=rows,
-            m=m,
-            terms=terms,
-            sums=sums,
-        )
+    def _launch(self, kernel, rows, **arguments):
+        defines = _defines(self.dev)
+        launch_groups(self.dev, "training/loss", kernel, rows, defines=defines, **arguments)
 
-    @property
-    def _defines(self):
-        values = lanes_of_loss(self.dev)
-        return {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
+
+def _defines(dev):
+    values = lanes_of_loss(dev)
+    return {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
 
 
 def lanes_of_loss(dev: Device) -> int:
@@ -207,61 +181,6 @@ def corner_of(
     return 3 * (top * pw + left)
 
 
-class MaskLoss:
-    """weight * mean (alpha - mask)^2, where pixels whose alpha is below the mask count less if a
-    call says so; holds its scratch buffers.
-
-    Without it the points reach half a spacing beyond the outline, where the network paints them
-    white, and white parts of the object stay transparent.
-    """
-
-    def __init__(self, dev: Device, weight: float):
-        self.dev = dev
-        self.weight = weight
-        self._buffers = Buffers(dev)
-
-    def forward_backward(
-        self,
-        transmittance: Array,
-        target_alpha: Array,
-        *,
-        size: tuple[int, int],
-        offset: tuple[int, int],
-        shortfall: float,
-    ) -> tuple[Array, Array]:
-        """(sums of the squares (PH,) by row, dL/dalpha (PH * PW,)), float32, valid until the next
-        call.
-
-        transmittance: (PH * PW,) of the padded image. target_alpha: (H, W) in [0, 1], below 0 where
-        a pixel is ignored. size: (PH, PW). offset: (left, top) of the target in it. shortfall: 0 to
-        1, weight of pixels whose alpha is below the mask.
-        """
-        (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
-        pixels = height * width
-        self._buffers.require(
-            {"grad_alpha": ((pixels,), np.float32), "row_term": ((height,), np.float32)}
-        )
-        launch_groups(
-            self.dev,
-            "training/mask",
-            "mask_gradient",
-            height,
-            ph=height,
-            pw=width,
-            h=h,
-            w=w,
-            left=left,
-            top=top,
-            weight=self.weight,
-            shortfall=shortfall,
-            transmittance=transmittance,
-            target_alpha=target_alpha,
-            grad_alpha=self._buffers.grad_alpha,
-            row_term=self._buffers.row_term,
-        )
-        return self._buffers.row_term, self._buffers.grad_alpha
-
-
 def ignore_target(
     dev: Device,
     ignored: Array,
@@ -276,7 +195,7 @@ def ignore_target(
     ignored: (H, W) uint8, 1 where it is. offset: (left, top) of the target in the prediction.
     """
     height, width = ignored.shape
-    dev.program("training/mask", GROUP=group_items(dev)).launch(
+    dev.program("training/loss", GROUP=group_items(dev), **_defines(dev)).launch(
         "ignore_target",
         (width, height),
         w=width,
@@ -295,7 +214,7 @@ def ignore_gradient(
 ) -> None:
     """Make dL/dprediction (PH, PW, 3) 0 where a pixel is ignored; as ignore_target() takes it."""
     height, width = ignored.shape
-    dev.program("training/mask", GROUP=group_items(dev)).launch(
+    dev.program("training/loss", GROUP=group_items(dev), **_defines(dev)).launch(
         "ignore_gradient",
         (width, height),
         w=width,

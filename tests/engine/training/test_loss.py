@@ -15,14 +15,13 @@ from pp_cl.engine.training.loss import Loss
 from pp_cl.errors import Diverged
 from pp_cl.reference import loss as oracle_loss
 from pp_cl.reference.differences import numeric_gradient
-from pp_cl.selftest.case import SIZES
-from pp_cl.selftest.loss import images
+from pp_cl.selftest.loss import four_terms, images
 
 
 def run(dev, prediction, target, weight, beta=0.0, **offset):
     loss = Loss(dev, weight, beta)
-    grad = loss.forward_backward(dev.upload(prediction), dev.upload(target), **offset)
-    return loss.terms.get()[:4], grad.get()
+    grad, _ = loss.forward_backward(dev.upload(prediction), dev.upload(target), **offset)
+    return loss, grad.get()
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.05])
@@ -41,13 +40,17 @@ def test_oracle_gradient_is_the_derivative(rng, beta):
 def test_a_nan_is_not_hidden(dev, rng, weight):
     prediction, target = images(rng, 14, 13)
     prediction[5, 6, 1] = np.nan
-    terms, grad = run(dev, prediction, target, weight, 0.05)
-    assert np.isnan(terms[0]) and np.isnan(grad[5, 6, 1])
+    loss, grad = run(dev, prediction, target, weight, 0.05)
+    assert np.isnan(grad[5, 6, 1])
+    pending = loss.read(7)
+    for _ in range(2):  # as often as asked
+        with pytest.raises(Diverged, match=r"at step 7 \(loss, l1(, ssim)?, psnr\)$"):
+            pending.get()
 
 
 def test_ssim_is_scikit_images(dev, rng):
     prediction, target = images(rng, 37, 64)
-    terms, _ = run(dev, prediction, target, 0.2)
+    loss, _ = run(dev, prediction, target, 0.2)
     expected = structural_similarity(
         prediction.astype(np.float64),
         target.astype(np.float64),
@@ -57,18 +60,18 @@ def test_ssim_is_scikit_images(dev, rng):
         data_range=1.0,
         channel_axis=-1,
     )
-    assert terms[2] == pytest.approx(1 - expected, rel=2e-6)
+    assert 1 - loss.read(1).get()["ssim"] == pytest.approx(1 - expected, rel=2e-6)
 
 
 @pytest.mark.parametrize(("left", "top"), [(0, 0), (1, 2), (3, 1)])
 def test_target_inside_a_larger_prediction(dev, rng, left, top):
     prediction, target = images(rng, 22, 29)
-    expected_terms, expected_grad = run(dev, prediction, target, 0.2)
+    expected, expected_grad = run(dev, prediction, target, 0.2)
     padded = np.full((24, 32, 3), np.nan, np.float32)  # poison: nothing outside may be read
     inner = np.s_[top : top + 22, left : left + 29]
     padded[inner] = prediction
-    terms, grad = run(dev, padded, target, 0.2, left=left, top=top)
-    np.testing.assert_array_equal(terms, expected_terms)
+    loss, grad = run(dev, padded, target, 0.2, left=left, top=top)
+    assert loss.read(1).get() == expected.read(1).get()
     np.testing.assert_array_equal(grad[inner], expected_grad)
     grad[inner] = 0
     assert not grad.any()
@@ -86,32 +89,10 @@ def test_sizes_may_change_between_calls(dev, rng):
     loss = Loss(dev, 0.2)
     for size in [(20, 30), (10, 5), (31, 17), (20, 30)]:
         prediction, target = images(rng, *size)
-        grad = loss.forward_backward(dev.upload(prediction), dev.upload(target))
+        grad, _ = loss.forward_backward(dev.upload(prediction), dev.upload(target))
         expected_terms, expected_grad = oracle_loss.loss(prediction, target, 0.2)
-        np.testing.assert_allclose(loss.terms.get()[:4], expected_terms, rtol=2e-6)
+        np.testing.assert_allclose(four_terms(loss), expected_terms, rtol=2e-6, atol=1e-15)
         assert relative_error(grad.get(), expected_grad) < 2e-6
-
-
-def float32_sum(terms, group):
-    """(4,) of terms (M, 4) in float32: member by member of a group, then as a tree."""
-    sums = np.zeros((group, 4), np.float32)
-    for first in range(0, len(terms), group):
-        part = terms[first : first + group]
-        sums[: len(part)] += part
-    while len(sums) > 1:
-        sums = sums[: len(sums) // 2] + sums[len(sums) // 2 :]
-    return sums[0]
-
-
-@pytest.mark.parametrize("m", [*SIZES, 1590])
-@pytest.mark.parametrize("group", [1, 2, 256])
-def test_terms_are_summed_in_a_fixed_order(dev, rng, m, group):
-    terms = rng.uniform(0, 1, (3, m, 4)).astype(np.float32)
-    sums = dev.empty((3, 4))
-    dev.program("training/loss", GROUP=group).launch(
-        "loss_sum", 3 * group, group, rows=3, m=m, terms=dev.upload(terms), sums=sums
-    )
-    assert np.array_equal(sums.get(), [float32_sum(row, group) for row in terms])
 
 
 def test_its_terms_by_name(dev, rng):
@@ -121,32 +102,23 @@ def test_its_terms_by_name(dev, rng):
     for step, (prediction, target) in enumerate(images_of):
         loss.forward_backward(dev.upload(prediction), dev.upload(target))
         if step == 0:
-            loss.add("mask", dev.upload([0.25, 0.5], np.float32), 2.0, scale=0.5)
+            loss.add_distortion(dev.upload(np.full(620, 0.5), np.float32), 2.0, scale=1 / 620)
         readings.append(loss.read(step + 1))
     for step, (prediction, target) in enumerate(images_of):
         expected, _ = oracle_loss.loss(prediction, target, 0.2)
         found = readings[step].get()
-        assert found.pop("loss") == pytest.approx(expected[0] + 0.75 * (step == 0), rel=1e-5)
+        assert found.pop("loss") == pytest.approx(expected[0] + 1.0 * (step == 0), rel=1e-5)
         assert found.pop("ssim") == pytest.approx(1 - expected[2], rel=1e-5)
         assert found.pop("psnr") == pytest.approx(-10 * np.log10(expected[3]), rel=1e-5)
-        assert found == pytest.approx({"l1": expected[1]} | ({} if step else {"mask": 0.375}))
+        assert found == pytest.approx({"l1": expected[1]} | ({} if step else {"distortion": 0.5}))
 
 
-@pytest.mark.parametrize(
-    "values, named",
-    [
-        ([np.nan, 0, 0, 0], "loss"),
-        ([np.inf, np.inf, 0, 0], "loss, l1"),
-        ([1e30, 1e30, 0.5, np.inf], "psnr"),  # the mean square overflows before the loss does
-    ],
-)
-def test_terms_that_are_not_finite_are_told_as_often_as_asked(dev, values, named):
-    loss = Loss(dev, 0.2)
-    loss.terms.set(np.float32([*values, 0, 0, 0, 0]))
-    pending = loss.read(7)
-    for _ in range(2):
-        with pytest.raises(Diverged, match=rf"at step 7 \({named}\)$"):
-            pending.get()
+def test_an_overflow_is_told_where_the_loss_is_finite(dev):
+    """The square of 1e30 overflows, its absolute value does not."""
+    loss = Loss(dev, 0.0)
+    loss.forward_backward(dev.upload(np.full((3, 3, 3), 1e30), np.float32), dev.zeros((3, 3, 3)))
+    with pytest.raises(Diverged, match=r"at step 2 \(psnr\)$"):
+        loss.read(2).get()
 
 
 def test_the_mask_is_learned(tmp_path):
