@@ -12,21 +12,27 @@
 #define SH_2C 0.31539157f  // 1/4 sqrt(5 / pi)
 #define SH_2D 0.54627422f  // 1/4 sqrt(15 / pi)
 
+// basis[0..8] of the unit vector (x, y, z), of numbers or lanes.
+#define SH_BASIS(basis, x, y, z)                                                                   \
+    {                                                                                              \
+        basis[0] = SH_0;                                                                           \
+        basis[1] = -SH_1 * (y);                                                                    \
+        basis[2] = SH_1 * (z);                                                                     \
+        basis[3] = -SH_1 * (x);                                                                    \
+        basis[4] = SH_2A * (x) * (y);                                                              \
+        basis[5] = -SH_2A * (y) * (z);                                                             \
+        basis[6] = SH_2B * (z) * (z) - SH_2C;                                                      \
+        basis[7] = -SH_2A * (x) * (z);                                                             \
+        basis[8] = SH_2D * ((x) * (x) - (y) * (y));                                                \
+    }
+
 // basis[0..8] of the direction from the eye to a point. point: x, y, z in the camera's axes,
 // distance.
 static inline void sh_basis_of_point(global const float *camera, const float4 point, float *basis) {
     const Camera cam = camera_load(camera);
     const float3 c = point.xyz / point.w;
     const float3 d = c.x * cam.right + c.y * cam.down + c.z * cam.forward;
-    basis[0] = SH_0;
-    basis[1] = -SH_1 * d.y;
-    basis[2] = SH_1 * d.z;
-    basis[3] = -SH_1 * d.x;
-    basis[4] = SH_2A * d.x * d.y;
-    basis[5] = -SH_2A * d.y * d.z;
-    basis[6] = SH_2B * d.z * d.z - SH_2C;
-    basis[7] = -SH_2A * d.x * d.z;
-    basis[8] = SH_2D * (d.x * d.x - d.y * d.y);
+    SH_BASIS(basis, d.x, d.y, d.z)
 }
 
 // READ_AHEAD() of all coefficients of point i in sh_0, sh_1, sh_2a and sh_2b, up to DEGREE.

@@ -16,7 +16,7 @@ import numpy as np
 from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.grid import MOST_IDS, Grid
 from pp_cl.engine.network.layers import parameter_table, unet_layers
-from pp_cl.engine.raster.points import SH_DEGREES
+from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.engine.training.schedule import ema_start
 from pp_cl.engine.training.state import PointState
@@ -27,7 +27,7 @@ from pp_cl.files.untrusted import opened_zip, refusal, strict_json
 from pp_cl.scene.identity import unpacked_views
 from pp_cl.settings import Config
 
-FORMAT = 3  # raised when the arrays change meaning
+FORMAT = 4  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
 # {key of the header: its types as JSON has them}, and those that it may lack
@@ -267,8 +267,9 @@ def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> di
     degrees = SH_DEGREES[: config.points.sh_degree + 1]
     sh_dtype = np.float16 if step is None else np.float32
     network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
-    table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
+    table: dict[str, Any] = {"points.ids": ((n,), np.uint32)}
     table["points.offset"] = (n, 4), np.float32
+    table["points.opacity"] = (n, OPACITIES), np.float32
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}
     if step is not None:

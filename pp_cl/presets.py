@@ -42,6 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.smooth_l1": 0.0,
         "train.sh_eps": 0.0197,
         "train.opacity_rate": (3e-2, 3e-3),
+        "train.lobe_rate": 0.0,
         "train.rate_steps": 0,
         "train.offset_rate": (0.0, 0.0),
         "train.pixel_jitter": False,

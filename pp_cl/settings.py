@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-FORMAT = 2  # of config.json: raised when keys are added, change meaning or are removed
+FORMAT = 3  # of config.json: raised when keys are added, change meaning or are removed
 BLOCKS = ("double", "single", "gated")  # what a level of the network computes
 
 
@@ -190,6 +190,13 @@ class TrainConfig:
     )
     opacity_rate: tuple = setting(
         (3e-2, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
+    )
+    lobe_rate: float = setting(
+        1.0,
+        "learning rate of the opacities' harmonics of degree 1, times opacity_rate; half of it of"
+        " degree 2 (0: opacities do not depend on the direction)",
+        0,
+        100,
     )
     offset_rate: tuple = setting(
         (1e-2, 1e-3),

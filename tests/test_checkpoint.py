@@ -321,7 +321,7 @@ def with_member(name, data):
 def with_shape(new):
     """Change the text of the opacities' own header, of the same length."""
     name = "points.opacity.npy"
-    return lambda path: rewritten(path, lambda m: m | {name: m[name].replace(b"(40,)", new)})
+    return lambda path: rewritten(path, lambda m: m | {name: m[name].replace(b"(40, 9)", new)})
 
 
 FILES = {
@@ -331,9 +331,9 @@ FILES = {
     "a readme": with_member("README.txt", b"hello"),
     "a pickle": with_member("x.npy", npy(np.array([{}], object), allow_pickle=True)),
     "a header of numbers": with_member("header.npy", npy(np.zeros(5))),
-    "fewer values than said": with_shape(b"(41,)"),
-    "less than none": with_shape(b"(-4,)"),
-    "brackets": with_shape(b"((((("),
+    "fewer values than said": with_shape(b"(41, 9)"),
+    "less than none": with_shape(b"(-4, 9)"),
+    "brackets": with_shape(b"((((((("),
     "a bomb": bomb,
     "4 GiB claimed": claimed,
 }

@@ -42,7 +42,7 @@ def _opacities(run, grid):
     dense = np.zeros(grid.dims[::-1], np.float32)
     positions = run.model.positions()
     i, j, k = np.rint((positions - np.asarray(grid.origin)) / grid.voxel_size).astype(int).T
-    dense[k, j, i] = run.model.cloud.opacity.get()
+    dense[k, j, i] = run.model.cloud.opacity.get()[:, 0]
     return dense
 
 

@@ -43,7 +43,7 @@ def row(run: Run, steps: int, cell: float) -> dict:
         "steps": steps,
         "cell": cell,
         "seconds": round(seconds, 1),
-        "gaussians": int((cloud.opacity.get() > LEAST_OPAQUE).sum()),
+        "gaussians": int((cloud.opacity.get()[:, 0] > LEAST_OPAQUE).sum()),
         "psnr": {size: round(float(np.mean(found)), 2) for size, found in measured.items()},
     }
 

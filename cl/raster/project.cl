@@ -5,6 +5,7 @@
 #include "grid.h"
 #include "lanes.h"
 #include "cloud.h"
+#include "sh.h"
 #include "raster/footprint.h"
 
 // Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside
@@ -61,8 +62,9 @@ ALWAYS_INLINE ints count_fragments(const Camera *cam, const Footprints *f) {
 }
 
 // Projects `count` points and writes them from `first` on: positions in camera axes, shapes, boxes
-// and numbers of fragments; of points of which none covers a pixel, only these numbers.
-ALWAYS_INLINE void project_points(
+// and numbers of fragments; of points of which none covers a pixel, only these numbers, and it
+// returns false.
+ALWAYS_INLINE bool project_points(
     const Camera *cam,
     const floats x,
     const floats y,
@@ -79,7 +81,7 @@ ALWAYS_INLINE void project_points(
     if (!project(cam, x, y, z, radius, form, &f)) {
         for (uint j = 0; j < count; j++)
             point_count[first + j] = 0;
-        return;
+        return false;
     }
     float place[4][LANES], shape[SHAPE][LANES];
     int fragments[LANES];
@@ -98,6 +100,7 @@ ALWAYS_INLINE void project_points(
         point_box[i] = (ushort4)(f.box[0][j], f.box[1][j], f.box[2][j], f.box[3][j]);
         point_count[i] = fragments[j];
     }
+    return true;
 }
 
 // Whether all points of a brick miss the image, wherever they are in their cells. id: of one of
@@ -128,8 +131,34 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
     return low + more;
 }
 
-// One work-item per LANES points: reads their grid indices and offsets, writes their numbers of
-// fragments and, if any is above 0, their camera-space positions and distances, shapes and boxes.
+// Writes the opacities of `count` points from `first` on, as cloud.h has them, in the direction from
+// the eye, (x, y, z) of any length.
+ALWAYS_INLINE void opacities_from_eye(
+    const floats x,
+    const floats y,
+    const floats z,
+    const uint first,
+    const uint count,
+    global const float *opacity,
+    global float *point_opacity) {
+    const floats distance = sqrt(square(x, y, z));
+    floats basis[OPACITIES], seen = 0.0f;
+    SH_BASIS(basis, x / distance, y / distance, z / distance)
+    basis[0] = 1.0f;
+    float learned[LANES], found[LANES];
+    GPU_UNROLLED_FOR (uint k = 0; k < OPACITIES; k++) {
+        for (uint j = 0; j < LANES; j++)
+            learned[j] = opacity[OPACITIES * (size_t)(first + min(j, count - 1)) + k];
+        seen += basis[k] * LANES_FROM(learned);
+    }
+    LANES_INTO(found, BOUNDED(seen, (floats)(0.0f), (floats)(1.0f)));
+    for (uint j = 0; j < count; j++)
+        point_opacity[first + j] = found[j];
+}
+
+// One work-item per LANES points: reads their grid indices, offsets and opacities, writes their
+// numbers of fragments and, if any is above 0, their camera-space positions and distances, shapes,
+// boxes and opacities from the eye.
 kernel void project_grid(
     const uint n,                      // points
     global const float *camera,        // (21) camera.h
@@ -137,10 +166,12 @@ kernel void project_grid(
     global const uint *point_id,       // (N)
     const float radius,                // of a point without offsets, world units
     global const float *cloud_offset,  // (N, OFFSETS) cloud.h
+    global const float *opacity,       // (N, OPACITIES) cloud.h
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
     global float *point_shape,         // (N, SHAPE) footprint.h
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
-    global uint *point_count)   // (N)
+    global uint *point_count,   // (N)
+    global float *point_opacity)  // (N) from the eye
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
@@ -175,12 +206,14 @@ kernel void project_grid(
         const floats learned = LANES_FROM(offset[3 + number]);
         form[number] = radius * (number < LOGS ? exp(learned) : learned);
     }
-    project_points(
-        &cam, grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0])),
-        grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1])),
-        grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])),
-        LOGS == 1 ? form[0] : radius, form, first, count, point_camera, point_shape, point_box,
-        point_count);
+    const floats px = grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0]));
+    const floats py = grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1]));
+    const floats pz = grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2]));
+    if (project_points(
+            &cam, px, py, pz, LOGS == 1 ? form[0] : radius, form, first, count, point_camera,
+            point_shape, point_box, point_count))
+        opacities_from_eye(
+            px - cam.eye.x, py - cam.eye.y, pz - cam.eye.z, first, count, opacity, point_opacity);
 }
 
 // One work-item per LANES spheres: reads their positions and radii, writes the same as

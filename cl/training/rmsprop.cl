@@ -5,7 +5,9 @@
 // features, and is never stored. The squares of the harmonics of a degree add up to the same in all
 // directions (Unsoeld 1927), so all coefficients of a feature share one second moment v, an average
 // of G^2 / (4 pi), which is the mean of Y_k^2 G^2 over the directions. They move by rate Y_k G /
-// (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike.
+// (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike. The opacity's
+// harmonics (cloud.h) share its second moment. Where the opacity that is seen is at a bound, they
+// move only away from it: else they would grow for as long as gradients point beyond the bound.
 //
 // A point without a gradient stays where it is; the decay of its second moments waits until it has
 // one.
@@ -60,8 +62,9 @@ kernel void rmsprop_move(
     const float point_eps,  // of offset and opacity, as the next two
     const float rate_offset,
     const float rate_opacity,
-    global const uint *visible,                   // (S) their indices
-    global const float *camera,                   // (21) camera.h
+    const float rate_lobe,       // of the opacity's harmonics of degree 1; half of it of degree 2
+    global const uint *visible,  // (S) their indices
+    global const float *camera,  // (21) camera.h
     global const float4 *point_camera,            // (N, 4) x, y, z, distance
     global const float16 *grad_visible_features,  // (?, 16) G, a row for each visible point
     global const float *grad_offset,              // (?, OFFSETS) alike, unread without MOVES_OFFSET
@@ -71,7 +74,7 @@ kernel void rmsprop_move(
     global float *v_offset,                       // (N, OFFSETS)
     global float *v_opacity,                      // (N)
     global float *offset,                         // (N, OFFSETS) cloud.h
-    global float *opacity,                        // (N)
+    global float *opacity,                        // (N, OPACITIES) cloud.h
     global float16 *sh_0,                         // (N, 1, 16)
     global float16 *sh_1,                         // (?, ?, 16) (N, 3, 16), untouched at degree 0
     global float16 *sh_2a,                        // (?, ?, 16) (N, 3, 16), untouched below degree 2
@@ -91,12 +94,23 @@ kernel void rmsprop_move(
     // a NaN is a gradient
     if (row >= s || !(any(grad_visible_features[g] != 0.0f) || any(o != 0.0f) || a != 0.0f)) return;
     const float decay = exp2((step - last) * LOG_BETA2);
+    float basis[9];
+    sh_basis_of_point(camera, point_camera[i], basis);
     if (ROW_PART == 0) {
         last_step[i] = step;
         const float w = decay * v_opacity[i] + DECAY2 * a * a;
         v_opacity[i] = w;
-        const float moved = opacity[i] - rate_opacity * a / (sqrt(w) + point_eps);
-        opacity[i] = BOUNDED(moved, 0.0f, 1.0f);
+        const float move = a / (sqrt(w) + point_eps);
+        global float *learned = opacity + OPACITIES * i;
+        float seen = learned[0];
+        for (uint k = 1; k < OPACITIES; k++)
+            seen += basis[k] * learned[k];
+        const bool stays = a < 0.0f ? seen >= 1.0f : seen <= 0.0f;
+        learned[0] = BOUNDED(learned[0] - rate_opacity * move, 0.0f, 1.0f);
+        for (uint k = 1; k < OPACITIES && !stays; k++) {
+            const float moved = learned[k] - (k < 4 ? 1.0f : 0.5f) * rate_lobe * basis[k] * move;
+            learned[k] = BOUNDED(moved, -1.0f, 1.0f);
+        }
         if (MOVES_OFFSET) {
             const Offsets u = decay * OFFSETS_AT(v_offset, i) + DECAY2 * o * o, most = MOST_OFFSET;
             OFFSETS_AT(v_offset, i) = u;
@@ -108,8 +122,6 @@ kernel void rmsprop_move(
     const floats moment = decay * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
     store_part(moment, v, i);
     const floats scaled = G / (sqrt(moment) + eps);
-    float basis[9];
-    sh_basis_of_point(camera, point_camera[i], basis);
     MOVE(sh_0, 0, 1, rate_0)
     if (DEGREE >= 1) MOVE(sh_1, 1, 3, rate_1)
     if (DEGREE >= 2) {

@@ -64,11 +64,10 @@ class GridScene:
         self.camera = Camera.look_at(eye, (0, 0, 0), fx=focal, width=size, height=size)
 
         net = UNet(dev, widths=(CHANNELS,) * 3)
-        self.cloud = PointCloud.create(dev, ids)
-        model = Model(dev, grid, self.depth_range, self.cloud, net=net)
         self.opacity = rng.uniform(0.7, 1, n).astype(np.float32)
+        self.cloud = PointCloud.create(dev, ids, opacity=self.opacity)
+        model = Model(dev, grid, self.depth_range, self.cloud, net=net)
         self.sh_0 = rng.standard_normal((n, 1, CHANNELS), np.float32)
-        self.cloud.opacity.set(self.opacity)
         self.cloud.sh[0].set(self.sh_0)
         for coefficients in self.cloud.sh[1:]:
             dev.fill(coefficients, HIGHER_SH)

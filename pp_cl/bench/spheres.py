@@ -46,6 +46,7 @@ def project_spheres(
         b.point_box,
         b.point_count,
         b.point_shape,
+        b.point_opacity,
     )
 
 

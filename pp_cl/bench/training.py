@@ -42,10 +42,9 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, config.points.count, scene_box(config))
     net, near_far = UNet.of_settings(dev, config.network), depth_range(views, hull)
-    cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree)
+    opacity = np.random.default_rng(0).uniform(0.3, 1, len(hull.ids))
+    cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, opacity)
     model = Model(dev, hull.grid, near_far, cloud, net=net)
-    count = model.cloud.count
-    model.cloud.opacity.set(np.random.default_rng(0).uniform(0.3, 1, count).astype(np.float32))
     trainer = Trainer(dev, config, model, views)
     trainer.step = max(0, config.train.iterations - 1 - 2 * STEPS)
     if trainer.exposure and not trainer.exposure.is_applied:
@@ -63,7 +62,7 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     }
     yield {
         "scene": config.scene.path,
-        "points": count,
+        "points": cloud.count,
         "size": max(max(view.camera.width, view.camera.height) for view in views),
         "blend": config.raster.blend,
         "ms": sum(stages.values()),

@@ -188,6 +188,7 @@ class Renderer:
                 self.model.grid_buffer,
                 point_id=cloud.ids,
                 cloud_offset=cloud.offset,
+                opacity=cloud.opacity,
                 radius=self.point_radius,
             )
         pairs, weights, tile_mask = self._pairs_and_weights(
@@ -230,7 +231,7 @@ class Renderer:
                     self._buffers,
                     pairs,
                     points.camera_buffer,
-                    self.model.cloud.opacity,
+                    points.point_opacity,
                     blend=settings.blend,
                     gamma=gamma,
                     max_tracked=settings.max_tracked,
@@ -281,7 +282,7 @@ class Renderer:
                 result.points,
                 result.pairs,
                 result.weights,
-                opacity=self.model.cloud.opacity,
+                opacity=result.points.point_opacity,
                 visible_features=result.visible_features,
                 features=result.features,
                 grad_features=grad_features,

@@ -358,8 +358,23 @@ def sh_basis(directions: np.ndarray) -> np.ndarray:
     )
 
 
+def directions(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """(N, 3) float64 of length 1, from the eye (3,) to positions (N, 3)."""
+    towards = np.asarray(positions, np.float64) - eye
+    return towards / np.linalg.norm(towards, axis=1, keepdims=True)
+
+
+def opacities(positions: np.ndarray, eye: np.ndarray, learned: np.ndarray) -> np.ndarray:
+    """(N,) float64 from the eye, of PointCloud.opacity (N, 9)."""
+    return np.clip(unbounded_opacities(directions(positions, eye), learned), 0, 1)
+
+
+def unbounded_opacities(towards: np.ndarray, learned: np.ndarray) -> np.ndarray:
+    """(N,) float64 in the unit directions (N, 3), of PointCloud.opacity (N, 9)."""
+    return learned[:, 0] + (learned[:, 1:] * sh_basis(towards)[:, 1:]).sum(1)
+
+
 def shade(positions: np.ndarray, eye: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """(N, C) features of coefficients (N, K, C), K = 1, 4 or 9."""
-    v = np.asarray(positions, np.float64) - eye
-    basis = sh_basis(v / np.linalg.norm(v, axis=1, keepdims=True))
+    basis = sh_basis(directions(positions, eye))
     return np.einsum("nk,nkc->nc", basis[:, : coefficients.shape[1]], coefficients)

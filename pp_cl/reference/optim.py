@@ -4,7 +4,7 @@ smoothing.
 
 import numpy as np
 
-from pp_cl.reference.dense import sh_basis
+from pp_cl.reference.dense import sh_basis, unbounded_opacities
 
 BETA2 = 0.999  # of both
 
@@ -29,28 +29,29 @@ class Adam:
 class RmsProp:
     """The step of cl/training/rmsprop.cl, written out for all points in every step.
 
-    values: {"sh": (N, count, 16), "offset": (N, 4), of Gaussians (N, 16), "opacity": (N,)}. basis:
-    (N, count), harmonics of the coefficients. most: of an offset; most_sh: of coefficients above
-    degree 0. v: {"sh": (N, 16), "offset", "opacity"}.
+    values: {"sh": (N, count, 16), "offset": (N, 4), of Gaussians (N, 16), "opacity": (N, 9)}.
+    directions: (N, 3), from the eye, of length 1. most: of an offset; most_sh: of coefficients
+    above degree 0. v: {"sh": (N, 16), "offset", "opacity": (N,)}.
     """
 
     def __init__(
         self,
         values: dict[str, np.ndarray],
-        basis: np.ndarray,
+        directions: np.ndarray,
         most: float,
         most_sh: float = np.inf,
     ):
-        self.basis, self.most, self.most_sh, self.t = basis, most, most_sh, 0
+        self.directions, self.most, self.most_sh, self.t = directions, most, most_sh, 0
         self.values = {name: np.array(array, np.float64) for name, array in values.items()}
         self.v = {name: np.zeros_like(array) for name, array in self.values.items()}
-        self.v["sh"] = np.zeros((len(basis), 16))
+        self.v |= {"sh": np.zeros((len(directions), 16)), "opacity": np.zeros(len(directions))}
 
     def step(
         self, t: int, gradients: dict[str, np.ndarray], rates: dict, eps: dict[str, float]
     ) -> None:
         """Step t with gradients "sh", (N, 16) of the features, "offset" and "opacity"; those
-        between it and the last were 0. rates: {"sh": of the basis functions, "offset", "opacity"}.
+        between it and the last were 0. rates: {"sh": of the basis functions, "offset", "opacity",
+        "lobe"}.
         """
         moves = {}
         for name, values in gradients.items():
@@ -60,19 +61,19 @@ class RmsProp:
             self.v[name] = v
             moves[name] = grad / (np.sqrt(v / (1 - BETA2**t)) + eps[name])
         self.t = t
-        by_basis = np.asarray(rates["sh"])[: self.basis.shape[1]] * self.basis
-        sh = self.values["sh"]
+        sh, opacity = self.values["sh"], self.values["opacity"]
+        basis, count = sh_basis(self.directions), sh.shape[1]
+        by_basis = np.asarray(rates["sh"])[:count] * basis[:, :count]
         sh -= by_basis[:, :, None] * moves["sh"][:, None, :]
         sh[:, 1:] = np.clip(sh[:, 1:], -self.most_sh, self.most_sh)
-        for name, (least, most) in {"offset": (-self.most, self.most), "opacity": (0, 1)}.items():
-            moved = self.values[name] - rates[name] * moves[name]
-            self.values[name] = np.clip(moved, least, most)
-
-
-def basis(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """(N, 9): the harmonics in the directions from the eye."""
-    towards = positions - eye
-    return sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+        offset = self.values["offset"] - rates["offset"] * moves["offset"]
+        self.values["offset"] = np.clip(offset, -self.most, self.most)
+        seen, move = unbounded_opacities(self.directions, opacity), moves["opacity"]
+        inward = np.where(np.where(move < 0, seen >= 1, seen <= 0), 0, move)
+        by_degree = np.repeat([rates["lobe"], rates["lobe"] / 2], (3, 5))
+        opacity[:, 0] = np.clip(opacity[:, 0] - rates["opacity"] * move, 0, 1)
+        lobes = opacity[:, 1:] - by_degree * basis[:, 1:] * inward[:, None]
+        opacity[:, 1:] = np.clip(lobes, -1, 1)
 
 
 def neighbours(vertices: np.ndarray) -> list[list[int | None]]:

@@ -19,13 +19,13 @@ from pp_cl.engine.training.optim import POINT_EPS, adam_update, ema_update, rmsp
 from pp_cl.engine.training.schedule import Rates
 from pp_cl.engine.training.smooth import Smoother
 from pp_cl.engine.training.state import PointState, split_opacity
-from pp_cl.reference import optim
+from pp_cl.reference import dense, optim
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
-from pp_cl.selftest.points import some_ids
+from pp_cl.selftest.points import some_ids, some_opacities
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
 EPSILONS = {"sh": 4e-7, "offset": POINT_EPS, "opacity": POINT_EPS}  # of the tiny preset
-RATES = Rates(sh=(0.1, 0.05, 0.025), offset=0.01, opacity=0.1, network=0.0)
+RATES = Rates(sh=(0.1, 0.05, 0.025), offset=0.01, opacity=0.1, lobe=0.05, network=0.0)
 Gradients = dict[str, np.ndarray]
 EYE = np.array([1.5, -2.5, 1.2])
 CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
@@ -33,8 +33,8 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 class Cloud:
     """n points on the grid, with random offsets, opacities and coefficients up to a degree, and
-    their float64 twin. width: of an offset. start, learned(): of "sh" (N, count, 16), "offset" (N,
-    width), "opacity" (N,).
+    their float64 twin. width: of an offset. positions: (N, 3) in the world. start, learned(): of
+    "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Cloud:
         self.start = {
             "sh": rng.standard_normal((n, count, 16)).astype(np.float32),
             "offset": rng.uniform(-most, most, (n, width)).astype(np.float32),
-            "opacity": rng.uniform(0, 1, n).astype(np.float32),
+            "opacity": some_opacities(rng, n),
         }
         most_sh = self.cloud.most_sh
         np.clip(self.start["sh"][:, 1:], -most_sh, most_sh, out=self.start["sh"][:, 1:])
@@ -61,10 +61,11 @@ class Cloud:
             array.set(self.start["sh"][:, block.first : block.first + block.count].copy())
         self.cloud.offset.set(self.start["offset"])
         self.cloud.opacity.set(self.start["opacity"])
-        basis = optim.basis(GRID.positions(ids), EYE)[:, :count]
-        self.twin = optim.RmsProp(self.start, basis, most, most_sh)
+        self.positions = GRID.positions(ids)
+        directions = dense.directions(self.positions, EYE)
+        self.twin = optim.RmsProp(self.start, directions, most, most_sh)
         self.state = PointState(dev, self.cloud)
-        self._points = seen_points(dev, GRID.positions(ids), CAMERA)
+        self._points = seen_points(dev, self.positions, CAMERA)
 
     def step(
         self,
@@ -115,7 +116,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     towards = positions - camera.eye
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
-    absent = (dev.zeros((1,)),) * 4
+    absent = (dev.zeros((1,)),) * 5
     return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
@@ -234,9 +235,12 @@ def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         for _ in range(60):
             cloud.step(gradients(rng, 257, 1e4, width), np.arange(257))
         most, learned = cloud.cloud.most_offset, cloud.learned()
-        for name, bounds in (("offset", (-most, most)), ("opacity", (0.0, 1.0))):
+        mean, lobes = np.split(learned["opacity"], [1], axis=1)
+        for values, bounds in ((learned["offset"], (-most, most)), (mean, (0.0, 1.0))):
+            yield exact([values.min(), values.max()], bounds)
+        yield exact(abs(lobes).max() <= 1, True)
+        for name in ("offset", "opacity"):
             yield finite(learned[name])
-            yield exact([learned[name].min(), learned[name].max()], bounds)
             yield absolute(learned[name], cloud.twin.values[name], 1e-5)  # sixty moves
     sh = learned["sh"]
     yield exact([sh[:, 1:].min(), sh[:, 1:].max()], [-cloud.cloud.most_sh, cloud.cloud.most_sh])
@@ -271,14 +275,14 @@ def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """1 - sqrt(1 - o), which cancels for small opacities."""
+    """1 - sqrt(1 - o), which cancels for small opacities; what depends on the direction alike."""
     for n in SIZES:
-        opacity = rng.uniform(0, 1, n).astype(np.float32)
-        opacity[::5], opacity[1::5], opacity[2::5] = 0, 1, 1e-7
+        opacity = some_opacities(rng, n)
+        opacity[::5, 0], opacity[1::5, 0], opacity[2::5, 0] = 0, 1, 1e-7
         array = dev.upload(opacity)
         split_opacity(dev, array)
         wide = opacity.astype(np.float64)
-        yield each(array.get(), wide / (1 + np.sqrt(1 - wide)), 3e-7)
+        yield each(array.get(), wide / (1 + np.sqrt(1 - wide[:, :1])), 3e-7)
 
 
 CASES = (

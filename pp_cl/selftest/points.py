@@ -16,6 +16,7 @@ from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import BlendGradients, blend_backward, blend_forward
+from pp_cl.engine.raster.points import OPACITIES
 from pp_cl.engine.raster.project import project_grid
 from pp_cl.engine.raster.weights import blend_weights, listed_fragments
 from pp_cl.reference import dense
@@ -46,6 +47,12 @@ def make_points(rng: np.random.Generator, n: int) -> np.ndarray:
 def some_ids(rng: np.random.Generator, grid: Grid, n: int) -> np.ndarray:
     """(n,) uint32 ascending ids of n vertices of a grid."""
     return np.sort(rng.choice(grid.ids_of(np.ones(grid.dims[::-1], bool)), n, replace=False))
+
+
+def some_opacities(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 9) float32 of a PointCloud, anywhere in their bounds."""
+    least = np.repeat([0.0, -1.0], (1, OPACITIES - 1))
+    return rng.uniform(least, 1, (n, OPACITIES)).astype(np.float32)
 
 
 class PairedPoints:
@@ -249,6 +256,7 @@ class PairedGaussians(PairedPoints):
                 dev.upload(grid.packed()),
                 point_id=dev.upload(ids, np.uint32),
                 cloud_offset=dev.upload(offset, np.float32),
+                opacity=dev.zeros((len(ids), OPACITIES)),
                 radius=radius,
             )
         )

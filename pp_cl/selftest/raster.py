@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from pp_cl.engine.camera import look_at
 from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import shade_forward
 from pp_cl.engine.raster.depth import depth_forward
-from pp_cl.engine.raster.points import SH_DEGREES, sh_blocks
+from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES, sh_blocks
 from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
 from pp_cl.engine.raster.weights import BLENDS, list_weights, record_weights
 from pp_cl.reference import dense
-from pp_cl.selftest.case import SIZES, Case, Check, absolute, each, exact, finite, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import (
     AXIS,
     FAR,
@@ -27,6 +28,7 @@ from pp_cl.selftest.points import (
     make_camera,
     make_points,
     some_ids,
+    some_opacities,
 )
 
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
@@ -55,6 +57,7 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             dev.upload(GRID.packed()),
             point_id=dev.upload(ids, np.uint32),
             cloud_offset=dev.upload(offset),
+            opacity=dev.zeros((n, OPACITIES)),
             radius=0.01,
         )
         place, covers = dense.camera_space(camera, positions), points.point_count.get() > 0
@@ -76,6 +79,41 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(covers[~drawn], np.zeros((~drawn).sum(), bool))
         yield exact(covers | ~(drawn & _inside(camera, place)), np.ones(n, bool))
         yield relative(placed[covers, :3], place[covers], PLACED)
+
+
+def _opacities(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Opacities in the direction from the eye: random ones; along the axes, where all harmonics
+    together take opacities to their bounds, beyond them and to little more or less than these.
+    """
+    for n in SIZES:
+        ids = some_ids(rng, GRID, n)
+        yield from _check_opacities(dev, make_camera(), ids, some_opacities(rng, n))
+    ids = GRID.ids(np.array([np.array(GRID.dims) // 2]))
+    for axis, sign in product(np.eye(3), (-1, 1)):
+        eye = GRID.positions(ids)[0] - 4 * sign * axis
+        camera = replace(make_camera(), pose=look_at(eye, GRID.positions(ids)[0]))
+        basis = dense.sh_basis(sign * axis[None])[0, 1:]
+        for mean, along in product((0, 1e-7, 0.5, 1 - 1e-7, 1), (0, 1e-7, -1e-7, 0.5, -0.5, 1, -1)):
+            learned = np.array([[mean, *(along * basis / (basis @ basis))]], np.float32)
+            yield from _check_opacities(dev, camera, ids, learned)
+
+
+def _check_opacities(dev, camera, ids, learned):
+    points = project_grid(
+        dev,
+        Buffers(dev),
+        "soft",
+        dev.upload(camera.packed(dense.DEPTH_RANGE)),
+        dev.upload(GRID.packed()),
+        point_id=dev.upload(ids, np.uint32),
+        cloud_offset=dev.zeros((len(ids), 4)),
+        opacity=dev.upload(learned),
+        radius=0.05,
+    )
+    covers = points.point_count.get() > 0
+    expected = dense.opacities(GRID.positions(ids), camera.eye, learned)
+    # eight products of about 1/2, by harmonics of a direction of four roundings
+    yield absolute(points.point_opacity.get()[covers], expected[covers], 8 * EPS)
 
 
 def _inside(camera, place):
@@ -250,6 +288,7 @@ def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]
 
 CASES = (
     Case("raster: project", _project),
+    Case("raster: opacities by direction", _opacities),
     Case("raster: points that are left out", _left_out),
     *(Case(f"raster: pairs, {kind}", partial(_pairs, kind)) for kind in FOOTPRINTS),
     Case("raster: thousands of equal depths", _equal_depths),

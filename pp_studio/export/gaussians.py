@@ -206,7 +206,7 @@ def _kept(path: Path, key: str) -> np.ndarray | None:
 
 def _table(run, cloud, deviation):
     """The visible ones as records of GAUSSIAN, relative to the centre of the run's grid."""
-    opacity, offset = cloud.opacity.get().clip(0, MOST_OPAQUE), cloud.offset.get()
+    opacity, offset = cloud.opacity.get()[:, 0].clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
     vertices = grid.positions(cloud.ids.get()[rows]) - grid.centre
     table = np.zeros(len(rows), GAUSSIAN)
@@ -268,7 +268,7 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     if not len(rows):
         raise UserError(f"{run.folder}: the training views show no points; train it longer")
     ids, moved = cloud.ids.get()[rows], cloud.offset.get()[rows]
-    opacity = cloud.opacity.get()[rows].clip(0, MOST_OPAQUE)
+    opacity = cloud.opacity.get()[rows, 0].clip(0, MOST_OPAQUE)
     vertices = (grid.positions(ids) - grid.origin) / grid.voxel_size
     places, unit = vertices + moved[:, :3], DEVIATION * run.config.raster.radius
     area = (unit * np.exp(moved[:, 3])) ** 2  # of a round one, in voxel sizes, over 2 pi
@@ -322,4 +322,5 @@ def config_of(run: Run, steps: int) -> Config:
     train.rate_steps = 0
     train.sh_rate = (1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster)
     train.opacity_rate, train.offset_rate = (2.3e-2, 6.8e-3), (4e-2 * faster, 4e-3 * faster)
+    train.lobe_rate = 0.0  # splats have one opacity
     return config

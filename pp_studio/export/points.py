@@ -74,7 +74,7 @@ def coloured_points(
         in_world(positions[rows], voxel_size),
         colours[rows],
         best[rows],
-        cloud.opacity.get()[rows],
+        cloud.opacity.get()[rows, 0],
         run.renderer.point_radius * np.exp(cloud.offset.get()[rows, 3]),
     )
 

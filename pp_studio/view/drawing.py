@@ -100,7 +100,7 @@ def most_opaque(run: Run, share: float) -> Run:
     one; it has the same network.
     """
     model = run.model
-    opacity = model.cloud.opacity.get()
+    opacity = model.cloud.opacity.get()[:, 0]
     count = max(1, round(share * len(opacity)))
     keep = np.sort(np.argsort(-opacity, kind="stable")[:count]).astype(np.uint32)
     cloud = model.cloud.rows(run.dev, run.dev.upload(keep))

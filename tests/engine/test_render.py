@@ -26,7 +26,8 @@ def chained(model, settings, camera):
     opacities and of the network) of the padded camera.
     """
     padded, _, _ = camera.padded(4)
-    positions, opacity = GRID.positions(model.cloud.ids.get()), model.cloud.opacity.get()
+    positions = GRID.positions(model.cloud.ids.get())
+    opacity = oracle_raster.opacities(positions, padded.eye, model.cloud.opacity.get())
     sh = np.concatenate([array.get() for array in model.cloud.sh], 1)
     unit = GRID.voxel_size if settings.footprint == "soft" else np.ptp(model.depth_range) / 4
     geometry = oracle_raster.geometry(padded, positions, settings.radius * unit, settings.footprint)

@@ -10,7 +10,7 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 from pp_cl.engine.raster.weights import listed_fragments
-from pp_cl.selftest.points import some_ids
+from pp_cl.selftest.points import some_ids, some_opacities
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
 
@@ -23,8 +23,8 @@ def make_model(dev, rng, n=90):
     ids = some_ids(rng, GRID, n)
     net = UNet(dev, widths=WIDTHS, seed=3)
     model = Model(dev, GRID, (2.0, 6.0), PointCloud.create(dev, ids), net=net)
-    opacity = rng.uniform(0.2, 1, n).astype(np.float32)
-    opacity[::9], opacity[4::9] = 0, 1
+    opacity = some_opacities(rng, n)
+    opacity[:, 0], opacity[::9, 0], opacity[4::9, 0] = rng.uniform(0.2, 1, n), 0, 1
     model.cloud.opacity.set(opacity)
     for array in model.cloud.sh:
         array.set(rng.normal(size=array.shape).astype(np.float32))

@@ -43,6 +43,7 @@ SH_BLOCKS = (
     ShBlock("sh_2b", 7, 2),
 )
 SH_DEGREES = (0, 1, 2)
+OPACITIES = 9  # numbers in a row of PointCloud.opacity
 MOST_OFFSET = 0.5  # voxel sizes each way: a point stays in its cell; radii times 0.61 to 1.65
 MOST_OF_GAUSSIANS = 2.0  # voxel sizes, logarithms and deviations
 MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: what a .spz can hold
@@ -77,8 +78,11 @@ class PointCloud:
     ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
     point in its cell, in voxel sizes, and the logarithm of its radius over point_radius() of the
     settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up to MOST_OF_GAUSSIANS:
-    see cl/cloud.h. opacity: (N) float32 in [0, 1]. sh: the SH coefficients, (N, count, 16) of each
-    block: float32, or float16 where they are not trained any more.
+    see cl/cloud.h. opacity: (N, 9) float32, o in [0, 1] and coefficients w_k in [-1, 1] of the
+    harmonics Y_k of degrees 1 and 2, as cl/sh.h has them: seen in a direction d, a unit vector from
+    the eye, the point has the opacity o + sum_k w_k Y_k(d), at least 0 and at most 1. sh: the SH
+    coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained any
+    more.
     """
 
     ids: Array
@@ -110,20 +114,24 @@ class PointCloud:
     def table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
         """The arrays of n points."""
         table: Table = {"ids": ((n,), np.uint32), "offset": ((n, 4), np.float32)}
-        table["opacity"] = (n,), np.float32
+        table["opacity"] = (n, OPACITIES), np.float32
         return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
 
     @classmethod
     def create(
-        cls, dev: Device, ids: np.ndarray, degree: int = SH_DEGREES[-1], opacity: float = 1.0
+        cls,
+        dev: Device,
+        ids: np.ndarray,
+        degree: int = SH_DEGREES[-1],
+        opacity: float | np.ndarray = 1.0,
     ) -> PointCloud:
-        """Points of one opacity on their vertices, SH coefficients of 0 of a degree, 0 to 2. ids:
-        (N), ascending.
+        """Points on their vertices, with opacities that are the same from all sides and SH
+        coefficients of 0 of a degree, 0 to 2. ids: (N), ascending. opacity: one for all or (N,).
         """
         n = len(ids)
-        opacities = dev.upload(np.full(n, opacity, np.float32))
+        opacities = _from_all_sides(np.broadcast_to(opacity, n))
         sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]
-        return cls(dev.upload(ids, np.uint32), dev.zeros((n, 4)), opacities, sh)
+        return cls(dev.upload(ids, np.uint32), dev.zeros((n, 4)), dev.upload(opacities), sh)
 
     @classmethod
     def of_gaussians(
@@ -140,8 +148,9 @@ class PointCloud:
         most[0] = np.inf
         begins = [block.first for block in sh_blocks(2)[1:]]
         blocks = np.split(sh.clip(-most, most).astype(np.float32), begins, axis=1)
-        arrays = dev.upload(ids, np.uint32), dev.upload(padded), dev.upload(opacity, np.float32)
-        return cls(*arrays, [dev.upload(block) for block in blocks])
+        opacities = dev.upload(_from_all_sides(opacity))
+        sh_arrays = [dev.upload(block) for block in blocks]
+        return cls(dev.upload(ids, np.uint32), dev.upload(padded), opacities, sh_arrays)
 
     def learned(self) -> dict[str, Array]:
         """{name: array} of all that training changes: "offset", "opacity", and the SH by block."""
@@ -196,3 +205,8 @@ class PointCloud:
             start = block.first - block.degree**2  # within its degree
             sh.append(dev.upload(by_degree[block.degree][:, start : start + block.count]))
         return cls(ids, offset, opacity, sh)
+
+
+def _from_all_sides(opacity):
+    """(N, 9) float32, PointCloud.opacity of opacities (N,) that are the same from all sides."""
+    return np.pad(np.asarray(opacity, np.float32)[:, None], ((0, 0), (0, OPACITIES - 1)))

@@ -31,7 +31,8 @@ class ProjectedPoints:
     (0, 0, 0, -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of
     the pixels that may be covered; last < first means none. point_shape: (N, 1) float32, the radius
     in world units; of Gaussians (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h).
-    cloud_offset, radius: of project_grid().
+    point_opacity: (N,) float32 in [0, 1], from the eye; of spheres undefined. cloud_offset, radius:
+    of project_grid().
     """
 
     footprint: str
@@ -40,6 +41,7 @@ class ProjectedPoints:
     point_box: Array
     point_count: Array
     point_shape: Array
+    point_opacity: Array
     cloud_offset: Array | None = None
     radius: float = 0.0
 
@@ -56,6 +58,7 @@ def projection_table(n: int, footprint: str = "soft") -> Table:
         "point_box": ((n, 4), np.uint16),
         "point_count": ((n,), np.uint32),
         "point_shape": ((n, footprint_macros(footprint)["SHAPE"]), np.float32),
+        "point_opacity": ((n,), np.float32),
     }
 
 
@@ -83,12 +86,14 @@ def project_grid(
     *,
     point_id: Array,
     cloud_offset: Array,
+    opacity: Array,
     radius: float,
 ) -> ProjectedPoints:
     """Project the points, each in the cell of a grid's vertex, into a camera.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
-    PointCloud.offset; of Gaussians (N, 16). radius: of points without offsets, world units.
+    PointCloud.offset; of Gaussians (N, 16). opacity: (N, 9) float32, PointCloud.opacity. radius: of
+    points without offsets, world units.
     """
     n = point_id.size
     b.require(projection_table(n, footprint))
@@ -102,10 +107,12 @@ def project_grid(
         point_id=point_id,
         radius=radius,
         cloud_offset=cloud_offset,
+        opacity=opacity,
         point_camera=b.point_camera,
         point_shape=b.point_shape,
         point_box=b.point_box,
         point_count=b.point_count,
+        point_opacity=b.point_opacity,
     )
     return ProjectedPoints(
         footprint,
@@ -114,6 +121,7 @@ def project_grid(
         b.point_box,
         b.point_count,
         b.point_shape,
+        b.point_opacity,
         cloud_offset,
         radius,
     )

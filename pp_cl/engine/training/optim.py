@@ -244,6 +244,7 @@ def rmsprop_update(
         point_eps=root * POINT_EPS,
         rate_offset=root * rates.offset,
         rate_opacity=root * rates.opacity,
+        rate_lobe=root * rates.lobe,
         visible=visible,
         camera=points.camera_buffer,
         point_camera=points.point_camera,

@@ -22,14 +22,14 @@ SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
 def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainConfig) -> Array:
     """(M,) uint32, ascending: the points that are kept during training. A point is judged once
     PRUNE_LOOKS steps had it in their image: it is kept if its blend weight reached
-    train.prune_weight in one of them and its opacity is at least LEAST_OPACITY, and its counts
-    start anew. Points seen less often are kept.
+    train.prune_weight in one of them and its opacity, the mean of all sides, is at least
+    LEAST_OPACITY, and its counts start anew. Points seen less often are kept.
 
     The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
     Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
     weight, seen = dev.download(state.max_weight), dev.download(state.times_seen)
-    opacities = dev.download(opacity)
+    opacities = dev.download(opacity)[:, 0]
     broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
@@ -56,7 +56,7 @@ def final_points_to_keep(
     """
     weight, seen = dev.download(max_weight), dev.download(times_seen)
     keep = (weight >= train.prune_weight) & (seen >= least)
-    return _listed(dev, keep & (dev.download(opacity) >= LEAST_OPACITY), weight)
+    return _listed(dev, keep & (dev.download(opacity)[:, 0] >= LEAST_OPACITY), weight)
 
 
 def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Config) -> Array:

@@ -25,12 +25,13 @@ LEFT_BY_PRUNING = 0.6
 @dataclass(frozen=True)
 class Rates:
     """The learning rates of one step. sh: of the degrees 0, 1, 2. offset: 0 for points that stay
-    on the grid.
+    on the grid. lobe: of the opacities' harmonics of degree 1.
     """
 
     sh: tuple[float, ...]
     offset: float
     opacity: float
+    lobe: float
     network: float
 
     @classmethod
@@ -48,10 +49,12 @@ class Rates:
                 train.sh_rate, SH_DELAY, (1.0, scale, scale), strict=True
             )
         )
+        opacity = scale * learning_rate(step, steps, *train.opacity_rate)
         return cls(
             sh,
             learning_rate(step, steps, *train.offset_rate) if train.offset_rate[0] else 0.0,
-            scale * learning_rate(step, steps, *train.opacity_rate),
+            opacity,
+            train.lobe_rate * opacity,
             learning_rate(step, steps, *network.rate),
         )
 

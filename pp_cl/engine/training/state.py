@@ -89,8 +89,9 @@ class PointState:
 
 
 def split_opacity(dev: Device, opacity: Array) -> None:
-    """Replace every opacity o in [0, 1], (N,) float32, by 1 - sqrt(1 - o), in place. On a refined
-    grid a ray crosses two points where it crossed one, and their transmittances multiply to 1 - o.
+    """Replace every opacity o in [0, 1], (N, 9) float32 of PointCloud, by 1 - sqrt(1 - o), in
+    place, and scale what depends on the direction as o. On a refined grid a ray crosses two points
+    where it crossed one, and their transmittances multiply to 1 - o.
     """
     n = len(opacity)
     dev.program("training/refine").launch("split_opacity", n, n=n, opacity=opacity)

@@ -62,6 +62,7 @@ def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, k
             dev.upload(grid.packed()),
             point_id=dev.upload(ids),
             cloud_offset=dev.upload(offset),
+            opacity=dev.zeros((len(ids), 9)),
             radius=0.04,
         ).point_count.get()
 

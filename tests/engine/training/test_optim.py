@@ -10,8 +10,8 @@ from support.models import make_model
 from pp_cl.engine.raster.points import SH_DEGREES
 from pp_cl.engine.training.optim import Optimiser, adam_update, ema_update
 from pp_cl.engine.training.state import PointState
-from pp_cl.reference import optim
-from pp_cl.selftest.optim import RATES, Cloud, adam_steps, gradients
+from pp_cl.reference import dense, optim
+from pp_cl.selftest.optim import EYE, RATES, Cloud, adam_steps, gradients
 
 pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
 
@@ -63,13 +63,15 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
     """Of the oracle: for one gradient seen from everywhere, v is the mean of those that Adam keeps
     of the coefficients, and the moves are Adam's with that mean.
     """
-    directions = rng.standard_normal((20_000, 3))
-    basis = optim.basis(directions, np.zeros(3))
+    directions = dense.directions(rng.standard_normal((20_000, 3)), np.zeros(3))
+    basis = dense.sh_basis(directions)
     grad = 1e-4 * np.ones((len(basis), 16))
-    others = {"offset": np.zeros((len(basis), 4)), "opacity": np.zeros(len(basis))}
-    twin = optim.RmsProp({"sh": np.zeros((len(basis), 9, 16))} | others, basis, 0.5)
+    others = {"offset": np.zeros((len(basis), 4))}
+    values = {"sh": np.zeros((len(basis), 9, 16)), "opacity": np.zeros((len(basis), 9))} | others
+    others["opacity"] = np.zeros(len(basis))
+    twin = optim.RmsProp(values, directions, 0.5)
     adam = optim.Adam(np.zeros((len(basis), 9, 16)), beta1=0.0)
-    rates = {"sh": np.ones(9), "offset": 0, "opacity": 0}
+    rates = {"sh": np.ones(9), "offset": 0, "opacity": 0, "lobe": 0}
     twin.step(1, {"sh": grad} | others, rates, {"sh": 0.0, "offset": 1.0, "opacity": 1.0})
     adam.step(basis[:, :, None] * grad[:, None], 1.0, 0.0)
     np.testing.assert_allclose(adam.v[:, :, 0].mean(axis=0), twin.v["sh"][0, 0], rtol=0.03)
@@ -83,7 +85,7 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
 def test_points_without_a_gradient_keep_their_values(dev, rng):
     cloud, visible = Cloud(dev, rng, 257), np.arange(0, 257, 2)
     # all at a bound may stay there
-    cloud.cloud.opacity.set(rng.uniform(0.3, 0.7, 257).astype(np.float32))
+    cloud.cloud.opacity.set(rng.uniform(0.3, 0.7, (257, 9)).astype(np.float32))
 
     def state():
         moments = {name: v.get() for name, v in cloud.state.second_moments.items()}
@@ -113,3 +115,38 @@ def test_degrees_at_rate_0_stay(dev, rng, rates):
     for degree, rate in enumerate(rates):
         part = np.s_[:, degree**2 : (degree + 1) ** 2]
         assert (found[part] == cloud.start["sh"][part]).all() == (rate == 0)
+
+
+def test_an_opacity_moves_as_it_changes_with_what_is_learned(dev, rng):
+    """Against finite differences of the float64 opacity from the eye, inside its bounds: the first
+    step of RMSprop is the rate times the sign of the gradient.
+    """
+    cloud = Cloud(dev, rng, 31)
+    start = np.hstack([rng.uniform(0.4, 0.6, (31, 1)), rng.uniform(-0.1, 0.1, (31, 8))])
+    cloud.cloud.opacity.set(start.astype(np.float32))
+    grads = gradients(rng, 31)
+    cloud.step(grads, np.arange(31), rates=replace(RATES, opacity=0.1, lobe=0.1))
+    slope = np.empty((31, 9))
+    for k in range(9):
+        step = 1e-6 * np.eye(9)[k]
+        higher, lower = (dense.opacities(cloud.positions, EYE, start + s) for s in (step, -step))
+        slope[:, k] = (higher - lower) / 2e-6
+    moved = cloud.cloud.opacity.get() - start
+    rates = np.repeat([0.1, 0.1, 0.05], (1, 3, 5))
+    expected = -rates * np.sign(grads["opacity"])[:, None] * slope
+    np.testing.assert_allclose(moved, expected, atol=1e-6)
+
+
+def test_harmonics_move_no_opacity_further_beyond_a_bound(dev, rng):
+    cloud = Cloud(dev, rng, 257)
+    towards = dense.directions(cloud.positions, EYE)
+    for _ in range(20):
+        before = cloud.cloud.opacity.get()
+        grads = gradients(rng, 257)
+        cloud.step(grads, np.arange(257), rates=replace(RATES, opacity=0.0, lobe=0.3))
+        after = cloud.cloud.opacity.get()
+        seen, now = (dense.unbounded_opacities(towards, rows) for rows in (before, after))
+        beyond = np.where(grads["opacity"] < 0, seen >= 1, seen <= 0)
+        assert 30 < beyond.sum() < 227
+        np.testing.assert_array_equal(after[beyond], before[beyond])
+        assert (np.sign(grads["opacity"]) * (now - seen) <= 0).all()

@@ -20,9 +20,14 @@ from pp_cl.settings import TrainConfig
 pytestmark = pytest.mark.kernels  # of refine.cl
 
 
+def rows(opacity):
+    """(N, 9) float32 of opacities that are the same from all sides."""
+    return np.pad(np.float32(opacity)[:, None], ((0, 0), (0, 8)))
+
+
 def survivors(dev, weights, least_weight, opacities, seen=None, least=1):
     settings = TrainConfig(prune_weight=least_weight)
-    arrays = weights, seen or [1] * len(weights), opacities
+    arrays = weights, seen or [1] * len(weights), rows(opacities)
     arrays = (dev.upload(np.asarray(a, np.float32)) for a in arrays)
     indices = final_points_to_keep(dev, *arrays, settings, least)
     assert indices.dtype == np.uint32
@@ -95,11 +100,11 @@ def test_only_what_was_seen_is_judged(dev):
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))
     state.times_seen.set(np.float32([99, 100, 100, 100, 1000, 100]))
-    opacity = dev.upload(np.float32([0, 1, 1, 0.01, 1, 1]))
+    opacity = dev.upload(rows([0, 1, 1, 0.01, 1, 1]))
     assert points_to_keep(dev, state, opacity, settings).get().tolist() == [0, 3, 4]
     assert state.times_seen.get().tolist() == [99, 0, 0, 0, 0, 0]
     assert not state.max_weight.get().any()
-    opacity.set(np.float32([0, 1, 1, 0, 1, 1]))
+    opacity.set(rows([0, 1, 1, 0, 1, 1]))
     state.times_seen.set(np.float32([200, 99, 99, 200, 0, 0]))
     state.max_weight.set(np.float32([5, 0, 0, 5, 0, 0]))
     assert points_to_keep(dev, state, opacity, settings).get().tolist() == [1, 2, 4, 5]
@@ -112,7 +117,7 @@ def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0, peak]))
     with pytest.raises(Diverged, match="^1 points have"):
-        points_to_keep(dev, state, dev.upload(np.float32([1, opacity])), TrainConfig())
+        points_to_keep(dev, state, dev.upload(rows([1, opacity])), TrainConfig())
 
 
 def test_one_judged_point_always_survives(dev):
@@ -169,5 +174,5 @@ def test_refined_points_let_as_much_light_through(dev, scene, tmp_path, blend):
     before = opacities[0].opacity.get(), opacities[1]["opacity"].get()
     trainer._refine()
     for old, new in zip(before, (opacities[0].opacity, opacities[1]["opacity"]), strict=True):
-        expected = 1 - np.sqrt(1 - old[0]) if blend == "alpha" else old[0]
-        np.testing.assert_allclose(new.get(), expected, rtol=1e-5)
+        expected = old[0] / (1 + np.sqrt(1 - old[0, 0])) if blend == "alpha" else old[0]
+        np.testing.assert_allclose(new.get(), np.tile(expected, (len(new), 1)), rtol=1e-5)

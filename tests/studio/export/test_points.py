@@ -32,7 +32,7 @@ def test_colours_are_those_of_the_best_view(run, points):
         assert colour.tolist() == images[best][line, column].tolist()
     assert points.weight == pytest.approx(weights.max(0)[points.rows])
     assert points.positions == pytest.approx(positions[points.rows], abs=1e-6)
-    assert (points.opacity == run.model.cloud.opacity.get()[points.rows]).all()
+    assert (points.opacity == run.model.cloud.opacity.get()[points.rows, 0]).all()
 
 
 def test_no_points_are_one_line(run):
