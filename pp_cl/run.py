@@ -74,7 +74,7 @@ class Run:
             return scene
         names = few_names([view.name for view in views if view.name in gone])
         told = f"{split}: {len(views) - len(left)} of {len(views)} views left out: their masks"
-        told += f" are beside the model, or training left them out ({names})"
+        told += f" are beside the model ({names})"
         warnings.warn(f"{self.config.scene.path}: {told}", stacklevel=2)
         return replace(scene, splits={split: left}, notes=[*scene.notes, told])
 

@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -59,7 +60,7 @@ def first_signal(*, in_haste: bool = False) -> Iterator[list[int]]:
 @contextmanager
 def deferred() -> Iterator[None]:
     """Ctrl-C and SIGTERM are answered after the block; processes that start in it get none."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
+    if sys.platform == "win32" or not hasattr(signal, "pthread_sigmask"):
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
