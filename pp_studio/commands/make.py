@@ -29,7 +29,8 @@ PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
 # Of the minutes, those that evaluation, splat and video take after the training: a share of what
 # the capture leaves, within these.
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
-LEAST_TRAINING = 0.6  # of what the capture leaves; after a long capture, 0.25 of all
+LEAST_TRAINING = 0.6  # of what the capture leaves
+LEAST_LEFT = 0.25  # of the minutes that a capture leaves, however long it took
 PER_PHOTOGRAPH = 0.03  # minutes that a capture takes, about: on two cores with AVX-512
 OF_SPLAT = 0.6  # of what is left after the evaluation
 LEAST_FPS = 8  # of the video
@@ -148,7 +149,7 @@ class _Clock:
 
     @property
     def left(self) -> float:
-        """Minutes that are left, a tenth of them if there are none."""
+        """Minutes that are left, a tenth of one at least."""
         return max(self.minutes - self.passed, 0.1)
 
     def tell_of_capture(self, source: str) -> None:
@@ -163,7 +164,7 @@ class _Clock:
 
     def training(self) -> float:
         """Minutes of the training; says how the rest is divided."""
-        left = max(self.minutes - self.passed, LEAST_TRAINING * self.minutes / 2)
+        left = max(self.minutes - self.passed, LEAST_LEFT * self.minutes)
         after = min(max(AFTER * left, LEAST_AFTER), MOST_AFTER, (1 - LEAST_TRAINING) * left)
         print(
             f"{self.minutes:g} min: {self.passed:.1f} have passed, {left - after:.1f} for the"
