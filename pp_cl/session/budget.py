@@ -18,7 +18,9 @@ DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 
 # time of 250 steps of `small`, lego has 27.4 dB with its refinement and 29.8 without, in that of
 # 800 steps 31.5 and 32.3.
 LEAST_REFINED = 1000
-WHOLE = 1.5  # times as long as a step of halved images that one takes without a refinement, about
+# Times as long as a step of halved images that one without a refinement takes: a guess, which the
+# next plan corrects.
+WHOLE = 1.5
 ENDING = 0.15  # of a step's time, for as many pixels of a training view, which the end looks at
 FEWEST, MOST = 10, 100  # last steps whose median time counts: first ones may build kernels
 
@@ -50,17 +52,14 @@ class Budget:
         clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
         left /= clearing * statistics.median(self._times)
         replan(train, step, left, self._ending)
-        if self._may_stay_coarse and train.iterations < LEAST_REFINED * refinements(train):
+        to_come = refine_steps(train)
+        is_coarse = self._may_stay_coarse and all(at > step for at in to_come)
+        if is_coarse and train.iterations < LEAST_REFINED * len(to_come):
             train.refine_at = NEVER
             self._times.clear()  # of images of another size
             replan(train, step, left / WHOLE, self._ending)
         self._may_stay_coarse = False
         return True
-
-
-def refinements(train: TrainConfig) -> int:
-    """How often train.refine_at asks for one."""
-    return sum(0 < share < 1 for share in train.refine_at)
 
 
 def replan(train: TrainConfig, step: int, left: float, ending: float = 0.0) -> None:
