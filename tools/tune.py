@@ -25,14 +25,13 @@ from pp_cl.engine.layers.conv import Blocking
 from pp_cl.engine.network.layers import convolutions, unet_layers
 
 SIDE = 96
-IMAGES, WEIGHTS = ("forward", "input"), ("weights",)
-ONE, TILE = (1, 1, 1), (16, 4, 1)  # work-groups
+BOTH, BACKWARD = ("forward", "backward"), ("backward",)
 # {class of device: [(variant, directions, the fields that are tried)]}
 CANDIDATES: dict[str, Any] = {
     "CPU": [
         (
             "winograd",
-            IMAGES,
+            BOTH,
             [
                 {"winograd_groups": groups, "winograd": (64, n), "winograd_narrow": narrow}
                 for groups, n, narrow in (
@@ -47,12 +46,12 @@ CANDIDATES: dict[str, Any] = {
                 )
             ],
         ),
-        ("winograd", WEIGHTS, [{"winograd_weights": n} for n in (16, 32, 64)]),
+        ("winograd", BACKWARD, [{"winograd_weights": n} for n in (16, 32, 64)]),
         (
             "direct",
-            IMAGES,
+            BOTH,
             [
-                {"direct": (*pair, ONE), "direct_odd": (*odd, ONE)}
+                {"direct": pair, "direct_odd": odd}
                 for pair, odd in (
                     ((8, 2), (12, 1)),
                     ((4, 2), (8, 1)),
@@ -62,19 +61,9 @@ CANDIDATES: dict[str, Any] = {
                 )
             ],
         ),
-        ("direct", WEIGHTS, [{"accumulators": n} for n in (24, 12, 6, 4)]),
+        ("direct", BACKWARD, [{"accumulators": n} for n in (24, 12, 6, 4)]),
     ],
-    "GPU": [
-        (
-            "direct",
-            IMAGES,
-            [
-                {"direct": (4, 1, group), "direct_odd": (4, 1, group)}
-                for group in (TILE, (8, 8, 1), (32, 2, 1))
-            ],
-        ),
-        ("direct", WEIGHTS, [{"accumulators": n} for n in (6, 12)]),
-    ],
+    "GPU": [("direct", BACKWARD, [{"accumulators": n} for n in (6, 12)])],
 }
 
 

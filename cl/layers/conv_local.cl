@@ -164,32 +164,39 @@ kernel void conv_local_forward(
     }
 }
 
-// One work-item per (4 input channels, ROWS lines of a tile), a work-group per (4 * QUADS channels,
-// GROUP_TILES tiles of the list): reads what the lines see in grad_out, and writes them to grad_x:
-// the convolution of grad_out with the flipped and transposed weights (conv_backward_weights.cl).
-// masked: x is the output of a ReLU and grad_x the gradient of that ReLU's input.
+// One work-item per (4 channels of x or x2, ROWS lines of a tile), a work-group per (4 * QUADS
+// channels, GROUP_TILES tiles of the list): reads what the lines see in grad_out, and writes them to
+// grad_x or grad_x2: the convolution of grad_out with the flipped and transposed weights
+// (conv_backward_weights.cl). masked: 1 if x is the output of a ReLU and grad_x the gradient of that
+// ReLU's input; plus 2 if x2 is.
 kernel void conv_local_backward_input(
-    const int c,
+    const int c1,
+    const int c2,  // channels of x2; 0 = there is none
     const int co,
     const int masked,
-    global const float *x,         // (height, width, c)
-    global const float4 *flipped,  // ((c+15)/16, KERNEL_SIZE, KERNEL_SIZE, co, 16)
+    global const float *x,         // (height, width, c1)
+    global const float *x2,        // (height, width, ?)
+    global const float4 *flipped,  // ((c1+15)/16+(c2+15)/16, KERNEL_SIZE, KERNEL_SIZE, co, 16)
     global const float *grad_out,  // (height, width, co)
     global const int *tile_list,   // (?) height, width, number, tiles
-    global float *grad_x)          // (height, width, c)
+    global float *grad_x,          // (height, width, c1)
+    global float *grad_x2)         // (height, width, ?)
 {
     local float values[CHUNK * GROUP_TILES * PITCH] __attribute__((aligned(16)));
     local float4 weights[CHUNK * TAPS * QUADS];
     local int2 corner[GROUP_TILES];
     find_corners(corner, tile_list);
     const int height = tile_list[0], width = tile_list[1];
-    const int channel = (get_group_id(1) * QUADS + item_quad()) * 4;
+    const int group = get_group_id(1), groups_of_x = (c1 + 4 * QUADS - 1) / (4 * QUADS);
+    const bool second = group >= groups_of_x;
+    const int channel = ((second ? group - groups_of_x : group) * QUADS + item_quad()) * 4;
+    const int c = second ? c2 : c1;
     float4 acc[ROWS * SIDE];
     UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++)
         acc[p] = 0.0f;
     convolve(
-        acc, values, weights, corner, grad_out, flipped + get_group_id(1) * QUADS * TAPS * co, co,
-        co, height, width);
+        acc, values, weights, corner, grad_out, flipped + group * QUADS * TAPS * co, co, co, height,
+        width);
 
     if (channel >= c || first_tile() + item_tile() >= tile_list[2]) return;
     const int2 at = corner[item_tile()] + (int2)(0, item_line());
@@ -197,8 +204,10 @@ kernel void conv_local_backward_input(
         const int px = at.x + p % SIDE, py = at.y + p / SIDE;
         if (px >= width || py >= height) continue;
         const size_t to = ((size_t)py * width + px) * c + channel;
-        const float4 dL_dx =
-            masked ? select((float4)(0.0f), acc[p], load_quad(x + to, c - channel) > 0.0f) : acc[p];
-        store_quad(dL_dx, grad_x + to, c - channel);
+        float4 dL_dx = acc[p];
+        if (masked & (second ? 2 : 1))
+            dL_dx = select(
+                (float4)(0.0f), dL_dx, load_quad((second ? x2 : x) + to, c - channel) > 0.0f);
+        store_quad(dL_dx, (second ? grad_x2 : grad_x) + to, c - channel);
     }
 }

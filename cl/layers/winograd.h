@@ -12,9 +12,6 @@
 #include "common.h"
 #include "layers/tiles.h"
 
-#ifndef TILES
-#define TILES 64  // tiles transformed and multiplied at a time
-#endif
 #define WINO_M SIDE          // side of a tile of outputs
 #define WINO_S (WINO_M + 2)  // side of a tile of inputs
 #define POSITIONS (WINO_S * WINO_S)
@@ -114,32 +111,33 @@ ALWAYS_INLINE void transform_kernel_tile(float16 *t) {
 #define WEIGHT_AT(position, block, blocks, channels)                                               \
     ((position) * ((blocks) * (channels) + 1) + (block) * (channels))
 
-// Values of many tiles at once are laid out (position, 16 channels, TILES tiles); vectors from one
+// Values of so many tiles at once are laid out (position, 16 channels, tile); vectors from one
 // position to the next. The odd one keeps the positions apart in the sets of a cache.
-#define PITCH(channels) ((channels) / 16 * TILES + 1)
+#define PITCH(channels, tiles) ((channels) / 16 * (tiles) + 1)
 
 // The corner of the i-th tile of tile_list: height, width, number, and the tiles of tiles.h.
 static inline int2 listed_corner(global const int *tile_list, const int i) {
     return tile_corner(tile_list[3 + i], tile_list[1]);
 }
 
-// A scratch begins with a vector for two counters, both 0 between kernels: how much of the work is
-// taken, and how many work-items found nothing more to take. Which work-item takes what changes no
-// result: a compute unit that is late or slow takes less.
+// A scratch begins with a vector for counters, all 0 between kernels: how much of the work is taken,
+// of two kinds, and how many work-items found nothing more to take. Which work-item takes what
+// changes no result: a compute unit that is late or slow takes less.
 #define COUNTERS 1
+#define TILE_WORK 0
+#define SUM_WORK 1
 
-// The first of the next n pieces of work.
-static inline int take(global float16 *scratch, const int n) {
-    return atomic_add((volatile global int *)scratch, n);
+// The first of the next n pieces of work of a kind.
+static inline int take(global float16 *scratch, const int kind, const int n) {
+    return atomic_add((volatile global int *)scratch + kind, n);
 }
 
 // Called once by each work-item, after it took more than there is.
 static inline void leave(global float16 *scratch) {
     volatile global int *counters = (volatile global int *)scratch;
-    if (atomic_inc(counters + 1) == (int)get_global_size(0) - 1) {
-        atomic_xchg(counters, 0);
-        atomic_xchg(counters + 1, 0);
-    }
+    if (atomic_inc(counters + 2) == (int)get_global_size(0) - 1)
+        for (int i = 0; i < 3; i++)
+            atomic_xchg(counters + i, 0);
 }
 
 // The `side` x `side` pixels from (x0, y0) on, 16 channels each, into rows of t that are S apart; 0
@@ -175,10 +173,11 @@ ALWAYS_INLINE void load_tile(
 }
 
 // v = B^T d B of the inputs d of `padded` tiles of tile_list from `first` on, 16 * chunks channels;
-// the last of `count` is repeated.
+// the last of `count` is repeated. tiles: for which v has room.
 ALWAYS_INLINE void transform_tiles(
     global float16 *v,
     const int pitch,
+    const int tiles,
     global float *patch,    // POSITIONS vectors
     global const float *x,  // at the first of the channels
     const int channels,     // of a pixel
@@ -196,7 +195,7 @@ ALWAYS_INLINE void transform_tiles(
                 t, WINO_S, patch, x + chunk * 16, channels, corner.x, corner.y, height, width);
             transform_input_tile(t);
             UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
-                v[i * pitch + chunk * TILES + tile] = t[i];
+                v[i * pitch + chunk * tiles + tile] = t[i];
         }
     }
 }

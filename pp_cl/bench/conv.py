@@ -4,10 +4,9 @@ Errors are against float64 (reference/network.py), of an image of at most CHECK_
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from pp_cl.engine.layers.choice import (
     can_run,
     device_class,
     lay_out,
-    work_shape,
+    work_table,
 )
 from pp_cl.engine.layers.conv import (
     DIRECTIONS,
@@ -37,7 +36,7 @@ from pp_cl.engine.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
 
 CHECK_SIDE = 33  # several tiles of any variant, and parts of some; float64 takes a second
-# what of Layer.expected a direction computes
+# what of Layer.expected errors are stated of
 RESULTS = {"forward": slice(0, 1), "weights": slice(1, 2), "input": slice(3, None)}
 
 
@@ -142,36 +141,37 @@ class UploadedLayer:
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
         tiles = tiles or all_tiles(dev, height, width)
-        sources: Iterable[Any] = range(len(parts)) if direction == "input" else [None]
-        for source in sources:
-            k = self.weight.shape[1]
-            shape = ConvShape(direction, k, channels, co, (height, width), source)
-            conv = Conv(dev, blocking, variant, shape, self.weight, self.bias)
-            if needed := work_shape(variant, shape):
-                n = math.prod(needed)
-                shared = dev.scratch("bench: weights and parts of their gradients", n)
-                conv.work = shared[:n].reshape(needed)
-                lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
-            if direction == "forward":
-                kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
-            elif direction == "weights":
-                count = kernels.backward_weights(conv, parts, grad_out, tiles=tiles)
-                grads = self.grad_weight, self.grad_bias
-                sum_parts(dev, [(conv, count)], self.table, conv.work, *grads)
-            else:
-                mask = parts[source] if self.relu else None
-                grad = self.grad_parts[source]
-                kernels.backward_input(conv, grad_out, grad, mask=mask, tiles=tiles)
+        shape = ConvShape(direction, self.weight.shape[1], channels, co, (height, width))
+        conv = Conv(dev, blocking, variant, shape, self.weight, self.bias)
+        for name, (needed, _) in work_table(variant, shape).items():
+            n = math.prod(needed)
+            setattr(conv, name, dev.scratch(f"bench: {name}", n)[:n].reshape(needed))
+        lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
+        if direction == "forward":
+            kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
+            return
+        masks = [self.relu] * len(parts)
+        count = kernels.backward(
+            conv, parts, grad_out, self.grad_parts, masks=masks, tiles=tiles, grad_tiles=tiles
+        )
+        grads = self.grad_weight, self.grad_bias
+        sum_parts(dev, [(conv, count)], self.table, conv.partial, *grads)
 
 
-def layer_errors(layer: Layer, computed: list[np.ndarray], direction: str) -> tuple[float, float]:
-    """errors() of what Layer.computed() returned, of one direction."""
-    own = RESULTS[direction]
+def layer_errors(layer: Layer, computed: list[np.ndarray], result: str) -> tuple[float, float]:
+    """errors() of what Layer.computed() returned, of one of RESULTS."""
+    own = RESULTS[result]
     actual, expected = (
         np.concatenate([array.ravel() for array in arrays[own]])
         for arrays in (computed, layer.expected)
     )
     return errors(actual, expected)
+
+
+def _direction_errors(layer, computed, direction):
+    """The larger ones of layer_errors() of what a direction computes."""
+    results = ["forward"] if direction == "forward" else ["weights", "input"]
+    return tuple(map(max, *(layer_errors(layer, computed, result) for result in results)))
 
 
 def bench_conv(
@@ -199,6 +199,6 @@ def bench_conv(
             yield from variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction},
                 {v: uploaded.runner(v, direction, blocking) for v in uploaded.variants},
-                {v: layer_errors(checked, results, direction) for v, results in found.items()},
-                flops=2 * layer.multiplications(size, size),
+                {v: _direction_errors(checked, results, direction) for v, results in found.items()},
+                flops=(2 if direction == "forward" else 4) * layer.multiplications(size, size),
             )

@@ -16,6 +16,7 @@ from pyopencl.array import Array
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import Prepared
 from pp_cl.engine.layers.tiles import tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
@@ -143,6 +144,7 @@ class Renderer:
         """Free the buffers; the next view makes them anew."""
         self.model.net.release()
         self._buffers = Buffers(self.dev)
+        self._launches = {name: Prepared(self.dev) for name in ("project", "pairs", "weights")}
 
     def forward(
         self,
@@ -180,16 +182,21 @@ class Renderer:
         b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
         dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
         with dev.stage("project"):
-            points = project_grid(
-                dev,
-                b,
-                self.settings.footprint,
-                b.camera_buffer,
-                self.model.grid_buffer,
-                point_id=cloud.ids,
-                cloud_offset=cloud.offset,
-                opacity=cloud.opacity,
-                radius=self.point_radius,
+            radius, grid = self.point_radius, self.model.grid_buffer
+            points = self._launches["project"].run(
+                lambda: project_grid(
+                    dev,
+                    b,
+                    self.settings.footprint,
+                    b.camera_buffer,
+                    grid,
+                    point_id=cloud.ids,
+                    cloud_offset=cloud.offset,
+                    opacity=cloud.opacity,
+                    radius=radius,
+                ),
+                *(grid, cloud.ids, cloud.offset, cloud.opacity),
+                numbers=(radius,),
             )
         pairs, weights, tile_mask = self._pairs_and_weights(
             points, size, gamma, early_stop, training
@@ -223,8 +230,9 @@ class Renderer:
         """
         settings, by_pair = self.settings, self._by_pair
         while True:
+            prepared, capacity = self._launches["pairs"], self._capacity[by_pair]
             with self.dev.stage("pairs"):
-                pairs = find_pairs(self.dev, self._buffers, points, size, self._capacity[by_pair])
+                pairs = find_pairs(self.dev, self._buffers, points, size, capacity, prepared)
             with self.dev.stage("weights"):
                 weights = blend_weights(
                     self.dev,
@@ -237,6 +245,7 @@ class Renderer:
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
                     derivatives=training,
+                    prepared=self._launches["weights"],
                 )
             tile_mask = None
             if self.model.net.is_planned(size):
@@ -246,6 +255,7 @@ class Renderer:
             if self._capacity[by_pair] == pairs.capacity:
                 return pairs, weights, tile_mask
             del pairs, weights  # else their arrays would stay beside the larger ones
+            self._launches |= {name: Prepared(self.dev) for name in ("pairs", "weights")}
 
     def backward(self, result: RenderResult, grad_image: Array, **options: Any) -> BlendGradients:
         """What backward_features() returns, from dL/dimage of result.image. The gradients of the

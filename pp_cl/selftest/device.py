@@ -8,7 +8,7 @@ import numpy as np
 from pp_cl.engine.device.buffers import compact_rows, gather_rows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import LARGEST_GROUP
-from pp_cl.engine.device.scan import BLOCK, exclusive_scan, nonzero
+from pp_cl.engine.device.scan import BLOCK, exclusive_scan, nonzero, read_front
 from pp_cl.selftest.case import SIZES, Case, Check, exact
 
 
@@ -32,8 +32,9 @@ def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         flags = rng.integers(1, 256, n) * (rng.random(n) < share)
         indices = dev.empty((n,), np.uint32)
         places = dev.upload(np.full(n, 7), np.uint32)
-        listed = nonzero(dev, dev.upload(flags, np.uint8), indices, places)
-        yield exact(listed.get().get(), np.flatnonzero(flags))
+        found = dev.empty((1,), np.uint32)
+        nonzero(dev, dev.upload(flags, np.uint8), indices, places, found)
+        yield exact(read_front(dev, indices, found).get().get(), np.flatnonzero(flags))
         expected = np.where(flags, np.cumsum(flags != 0) - 1, 7)
         yield exact(places.get(), expected)
 

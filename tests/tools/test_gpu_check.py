@@ -9,7 +9,7 @@ from pp_cl.engine.device.kernel import parse_signatures
 from tools import gpu_check
 from tools.gpu_check import TARGETS, Build, check, complaints, missing
 
-CPU_FILES = {"layers/winograd", "layers/winograd_backward_weights", "layers/winograd_transform"}
+CPU_FILES = {"layers/winograd", "layers/winograd_backward"}
 PTXAS = """ptxas info    : Compiling entry function 'one' for 'sm_90'
     112 bytes stack frame, {} bytes spill stores, 8 bytes spill loads
 ptxas info    : Used 255 registers, used 1 barriers, {} bytes smem, 400 bytes cmem[0]

@@ -15,6 +15,7 @@ import weakref
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,7 +41,7 @@ INTEL_PLATFORM = "Intel(R) OpenCL"
 # by default, and not with 256, of which half as many threads run (docs/devices.md).
 SPILLING_ON_INTEL = frozenset(
     (
-        "layers/conv_backward_weights",
+        "layers/conv_backward",
         "layers/conv_local",
         "layers/conv_local_backward_weights",
     )
@@ -166,7 +167,8 @@ class QueuedArray(Array):
 
 class Launch(NamedTuple):
     """A launch that has been checked. offset: of its first work-item, or None. values: in the
-    kernel's order; arguments: the same by name. watched: it may take too long for a watchdog.
+    kernel's order; arguments: the same by name. watched: it may take too long for a watchdog. own:
+    a kernel that has these arguments for good, if there is one.
     """
 
     kernel: Kernel
@@ -176,6 +178,7 @@ class Launch(NamedTuple):
     values: list[Any]
     arguments: dict[str, Any]
     watched: bool
+    own: cl.Kernel | None = None
 
 
 def _ignore_full_files():
@@ -207,7 +210,7 @@ class Device:
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
         self.bytes = self.peak_bytes = self.launches = 0
         self.waited = 0.0
-        self._recorded: list[Launch] | None = None  # what recorded() yields
+        self._recorded: list[Any] | None = None  # what recorded() yields
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
@@ -335,6 +338,8 @@ class Device:
 
     def fill(self, array: Array, value: float) -> None:
         """Set all elements of an array of this device to one value."""
+        if self._recorded is not None:
+            self._recorded.append(partial(self.fill, array, value))
         if array.size:
             self.attempt(
                 "fill a buffer",
@@ -376,11 +381,11 @@ class Device:
         self.waited += time.thread_time() - start
 
     @contextmanager
-    def recorded(self) -> Iterator[list[Launch]]:
-        """Yields the list of the launches inside the block, which enqueue() repeats. They keep
-        their arguments alive.
+    def recorded(self) -> Iterator[list[Any]]:
+        """Yields the list of the launches inside the block, which enqueue() repeats, and of
+        functions that repeat its fills. They keep their arguments alive.
         """
-        launches: list[Launch] = []
+        launches: list[Any] = []
         self._recorded = launches
         try:
             yield launches
@@ -392,12 +397,12 @@ class Device:
         kernel = launch.kernel
         event = self.attempt(
             kernel.run,
-            kernel.kernel,
+            cl.enqueue_nd_range_kernel,
             self.queue,
+            launch.own or kernel.with_arguments(launch.values),
             launch.size,
             launch.local,
-            *launch.values,
-            global_offset=launch.offset,
+            launch.offset,
         )
         self.launches += 1
         if self._recorded is not None:
@@ -543,7 +548,7 @@ class Program:
                 f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}", str(error)
             ) from error
         self.kernels = {
-            k: Kernel(getattr(built, k), device.device, p, defines=defines, label=f"{name}.cl:{k}")
+            k: Kernel(built, k, device.device, p, defines=defines, label=f"{name}.cl:{k}")
             for k, p in signatures.items()
         }
 

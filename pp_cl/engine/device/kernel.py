@@ -135,18 +135,19 @@ class Kernel:
 
     def __init__(
         self,
-        kernel: cl.Kernel,
+        program: cl.Program,
+        name: str,
         device: cl.Device,
         parameters: list[Parameter],
         *,
         defines: dict[str, Any],
         label: str,
     ):
-        # with their types pyopencl packs scalars itself; without, ten of them take it 40 us
-        kernel.set_scalar_arg_dtypes([None if p.is_buffer else p.dtype for p in parameters])
-        self.kernel = kernel
+        self._program, self._name = program, name
+        self._types = [None if p.is_buffer else p.dtype for p in parameters]
+        self._kernel = self._made()
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
-        self.largest_group: Any = kernel.get_work_group_info(limit, device)  # work-items
+        self.largest_group: Any = self._kernel.get_work_group_info(limit, device)  # work-items
         self.most_items = tuple(device.max_work_item_sizes)  # of a group, along each dimension
         self.parameters = parameters
         self.names = {p.name for p in parameters}
@@ -218,6 +219,18 @@ class Kernel:
                 self._checked.clear()
             self._checked.add(key)
         return arguments
+
+    def _made(self):
+        kernel = cl.Kernel(self._program, self._name)
+        # with their types pyopencl packs scalars itself; without, ten of them take it 40 us
+        kernel.set_scalar_arg_dtypes(self._types)
+        return kernel
+
+    def with_arguments(self, values: list[Any], *, for_good: bool = False) -> cl.Kernel:
+        """The kernel set to what arguments() returned; for the next launch, or a new one for good."""
+        kernel = self._made() if for_good else self._kernel
+        kernel.set_args(*values)
+        return kernel
 
     def ranges(
         self, size: int | tuple[int, ...], local: int | tuple[int, ...] | None

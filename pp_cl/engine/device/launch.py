@@ -77,24 +77,35 @@ def launch_groups(
 
 
 class Prepared:
-    """The launches of a function, which are checked when it runs and repeated as they were from
-    then on.
+    """The launches and fills of a function, which are checked when it runs and repeated as they
+    were from then on, by kernels whose arguments stay set.
     """
 
     def __init__(self, dev: Device):
         self._dev = dev
         self._given: tuple[Any, ...] = ()
-        self._launches: list[Launch] | None = None
+        self._numbers: tuple[Any, ...] = ()
+        self._launches: list[Launch | Callable[[], None]] | None = None
+        self._result: Any = None
 
-    def run(self, function: Callable[[], None], *given: Any) -> None:
-        """Enqueue what the function launches, which depends on these objects alone; what else it
-        does to the device must last.
+    def run(self, function: Callable[[], Any], *given: Any, numbers: tuple[Any, ...] = ()) -> Any:
+        """Enqueue what the function launches and fills, and return what it returns, all of which
+        depends on these objects and numbers alone; what else it does to the device must last.
         """
-        if self._launches is not None and all(map(is_, given, self._given)):
-            for launch in self._launches:
-                self._dev.enqueue(launch)
-            return
-        self._given, self._launches = given, None
-        with self._dev.recorded() as launches:
-            function()
-        self._launches = launches
+        is_known = self._launches is not None and numbers == self._numbers
+        if self._launches is None or not (is_known and all(map(is_, given, self._given))):
+            self._launches = self._result = None  # frees their arrays
+            self._given, self._numbers = given, numbers
+            with self._dev.recorded() as launches:
+                self._result = function()
+            self._launches = launches
+            return self._result
+        for i, launch in enumerate(self._launches):
+            if not isinstance(launch, Launch):
+                launch()
+                continue
+            if launch.own is None:  # many would be gone before they are repeated
+                own = launch.kernel.with_arguments(launch.values, for_good=True)
+                launch = self._launches[i] = launch._replace(own=own)
+            self._dev.enqueue(launch)
+        return self._result

@@ -45,13 +45,13 @@ def read_total(dev: Device, offsets: Array) -> Pending[int]:
     return read_later(dev, offsets, len(offsets) - 1, lambda last: int(last[0]))
 
 
-def nonzero(dev: Device, flags: Array, indices: Array, places: Array) -> Pending[Array]:
-    """(S,) uint32 on the device, the front of `indices`: where flags are not zero, ascending.
+def nonzero(dev: Device, flags: Array, indices: Array, places: Array, found: Array) -> None:
+    """Write to `indices` where flags are not zero, ascending, and how many are to `found`.
 
     flags: (N) uint8, N >= 1. indices: (N) uint32. places: (N) uint32, where each of them stands in
-    `indices`; others are left alone.
+    `indices`; others are left alone. found: (1,) uint32.
     """
-    n, found = flags.size, dev.scratch("found", 1, np.uint32)
+    n = flags.size
     block_sum = _block_sums(dev, "count_nonzero", n, flags=flags)
     _launch(
         dev,
@@ -63,4 +63,8 @@ def nonzero(dev: Device, flags: Array, indices: Array, places: Array) -> Pending
         places=places,
         found=found,
     )
+
+
+def read_front(dev: Device, indices: Array, found: Array) -> Pending[Array]:
+    """(S,) uint32 on the device: what nonzero() wrote to `indices`."""
     return read_later(dev, found, convert=lambda total: indices[: int(total[0])])

@@ -8,11 +8,22 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.engine.device.buffers import Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers import conv_direct, conv_local, conv_winograd
-from pp_cl.engine.layers.conv import Blocking, Conv, ConvShape, packed_shape, parts_shape
+from pp_cl.engine.layers.conv import (
+    Blocking,
+    Conv,
+    ConvShape,
+    first_float,
+    packed_shape,
+    parts_shape,
+    weights_program,
+)
+from pp_cl.engine.layers.tiles import VECTOR
 
 AUTO = "auto"
 # The modules have the same functions.
@@ -26,15 +37,16 @@ VARIANTS: dict[str, Any] = {
 OFFERED = {"CPU": ("direct", "winograd"), "GPU": ("local", "direct")}
 # {direction: pixels}: on CPUs Winograd runs in images of at least so many. It is 2.7 times as fast
 # as direct in the paper's network at 256x256, on 2 cores with AVX-512. In smaller images too few
-# tiles share the cost of transforming the weights; channels matter less, from 16 on all gain.
-WINOGRAD_FROM = {"forward": 900, "input": 900, "weights": 64}
+# tiles share the cost of transforming the weights; channels matter less, from 16 on all gain. Half
+# of a backward pass, the gradients of the weights, gains from 64 pixels on.
+WINOGRAD_FROM = {"forward": 900, "backward": 400}
 
 # AVX2 has 16 registers of 8 floats, which hold 8 vectors of 16: 4 sums, the weights of a row, and
 # what they are multiplied with. Measured on Zen 3: 1.6 times (forward) and 1.75 times (training)
 # the speed of the numbers for AVX-512.
 _EIGHT_VECTORS = Blocking(
-    direct=(4, 1, (1, 1, 1)),
-    direct_odd=(4, 1, (1, 1, 1)),
+    direct=(4, 1),
+    direct_odd=(4, 1),
     accumulators=4,
     work_group=(1, 1, 1),
     winograd_groups=1,
@@ -46,8 +58,8 @@ CPUS = {
     # AVX-512 has 32 registers of 16 floats. Where groups of 16 channels pair up, two share each
     # input value and take 8 pixels: 16 accumulators and 6 weights; else one takes 12.
     16: Blocking(
-        direct=(8, 2, (1, 1, 1)),
-        direct_odd=(12, 1, (1, 1, 1)),
+        direct=(8, 2),
+        direct_odd=(12, 1),
         accumulators=24,
         work_group=(1, 1, 1),
         winograd_groups=2,
@@ -60,8 +72,8 @@ CPUS = {
 }
 # A work-item has about 255 scalar registers, and a vector of 16 takes 16 of them: 4 pixels.
 GPU = Blocking(
-    direct=(4, 1, (16, 4, 1)),
-    direct_odd=(4, 1, (16, 4, 1)),
+    direct=(4, 1),
+    direct_odd=(4, 1),
     accumulators=6,
     work_group=None,
 )
@@ -101,38 +113,62 @@ def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> str:
     return variant if can_run(variant, shape.k, *shape.sources, shape.co) else "direct"
 
 
-def work_shape(variant: str, shape: ConvShape) -> tuple[int, ...] | None:
-    """Of the float32 array that a convolution takes beside the layer's own, Conv.work: the weights
-    as the kernels read them, None where they read them as they are; or the parts of the gradients.
+def work_table(variant: str, shape: ConvShape) -> Table:
+    """The arrays that a convolution takes beside the layer's own: "work" and "partial" of Conv, of
+    which it may need none.
     """
-    if shape.direction == "weights":
-        return parts_shape(VARIANTS[variant].parts_of(shape), shape)
+    shapes: dict[str, tuple[int, ...]] = {}
+    if shape.direction == "backward":
+        shapes["work"] = packed_shape(shape.k, shape.co, VECTOR * sum(_blocks(shape.sources)))
+        shapes["partial"] = parts_shape(VARIANTS[variant].parts_of(shape), shape)
     if variant == "winograd":
-        return conv_winograd.transformed_shape(shape)
-    return packed_shape(shape.k, shape.co, shape.ci) if shape.direction == "input" else None
+        shapes["work"] = conv_winograd.transformed_shape(shape)
+    return {name: (of_array, np.float32) for name, of_array in shapes.items()}
 
 
 def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> None:
-    """Write the weights that convolutions read to Conv.work, in a launch for each kernel that does.
+    """Write the weights that convolutions read to Conv.work, in one launch.
 
     weights, work: (?,) float32, in which Conv.weight and Conv.work lie.
     """
-    laid_out = [conv for conv in convs if conv.shape.direction != "weights"]
-    transformed = [conv for conv in laid_out if conv.variant == "winograd"]
-    flipped = [c for c in laid_out if c.variant != "winograd" and c.shape.direction == "input"]
-    if flipped:
-        conv_direct.flip_weights(dev, flipped, weights, work)
-    if transformed:
-        conv_winograd.transform_weights(dev, transformed, weights, work)
+    rows, n = [], 0
+    for conv in convs:
+        shape, places = conv.shape, [first_float(conv.weight), first_float(conv.work) // VECTOR]
+        k, ci, co, is_forward = shape.k, shape.ci, shape.co, shape.direction == "forward"
+        if conv.variant == "winograd":
+            kind, read, made = (1, ci, co) if is_forward else (2, co, ci)
+            rows.append((n, kind, k**2, read, made, 0, ci, *places))
+            n += read * made // VECTOR
+        elif not is_forward:
+            first = 0
+            for channels, blocks in zip(shape.sources, _blocks(shape.sources), strict=True):
+                rows.append((n, 0, k**2, co, channels, first, ci, *places))
+                vectors = blocks * k**2 * co
+                n, first, places[1] = n + vectors, first + channels, places[1] + vectors
+    if rows:
+        weights_program(dev).launch(
+            "lay_out_weights",
+            n,
+            VECTOR if dev.is_cpu else None,
+            n=n,
+            rows=len(rows),
+            table=dev.constant(rows),
+            weights=weights,
+            laid_out=work,
+        )
+
+
+def _blocks(channels):
+    """Groups of 16 of these numbers of channels."""
+    return [-(-c // VECTOR) for c in channels]
 
 
 def prepared(dev: Device, shape: ConvShape, weight: Array, bias: Array) -> Conv:
-    """What computes a convolution by the shipped choice; its weights, which do not change, are laid
-    out in an array of its own.
+    """What computes a convolution's output by the shipped choice; its weights, which do not change,
+    are laid out in an array of its own.
     """
     conv = Conv(dev, blocking_of(dev), choose(dev, shape), shape, weight, bias)
-    needed = work_shape(conv.variant, shape)
-    if needed:
-        conv.work = dev.empty(needed)
+    for row in work_table(conv.variant, shape).values():
+        conv.work = dev.empty(*row)
         lay_out(dev, [conv], weight.reshape(-1), conv.work)
     return conv

@@ -1,8 +1,8 @@
 """What all convolutions share: the layout of weights, and the sums of the parts of their gradients.
 
 All are convolutions K x K (K = 1 or 3) of stride 1 with zero padding K // 2. conv_direct.py,
-conv_local.py and conv_winograd.py compute them, each with the functions forward(),
-backward_input() and backward_weights(); choice.py says which one is taken.
+conv_local.py and conv_winograd.py compute them, each with the functions forward() and backward();
+choice.py says which one is taken.
 """
 
 import math
@@ -14,13 +14,12 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import PackedArrays
-from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.device import Device, Program
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.layers.tiles import VECTOR
 
-# What of a convolution is computed: its output, the gradient of one of its inputs, or the gradients
-# of its weights and bias.
-DIRECTIONS = ("forward", "input", "weights")
+# What of a convolution is computed: its output, or the gradients of its inputs, weights and bias.
+DIRECTIONS = ("forward", "backward")
 # The parts of gradients take at most this many floats (64 MiB), or one part if that is larger.
 PARTIAL_FLOATS = 1 << 24
 
@@ -30,8 +29,7 @@ class ConvShape:
     """One direction of a convolution.
 
     direction: one of DIRECTIONS. k: side of the kernel. sources: channels of each input, one or
-    two, which are read as one. co: output channels. size: (height, width) of the image. source:
-    index of the input whose gradient is computed, None in the other directions.
+    two, which are read as one. co: output channels. size: (height, width) of the image.
     """
 
     direction: str
@@ -39,17 +37,11 @@ class ConvShape:
     sources: tuple[int, ...]
     co: int
     size: tuple[int, int]
-    source: int | None = None
 
     @property
     def ci(self) -> int:
-        """Input channels; of a gradient of the input, those of its one source."""
-        return sum(self.sources) if self.source is None else self.sources[self.source]
-
-    @property
-    def first(self) -> int:
-        """The input channel of the weights that is the first of `ci`."""
-        return sum(self.sources[: self.source or 0])
+        """Input channels."""
+        return sum(self.sources)
 
     @property
     def products(self) -> int:
@@ -60,20 +52,20 @@ class ConvShape:
 @dataclass(frozen=True)
 class Blocking:
     """Sizes that kernels are built and launched with. They change speed, and the rounding of
-    winograd_backward_weights.cl, which sums `winograd_weights` tiles at a time.
+    winograd_backward.cl, which sums `winograd_weights` tiles at a time.
 
-    direct: (pixels of a row, groups of 16 output channels, work-group) of a work-item of conv.cl,
-    where the groups come in multiples of that number; direct_odd: the same for other channels.
-    accumulators: float16 sums that a work-item of conv_backward_weights.cl keeps in registers;
-    work_group: its work-group, None = the launcher's default. winograd_groups: groups of 16 output
-    channels that winograd.cl multiplies together, where the groups come in multiples of that
-    number. winograd: (tiles transformed at a time, tiles multiplied together) there;
-    winograd_narrow: the same for few channels (conv_winograd.NARROW). winograd_weights: tiles
-    transformed at a time by winograd_backward_weights.cl.
+    direct: (pixels of a row, groups of 16 output channels) of a work-item of direct.h, where the
+    groups come in multiples of that number; direct_odd: the same for other channels. accumulators:
+    float16 sums of weights' gradients that a work-item keeps in registers. work_group: of direct
+    convolutions, None = the launcher's default. winograd_groups: groups of 16 output channels that
+    Winograd's kernels multiply together, where the groups come in multiples of that number.
+    winograd: (tiles transformed at a time, tiles multiplied together) there; winograd_narrow: the
+    same for few channels (conv_winograd.NARROW). winograd_weights: tiles transformed at a time for
+    the gradients of weights.
     """
 
-    direct: tuple[int, int, tuple[int, int, int]]
-    direct_odd: tuple[int, int, tuple[int, int, int]]
+    direct: tuple[int, int]
+    direct_odd: tuple[int, int]
     accumulators: int
     work_group: tuple[int, int, int] | None
     winograd_groups: int = 2
@@ -90,9 +82,9 @@ class Conv:
     """One direction of a layer's convolution on a device.
 
     variant: what computes it, a key of choice.VARIANTS. weight, bias: the layer's, (ceil(CO/16), K,
-    K, CI, 16) and (ceil(CO/16) * 16,) float32; of the direction "weights" their gradients. work: of
-    choice.work_shape(): the weights as the kernels read them, by default as they are, or the parts
-    of the gradients.
+    K, CI, 16) and (ceil(CO/16) * 16,) float32. work: the weights as the kernels read them, by
+    default as they are. partial: of the direction "backward", the parts of the gradients of the
+    weights and biases. Both are of choice.work_table().
     """
 
     dev: Device
@@ -102,6 +94,7 @@ class Conv:
     weight: Array
     bias: Array
     work: Array = field(init=False)
+    partial: Array = field(init=False)
 
     def __post_init__(self) -> None:
         self.work = self.weight
@@ -147,6 +140,16 @@ def first_float(array: Array) -> int:
     return data.offset // array.dtype.itemsize
 
 
+def mask_bits(masks: Sequence[bool]) -> int:
+    """The argument `masked` of kernels: a bit for each source."""
+    return sum(1 << i for i, is_masked in enumerate(masks) if is_masked)
+
+
+def weights_program(dev: Device) -> Program:
+    """The kernels of layers/weights.cl."""
+    return dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=int(dev.is_cpu))
+
+
 def sum_parts(
     dev: Device,
     parts: Sequence[tuple[Conv, int]],
@@ -158,19 +161,20 @@ def sum_parts(
     """Overwrite the gradients of weights and biases by the sums, in order, of their parts, those of
     all convolutions in one launch.
 
-    parts: [(convolution, number of parts that backward_weights() has left)]. table: for what the
-    kernel reads of them, until the next call with it. work, grad_weights, grad_biases: (?,)
-    float32, in which Conv.work, Conv.weight and Conv.bias lie.
+    parts: [(convolution, number of parts that backward() has left)]. table: for what the kernel
+    reads of them, until the next call with it. work: (?,) float32, in which Conv.partial lie;
+    grad_weights, grad_biases: (?,) float32, in which the gradients lie as Conv.weight and Conv.bias
+    do in their arrays.
     """
     rows, n = [], 0
     for conv, count in parts:
-        _, blocks, sums, _ = conv.work.shape
-        places = [first_float(array) // VECTOR for array in (conv.work, conv.weight, conv.bias)]
-        rows.append((n, sums, blocks, count, *places, 0))
+        _, blocks, sums, _ = conv.partial.shape
+        places = [first_float(array) // VECTOR for array in (conv.partial, conv.weight, conv.bias)]
+        rows.append((n, sums, blocks, count, *places))
         n += sums * blocks
-    (sent,) = table.send([((len(rows), 8), np.int32)], [np.array(rows, np.int32)])
-    dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
-        "conv_sum_parts",
+    (sent,) = table.send([((len(rows), 7), np.int32)], [np.array(rows, np.int32)])
+    weights_program(dev).launch(
+        "sum_parts",
         n * row_parts(dev),
         n=n,
         rows=len(rows),

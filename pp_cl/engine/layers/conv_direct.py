@@ -1,14 +1,14 @@
 """Direct convolutions, of any channels, 1x1 and 3x3: the launches of conv.cl and of
-conv_backward_weights.cl.
+conv_backward.cl.
 """
 
+import math
 from collections.abc import Sequence
 
 from pyopencl.array import Array
 
-from pp_cl.engine.device.device import Device, Program
-from pp_cl.engine.device.launch import lanes
-from pp_cl.engine.layers.conv import Conv, ConvShape, first_float, most_parts
+from pp_cl.engine.device.device import Program
+from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits, most_parts
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles
 
 # Rows of the image that one work-item sums for the gradient of the weights: few enough to stay in a
@@ -23,11 +23,11 @@ def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, til
     out to compute. Raises ValueError for arrays and tiles of other shapes.
     """
     shape = conv.shape
-    program, size, work_group = _program(conv, shape.co, tiles)
+    program, size = _program(conv, "layers/conv", (shape.co,), (tiles,))
     program.launch(
         "conv_forward",
         size,
-        work_group,
+        conv.blocking.work_group,
         multiply_adds=tiles.number * SIDE**2 * shape.products,
         along=1,
         height=shape.size[0],
@@ -45,103 +45,64 @@ def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, til
     )
 
 
-def backward_input(
-    conv: Conv, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
-) -> None:
-    """grad_x = gradient of the convolution's input, 0 where mask <= 0.
+def backward(
+    conv: Conv,
+    sources: Sequence[Array],
+    grad_out: Array,
+    grads: Sequence[Array],
+    *,
+    masks: Sequence[bool],
+    tiles: Tiles,
+    grad_tiles: Tiles,
+) -> int:
+    """Write the gradients of the sources, and those of the weights and biases of forward() as sums
+    of the image's parts to conv.partial; returns the number of parts, which conv.sum_parts() sums.
 
-    grad_out: (H, W, CO) float32, dL/dout before the ReLU; grad_x: (H, W, C) float32; mask: (H, W,
-    C), the input where it is a ReLU's output, so that grad_x is the gradient of the ReLU's input,
-    or None; tiles: those of grad_x to compute. Raises ValueError as forward().
+    grad_out: (H, W, CO) float32, dL/dout before the ReLU. grads: like the sources. masks: of each
+    source, whether it is a ReLU's output: then its gradient is that of the ReLU's input. tiles:
+    those of grad_out to sum, each as often as it counts; grad_tiles: those of grads to compute. The
+    order of the sums depends on the shapes alone, with other variants on the number of tiles too.
+    Raises ValueError as forward().
     """
-    shape = conv.shape
-    program, size, work_group = _program(conv, shape.ci, tiles)
+    shape, (parts, rows) = conv.shape, _image_parts(conv.shape)
+    height, width = shape.size
+    # input channels of a work-item, whose sums, k for each, fit the registers
+    most = conv.blocking.accumulators // shape.k
+    group = next(n for n in (16, 8, 4, 2, 1) if n <= most and math.gcd(*shape.sources) % n == 0)
+    more = {"CI_GROUP": group}
+    program, size = _program(
+        conv, "layers/conv_backward", shape.sources, (tiles, grad_tiles), **more
+    )
+    sums, others = shape.ci // group * shape.k * -(-shape.co // VECTOR) * parts, math.prod(size)
     program.launch(
-        "conv_backward_input",
-        size,
-        work_group,
-        multiply_adds=tiles.number * SIDE**2 * shape.products,
-        along=1,
-        height=shape.size[0],
-        width=shape.size[1],
-        c=shape.ci,
+        "conv_backward",
+        sums + others,
+        conv.blocking.work_group and 1,
+        # as if all work-items did as much as those that do the most
+        multiply_adds=height * width * shape.products * (sums + others) / min(sums, others),
+        height=height,
+        width=width,
+        c1=shape.sources[0],
+        c2=sum(shape.sources[1:]),
         co=shape.co,
-        masked=mask is not None,
-        x=grad_x if mask is None else mask,
+        masked=mask_bits(masks),
+        rows=rows,
+        x=sources[0],
+        x2=sources[-1],
         flipped=conv.work,
         grad_out=grad_out,
         tile_count=tiles.count,
-        grad_x=grad_x,
+        grad_tiles=grad_tiles.count,
+        partial=conv.partial,
+        grad_x=grads[0],
+        grad_x2=grads[-1],
     )
-
-
-def backward_weights(conv: Conv, sources: Sequence[Array], grad_out: Array, *, tiles: Tiles) -> int:
-    """Write the gradients of the weights and biases of forward(), given dL/dout (H, W, CO) before
-    the ReLU, as sums of the image's parts to conv.work; returns the number of parts, which
-    conv.sum_parts() sums.
-
-    tiles: those of grad_out to sum, each as often as it counts. The order of the sums depends on
-    the shapes alone, with other variants on the number of tiles too. Raises ValueError as
-    forward().
-    """
-    shape, (parts, rows), first = conv.shape, _image_parts(conv.shape), 0
-    for source, c in zip(sources, shape.sources, strict=True):
-        # input channels of a work-item, whose sums, k for each, fit the registers
-        group = next(
-            n for n in (16, 8, 4, 2, 1) if n * shape.k <= conv.blocking.accumulators and c % n == 0
-        )
-        conv.dev.program(
-            "layers/conv_backward_weights", KERNEL_SIZE=shape.k, CI_GROUP=group
-        ).launch(
-            "conv_backward_weights",
-            (c // group * shape.k, -(-shape.co // VECTOR), parts),
-            conv.blocking.work_group,
-            multiply_adds=shape.size[0] * shape.size[1] * shape.k**2 * c * shape.co,
-            along=2,
-            height=shape.size[0],
-            width=shape.size[1],
-            c=c,
-            co=shape.co,
-            first=first,
-            ci=shape.ci,
-            rows=rows,
-            x=source,
-            grad_out=grad_out,
-            tile_count=tiles.count,
-            partial=conv.work,
-        )
-        first += c
     return parts
 
 
 def parts_of(shape: ConvShape) -> int:
     """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
     return _image_parts(shape)[0]
-
-
-def flip_weights(dev: Device, convs: Sequence[Conv], weights: Array, work: Array) -> None:
-    """Lay out the weights of input gradients in one launch: with the kernel mirrored and the roles
-    of input and output channels exchanged, (ceil(CI/16), K, K, CO, 16).
-
-    weights, work: (?,) float32, in which Conv.weight and Conv.work lie.
-    """
-    rows, n = [], 0
-    for conv in convs:
-        shape = conv.shape
-        blocks, ci, taps = -(-shape.ci // VECTOR), sum(shape.sources), shape.k**2
-        taken = min(ci - shape.first, blocks * VECTOR)
-        start, target = first_float(conv.weight), first_float(conv.work) // VECTOR
-        rows.append((n, taps, shape.co, taken, shape.first, ci, start, target))
-        n += shape.co * taps * blocks
-    dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
-        "conv_flip_weights",
-        n,
-        n=n,
-        rows=len(rows),
-        table=dev.constant(rows),
-        weights=weights,
-        flipped=work,
-    )
 
 
 def _image_parts(shape: ConvShape) -> tuple[int, int]:
@@ -151,17 +112,18 @@ def _image_parts(shape: ConvShape) -> tuple[int, int]:
 
 
 def _program(
-    conv: Conv, channels: int, tiles: Tiles
-) -> tuple[Program, tuple[int, int, int], tuple[int, int, int]]:
-    """(program, work-items, work-group) for a result of so many channels; no work-item computes
-    groups of channels or a row in vain.
+    conv: Conv, file: str, channels: Sequence[int], tiles: Sequence[Tiles], **defines: int
+) -> tuple[Program, tuple[int, int, int]]:
+    """(program, work-items) for results of so many channels each; no work-item computes groups of
+    channels or a row in vain.
     """
-    tiles.check(conv.shape.size)
-    (height, width), blocks = conv.shape.size, -(-channels // VECTOR)
-    pixels, groups, work_group = conv.blocking.direct
-    if blocks % groups:
-        pixels, groups, work_group = conv.blocking.direct_odd
+    for of_map in tiles:
+        of_map.check(conv.shape.size)
+    (height, width), blocks = conv.shape.size, [-(-c // VECTOR) for c in channels]
+    pixels, groups = conv.blocking.direct
+    if math.gcd(*blocks) % groups:
+        pixels, groups = conv.blocking.direct_odd
     pixels = next(p for p in (pixels, 8, 4, 1) if p <= width)
-    size = (-(-width // pixels), height, -(-blocks // groups))
-    defines = {"KERNEL_SIZE": conv.shape.k, "PIXELS": pixels, "BLOCKS": groups}
-    return conv.dev.program("layers/conv", **defines), size, work_group
+    size = (-(-width // pixels), height, sum(-(-n // groups) for n in blocks))
+    defines |= {"KERNEL_SIZE": conv.shape.k, "PIXELS": pixels, "BLOCKS": groups}
+    return conv.dev.program(file, **defines), size

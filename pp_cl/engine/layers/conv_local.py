@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Program
-from pp_cl.engine.layers.conv import Conv, ConvShape, most_parts
+from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits, most_parts
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles, grid_shape
 
 QUAD = 4  # channels of a work-item
@@ -33,7 +33,7 @@ MOST_GROUPS = 512
 def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
     """See conv_direct."""
     shape, kernel = conv.shape, "conv_local_forward"
-    program, size, items = _program(conv, kernel, shape.co, shape.sources, tiles)
+    program, size, items = _program(conv, kernel, (shape.co,), shape.sources, tiles)
     program.launch(
         kernel,
         size,
@@ -52,31 +52,36 @@ def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, til
     )
 
 
-def backward_input(
-    conv: Conv, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
-) -> None:
-    """See conv_direct."""
+def backward(
+    conv: Conv,
+    sources: Sequence[Array],
+    grad_out: Array,
+    grads: Sequence[Array],
+    *,
+    masks: Sequence[bool],
+    tiles: Tiles,
+    grad_tiles: Tiles,
+) -> int:
+    """See conv_direct. In two launches: groups of both kinds have other sizes."""
     shape, kernel = conv.shape, "conv_local_backward_input"
-    program, size, items = _program(conv, kernel, shape.ci, (shape.co,), tiles)
+    program, size, items = _program(conv, kernel, shape.sources, (shape.co,), grad_tiles)
     program.launch(
         kernel,
         size,
         (items, 1),
-        multiply_adds=tiles.number * SIDE**2 * shape.products,
-        c=shape.ci,
+        multiply_adds=grad_tiles.number * SIDE**2 * shape.products,
+        c1=shape.sources[0],
+        c2=sum(shape.sources[1:]),
         co=shape.co,
-        masked=mask is not None,
-        x=grad_x if mask is None else mask,
+        masked=mask_bits(masks),
+        x=sources[0],
+        x2=sources[-1],
         flipped=conv.work,
         grad_out=grad_out,
-        tile_list=tiles.list,
-        grad_x=grad_x,
+        tile_list=grad_tiles.list,
+        grad_x=grads[0],
+        grad_x2=grads[-1],
     )
-
-
-def backward_weights(conv: Conv, sources: Sequence[Array], grad_out: Array, *, tiles: Tiles) -> int:
-    """See conv_direct."""
-    shape = conv.shape
     k, co, (_, width) = shape.k, shape.co, shape.size
     run = max(SUMMED, -(-tiles.number // parts_of(shape)))
     parts = -(-tiles.number // run)
@@ -98,14 +103,14 @@ def backward_weights(conv: Conv, sources: Sequence[Array], grad_out: Array, *, t
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=conv.work,
+        partial=conv.partial,
     )
     return parts
 
 
 def parts_of(shape: ConvShape) -> int:
     """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
-    quads = _quads(shape.co, _is_aligned(*shape.sources, shape.co))
+    quads = _quads((shape.co,), _is_aligned(*shape.sources, shape.co))
     groups = -(-shape.ci // (QUAD * CI_QUADS[shape.k])) * -(-shape.co // (QUAD * quads))
     tiles = math.prod(grid_shape(*shape.size))
     wanted = min(-(-tiles // PART_TILES), -(-MOST_GROUPS // groups))
@@ -113,13 +118,13 @@ def parts_of(shape: ConvShape) -> int:
 
 
 def _program(
-    conv: Conv, kernel: str, channels: int, inputs: tuple[int, ...], tiles: Tiles
+    conv: Conv, kernel: str, channels: tuple[int, ...], inputs: tuple[int, ...], tiles: Tiles
 ) -> tuple[Program, tuple[int, int], int]:
-    """(program, work-items, items of a work-group) for the tiles of a result of so many channels,
-    of inputs of so many each; in the largest groups that the device runs.
+    """(program, work-items, items of a work-group) for the tiles of results of so many channels
+    each, of inputs of so many each; in the largest groups that the device runs.
     """
     tiles.check(conv.shape.size)
-    aligned = _is_aligned(channels, *inputs)
+    aligned = _is_aligned(*channels, *inputs)
     in_group = _quads(channels, aligned)
     for items in (n for n in GROUPS if n >= TILE_PARTS * in_group):
         program = conv.dev.program(
@@ -132,13 +137,13 @@ def _program(
         if program.kernels[kernel].largest_group >= items:
             break
     groups = -(-tiles.number * TILE_PARTS * in_group // items)
-    return program, (groups * items, -(-channels // (QUAD * in_group))), items
+    return program, (groups * items, sum(-(-c // (QUAD * in_group)) for c in channels)), items
 
 
 def _weights_program(conv: Conv) -> tuple[Program, int, int]:
     """(program, groups of four output channels and work-items of a work-group)."""
     k, aligned = conv.shape.k, _is_aligned(*conv.shape.sources, conv.shape.co)
-    most = _quads(conv.shape.co, aligned)
+    most = _quads((conv.shape.co,), aligned)
     for in_group in (n for n in (16, 8, 4) if n <= most):
         items = CI_QUADS[k] * in_group * k
         program = conv.dev.program(
@@ -159,8 +164,8 @@ def _is_aligned(*channels):
 
 
 def _quads(channels, aligned):
-    """Groups of four of the output channels that a work-group computes: 16, 8 or 4, so that nothing
+    """Groups of four of a result's channels that a work-group computes: 16, 8 or 4, so that nothing
     is computed in vain. Channels that are not aligned are few.
     """
-    blocks = -(-channels // VECTOR)
-    return VECTOR // QUAD * (math.gcd(blocks, 4) if aligned else 1)
+    blocks = (-(-c // VECTOR) for c in channels)
+    return VECTOR // QUAD * (math.gcd(4, *blocks) if aligned else 1)

@@ -1,15 +1,14 @@
 """3x3 convolutions by Winograd's minimal filtering F(4 x 4, 3 x 3): 4 times fewer multiplications
 than the direct ones, at two or three times the error. Channels come in multiples of 16. The
-launches of winograd.cl, winograd_transform.cl and winograd_backward_weights.cl; results do not
-depend on the number of compute units.
+launches of winograd.cl and winograd_backward.cl; results do not depend on the number of compute
+units.
 """
 
 from collections.abc import Iterable, Sequence
 
 from pyopencl.array import Array
 
-from pp_cl.engine.device.device import Device, Program
-from pp_cl.engine.layers.conv import Conv, ConvShape, first_float
+from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles
 
 POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile
@@ -35,7 +34,8 @@ def fits(*channels: int) -> bool:
 def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
     """See conv_direct."""
     shape = conv.shape
-    _program(conv, shape.co, tiles).launch(
+    tiles.check(shape.size)
+    conv.dev.program("layers/winograd", **_defines(conv, shape.co)).launch(
         "winograd_forward",
         min(conv.dev.info["compute_units"], tiles.number),
         1,
@@ -53,53 +53,49 @@ def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, til
     )
 
 
-def backward_input(
-    conv: Conv, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
-) -> None:
-    """See conv_direct."""
-    shape = conv.shape
-    _program(conv, shape.ci, tiles).launch(
-        "winograd_backward_input",
-        min(conv.dev.info["compute_units"], tiles.number),
-        1,
-        c=shape.ci,
-        co=shape.co,
-        masked=mask is not None,
-        x=grad_x if mask is None else mask,
-        flipped=conv.work,
-        grad_out=grad_out,
-        tile_list=tiles.list,
-        grad_x=grad_x,
-        scratch=_scratch(conv),
-    )
-
-
-def backward_weights(conv: Conv, sources: Sequence[Array], grad_out: Array, *, tiles: Tiles) -> int:
+def backward(
+    conv: Conv,
+    sources: Sequence[Array],
+    grad_out: Array,
+    grads: Sequence[Array],
+    *,
+    masks: Sequence[bool],
+    tiles: Tiles,
+    grad_tiles: Tiles,
+) -> int:
     """See conv_direct."""
     ci, co, units = conv.shape.ci, conv.shape.co, conv.dev.info["compute_units"]
+    for of_map in (tiles, grad_tiles):
+        of_map.check(conv.shape.size)
     tile_parts = _tile_parts(tiles.number, ci, co)
     ci_part = ci if tile_parts > 1 else _ci_part(units, ci, co)
     parts = tile_parts * -(-ci // ci_part) * -(-co // CO_PART)
     conv.dev.program(
-        "layers/winograd_backward_weights",
-        TILES=conv.blocking.winograd_weights,
+        "layers/winograd_backward",
+        SUM_TILES=conv.blocking.winograd_weights,
+        SUM_BLOCKS=_groups(conv, co),
         CO_PART=min(CO_PART, co),
-        BLOCKS=_groups(conv, co),
+        **_defines(conv, ci),
     ).launch(
-        "winograd_backward_weights",
-        min(units, parts),
+        "winograd_backward",
+        min(units, max(parts, grad_tiles.number)),
         1,
         c1=conv.shape.sources[0],
         c2=sum(conv.shape.sources[1:]),
         co=co,
+        masked=mask_bits(masks),
         ci_part=ci_part,
         tile_parts=tile_parts,
         x=sources[0],
         x2=sources[-1],
+        flipped=conv.work,
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=conv.work,
+        grad_list=grad_tiles.list,
+        partial=conv.partial,
+        grad_x=grads[0],
+        grad_x2=grads[-1],
         scratch=_scratch(conv),
     )
     return tile_parts
@@ -115,31 +111,6 @@ def transformed_shape(shape: ConvShape) -> tuple[int]:
     return (POSITIONS * (shape.ci * shape.co + VECTOR),)
 
 
-def transform_weights(dev: Device, convs: Sequence[Conv], weights: Array, work: Array) -> None:
-    """Transform the weights of convolutions in one launch.
-
-    weights, work: (?,) float32, in which Conv.weight and Conv.work lie.
-    """
-    rows, n = [], 0
-    for conv in convs:
-        shape, flipped = conv.shape, conv.shape.direction == "input"
-        channels, co = (shape.co, shape.ci) if flipped else (shape.ci, shape.co)
-        start, target = first_float(conv.weight), first_float(conv.work) // VECTOR
-        ci = sum(shape.sources)
-        rows.append((n, channels, co // VECTOR, start, target, shape.first, ci, int(flipped)))
-        n += channels * co // VECTOR
-    dev.program("layers/winograd_transform").launch(
-        "winograd_transform",
-        n,
-        VECTOR,
-        n=n,
-        rows=len(rows),
-        table=dev.constant(rows),
-        weights=weights,
-        transformed=work,
-    )
-
-
 def reserve_scratch(convs: Iterable[Conv]) -> None:
     """Allocate the scratch for all of the convolutions at once, before launches hold it."""
     transformed = [conv for conv in convs if conv.variant == "winograd"]
@@ -151,10 +122,11 @@ def scratch_floats(conv: Conv) -> int:
     """Floats of the scratch that all convolutions share: each compute unit's slice of it."""
     ci, co = conv.shape.ci, conv.shape.co
     vectors = POSITIONS * ((ci + co) // VECTOR * _at_once(conv)[0] + 3)
-    if conv.shape.direction == "weights":
+    if conv.shape.direction == "backward":
         ci_part, co_part = min(CI_PART, ci), min(CO_PART, co)
         values = (ci_part + co_part) // VECTOR * conv.blocking.winograd_weights
-        vectors = POSITIONS * (values + 3 + ci_part * co_part // VECTOR) + co_part // VECTOR
+        sums = POSITIONS * (values + 3 + ci_part * co_part // VECTOR) + co_part // VECTOR
+        vectors = max(vectors, sums)
     return COUNTERS + conv.dev.info["compute_units"] * vectors * VECTOR
 
 
@@ -164,12 +136,10 @@ def _scratch(conv: Conv) -> Array:
     )
 
 
-def _program(conv: Conv, channels: int, tiles: Tiles) -> Program:
-    """The program for a result of so many channels."""
-    tiles.check(conv.shape.size)
+def _defines(conv, channels):
+    """Of a program for a result of so many channels."""
     at_once, together = _at_once(conv)
-    blocks = _groups(conv, channels)
-    return conv.dev.program("layers/winograd", TILES=at_once, TOGETHER=together, BLOCKS=blocks)
+    return {"TILES": at_once, "TOGETHER": together, "BLOCKS": _groups(conv, channels)}
 
 
 def _at_once(conv):

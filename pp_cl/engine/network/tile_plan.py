@@ -104,13 +104,16 @@ def receptive_radius(layers: list[Layer]) -> dict[str, int]:
 
 def gradient_radius(layers: list[Layer]) -> dict[str, int]:
     """{name: pixels}: radius of the receptive field, in the image's gradient, of the gradient of
-    each layer's output and of x.
+    each layer's output and of x; at least that, of those which are computed in one launch.
     """
     radius = dict.fromkeys([gradient_of(layer.name) for layer in layers], 0)
     for layer in reversed(layers):
         reached = radius[gradient_of(layer.name)] + _backward_radius(layer)
         for grad in map(gradient_of, layer.inputs):
             radius[grad] = max(radius.get(grad, 0), reached)
+    for layer in layers:
+        grads = [gradient_of(name) for name in layer.inputs]
+        radius |= dict.fromkeys(grads, max(radius[grad] for grad in grads))
     return radius
 
 

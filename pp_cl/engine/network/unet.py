@@ -10,8 +10,9 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import PackedArrays, Table, packed_arrays, table_bytes
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import Prepared
-from pp_cl.engine.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out, work_shape
+from pp_cl.engine.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out, work_table
 from pp_cl.engine.layers.conv import (
+    DIRECTIONS,
     Conv,
     ConvShape,
     first_float,
@@ -57,7 +58,7 @@ WHITE = 1.0  # of a target where its image is transparent
 SIMPLE = {"gate": gate_forward, "pool": avgpool2_forward, "upsample": upsample2_forward}
 
 Size = tuple[int, int]  # (height, width)
-Convs = dict[tuple[str, str, int | None], Conv]  # {(layer, direction, source): Conv}
+Convs = dict[tuple[str, str], Conv]  # {(layer, direction): Conv}
 
 
 class Workspace:
@@ -108,17 +109,20 @@ class Workspace:
         needed = _work_rows(self.convs)
         whole, arrays = packed_arrays(net.dev, [*needed.values()])
         self.work = whole.view(np.float32)
-        for key, array in zip(needed, arrays, strict=True):
-            self.convs[key].work = array
+        for (key, name), array in zip(needed, arrays, strict=True):
+            setattr(self.convs[key], name, array)
         reserve_scratch(self.convs.values())
         self.all_tiles = plan_all(net.dev, net.layers, size)
         self.size = size
 
 
 def _work_rows(convs):
-    """{key: (shape, dtype)} of the arrays that convolutions take beside a layer's own."""
-    shapes = {key: work_shape(conv.variant, conv.shape) for key, conv in convs.items()}
-    return {key: (shape, np.float32) for key, shape in shapes.items() if shape}
+    """{(key, name): (shape, dtype)} of the arrays that convolutions take beside a layer's own."""
+    return {
+        (key, name): row
+        for key, conv in convs.items()
+        for name, row in work_table(conv.variant, conv.shape).items()
+    }
 
 
 class UNet:
@@ -282,7 +286,7 @@ class UNet:
             sources, out = [arrays[name] for name in layer.inputs], arrays[layer.name]
             tiles = plan.tiles[layer.name]
             if layer.kind == "conv":
-                conv = space.convs[layer.name, "forward", None]
+                conv = space.convs[layer.name, "forward"]
                 variant = VARIANTS[conv.variant]
                 variant.forward(conv, sources, out, relu=layer.relu, tiles=tiles)
             else:
@@ -314,28 +318,29 @@ class UNet:
         for layer in reversed(self.layers):
             grad_out = arrays[gradient_of(layer.name)]
             plan.copy_tiles(dev, gradient_of(layer.name), grad_out)
-            if layer.kind == "conv":
-                conv = convs[layer.name, "weights", None]
-                sources = [arrays[name] for name in layer.inputs]
-                tiles = plan.tiles[gradient_of(layer.name)]
-                count = VARIANTS[conv.variant].backward_weights(
-                    conv, sources, grad_out, tiles=tiles
+            sources = [arrays[name] for name in layer.inputs]
+            grads = [arrays[gradient_of(name)] for name in layer.inputs]
+            masks = [name in self.relu_outputs for name in layer.inputs]
+            tiles = plan.tiles[gradient_of(layer.inputs[0])]
+            if layer.kind == "gate":
+                gate_backward(dev, *sources, grad_out, *grads, tiles=tiles)
+            elif layer.kind == "pool":  # adds to the gradient of the skip
+                mask = sources[0] if masks[0] else None
+                avgpool2_backward(dev, mask, grad_out, *grads, tiles=tiles)
+            elif layer.kind == "upsample":
+                upsample2_backward(dev, grad_out, *grads, tiles=tiles)
+            else:
+                conv = convs[layer.name, "backward"]
+                count = VARIANTS[conv.variant].backward(
+                    conv,
+                    sources,
+                    grad_out,
+                    grads,
+                    masks=masks,
+                    tiles=plan.tiles[gradient_of(layer.name)],
+                    grad_tiles=tiles,
                 )
                 parts.append((conv, count))
-            for i, name in enumerate(layer.inputs):
-                x, grad_x = arrays[name], arrays[gradient_of(name)]
-                tiles = plan.tiles[gradient_of(name)]
-                mask = x if name in self.relu_outputs else None
-                if layer.kind == "gate":
-                    gate_backward(dev, x, grad_out, grad_x, tiles=tiles)
-                elif layer.kind == "pool":  # adds to the gradient of the skip
-                    avgpool2_backward(dev, mask, grad_out, grad_x, tiles=tiles)
-                elif layer.kind == "upsample":
-                    upsample2_backward(dev, grad_out, grad_x, tiles=tiles)
-                else:
-                    conv = convs[layer.name, "input", i]
-                    variant = VARIANTS[conv.variant]
-                    variant.backward_input(conv, grad_out, grad_x, mask=mask, tiles=tiles)
         grad_x = arrays[gradient_of("x")]
         plan.copy_tiles(dev, gradient_of("x"), grad_x)
         if self._residual:
@@ -350,23 +355,19 @@ class UNet:
         return self._workspaces[True].arrays[name]
 
     def convolutions(self, size: Size, training: bool) -> Convs:
-        """What computes the convolutions of images of a size: their outputs, and for training the
-        gradients of the weights and of each input. They have no arrays of their own yet.
+        """What computes the convolutions of images of a size, and their gradients in training; they
+        have no arrays of their own yet.
         """
         found: Convs = {}
         for layer in convolutions(self.layers):
             here = size[0] >> layer.level, size[1] >> layer.level
-            ways: list[tuple[str, int | None]] = [("forward", None)]
-            if training:
-                ways += [("weights", None), *(("input", i) for i in range(len(layer.sources)))]
-            for direction, source in ways:
+            for direction in DIRECTIONS if training else ("forward",):
                 of_layer = layer.kernel_size, layer.sources, layer.channels
-                shape = ConvShape(direction, *of_layer, here, source)
+                shape = ConvShape(direction, *of_layer, here)
                 variant = choose(self.dev, shape, self.variant)
-                given = self.gradients if direction == "weights" else self.parameters
-                arrays = given[f"{layer.name}.weight"], given[f"{layer.name}.bias"]
-                conv = Conv(self.dev, self.blocking, variant, shape, *arrays)
-                found[layer.name, direction, source] = conv
+                weight, bias = (self.parameters[f"{layer.name}.{n}"] for n in ("weight", "bias"))
+                conv = Conv(self.dev, self.blocking, variant, shape, weight, bias)
+                found[layer.name, direction] = conv
         return found
 
     def table(self, crop: Size, image: Size) -> Table:

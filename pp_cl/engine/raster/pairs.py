@@ -4,14 +4,15 @@ backward pass, and by pixel sorted by depth for blending.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes
+from pp_cl.engine.device.launch import Prepared, lanes
 from pp_cl.engine.device.scan import exclusive_scan, read_total
 from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.errors import UserError
@@ -81,15 +82,27 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
 
 
 def find_pairs(
-    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], capacity: int = 1
+    dev: Device,
+    b: Buffers,
+    points: ProjectedPoints,
+    size: tuple[int, int],
+    capacity: int = 1,
+    prepared: Prepared | None = None,
 ) -> Pairs:
     """The fragments in an image of size (height, width), if there are no more than `capacity`; does
-    not wait for the device.
+    not wait for the device. prepared: for the launches, of the same b.
     """
-    n, pixels = len(points.point_box), size[0] * size[1]
+    run, pixels = (prepared or Prepared(dev)).run, size[0] * size[1]
+    numbers = pixels, capacity
+    pairs = run(lambda: _launch_all(dev, b, points, *numbers), points, numbers=numbers)
+    return replace(pairs, count=read_total(dev, pairs.point_offset))
+
+
+def _launch_all(dev, b, points, pixels, capacity):
+    """Pairs without their count."""
+    n = len(points.point_box)
     b.require(pairs_table(n, pixels, capacity))
     exclusive_scan(dev, points.point_count, b.point_offset)
-    count = read_total(dev, b.point_offset)
     if not dev.is_cpu:
         b.require({"pixel_count": ((pixels,), np.uint32)})
         dev.fill(b.pixel_count, 0)
@@ -112,9 +125,10 @@ def find_pairs(
         _list_by_bucket(dev, b, n, pixels, capacity)
     else:
         _list_by_key(dev, b, pixels, capacity)
+    unknown: Any = None
     return Pairs(
         points.footprint,
-        count,
+        unknown,
         b.point_offset,
         b.pixel_offset,
         b.pair_pixel,

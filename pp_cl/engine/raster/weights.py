@@ -4,7 +4,7 @@ the list of visible points, and each point's highest weight for pruning.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Pending, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes
-from pp_cl.engine.device.scan import nonzero
+from pp_cl.engine.device.launch import Prepared, lanes
+from pp_cl.engine.device.scan import nonzero, read_front
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import footprint_macros
 
@@ -63,6 +63,7 @@ def weights_table(n: int, pixels: int, derivatives: int) -> Table:
         "point_is_visible": ((n,), np.uint8),
         "visible": ((n,), np.uint32),
         "point_slot": ((n,), np.uint32),
+        "visible_count": ((1,), np.uint32),
     }
 
 
@@ -78,6 +79,7 @@ def blend_weights(
     max_tracked: int = 0,
     early_stop: float = 0.0,
     derivatives: bool = True,
+    prepared: Prepared | None = None,
 ) -> BlendWeights:
     """The weights of all pairs, in the buffers b of find_pairs().
 
@@ -85,8 +87,21 @@ def blend_weights(
     max_tracked: only this many nearest fragments of a pixel get gradients (64 in the paper); 0:
     all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
     have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
-    pass reads.
+    pass reads. prepared: for the launches, of the same b.
     """
+    numbers = blend, gamma, max_tracked, early_stop, derivatives
+    weights = (prepared or Prepared(dev)).run(
+        lambda: _launch_all(dev, b, pairs, camera_buffer, opacity, *numbers),
+        *(pairs.pair_key, pairs.point_offset, pairs.pixel_offset, camera_buffer, opacity),
+        numbers=numbers if blend == "softmax" else (blend, *numbers[2:]),
+    )
+    return replace(weights, visible_list=read_front(dev, b.visible, b.visible_count))
+
+
+def _launch_all(
+    dev, b, pairs, camera_buffer, opacity, blend, gamma, max_tracked, early_stop, derivatives
+):
+    """BlendWeights without the visible points."""
     b.require(weights_table(pairs.points, pairs.pixels, pairs.capacity if derivatives else 1))
     dev.fill(b.point_is_visible, 0)
     defines: dict[str, Any] = {"LANES": lanes(dev), "DERIVATIVES": int(derivatives)}
@@ -109,14 +124,15 @@ def blend_weights(
         program.launch(
             "softmax_weights", pairs.pixels, sharpness=1 / gamma, camera=camera_buffer, **shared
         )
-    visible_list = nonzero(dev, b.point_is_visible, b.visible, b.point_slot)
+    nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
+    unknown: Any = None
     return BlendWeights(
         blend,
         max_tracked or ALL,
         b.pair_scratch,
         b.pixel_derivative if derivatives else None,
         b.point_is_visible,
-        visible_list,
+        unknown,
         b.point_slot,
         b.transmittance if blend == "alpha" else None,
     )

@@ -190,7 +190,7 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
 def test_intels_gpus_take_more_registers_for_files_that_spill(platform, kind, large):
     info = {"platform": platform, "type": kind}
     expected = ("-cl-intel-256-GRF-per-thread",) if large else ()
-    assert device_module.vendor_options(info, "layers/conv_backward_weights") == expected
+    assert device_module.vendor_options(info, "layers/conv_backward") == expected
     assert device_module.vendor_options(info, "raster/shade") == ()
     files = device_module.SPILLING_ON_INTEL
     assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)

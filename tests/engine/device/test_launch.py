@@ -13,6 +13,7 @@ from pp_cl.engine.device.launch import channel_ranges, group_items, group_ranges
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
+ENQUEUE = "enqueue_nd_range_kernel"  # pyopencl's
 STEMS = sorted(
     p.relative_to(KERNEL_FOLDER).with_suffix("").as_posix() for p in KERNEL_FOLDER.rglob("*.cl")
 )
@@ -63,9 +64,9 @@ def test_a_launch_computes(program, dev, rows):
         ((np.uint32(3), 1, 1), None, ((16, 4, 1), (16, 4, 1))),
     ],
 )
-def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqueued):
+def test_sizes_are_rounded_up_to_the_work_group(program, rows, monkeypatch, size, local, enqueued):
     seen = []
-    program.kernels["rows"].kernel = lambda queue, *args, **_: seen.append(args[:2])
+    monkeypatch.setattr(cl, ENQUEUE, lambda queue, kernel, *args: seen.append(args[:2]))
     program.launch("rows", size, local=local, **rows)
     assert seen == [enqueued]
 
@@ -90,23 +91,23 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
 ):
     monkeypatch.setattr(device_module, "MOST_MULTIPLY_ADDS", 100)
     monkeypatch.setattr(dev, "has_watchdog", has_watchdog)
-    seen, flushed, kernel, queue = [], [], program.kernels["rows"].kernel, dev.queue
+    seen, flushed, enqueued, queue = [], [], getattr(cl, ENQUEUE), dev.queue
 
     class Watched:
         def flush(self):
             flushed.append(len(seen))
 
-    def enqueue(_, size, *args, global_offset):
-        seen.append((global_offset, size))
-        return kernel(queue, size, *args, global_offset=global_offset)
+    def enqueue(_, kernel, size, local, offset):
+        seen.append((offset, size))
+        return enqueued(queue, kernel, size, local, offset)
 
-    program.kernels["rows"].kernel = enqueue
     x = rows["x"].get()
     n = 200
     longer = np.resize(x, (n, 4))
     rows |= {"n": n, "x": dev.upload(longer), "y": dev.empty((n, 1))}
     with monkeypatch.context() as patch:
         patch.setattr(dev, "queue", Watched())
+        patch.setattr(cl, ENQUEUE, enqueue)
         program.launch("rows", n, multiply_adds=multiply_adds, **rows)
     assert seen == launched
     # each part is handed to the system by itself
@@ -135,11 +136,11 @@ REFUSED = [
 
 
 @pytest.mark.parametrize("change, error, message", REFUSED)
-def test_refused_before_the_enqueue(program, dev, rows, change, error, message):
+def test_refused_before_the_enqueue(program, dev, rows, monkeypatch, change, error, message):
     program.launch("rows", 33, **rows)  # a good launch before must not hide a bad one
     dev.fill(rows["y"], -1)
     enqueued = []
-    program.kernels["rows"].kernel = lambda *args, **_: enqueued.append(args)
+    monkeypatch.setattr(cl, ENQUEUE, lambda *args: enqueued.append(args))
     ((name, value),) = change.items()
     rows[name] = dev.upload(value) if isinstance(value, np.ndarray) else value
     if value is None:
@@ -181,7 +182,7 @@ def test_a_length_that_is_a_formula_is_checked(dev, tmp_path, monkeypatch, chang
 def test_a_work_group_larger_than_the_device_runs_is_one_line(program, dev, rows):
     kernel = program.kernels["rows"]
     limit, what = kernel.largest_group, cl.kernel_work_group_info.WORK_GROUP_SIZE
-    assert limit == kernel.kernel.get_work_group_info(what, dev.device)
+    assert limit == kernel._kernel.get_work_group_info(what, dev.device)
     program.launch("rows", 33, local=min(64, limit), **rows)
     with pytest.raises(
         UserError, match=rf"^toy.cl:rows: a work-group of {2 * limit} work-items, but .* {limit} "

@@ -13,7 +13,7 @@ from support.tiles import pixels_of, random_counts
 
 from pp_cl.bench.conv import Layer
 from pp_cl.engine.layers import conv
-from pp_cl.engine.layers.choice import CPUS, GPU, VARIANTS, lay_out, work_shape
+from pp_cl.engine.layers.choice import CPUS, GPU, VARIANTS, lay_out, work_table
 from pp_cl.engine.layers.conv import Conv, ConvShape
 from pp_cl.engine.layers.tiles import all_tiles, some_tiles
 from pp_cl.engine.network.tile_plan import grow
@@ -56,15 +56,15 @@ def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
 def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, variant, k):
     """As for a watchdog."""
     layer = Layer.random(rng, (17, 30), (13,), 64, k)
-    prefix = "conv" if variant == DIRECT else "conv_local"
-    for direction in ("forward", "backward_input", "backward_weights"):
+    kernels = ["conv_forward", "conv_backward"]
+    if variant == LOCAL:
+        directions = ("forward", "backward_input", "backward_weights")
+        kernels = [f"conv_local_{direction}" for direction in directions]
+    for kernel in kernels:
         launched = check_parts(
-            dev,
-            monkeypatch,
-            f"{prefix}_{direction}",
-            lambda: tuple(layer.computed(dev, variant, GPU)),
+            dev, monkeypatch, kernel, lambda: tuple(layer.computed(dev, variant, GPU))
         )
-        assert launched > 1, direction
+        assert launched > 1, kernel
 
 
 @pytest.mark.parametrize("size, channels", [large((131, 40), 48)])
@@ -101,7 +101,7 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch):
 def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, variant, most):
     """Up to a single one."""
     layer = Layer.random(rng, (33, 10), (16, 20), 48)
-    shape = ConvShape("weights", 3, (16, 20), 48, (33, 10))
+    shape = ConvShape("backward", 3, (16, 20), 48, (33, 10))
     parts = VARIANTS[variant].parts_of(shape)
     monkeypatch.setattr(conv, "PARTIAL_FLOATS", most)
     assert VARIANTS[variant].parts_of(shape) < parts
@@ -153,10 +153,9 @@ def test_what_does_not_fit_together_is_refused(dev, variant, k):
     def made(direction, **replaced):
         shape = ConvShape(direction, k, (16,), 32, (4, 4))
         conv = Conv(dev, CPU, variant, shape, weight, bias)
-        needed = work_shape(variant, shape)
-        if needed:
-            conv.work = zeros(needed)
-            lay_out(dev, [conv], weight.reshape(-1), conv.work)
+        for name, row in work_table(variant, shape).items():
+            setattr(conv, name, zeros(*row))
+        lay_out(dev, [conv], weight.reshape(-1), conv.work)
         for name, value in replaced.items():
             setattr(conv, name, value)
         return conv
@@ -164,14 +163,18 @@ def test_what_does_not_fit_together_is_refused(dev, variant, k):
     def forward(sources=(x,), out=out, tiles=tiles, **replaced):
         kernels.forward(made("forward", **replaced), sources, out, relu=False, tiles=tiles)
 
-    def backward_input(grad_out=out, grad_x=x, tiles=tiles, **replaced):
-        conv = made("input", **replaced)
-        kernels.backward_input(conv, grad_out, grad_x, mask=None, tiles=tiles)
+    def backward(sources=(x,), grad_out=out, grad_x=x, tiles=tiles, grad_tiles=tiles, **replaced):
+        kernels.backward(
+            made("backward", **replaced),
+            sources,
+            grad_out,
+            (grad_x,),
+            masks=(False,),
+            tiles=tiles,
+            grad_tiles=grad_tiles,
+        )
 
-    def backward_weights(sources=(x,), grad_out=out, tiles=tiles, **replaced):
-        kernels.backward_weights(made("weights", **replaced), sources, grad_out, tiles=tiles)
-
-    for call in (forward, backward_input, backward_weights):
+    for call in (forward, backward):
         call()
     for call in (
         partial(forward, (zeros((4, 4, 32)),)),
@@ -179,14 +182,13 @@ def test_what_does_not_fit_together_is_refused(dev, variant, k):
         partial(forward, bias=zeros(16)),
         partial(forward, out=zeros((4, 5, 32))),
         partial(forward, tiles=grown),
-        partial(backward_input, work=zeros((2, k, k, 16, 16))),
-        partial(backward_input, grad_out=zeros((4, 4, 20))),
-        partial(backward_input, grad_x=zeros((4, 4, 32))),
-        partial(backward_input, tiles=grown),
-        partial(backward_weights, (zeros((4, 4, 32)),)),
-        partial(backward_weights, grad_out=zeros((4, 4, 16))),
-        partial(backward_weights, work=zeros((1, 1, k * k * 16 + 1, 16))),
-        partial(backward_weights, tiles=grown),
+        partial(backward, (zeros((4, 4, 32)),)),
+        partial(backward, work=zeros((2, k, k, 16, 16))),
+        partial(backward, partial=zeros((1, 1, k * k * 16 + 1, 16))),
+        partial(backward, grad_out=zeros((4, 4, 20))),
+        partial(backward, grad_x=zeros((4, 4, 32))),
+        partial(backward, tiles=grown),
+        partial(backward, grad_tiles=grown),
     ):
         with pytest.raises(ValueError, match="tiles|expected"):
             call()

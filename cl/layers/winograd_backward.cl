@@ -1,23 +1,30 @@
-// Weight and bias gradients of a 3x3 convolution by Winograd's minimal filtering (winograd.h).
+// 3x3 convolution by Winograd's minimal filtering (winograd.h): the backward pass, of the weights and
+// the bias and of the input. One launch does both: a compute unit that has no part of the weights'
+// left begins with the input's tiles.
 //
 // With inputs V = B^T d B and gradients Z = A g A^T of a tile, the gradient of the transformed
 // weights is the sum of V o Z over all tiles: position by position a product of matrices (CI x
 // tiles) (tiles x CO). The weights' own is G^T ... G of it.
-#include "layers/winograd.h"
+#include "layers/winograd_convolve.h"
 
-#ifndef BLOCKS
-#define BLOCKS 2  // groups of 16 output channels multiplied together; divides their number
+#ifndef SUM_TILES
+#define SUM_TILES 32  // tiles transformed at a time for the weights
+#endif
+#ifndef SUM_BLOCKS
+#define SUM_BLOCKS 2  // groups of 16 output channels multiplied together; divides their number
 #endif
 #ifndef CO_PART
-#define CO_PART 128  // output channels taken at a time, a multiple of 16 * BLOCKS
+#define CO_PART 128  // output channels taken at a time, a multiple of 16 * SUM_BLOCKS
 #endif
 // Vectors of one work-item's scratch: values, gradients, the sums of weights' and biases'
 // gradients, a patch for load_tile.
-#define SLICE(ci_part)                                                                             \
-    (POSITIONS * (PITCH(ci_part) + PITCH(CO_PART) + (ci_part) * (CO_PART / 16) + 1) + CO_PART / 16)
+#define SUM_SLICE(ci_part)                                                                         \
+    (POSITIONS * (SUM_PITCH(ci_part) + SUM_PITCH(CO_PART) + (ci_part) * (CO_PART / 16) + 1) +      \
+     CO_PART / 16)
+#define SUM_PITCH(channels) PITCH(channels, SUM_TILES)
 // tiles summed before their sum joins the rest: one sum over a large image would lose digits
-#define SUMMED (32 * TILES)
-// input channels multiplied together: ROWS * BLOCKS accumulators and BLOCKS vectors fit AVX-512
+#define SUMMED (32 * SUM_TILES)
+// input channels multiplied together: ROWS * SUM_BLOCKS accumulators and as many vectors fit AVX-512
 #define ROWS 8
 
 // z = A g A^T of the gradients of `count` tiles of tile_list from `first` on, each times its
@@ -53,7 +60,7 @@ ALWAYS_INLINE void transform_gradients(
             UNROLLED_FOR (int i = 0; i < WINO_S; i++)
                 transform_gradient(t + i * WINO_S, 1);
             UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
-                z[i * PITCH(CO_PART) + block * TILES + tile] = t[i];
+                z[i * SUM_PITCH(CO_PART) + block * SUM_TILES + tile] = t[i];
         }
         sums[block] += round;
     }
@@ -71,26 +78,27 @@ ALWAYS_INLINE void multiply_gradients(
     const int count,
     const int first_round) {
     for (int position = 0; position < POSITIONS; position++)
-        for (int block = 0; block < blocks; block += BLOCKS)
+        for (int block = 0; block < blocks; block += SUM_BLOCKS)
             for (int row = 0; row < rows; row += ROWS) {
-                float16 acc[BLOCKS][ROWS];
-                UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                float16 acc[SUM_BLOCKS][ROWS];
+                UNROLLED_FOR (int b = 0; b < SUM_BLOCKS; b++)
                     UNROLLED_FOR (int i = 0; i < ROWS; i++)
                         acc[b][i] = 0.0f;
-                global const float16 *grad = z + position * PITCH(CO_PART) + block * TILES;
+                global const float16 *grad = z + position * SUM_PITCH(CO_PART) + block * SUM_TILES;
                 global const float *value =
-                    (global const float *)(v + position * PITCH(ci_part) + row / 16 * TILES);
+                    (global const float *)(v + position * SUM_PITCH(ci_part) +
+                                           row / 16 * SUM_TILES);
 #pragma unroll 4
                 for (int tile = 0; tile < count; tile++) {
-                    float16 g[BLOCKS];
-                    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
-                        g[b] = grad[b * TILES + tile];
+                    float16 g[SUM_BLOCKS];
+                    UNROLLED_FOR (int b = 0; b < SUM_BLOCKS; b++)
+                        g[b] = grad[b * SUM_TILES + tile];
                     UNROLLED_FOR (int i = 0; i < ROWS; i++)
-                        UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                        UNROLLED_FOR (int b = 0; b < SUM_BLOCKS; b++)
                             acc[b][i] += value[tile * 16 + row % 16 + i] * g[b];
                 }
                 global float16 *sum = sums + (position * (CO_PART / 16) + block) * ci_part + row;
-                UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+                UNROLLED_FOR (int b = 0; b < SUM_BLOCKS; b++)
                     UNROLLED_FOR (int i = 0; i < ROWS; i++)
                         sum[b * ci_part + i] =
                             first_round ? acc[b][i] : sum[b * ci_part + i] + acc[b][i];
@@ -121,33 +129,43 @@ ALWAYS_INLINE void store_gradients(
     }
 }
 
-// One work-item per compute unit (work-groups of 1): takes one part after the other, each of them
-// ci_part x CO_PART channels and one of tile_parts stretches of tile_list: walks those tiles in
-// [x, x2] (without making it) and grad_out, and writes its part of the sums: dL/dweight in rows
-// (ky, kx, channel) of partial, dL/dbias in the last row.
-kernel void winograd_backward_weights(
+// One work-item per compute unit (work-groups of 1): takes one part of the weights' gradients after
+// the other, each of them ci_part x CO_PART channels and one of tile_parts stretches of tile_list:
+// walks those tiles in [x, x2] (without making it) and grad_out, and writes its part of the sums:
+// dL/dweight in rows (ky, kx, channel) of partial, dL/dbias in the last row. Then takes tiles of
+// grad_list, reads their neighbourhood in grad_out, and writes those tiles of grad_x and grad_x2,
+// which are the convolution of grad_out with the flipped weights. masked: 1 if x is the output of a
+// ReLU and grad_x the gradient of its input; plus 2 if x2 is.
+kernel void winograd_backward(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
     const int co,
+    const int masked,
     const int ci_part,               // a multiple of 16
     const int tile_parts,            // at most the number of tiles
     global const float *x,           // (height, width, c1)
     global const float *x2,          // (height, width, ?)
+    global const float16 *flipped,   // (36*(c1*co+c2*co+16)) transformed, as winograd.h says
     global const float *grad_out,    // (height, width, co)
     global const int *tile_list,     // (?) of grad_out
     global const float *tile_count,  // ((height+3)/4, (width+3)/4) of grad_out
+    global const int *grad_list,     // (?) of grad_x and grad_x2
     global float16 *partial,         // (?, co/16, 9*(c1+c2)+1, 16) of each of tile_parts
-    global float16 *scratch)         // (...) COUNTERS + work-items * SLICE(ci_part)
+    global float *grad_x,            // (height, width, c1)
+    global float *grad_x2,           // (height, width, ?)
+    global float16 *scratch)         // (...) COUNTERS + work-items * the larger SLICE
 {
     const int tiles = tile_list[2], ci = c1 + c2;
     const int co_parts = (co + CO_PART - 1) / CO_PART,
               weight_parts = (ci + ci_part - 1) / ci_part * co_parts;
-    global float16 *v = scratch + COUNTERS + (size_t)get_global_id(0) * SLICE(ci_part);
-    global float16 *z = v + POSITIONS * PITCH(ci_part), *sums = z + POSITIONS * PITCH(CO_PART);
+    global float16 *v =
+        scratch + COUNTERS + (size_t)get_global_id(0) * max(SUM_SLICE(ci_part), SLICE(co, ci));
+    global float16 *z = v + POSITIONS * SUM_PITCH(ci_part),
+                   *sums = z + POSITIONS * SUM_PITCH(CO_PART);
     global float16 *bias = sums + POSITIONS * ci_part * (CO_PART / 16);
     global float *patch = (global float *)(bias + CO_PART / 16);
     const int parts = weight_parts * tile_parts;
-    for (int part = take(scratch, 1); part < parts; part = take(scratch, 1)) {
+    for (int part = take(scratch, SUM_WORK, 1); part < parts; part = take(scratch, SUM_WORK, 1)) {
         const int tile_part = part / weight_parts, weight_part = part % weight_parts;
         const int c0 = weight_part / co_parts * ci_part, rows = min(ci_part, ci - c0);
         const int rows_of_x = clamp(c1 - c0, 0, rows);
@@ -159,12 +177,12 @@ kernel void winograd_backward_weights(
         for (int begin = first; begin < end; begin += SUMMED) {
             for (int block = 0; block < blocks; block++)
                 bias[block] = 0.0f;
-            for (int tile = begin; tile < min(begin + SUMMED, end); tile += TILES) {
-                const int count = min(TILES, end - tile);
+            for (int tile = begin; tile < min(begin + SUMMED, end); tile += SUM_TILES) {
+                const int count = min(SUM_TILES, end - tile);
                 for (int source = 0; source < (c2 ? 2 : 1); source++)
                     transform_tiles(
-                        v + (source ? rows_of_x / 16 * TILES : 0), PITCH(ci_part), patch,
-                        source ? x2 + max(c0 - c1, 0) : x + c0, source ? c2 : c1,
+                        v + (source ? rows_of_x / 16 * SUM_TILES : 0), SUM_PITCH(ci_part),
+                        SUM_TILES, patch, source ? x2 + max(c0 - c1, 0) : x + c0, source ? c2 : c1,
                         (source ? rows - rows_of_x : rows_of_x) / 16, tile_list, tile, count,
                         count);
                 transform_gradients(
@@ -181,5 +199,7 @@ kernel void winograd_backward_weights(
             }
         }
     }
-    leave(scratch);
+    convolve(
+        grad_out, 0, co, 0, flipped, 0, 0, masked & 1 ? x : 0, masked & 2 ? x2 : 0, grad_x, grad_x2,
+        c1, c2, grad_list, scratch, v);
 }

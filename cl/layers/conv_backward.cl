@@ -1,0 +1,152 @@
+// Direct K x K convolution (direct.h): the backward pass, of the weights and the bias and of the
+// input. One launch does both, as either alone may be too little for all compute units.
+#include "layers/direct.h"
+
+#ifndef CI_GROUP
+// input channels of one work-item; divides those of each source. K * CI_GROUP accumulators fit
+// AVX-512
+#define CI_GROUP 8
+#endif
+// pixels of a row summed in registers: one sum over an image of background would lose digits
+#define SUMMED 128
+
+// The gradients of 16 channels, `count` times; 0 where count is, whatever they are.
+static inline float16 counted(global const float *grad, const float count, const int lanes) {
+    return count > 0.0f ? count * load16(grad, lanes) : (float16)0.0f;
+}
+
+// The gradients of the weights of CI_GROUP input channels and of one ky, and that of the bias if
+// with_bias: of 16 output channels over rows y0 to end of the image. x: at the first of the input
+// channels, c to a pixel; grad_out: at the first of the output channels. Needs no border test: it
+// visits only pixels that exist. A gradient counts as often as its tile.
+ALWAYS_INLINE void sum_weights(
+    global const float *x,
+    global const float *grad_out,
+    global const float *tile_count,
+    global float16 *out,  // kx, channel: ci to a kx
+    global float16 *bias,
+    const bool with_bias,
+    const int c,
+    const int ci,
+    const int co,
+    const int lanes,
+    const int ky,
+    const int y0,
+    const int end,
+    const int height,
+    const int width) {
+    for (int kx = 0; kx < KERNEL_SIZE; kx++)
+        for (int i = 0; i < CI_GROUP; i++)
+            out[kx * ci + i] = 0.0f;
+    if (with_bias) *bias = 0.0f;
+
+    for (int y = y0; y < end; y++) {
+        const int row = y + ky - PAD;
+        if (row < 0 || row >= height) continue;
+        global const float *pixel = x + (size_t)row * width * c;
+        global const float *grad = grad_out + (size_t)y * width * co;
+        global const float *count = tile_count + y / SIDE * tile_columns(width);
+        float16 window[KERNEL_SIZE];  // window[kx]: dL/dout at column + PAD - kx
+        UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+            window[kx] = 0.0f;
+        if (PAD) window[0] = counted(grad, count[0], lanes);
+        for (int begin = 0; begin < width; begin += SUMMED) {
+            float16 acc[KERNEL_SIZE][CI_GROUP], sum = 0.0f;
+            UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
+                    acc[kx][i] = 0.0f;
+            for (int column = begin; column < min(begin + SUMMED, width); column++) {
+                UNROLLED_FOR (int kx = KERNEL_SIZE - 1; kx > 0; kx--)
+                    window[kx] = window[kx - 1];
+                const int ahead = column + PAD;
+                window[0] = ahead < width ? counted(grad + ahead * co, count[ahead / SIDE], lanes)
+                                          : (float16)0.0f;
+                // pixels that no counted gradient sees may hold anything
+                if (count[max(column - PAD, 0) / SIDE] == 0.0f &&
+                    count[min(column + PAD, width - 1) / SIDE] == 0.0f)
+                    continue;
+                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++) {
+                    const float value = pixel[column * c + i];
+                    UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                        acc[kx][i] += value * window[kx];
+                }
+                sum += window[PAD];
+            }
+            UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
+                    out[kx * ci + i] += acc[kx][i];
+            if (with_bias) *bias += sum;
+        }
+    }
+}
+
+// The first work-items: one per (CI_GROUP channels of [x, x2] and ky, 16 output channels, `rows`
+// rows of the image): reads its rows and the gradients of the K output pixels that see each pixel,
+// writes its part of the sums: dL/dweight in rows (ky, kx, channel) of partial, dL/dbias in the last
+// row.
+//
+// The others: one per (PIXELS pixels, row, BLOCKS * 16 channels of x or x2): reads grad_out, writes
+// those of grad_x or grad_x2 that lie in a tile to compute: the convolution of grad_out with the
+// flipped and transposed weights (weights.cl). masked: 1 if x is the output of a ReLU and grad_x the
+// gradient of that ReLU's input, so that the mask costs no pass of its own; plus 2 if x2 is.
+kernel void conv_backward(
+    const int height,
+    const int width,
+    const int c1,
+    const int c2,  // channels of x2; 0 = there is none
+    const int co,
+    const int masked,
+    const int rows,
+    global const float *x,           // (height, width, c1)
+    global const float *x2,          // (height, width, ?)
+    global const float16 *flipped,   // ((c1+15)/16+(c2+15)/16, KERNEL_SIZE, KERNEL_SIZE, co, 16)
+    global const float *grad_out,    // (height, width, co)
+    global const float *tile_count,  // ((height+3)/4, (width+3)/4) of grad_out; 0 = not read
+    global const float *grad_tiles,  // ((height+3)/4, (width+3)/4) of grad_x; 0 = not computed
+    global float16 *partial,  // (?, (co+15)/16, KERNEL_SIZE*KERNEL_SIZE*(c1+c2)+1, 16) of each part
+    global float *grad_x,     // (height, width, c1)
+    global float *grad_x2)    // (height, width, ?)
+{
+    const int ci = c1 + c2, groups = ci / CI_GROUP, blocks_out = (co + 15) / 16;
+    const int parts = (height + rows - 1) / rows, sums = KERNEL_SIZE * groups * blocks_out * parts;
+    int item = get_global_id(0);
+    if (item < sums) {
+        const int ky = item / groups % KERNEL_SIZE, c0 = item % groups * CI_GROUP;
+        const int at = item / (groups * KERNEL_SIZE), block = at % blocks_out,
+                  part = at / blocks_out;
+        const bool second = c0 >= c1;
+        global float16 *out = partial + ((size_t)part * blocks_out + block) * (TAPS * ci + 1);
+        sum_weights(
+            second ? x2 + c0 - c1 : x + c0, grad_out + block * 16, tile_count,
+            out + ky * KERNEL_SIZE * ci + c0, out + TAPS * ci, ky == PAD && c0 == 0,
+            second ? c2 : c1, ci, co, co - block * 16, ky, part * rows,
+            min(height, (part + 1) * rows), height, width);
+        return;
+    }
+    item -= sums;
+    const int columns = (width + PIXELS - 1) / PIXELS, blocks_of_x = (c1 + 15) / 16;
+    const int tile_x = item % columns * PIXELS, y = item / columns % height,
+              first = item / columns / height * BLOCKS;
+    const bool second = first >= blocks_of_x;
+    const int block = second ? first - blocks_of_x : first, c = second ? c2 : c1;
+    const int x0 = min(tile_x, width - PIXELS);
+    if (block * 16 >= c || !any_is_computed(grad_tiles, x0, y, width)) return;
+    float16 acc[BLOCKS][PIXELS];
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
+            acc[b][p] = 0.0f;
+
+    convolve(acc, grad_out, flipped + first * TAPS * co, co, co, TAPS * co, x0, y, height, width);
+
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
+            if (x0 + p >= tile_x && tile_is_computed(grad_tiles, x0 + p, y, width)) {
+                const size_t at = ((size_t)y * width + x0 + p) * c + (block + b) * 16;
+                const int lanes = c - (block + b) * 16;
+                float16 dL_dx = acc[b][p];
+                if (masked & (second ? 2 : 1))
+                    dL_dx =
+                        select((float16)0.0f, dL_dx, load16((second ? x2 : x) + at, lanes) > 0.0f);
+                store16(dL_dx, (second ? grad_x2 : grad_x) + at, lanes);
+            }
+}
