@@ -124,29 +124,9 @@ kernel void conv_backward(
         return;
     }
     item -= sums;
-    const int columns = (width + PIXELS - 1) / PIXELS, blocks_of_x = (c1 + 15) / 16;
-    const int tile_x = item % columns * PIXELS, y = item / columns % height,
-              first = item / columns / height * BLOCKS;
-    const bool second = first >= blocks_of_x;
-    const int block = second ? first - blocks_of_x : first, c = second ? c2 : c1;
-    const int x0 = min(tile_x, width - PIXELS);
-    if (block * 16 >= c || !any_is_computed(grad_tiles, x0, y, width)) return;
-    float16 acc[BLOCKS][PIXELS];
-    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
-        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
-            acc[b][p] = 0.0f;
-
-    convolve(acc, grad_out, flipped + first * TAPS * co, co, co, TAPS * co, x0, y, height, width);
-
-    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
-        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
-            if (x0 + p >= tile_x && tile_is_computed(grad_tiles, x0 + p, y, width)) {
-                const size_t at = ((size_t)y * width + x0 + p) * c + (block + b) * 16;
-                const int lanes = c - (block + b) * 16;
-                float16 dL_dx = acc[b][p];
-                if (masked & (second ? 2 : 1))
-                    dL_dx =
-                        select((float16)0.0f, dL_dx, load16((second ? x2 : x) + at, lanes) > 0.0f);
-                store16(dL_dx, (second ? grad_x2 : grad_x) + at, lanes);
-            }
+    const int columns = (width + PIXELS - 1) / PIXELS;
+    convolve_pixels(
+        grad_out, 0, co, 0, flipped, 0, 0, masked & 1 ? x : 0, masked & 2 ? x2 : 0, grad_x, grad_x2,
+        c1, c2, grad_tiles, item % columns * PIXELS, item / columns % height,
+        item / columns / height * BLOCKS, height, width);
 }

@@ -123,31 +123,42 @@ ALWAYS_INLINE void find_corners(local int2 *corner, global const int *tile_list)
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// One work-item per (4 output channels, ROWS lines of a tile), a work-group per (4 * QUADS
+// One work-item per (4 channels of out or out2, ROWS lines of a tile), a work-group per (4 * QUADS
 // channels, GROUP_TILES tiles of the list): reads what the lines see in x, then in x2 (the
-// concatenation [x, x2] without making it), and writes them to out.
-kernel void conv_local_forward(
+// concatenation [x, x2] without making it), and writes them to out or out2. In the backward pass x
+// is the gradient of the output, and out and out2 are those of the inputs: its convolution with the
+// flipped and transposed weights (weights.cl).
+kernel void conv_local(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
-    const int co,
+    const int co1,
+    const int co2,                // channels of out2; 0 = out2 is not written
+    const int forward,            // add bias
     const int relu,               // negative results become 0
+    const int masked,             // results become 0 where, 1: mask is not positive; 2: mask2
     global const float *x,        // (height, width, c1)
     global const float *x2,       // (height, width, ?)
-    global const float4 *weight,  // ((co+15)/16, KERNEL_SIZE, KERNEL_SIZE, c1 + c2, 16)
-    global const float4 *bias,    // ((co+15)/16*16)
+    global const float4 *weight,  // ((co1+15)/16+(co2+15)/16, KERNEL_SIZE, KERNEL_SIZE, c1+c2, 16)
+    global const float4 *bias,    // (?) ((co1+15)/16*16)
+    global const float *mask,     // (height, width, co1)
+    global const float *mask2,    // (height, width, ?)
     global const int *tile_list,  // (?) height, width, number, tiles
-    global float *out)            // (height, width, co)
+    global float *out,            // (height, width, co1)
+    global float *out2)           // (height, width, ?)
 {
     local float values[CHUNK * GROUP_TILES * PITCH] __attribute__((aligned(16)));
     local float4 weights[CHUNK * TAPS * QUADS];
     local int2 corner[GROUP_TILES];
     find_corners(corner, tile_list);
     const int height = tile_list[0], width = tile_list[1], ci = c1 + c2;
-    const int channel = (get_group_id(1) * QUADS + item_quad()) * 4;
+    const int group = get_group_id(1), groups_of_out = (co1 + 4 * QUADS - 1) / (4 * QUADS);
+    const bool second = group >= groups_of_out;
+    const int channel = ((second ? group - groups_of_out : group) * QUADS + item_quad()) * 4;
+    const int co = second ? co2 : co1;
     float4 acc[ROWS * SIDE];
     UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++)
-        acc[p] = bias[channel / 4];
-    global const float4 *w = weight + get_group_id(1) * QUADS * TAPS * ci;
+        acc[p] = forward ? bias[channel / 4] : (float4)(0.0f);
+    global const float4 *w = weight + group * QUADS * TAPS * ci;
     for (int source = 0; source < (c2 ? 2 : 1); source++)
         convolve(
             acc, values, weights, corner, source ? x2 : x, source ? w + c1 * 4 : w,
@@ -157,57 +168,14 @@ kernel void conv_local_forward(
     const int2 at = corner[item_tile()] + (int2)(0, item_line());
     UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++) {
         const int px = at.x + p % SIDE, py = at.y + p / SIDE;
-        // max(., 0) would hide a NaN
-        const float4 value = relu ? select(acc[p], (float4)(0.0f), acc[p] < 0.0f) : acc[p];
-        if (px < width && py < height)
-            store_quad(value, out + ((size_t)py * width + px) * co + channel, co - channel);
-    }
-}
-
-// One work-item per (4 channels of x or x2, ROWS lines of a tile), a work-group per (4 * QUADS
-// channels, GROUP_TILES tiles of the list): reads what the lines see in grad_out, and writes them to
-// grad_x or grad_x2: the convolution of grad_out with the flipped and transposed weights
-// (conv_backward_weights.cl). masked: 1 if x is the output of a ReLU and grad_x the gradient of that
-// ReLU's input; plus 2 if x2 is.
-kernel void conv_local_backward_input(
-    const int c1,
-    const int c2,  // channels of x2; 0 = there is none
-    const int co,
-    const int masked,
-    global const float *x,         // (height, width, c1)
-    global const float *x2,        // (height, width, ?)
-    global const float4 *flipped,  // ((c1+15)/16+(c2+15)/16, KERNEL_SIZE, KERNEL_SIZE, co, 16)
-    global const float *grad_out,  // (height, width, co)
-    global const int *tile_list,   // (?) height, width, number, tiles
-    global float *grad_x,          // (height, width, c1)
-    global float *grad_x2)         // (height, width, ?)
-{
-    local float values[CHUNK * GROUP_TILES * PITCH] __attribute__((aligned(16)));
-    local float4 weights[CHUNK * TAPS * QUADS];
-    local int2 corner[GROUP_TILES];
-    find_corners(corner, tile_list);
-    const int height = tile_list[0], width = tile_list[1];
-    const int group = get_group_id(1), groups_of_x = (c1 + 4 * QUADS - 1) / (4 * QUADS);
-    const bool second = group >= groups_of_x;
-    const int channel = ((second ? group - groups_of_x : group) * QUADS + item_quad()) * 4;
-    const int c = second ? c2 : c1;
-    float4 acc[ROWS * SIDE];
-    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++)
-        acc[p] = 0.0f;
-    convolve(
-        acc, values, weights, corner, grad_out, flipped + group * QUADS * TAPS * co, co, co, height,
-        width);
-
-    if (channel >= c || first_tile() + item_tile() >= tile_list[2]) return;
-    const int2 at = corner[item_tile()] + (int2)(0, item_line());
-    UNROLLED_FOR (int p = 0; p < ROWS * SIDE; p++) {
-        const int px = at.x + p % SIDE, py = at.y + p / SIDE;
         if (px >= width || py >= height) continue;
-        const size_t to = ((size_t)py * width + px) * c + channel;
-        float4 dL_dx = acc[p];
+        const size_t to = ((size_t)py * width + px) * co + channel;
+        float4 value = acc[p];
+        if (relu) value = select(value, (float4)(0.0f), value < 0.0f);  // max() would hide a NaN
         if (masked & (second ? 2 : 1))
-            dL_dx = select(
-                (float4)(0.0f), dL_dx, load_quad((second ? x2 : x) + to, c - channel) > 0.0f);
-        store_quad(dL_dx, (second ? grad_x2 : grad_x) + to, c - channel);
+            value = select(
+                (float4)(0.0f), value,
+                load_quad((second ? mask2 : mask) + to, co - channel) > 0.0f);
+        store_quad(value, (second ? out2 : out) + to, co - channel);
     }
 }

@@ -78,4 +78,61 @@ any_is_computed(global const float *tile_count, const int x0, const int y, const
     return any;
 }
 
+// One work-item's part of a convolution of [x, x2] (c2 = 0: of x), which is not made, to out and
+// out2: PIXELS pixels from tile_x on of row y, BLOCKS * 16 channels from `first` groups on, of which
+// those in a tile to compute are written. weight: ((co1+15)/16+(co2+15)/16, K, K, c1 + c2, 16);
+// bias: 0 = none; relu: negative results become 0; mask of either: 0 = none, results become 0 where
+// it is not positive.
+ALWAYS_INLINE void convolve_pixels(
+    global const float *x,
+    global const float *x2,
+    const int c1,
+    const int c2,
+    global const float16 *weight,
+    global const float16 *bias,
+    const int relu,
+    global const float *mask1,
+    global const float *mask2,
+    global float *out1,
+    global float *out2,
+    const int co1,
+    const int co2,
+    global const float *tile_count,
+    const int tile_x,
+    const int y,
+    const int first,
+    const int height,
+    const int width) {
+    const bool second = first >= (co1 + 15) / 16;
+    const int block = second ? first - (co1 + 15) / 16 : first, co = second ? co2 : co1;
+    if (tile_x >= width || y >= height || block * 16 >= co) return;
+    // the last ones move left, and store only what their neighbours do not
+    const int x0 = min(tile_x, width - PIXELS);
+    if (!any_is_computed(tile_count, x0, y, width)) return;
+    float16 acc[BLOCKS][PIXELS];
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
+            acc[b][p] = bias ? bias[block + b] : (float16)0.0f;
+
+    const int kx_stride = c1 + c2, block_stride = TAPS * kx_stride;
+    for (int source = 0; source < (c2 ? 2 : 1); source++)
+        convolve(
+            acc, source ? x2 : x, weight + first * block_stride + source * c1, source ? c2 : c1,
+            kx_stride, block_stride, x0, y, height, width);
+
+    global const float *mask = second ? mask2 : mask1;
+    global float *out = second ? out2 : out1;
+    UNROLLED_FOR (int b = 0; b < BLOCKS; b++)
+        UNROLLED_FOR (int p = 0; p < PIXELS; p++)
+            if (x0 + p >= tile_x && tile_is_computed(tile_count, x0 + p, y, width)) {
+                const size_t at = ((size_t)y * width + x0 + p) * co + (block + b) * 16;
+                const int lanes = co - (block + b) * 16;
+                float16 value = acc[b][p];
+                if (relu)  // max(., 0) would hide a NaN
+                    value = select(value, (float16)0.0f, value < 0.0f);
+                if (mask) value = select((float16)0.0f, value, load16(mask + at, lanes) > 0.0f);
+                store16(value, out + at, lanes);
+            }
+}
+
 #endif

@@ -20,17 +20,6 @@ kernel void output_forward(
     }
 }
 
-// One work-item per colour: reads its gradient, writes that of the last layer's output.
-kernel void output_backward(
-    const uint n,
-    global const float *grad_image,  // (H, W, 3)
-    global float *grad_out)          // (H, W, 3)
-{
-    const size_t i = get_global_id(0);
-    if (i >= n) return;
-    grad_out[i] = 0.5f * grad_image[i];
-}
-
 // One work-item per pixel: reads the gradient of its colours, adds to that of its features what
 // passes around the network.
 kernel void residual_backward(

@@ -18,8 +18,8 @@ row_of(global const int *table, const int length, const uint rows, const int ite
     return row;
 }
 
-// The weights of `count` input channels from `first` on, at most 16, for a tap and the output
-// channel o; 0 beyond.
+// `scale` times the weights of `count` input channels from `first` on, at most 16, for a tap and the
+// output channel o; 0 beyond.
 static inline float16 across(
     global const float *weight,  // (blocks, taps, ci, 16)
     const int taps,
@@ -27,46 +27,50 @@ static inline float16 across(
     const int o,
     const int ci,
     const int first,
-    const int count) {
+    const int count,
+    const float scale) {
     global const float *at = weight + ((o / 16 * taps + tap) * ci + first) * 16 + o % 16;
     float lane[16];
     for (int i = 0; i < 16; i++)
-        lane[i] = i < count ? at[16 * i] : 0.0f;
+        lane[i] = i < count ? scale * at[16 * i] : 0.0f;
     return vload16(0, lane);
 }
 
 // One work-item per vector of 16 channels of the result and channel that it is computed from; one
 // for all taps where weights are transformed. For an input gradient kernels are mirrored, and input
-// and output channels exchange their roles. Rows of `table`: first work-item; 0 for weights of an
+// and output channels exchange their roles; they are halved where what follows the convolution
+// halves its output. Rows of `table`: first work-item; 0 for weights of an
 // input gradient (blocks, K, K, co, 16), 1 for the transform G g G^T that winograd.cl reads
 // (winograd.h), 2 for that of an input gradient; taps (K * K); channels that the result is computed
 // from, and of the result, the first of these among the input channels; input channels of the
-// weights; where weights and vectors begin.
+// weights; where weights and vectors begin; 1 if they are halved.
 kernel void lay_out_weights(
     const uint n,  // work-items
     const uint rows,
-    global const int *table,      // (rows, 9)
+    global const int *table,      // (rows, 10)
     global const float *weights,  // (?) of all rows, each (blocks, K, K, ci, 16)
     global float16 *laid_out)     // (...)
 {
     const int item = get_global_id(0);
     if (item >= n) return;
-    global const int *row = row_of(table, 9, rows, item);
+    global const int *row = row_of(table, 10, rows, item);
     const int kind = row[1], taps = row[2], channels = row[3], ci = row[6];
     const int c = (item - row[0]) % channels, rest = (item - row[0]) / channels;
+    const float scale = row[9] ? 0.5f : 1.0f;
     global const float *weight = weights + row[7];
     global float16 *out = laid_out + row[8];
     if (kind == 0) {
         const int tap = rest % taps, block = rest / taps;
         out[(block * taps + taps - 1 - tap) * channels + c] =
-            across(weight, taps, tap, c, ci, row[5] + block * 16, row[4] - block * 16);
+            across(weight, taps, tap, c, ci, row[5] + block * 16, row[4] - block * 16, scale);
         return;
     }
 #if WINOGRAD
     float16 t[POSITIONS];
     UNROLLED_FOR (int i = 0; i < 9; i++)
-        t[i / 3 * WINO_S + i % 3] = kind == 2 ? across(weight, 9, 8 - i, c, ci, rest * 16, 16)
-                                              : vload16((rest * 9 + i) * ci + c, weight);
+        t[i / 3 * WINO_S + i % 3] = kind == 2
+                                        ? across(weight, 9, 8 - i, c, ci, rest * 16, 16, scale)
+                                        : vload16((rest * 9 + i) * ci + c, weight);
     transform_kernel_tile(t);
     UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
         out[WEIGHT_AT(i, rest, row[4] / 16, channels) + c] = t[i];
@@ -80,19 +84,20 @@ kernel void lay_out_weights(
 kernel void sum_parts(
     const uint n,  // rows of partial, of one part of all weights
     const uint rows,
-    global const int *table,        // (rows, 7)
+    global const int *table,        // (rows, 8)
     global const float16 *partial,  // (...) as above
     global float16 *grad_weights,   // (...)
     global float16 *grad_biases)    // (...)
 {
     const int item = get_global_id(0) / ROW_PARTS;
     if (item >= n) return;
-    global const int *of = row_of(table, 7, rows, item);
+    global const int *of = row_of(table, 8, rows, item);
     const int per_block = of[1], blocks = of[2], parts = of[3];
     const int row = (item - of[0]) % per_block, block = (item - of[0]) / per_block;
     floats sum = 0.0f;
     for (int part = 0; part < parts; part++)
         sum += load_part(partial, of[4] + ((size_t)part * blocks + block) * per_block + row);
+    if (of[7]) sum *= 0.5f;
     if (row < per_block - 1)
         store_part(sum, grad_weights, of[5] + block * (per_block - 1) + row);
     else

@@ -58,6 +58,7 @@ def find_all_pairs(
     """
     while True:
         pairs = find_pairs(dev, b, points, size, capacity)
+        pairs.read_count(dev)
         capacity = capacity_needed(pairs)
         if capacity == pairs.capacity:
             return pairs

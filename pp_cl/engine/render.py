@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -182,21 +183,14 @@ class Renderer:
         b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
         dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
         with dev.stage("project"):
-            radius, grid = self.point_radius, self.model.grid_buffer
             points = self._launches["project"].run(
-                lambda: project_grid(
-                    dev,
-                    b,
-                    self.settings.footprint,
-                    b.camera_buffer,
-                    grid,
-                    point_id=cloud.ids,
-                    cloud_offset=cloud.offset,
-                    opacity=cloud.opacity,
-                    radius=radius,
-                ),
-                *(grid, cloud.ids, cloud.offset, cloud.opacity),
-                numbers=(radius,),
+                partial(project_grid, dev, b, self.settings.footprint),
+                b.camera_buffer,
+                self.model.grid_buffer,
+                point_id=cloud.ids,
+                cloud_offset=cloud.offset,
+                opacity=cloud.opacity,
+                radius=self.point_radius,
             )
         pairs, weights, tile_mask = self._pairs_and_weights(
             points, size, gamma, early_stop, training
@@ -228,25 +222,26 @@ class Renderer:
         """(Pairs, BlendWeights, RenderResult.tile_mask). Both stages are enqueued before the number
         of pairs is known, and run again with more capacity if it was too small.
         """
-        settings, by_pair = self.settings, self._by_pair
+        settings, by_pair, b = self.settings, self._by_pair, self._buffers
         while True:
-            prepared, capacity = self._launches["pairs"], self._capacity[by_pair]
             with self.dev.stage("pairs"):
-                pairs = find_pairs(self.dev, self._buffers, points, size, capacity, prepared)
+                find = partial(find_pairs, self.dev, b)
+                capacity = self._capacity[by_pair]
+                pairs = self._launches["pairs"].run(find, points, size, capacity)
+                pairs.read_count(self.dev)
             with self.dev.stage("weights"):
-                weights = blend_weights(
-                    self.dev,
-                    self._buffers,
+                weights = self._launches["weights"].run(
+                    partial(blend_weights, self.dev, b),
                     pairs,
                     points.camera_buffer,
                     points.point_opacity,
                     blend=settings.blend,
-                    gamma=gamma,
+                    gamma=gamma if settings.blend == "softmax" else 1.0,
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
                     derivatives=training,
-                    prepared=self._launches["weights"],
                 )
+                weights.read_visible(self.dev)
             tile_mask = None
             if self.model.net.is_planned(size):
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)

@@ -153,6 +153,7 @@ class PairedPoints:
             gamma=gamma,
             **drops,
         )
+        self.weights.read_visible(self.dev)
         visible = self.weights.visible.get()
         rows = np.full((len(visible) + 1, 16), np.nan)  # as if there was room for one more
         rows[:-1] = np.asarray(point_features)[visible]

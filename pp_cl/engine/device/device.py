@@ -271,7 +271,7 @@ class Device:
         """
         array = self._allocate(shape, dtype)
         if self.debug >= 3 and array.nbytes:
-            self.fill(array, 0)
+            self._fill(array, 0)
         return array
 
     def scratch(self, name: Hashable, n: int, dtype: type = np.float32, *, zeros: int = 0) -> Array:
@@ -284,7 +284,7 @@ class Device:
             held = self._scratch[name] = None  # frees the old one first
             held = self._scratch[name] = self.empty((n,), dtype)
             if zeros:
-                self.fill(held[:zeros], 0)
+                self._fill(held[:zeros], 0)
         return held
 
     def constant(self, rows: Sequence[tuple[int, ...]]) -> Array:
@@ -297,7 +297,7 @@ class Device:
     def zeros(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
         """Array of zeros on the device."""
         array = self._allocate(shape, dtype)
-        self.fill(array, 0)
+        self._fill(array, 0)
         return array
 
     def upload(self, values: ArrayLike, dtype: type | None = None) -> Array:
@@ -339,7 +339,10 @@ class Device:
     def fill(self, array: Array, value: float) -> None:
         """Set all elements of an array of this device to one value."""
         if self._recorded is not None:
-            self._recorded.append(partial(self.fill, array, value))
+            self._recorded.append(partial(self._fill, array, value))
+        self._fill(array, value)
+
+    def _fill(self, array, value):
         if array.size:
             self.attempt(
                 "fill a buffer",

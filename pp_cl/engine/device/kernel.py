@@ -170,15 +170,15 @@ class Kernel:
             )
             for p in parameters
         ]
-        # (parameter, axis, dimension as text, its formula), letters first: others are computed of
-        # them
+        # (parameter, axis, dimension as text, the letter that it is, its formula), letters first:
+        # others are computed of them
         dimensions = [
-            (p, axis, word, compile_formula(word))
+            (p, axis, word, word.lower() if word in names - defines.keys() else "", formula)
             for p in parameters
             for axis, word in enumerate(p.shape or ())
-            if word != "?"
+            if word != "?" and (formula := compile_formula(word))
         ]
-        self._dimensions = sorted(dimensions, key=lambda d: not d[2].isidentifier())
+        self._dimensions = sorted(dimensions, key=lambda d: not d[3])
         self._checked: set[Any] = set()  # shapes and sizes already found right
         self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 
@@ -227,7 +227,7 @@ class Kernel:
         return kernel
 
     def with_arguments(self, values: list[Any], *, for_good: bool = False) -> cl.Kernel:
-        """The kernel set to what arguments() returned; for the next launch, or a new one for good."""
+        """The kernel set to what arguments() returned: for one launch, or a new one for good."""
         kernel = self._made() if for_good else self._kernel
         kernel.set_args(*values)
         return kernel
@@ -290,11 +290,11 @@ class Kernel:
         """Compare the arrays with their parameters. sizes: {letter: size} of the scalars; the sizes
         of the other letters are added.
         """
-        for p, _, dtype, *_ in self._slots:
+        for p, name, dtype, *_ in self._slots:
             if dtype is None:
                 continue
-            array = values[p.name]
-            if not array.flags.c_contiguous:
+            array = values[name]
+            if not _is_contiguous(array.shape, array.strides, dtype.itemsize):
                 raise ValueError(
                     f"{self.label}: {p.name} has shape {array.shape} and strides {array.strides}:"
                     " not contiguous"
@@ -304,20 +304,30 @@ class Kernel:
                     f"{self.label}: {p.name} has shape {array.shape}, expected rank"
                     f" {len(p.shape)} {p.shape}"
                 )
-        for p, axis, word, formula in self._dimensions:
+        for p, axis, word, letter, formula in self._dimensions:
             size = values[p.name].shape[axis]
-            known = {n: self._macros.get(n, sizes.get(n.lower())) for n in formula.co_names}
-            if None in known.values():  # a letter's first buffer
-                expected = sizes.setdefault(word.lower(), size)
-            elif word in known:
-                expected = known[word]
+            if letter:
+                expected = sizes.setdefault(letter, size)
             else:
-                expected = eval(formula, {}, known)  # noqa: S307 - checked by compile_formula()
+                known = {n: self._macros.get(n, sizes.get(n.lower())) for n in formula.co_names}
+                if None in known.values():  # of a letter that stands nowhere alone
+                    expected = sizes.setdefault(word, size)
+                else:
+                    expected = eval(formula, {}, known)  # noqa: S307 - of compile_formula()
             if size != expected:
                 raise ValueError(
                     f"{self.label}: {p.name} has shape {values[p.name].shape}, expected {p.shape}"
                     f" with {word} = {expected}"
                 )
+
+
+@functools.lru_cache(1024)
+def _is_contiguous(shape, strides, item_bytes):
+    for size, stride in zip(reversed(shape), reversed(strides), strict=True):
+        if size > 1 and stride != item_bytes:
+            return False
+        item_bytes *= size
+    return True
 
 
 def _kind(value):

@@ -3,7 +3,6 @@ that are prepared once.
 """
 
 from collections.abc import Callable
-from operator import is_
 from typing import Any
 
 from pp_cl.engine.device.device import Device, Launch
@@ -84,20 +83,20 @@ class Prepared:
     def __init__(self, dev: Device):
         self._dev = dev
         self._given: tuple[Any, ...] = ()
-        self._numbers: tuple[Any, ...] = ()
-        self._launches: list[Launch | Callable[[], None]] | None = None
+        self._launches: list[Any] | None = None
         self._result: Any = None
 
-    def run(self, function: Callable[[], Any], *given: Any, numbers: tuple[Any, ...] = ()) -> Any:
-        """Enqueue what the function launches and fills, and return what it returns, all of which
-        depends on these objects and numbers alone; what else it does to the device must last.
+    def run(self, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        """Enqueue what function(*given, **named) launches and fills, and return what it returns,
+        all of which depends on these objects and numbers alone; what else it does to the device
+        must last.
         """
-        is_known = self._launches is not None and numbers == self._numbers
-        if self._launches is None or not (is_known and all(map(is_, given, self._given))):
+        asked = *given, *named.values()
+        if self._launches is None or not all(map(_is_same, asked, self._given)):
             self._launches = self._result = None  # frees their arrays
-            self._given, self._numbers = given, numbers
+            self._given = asked
             with self._dev.recorded() as launches:
-                self._result = function()
+                self._result = function(*given, **named)
             self._launches = launches
             return self._result
         for i, launch in enumerate(self._launches):
@@ -109,3 +108,8 @@ class Prepared:
                 launch = self._launches[i] = launch._replace(own=own)
             self._dev.enqueue(launch)
         return self._result
+
+
+def _is_same(a, b):
+    """Whether they are one object, or equal numbers."""
+    return a is b or (isinstance(a, int | float | str | tuple) and a == b)

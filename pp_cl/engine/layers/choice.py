@@ -135,14 +135,15 @@ def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> 
     for conv in convs:
         shape, places = conv.shape, [first_float(conv.weight), first_float(conv.work) // VECTOR]
         k, ci, co, is_forward = shape.k, shape.ci, shape.co, shape.direction == "forward"
+        halved = conv.is_halved and not is_forward
         if conv.variant == "winograd":
             kind, read, made = (1, ci, co) if is_forward else (2, co, ci)
-            rows.append((n, kind, k**2, read, made, 0, ci, *places))
+            rows.append((n, kind, k**2, read, made, 0, ci, *places, halved))
             n += read * made // VECTOR
         elif not is_forward:
             first = 0
             for channels, blocks in zip(shape.sources, _blocks(shape.sources), strict=True):
-                rows.append((n, 0, k**2, co, channels, first, ci, *places))
+                rows.append((n, 0, k**2, co, channels, first, ci, *places, halved))
                 vectors = blocks * k**2 * co
                 n, first, places[1] = n + vectors, first + channels, places[1] + vectors
     if rows:

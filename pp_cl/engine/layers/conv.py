@@ -84,7 +84,8 @@ class Conv:
     variant: what computes it, a key of choice.VARIANTS. weight, bias: the layer's, (ceil(CO/16), K,
     K, CI, 16) and (ceil(CO/16) * 16,) float32. work: the weights as the kernels read them, by
     default as they are. partial: of the direction "backward", the parts of the gradients of the
-    weights and biases. Both are of choice.work_table().
+    weights and biases. Both are of choice.work_table(). is_halved: whether what follows halves the
+    output: backward() takes the gradient of that.
     """
 
     dev: Device
@@ -93,6 +94,7 @@ class Conv:
     shape: ConvShape
     weight: Array
     bias: Array
+    is_halved: bool = False
     work: Array = field(init=False)
     partial: Array = field(init=False)
 
@@ -170,9 +172,9 @@ def sum_parts(
     for conv, count in parts:
         _, blocks, sums, _ = conv.partial.shape
         places = [first_float(array) // VECTOR for array in (conv.partial, conv.weight, conv.bias)]
-        rows.append((n, sums, blocks, count, *places))
+        rows.append((n, sums, blocks, count, *places, conv.is_halved))
         n += sums * blocks
-    (sent,) = table.send([((len(rows), 7), np.int32)], [np.array(rows, np.int32)])
+    (sent,) = table.send([((len(rows), 8), np.int32)], [np.array(rows, np.int32)])
     weights_program(dev).launch(
         "sum_parts",
         n * row_parts(dev),

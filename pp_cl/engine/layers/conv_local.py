@@ -32,24 +32,8 @@ MOST_GROUPS = 512
 
 def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
     """See conv_direct."""
-    shape, kernel = conv.shape, "conv_local_forward"
-    program, size, items = _program(conv, kernel, (shape.co,), shape.sources, tiles)
-    program.launch(
-        kernel,
-        size,
-        (items, 1),
-        multiply_adds=tiles.number * SIDE**2 * shape.products,
-        c1=shape.sources[0],
-        c2=sum(shape.sources[1:]),
-        co=shape.co,
-        relu=relu,
-        x=sources[0],
-        x2=sources[-1],
-        weight=conv.work,
-        bias=conv.bias,
-        tile_list=tiles.list,
-        out=out,
-    )
+    shape = conv.shape
+    _launch(conv, shape.sources, (shape.co,), sources, (out,), (out,), (False,), relu, tiles)
 
 
 def backward(
@@ -63,25 +47,8 @@ def backward(
     grad_tiles: Tiles,
 ) -> int:
     """See conv_direct. In two launches: groups of both kinds have other sizes."""
-    shape, kernel = conv.shape, "conv_local_backward_input"
-    program, size, items = _program(conv, kernel, shape.sources, (shape.co,), grad_tiles)
-    program.launch(
-        kernel,
-        size,
-        (items, 1),
-        multiply_adds=grad_tiles.number * SIDE**2 * shape.products,
-        c1=shape.sources[0],
-        c2=sum(shape.sources[1:]),
-        co=shape.co,
-        masked=mask_bits(masks),
-        x=sources[0],
-        x2=sources[-1],
-        flipped=conv.work,
-        grad_out=grad_out,
-        tile_list=grad_tiles.list,
-        grad_x=grads[0],
-        grad_x2=grads[-1],
-    )
+    shape = conv.shape
+    _launch(conv, (shape.co,), shape.sources, (grad_out,), grads, sources, masks, False, grad_tiles)
     k, co, (_, width) = shape.k, shape.co, shape.size
     run = max(SUMMED, -(-tiles.number // parts_of(shape)))
     parts = -(-tiles.number // run)
@@ -117,11 +84,9 @@ def parts_of(shape: ConvShape) -> int:
     return min(wanted, most_parts(shape))
 
 
-def _program(
-    conv: Conv, kernel: str, channels: tuple[int, ...], inputs: tuple[int, ...], tiles: Tiles
-) -> tuple[Program, tuple[int, int], int]:
-    """(program, work-items, items of a work-group) for the tiles of results of so many channels
-    each, of inputs of so many each; in the largest groups that the device runs.
+def _launch(conv, inputs, channels, xs, results, mask_arrays, masks, relu, tiles):
+    """Convolve arrays of so many channels each to the tiles of results of so many; in the largest
+    groups that the device runs.
     """
     tiles.check(conv.shape.size)
     aligned = _is_aligned(*channels, *inputs)
@@ -134,10 +99,31 @@ def _program(
             ALIGNED=int(aligned),
             QUADS=in_group,
         )
-        if program.kernels[kernel].largest_group >= items:
+        if program.kernels["conv_local"].largest_group >= items:
             break
     groups = -(-tiles.number * TILE_PARTS * in_group // items)
-    return program, (groups * items, sum(-(-c // (QUAD * in_group)) for c in channels)), items
+    program.launch(
+        "conv_local",
+        (groups * items, sum(-(-c // (QUAD * in_group)) for c in channels)),
+        (items, 1),
+        multiply_adds=tiles.number * SIDE**2 * conv.shape.products,
+        c1=inputs[0],
+        c2=sum(inputs[1:]),
+        co1=channels[0],
+        co2=sum(channels[1:]),
+        forward=conv.shape.direction == "forward",
+        relu=relu,
+        masked=mask_bits(masks),
+        x=xs[0],
+        x2=xs[-1],
+        weight=conv.work,
+        bias=conv.bias,
+        mask=mask_arrays[0],
+        mask2=mask_arrays[-1],
+        tile_list=tiles.list,
+        out=results[0],
+        out2=results[-1],
+    )
 
 
 def _weights_program(conv: Conv) -> tuple[Program, int, int]:

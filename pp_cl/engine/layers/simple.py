@@ -104,7 +104,8 @@ def _launch(dev, file, kernel, shape, result, tiles, **arguments):
 
 def output_forward(dev: Device, image: Array, features: Array | None) -> None:
     """image (H, W, 3) = 0.5 + 0.5 * image, and SHARE * (the first three of the features (H, W, C)
-    - the background's 1), if they are given: a residual connection past the network.
+    - the background's 1), if they are given: a residual connection past the network. For the
+    gradient see Conv.is_halved and residual_backward().
     """
     height, width, channels = (image if features is None else features).shape
     dev.program("layers/output").launch(
@@ -116,14 +117,6 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
         share=SHARE,
         features=image if features is None else features,
         image=image,
-    )
-
-
-def output_backward(dev: Device, grad_image: Array, grad_out: Array) -> None:
-    """Write grad_out (H, W, 3), dL/d(last layer's output), from grad_image (H, W, 3)."""
-    n = grad_image.size
-    dev.program("layers/output").launch(
-        "output_backward", n, n=n, grad_image=grad_image, grad_out=grad_out
     )
 
 

@@ -157,7 +157,8 @@ def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]
     """[(name, first, last)]: the first and last layer, counted through the forward and the backward
     pass, at which each array is in use; by first use.
 
-    The network's input "x" is not among them: it belongs to the caller.
+    The network's input "x" and the gradient of its output are not among them: they belong to the
+    caller.
     """
     schedule = [(*layer.inputs, layer.name) for layer in layers]
     if training:
@@ -171,6 +172,7 @@ def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]
             found[name] = (found.get(name, (time,))[0], time)
     del found["x"]
     last = layers[-1].name
+    found.pop(gradient_of(last), None)
     found[last] = (found[last][0], len(schedule))  # the caller may read it after backward
     return [(name, *lifetime) for name, lifetime in found.items()]
 

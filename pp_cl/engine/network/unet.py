@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from pp_cl.engine.layers.simple import (
     avgpool2_forward,
     gate_backward,
     gate_forward,
-    output_backward,
     output_forward,
     residual_backward,
     upsample2_backward,
@@ -270,12 +270,13 @@ class UNet:
         if space.size != (height, width):
             space.plan(self, (height, width), training)
         if not (self._is_frozen and space.is_laid_out):
+            convs = space.convs.values()
             space.launches["weights"].run(
-                lambda: lay_out(self.dev, space.convs.values(), self.all_parameters, space.work)
+                partial(lay_out, self.dev, convs), self.all_parameters, space.work
             )
             space.is_laid_out = True
         plan = plan or space.all_tiles
-        space.launches["forward"].run(lambda: self._forward(space, plan, x), plan, x)
+        space.launches["forward"].run(partial(self._forward, space), plan, x)
         if training:
             self._trained = plan, x
         return space.arrays[self.layers[-1].name]
@@ -305,19 +306,20 @@ class UNet:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
         space, (plan, x), self._trained = self._workspaces[True], self._trained, None
         plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
-        run = space.launches["backward"].run
-        run(lambda: self._backward(space, plan, x, grad_y), plan, x, grad_y)
+        space.launches["backward"].run(partial(self._backward, space), plan, x, grad_y)
         return space.arrays[gradient_of("x")]
 
     def _backward(self, space, plan, x, grad_y):
         dev, arrays, convs = self.dev, space.arrays | {"x": x}, space.convs
-        output_backward(dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
+        last = self.layers[-1]
+        arrays[gradient_of(last.name)] = grad_y
         for name in sorted(plan.copies.keys() - plan.tiles.keys()):  # outputs that it reads
             plan.copy_tiles(dev, name, arrays[name])
         parts = []
         for layer in reversed(self.layers):
             grad_out = arrays[gradient_of(layer.name)]
-            plan.copy_tiles(dev, gradient_of(layer.name), grad_out)
+            if layer is not last:
+                plan.copy_tiles(dev, gradient_of(layer.name), grad_out)
             sources = [arrays[name] for name in layer.inputs]
             grads = [arrays[gradient_of(name)] for name in layer.inputs]
             masks = [name in self.relu_outputs for name in layer.inputs]
@@ -366,7 +368,8 @@ class UNet:
                 shape = ConvShape(direction, *of_layer, here)
                 variant = choose(self.dev, shape, self.variant)
                 weight, bias = (self.parameters[f"{layer.name}.{n}"] for n in ("weight", "bias"))
-                conv = Conv(self.dev, self.blocking, variant, shape, weight, bias)
+                is_last = layer is self.layers[-1]  # output_forward() halves what it gives
+                conv = Conv(self.dev, self.blocking, variant, shape, weight, bias, is_last)
                 found[layer.name, direction] = conv
         return found
 

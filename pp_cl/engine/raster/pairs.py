@@ -4,15 +4,15 @@ backward pass, and by pixel sorted by depth for blending.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
+from pp_cl.engine.device.buffers import Buffers, Table, grown
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import Prepared, lanes
+from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.device.scan import exclusive_scan, read_total
 from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.errors import UserError
@@ -24,14 +24,14 @@ RUN = 64  # keys that GPUs rank at once by comparing all with all; longer lists 
 LONG_LIST = RUN * RUN  # keys of lists that they merge in more than one pass
 
 
-@dataclass(frozen=True)
+@dataclass
 class Pairs:
     """The fragments of a view of N points and HW pixels, valid until the next ones are found.
 
     The arrays have a capacity of P pairs. If the view has more, pixel_offset is all zeros and the
     other arrays must not be read: find the pairs again with more capacity (capacity_needed()).
 
-    footprint: of the points, one of FOOTPRINTS. count: how many pairs there are.
+    footprint: of the points, one of FOOTPRINTS. count: how many pairs there are, of read_count().
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_falloff: (P, 2) uint32, the point, and the bits
@@ -40,12 +40,16 @@ class Pairs:
     """
 
     footprint: str
-    count: Pending[int]
     point_offset: Array
     pixel_offset: Array
     pair_pixel: Array
     pair_point_falloff: Array
     pair_key: Array
+    count: Any = None
+
+    def read_count(self, dev: Device) -> None:
+        """Enqueue the download of the number of pairs."""
+        self.count = read_total(dev, self.point_offset)
 
     @property
     def total(self) -> int:
@@ -82,25 +86,12 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
 
 
 def find_pairs(
-    dev: Device,
-    b: Buffers,
-    points: ProjectedPoints,
-    size: tuple[int, int],
-    capacity: int = 1,
-    prepared: Prepared | None = None,
+    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], capacity: int = 1
 ) -> Pairs:
     """The fragments in an image of size (height, width), if there are no more than `capacity`; does
-    not wait for the device. prepared: for the launches, of the same b.
+    not wait for the device. Their number is known after read_count().
     """
-    run, pixels = (prepared or Prepared(dev)).run, size[0] * size[1]
-    numbers = pixels, capacity
-    pairs = run(lambda: _launch_all(dev, b, points, *numbers), points, numbers=numbers)
-    return replace(pairs, count=read_total(dev, pairs.point_offset))
-
-
-def _launch_all(dev, b, points, pixels, capacity):
-    """Pairs without their count."""
-    n = len(points.point_box)
+    n, pixels = len(points.point_box), size[0] * size[1]
     b.require(pairs_table(n, pixels, capacity))
     exclusive_scan(dev, points.point_count, b.point_offset)
     if not dev.is_cpu:
@@ -125,10 +116,8 @@ def _launch_all(dev, b, points, pixels, capacity):
         _list_by_bucket(dev, b, n, pixels, capacity)
     else:
         _list_by_key(dev, b, pixels, capacity)
-    unknown: Any = None
     return Pairs(
         points.footprint,
-        unknown,
         b.point_offset,
         b.pixel_offset,
         b.pair_pixel,

@@ -4,15 +4,15 @@ the list of visible points, and each point's highest weight for pruning.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, Pending, Table
+from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import Prepared, lanes
+from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.device.scan import nonzero, read_front
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import footprint_macros
@@ -22,7 +22,7 @@ NO_POINT = 0xFFFFFFFF  # in pixel_weight_point, behind which fragments were drop
 ALL = 2**32 - 1  # fragments of a pixel that get gradients
 
 
-@dataclass(frozen=True)
+@dataclass
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
@@ -31,9 +31,10 @@ class BlendWeights:
     where fragments are dropped, a number without a point ends the pixel's list. pixel_derivative:
     (P,) float32 alike, the factor s of the backward pass, dL/dopacity = s * dL/db
     (cl/raster/blend.cl); None without derivatives. point_is_visible: (N,) uint8, 1 for visible
-    points. visible_list: `visible`, whose length is still on its way. point_slot: (N,) uint32,
-    where a visible point stands in `visible`, undefined for others. transmittance: (HW,) float32
-    behind all fragments, None with the softmax.
+    points. point_slot: (N,) uint32, where a visible point stands in `visible`, undefined for
+    others. transmittance: (HW,) float32 behind all fragments, None with the softmax. visible_rows:
+    (N,) uint32, `visible` at its front; visible_count: (1,) uint32, how many; visible_list:
+    `visible`, of read_visible().
     """
 
     blend: str
@@ -41,9 +42,15 @@ class BlendWeights:
     pixel_weight_point: Array
     pixel_derivative: Array | None
     point_is_visible: Array
-    visible_list: Pending[Array]
     point_slot: Array
     transmittance: Array | None
+    visible_rows: Array
+    visible_count: Array
+    visible_list: Any = None
+
+    def read_visible(self, dev: Device) -> None:
+        """Enqueue the download of the number of visible points."""
+        self.visible_list = read_front(dev, self.visible_rows, self.visible_count)
 
     @property
     def visible(self) -> Array:
@@ -79,7 +86,6 @@ def blend_weights(
     max_tracked: int = 0,
     early_stop: float = 0.0,
     derivatives: bool = True,
-    prepared: Prepared | None = None,
 ) -> BlendWeights:
     """The weights of all pairs, in the buffers b of find_pairs().
 
@@ -87,21 +93,8 @@ def blend_weights(
     max_tracked: only this many nearest fragments of a pixel get gradients (64 in the paper); 0:
     all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
     have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
-    pass reads. prepared: for the launches, of the same b.
+    pass reads. Which points are visible is known after read_visible().
     """
-    numbers = blend, gamma, max_tracked, early_stop, derivatives
-    weights = (prepared or Prepared(dev)).run(
-        lambda: _launch_all(dev, b, pairs, camera_buffer, opacity, *numbers),
-        *(pairs.pair_key, pairs.point_offset, pairs.pixel_offset, camera_buffer, opacity),
-        numbers=numbers if blend == "softmax" else (blend, *numbers[2:]),
-    )
-    return replace(weights, visible_list=read_front(dev, b.visible, b.visible_count))
-
-
-def _launch_all(
-    dev, b, pairs, camera_buffer, opacity, blend, gamma, max_tracked, early_stop, derivatives
-):
-    """BlendWeights without the visible points."""
     b.require(weights_table(pairs.points, pairs.pixels, pairs.capacity if derivatives else 1))
     dev.fill(b.point_is_visible, 0)
     defines: dict[str, Any] = {"LANES": lanes(dev), "DERIVATIVES": int(derivatives)}
@@ -125,16 +118,16 @@ def _launch_all(
             "softmax_weights", pairs.pixels, sharpness=1 / gamma, camera=camera_buffer, **shared
         )
     nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
-    unknown: Any = None
     return BlendWeights(
         blend,
         max_tracked or ALL,
         b.pair_scratch,
         b.pixel_derivative if derivatives else None,
         b.point_is_visible,
-        unknown,
         b.point_slot,
         b.transmittance if blend == "alpha" else None,
+        b.visible,
+        b.visible_count,
     )
 
 

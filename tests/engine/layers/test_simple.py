@@ -10,7 +10,6 @@ from pp_cl.engine.layers.simple import (
     SHARE,
     gate_backward,
     gate_forward,
-    output_backward,
     output_forward,
     residual_backward,
 )
@@ -71,7 +70,6 @@ def test_outputs_of_other_shapes_are_refused(dev):
     features, image = dev.zeros((4, 5, 16)), dev.zeros((5, 4, 3))
     for call, *given in (
         (output_forward, image, features),
-        (output_backward, image, features),
         (residual_backward, image, features),
     ):
         with pytest.raises(ValueError, match="has shape .*, expected"):

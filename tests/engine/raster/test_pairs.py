@@ -99,4 +99,5 @@ def test_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch):
     for units in (1, 3, 16, 1000):
         monkeypatch.setitem(dev.info, "compute_units", units)
         pairs = find_pairs(dev, Buffers(dev), scene.projected, scene.shape, scene.pairs.total)
+        pairs.read_count(dev)
         assert all(map(np.array_equal, bits(scene.pairs), bits(pairs)))
