@@ -15,75 +15,11 @@ static inline float16 counted(global const float *grad, const float count, const
     return count > 0.0f ? count * load16(grad, lanes) : (float16)0.0f;
 }
 
-// The gradients of the weights of CI_GROUP input channels and of one ky, and that of the bias if
-// with_bias: of 16 output channels over rows y0 to end of the image. x: at the first of the input
-// channels, c to a pixel; grad_out: at the first of the output channels. Needs no border test: it
-// visits only pixels that exist. A gradient counts as often as its tile.
-ALWAYS_INLINE void sum_weights(
-    global const float *x,
-    global const float *grad_out,
-    global const float *tile_count,
-    global float16 *out,  // kx, channel: ci to a kx
-    global float16 *bias,
-    const bool with_bias,
-    const int c,
-    const int ci,
-    const int co,
-    const int lanes,
-    const int ky,
-    const int y0,
-    const int end,
-    const int height,
-    const int width) {
-    for (int kx = 0; kx < KERNEL_SIZE; kx++)
-        for (int i = 0; i < CI_GROUP; i++)
-            out[kx * ci + i] = 0.0f;
-    if (with_bias) *bias = 0.0f;
-
-    for (int y = y0; y < end; y++) {
-        const int row = y + ky - PAD;
-        if (row < 0 || row >= height) continue;
-        global const float *pixel = x + (size_t)row * width * c;
-        global const float *grad = grad_out + (size_t)y * width * co;
-        global const float *count = tile_count + y / SIDE * tile_columns(width);
-        float16 window[KERNEL_SIZE];  // window[kx]: dL/dout at column + PAD - kx
-        UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
-            window[kx] = 0.0f;
-        if (PAD) window[0] = counted(grad, count[0], lanes);
-        for (int begin = 0; begin < width; begin += SUMMED) {
-            float16 acc[KERNEL_SIZE][CI_GROUP], sum = 0.0f;
-            UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
-                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
-                    acc[kx][i] = 0.0f;
-            for (int column = begin; column < min(begin + SUMMED, width); column++) {
-                UNROLLED_FOR (int kx = KERNEL_SIZE - 1; kx > 0; kx--)
-                    window[kx] = window[kx - 1];
-                const int ahead = column + PAD;
-                window[0] = ahead < width ? counted(grad + ahead * co, count[ahead / SIDE], lanes)
-                                          : (float16)0.0f;
-                // pixels that no counted gradient sees may hold anything
-                if (count[max(column - PAD, 0) / SIDE] == 0.0f &&
-                    count[min(column + PAD, width - 1) / SIDE] == 0.0f)
-                    continue;
-                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++) {
-                    const float value = pixel[column * c + i];
-                    UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
-                        acc[kx][i] += value * window[kx];
-                }
-                sum += window[PAD];
-            }
-            UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
-                UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
-                    out[kx * ci + i] += acc[kx][i];
-            if (with_bias) *bias += sum;
-        }
-    }
-}
-
 // The first work-items: one per (CI_GROUP channels of [x, x2] and ky, 16 output channels, `rows`
 // rows of the image): reads its rows and the gradients of the K output pixels that see each pixel,
 // writes its part of the sums: dL/dweight in rows (ky, kx, channel) of partial, dL/dbias in the last
-// row.
+// row. Needs no border test: it visits only pixels that exist. A gradient counts as often as its
+// tile.
 //
 // The others: one per (PIXELS pixels, row, BLOCKS * 16 channels of x or x2): reads grad_out, writes
 // those of grad_x or grad_x2 that lie in a tile to compute: the convolution of grad_out with the
@@ -114,13 +50,54 @@ kernel void conv_backward(
         const int ky = item / groups % KERNEL_SIZE, c0 = item % groups * CI_GROUP;
         const int at = item / (groups * KERNEL_SIZE), block = at % blocks_out,
                   part = at / blocks_out;
-        const bool second = c0 >= c1;
-        global float16 *out = partial + ((size_t)part * blocks_out + block) * (TAPS * ci + 1);
-        sum_weights(
-            second ? x2 + c0 - c1 : x + c0, grad_out + block * 16, tile_count,
-            out + ky * KERNEL_SIZE * ci + c0, out + TAPS * ci, ky == PAD && c0 == 0,
-            second ? c2 : c1, ci, co, co - block * 16, ky, part * rows,
-            min(height, (part + 1) * rows), height, width);
+        const bool second = c0 >= c1, with_bias = ky == PAD && c0 == 0;
+        const int c = second ? c2 : c1, lanes = co - block * 16;
+        global float16 *of_block = partial + ((size_t)part * blocks_out + block) * (TAPS * ci + 1);
+        global float16 *out = of_block + ky * KERNEL_SIZE * ci + c0, *bias = of_block + TAPS * ci;
+        for (int kx = 0; kx < KERNEL_SIZE; kx++)
+            for (int i = 0; i < CI_GROUP; i++)
+                out[kx * ci + i] = 0.0f;
+        if (with_bias) *bias = 0.0f;
+
+        for (int y = part * rows; y < min(height, (part + 1) * rows); y++) {
+            const int row = y + ky - PAD;
+            if (row < 0 || row >= height) continue;
+            global const float *pixel = (second ? x2 + c0 - c1 : x + c0) + (size_t)row * width * c;
+            global const float *grad = grad_out + (size_t)y * width * co + block * 16;
+            global const float *count = tile_count + y / SIDE * tile_columns(width);
+            float16 window[KERNEL_SIZE];  // window[kx]: dL/dout at column + PAD - kx
+            UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                window[kx] = 0.0f;
+            if (PAD) window[0] = counted(grad, count[0], lanes);
+            for (int begin = 0; begin < width; begin += SUMMED) {
+                float16 acc[KERNEL_SIZE][CI_GROUP], sum = 0.0f;
+                UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                    UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
+                        acc[kx][i] = 0.0f;
+                for (int column = begin; column < min(begin + SUMMED, width); column++) {
+                    UNROLLED_FOR (int kx = KERNEL_SIZE - 1; kx > 0; kx--)
+                        window[kx] = window[kx - 1];
+                    const int ahead = column + PAD;
+                    window[0] = ahead < width
+                                    ? counted(grad + ahead * co, count[ahead / SIDE], lanes)
+                                    : (float16)0.0f;
+                    // pixels that no counted gradient sees may hold anything
+                    if (count[max(column - PAD, 0) / SIDE] == 0.0f &&
+                        count[min(column + PAD, width - 1) / SIDE] == 0.0f)
+                        continue;
+                    UNROLLED_FOR (int i = 0; i < CI_GROUP; i++) {
+                        const float value = pixel[column * c + i];
+                        UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                            acc[kx][i] += value * window[kx];
+                    }
+                    sum += window[PAD];
+                }
+                UNROLLED_FOR (int kx = 0; kx < KERNEL_SIZE; kx++)
+                    UNROLLED_FOR (int i = 0; i < CI_GROUP; i++)
+                        out[kx * ci + i] += acc[kx][i];
+                if (with_bias) *bias += sum;
+            }
+        }
         return;
     }
     item -= sums;

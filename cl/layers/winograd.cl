@@ -1,5 +1,5 @@
 // 3x3 convolution by Winograd's minimal filtering: the forward pass.
-#include "layers/winograd_convolve.h"
+#include "layers/winograd.h"
 
 // One work-item per compute unit: takes tiles, reads their neighbourhood in x, then in x2 (the
 // concatenation [x, x2] without making it), and writes those tiles of out.

@@ -5,7 +5,7 @@
 // With inputs V = B^T d B and gradients Z = A g A^T of a tile, the gradient of the transformed
 // weights is the sum of V o Z over all tiles: position by position a product of matrices (CI x
 // tiles) (tiles x CO). The weights' own is G^T ... G of it.
-#include "layers/winograd_convolve.h"
+#include "layers/winograd.h"
 
 #ifndef SUM_TILES
 #define SUM_TILES 32  // tiles transformed at a time for the weights
@@ -24,7 +24,7 @@
 #define SUM_PITCH(channels) PITCH(channels, SUM_TILES)
 // tiles summed before their sum joins the rest: one sum over a large image would lose digits
 #define SUMMED (32 * SUM_TILES)
-// input channels multiplied together: ROWS * SUM_BLOCKS accumulators and as many vectors fit AVX-512
+// input channels multiplied together: ROWS * SUM_BLOCKS sums and SUM_BLOCKS vectors fit AVX-512
 #define ROWS 8
 
 // z = A g A^T of the gradients of `count` tiles of tile_list from `first` on, each times its

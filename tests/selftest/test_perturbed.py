@@ -52,7 +52,7 @@ FLIPS = [
     ("layers/conv_backward", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
     ("layers/conv_local", "+ p] += v", "+ p] -= v", "conv: local, hard inputs"),
     ("layers/conv_local_backward_weights", "[0] += v", "[0] -= v", "conv: local, hard inputs"),
-    ("layers/winograd_convolve.h", "[i] += value", "[i] -= value", "conv: winograd, hard inputs"),
+    ("layers/winograd.h", "[i] += value", "[i] -= value", "conv: winograd, hard inputs"),
     ("layers/winograd_backward", "[i] += v", "[i] -= v", "conv: winograd, hard inputs"),
     ("layers/weights", ": vload16((rest", ": -vload16((rest", "conv: winograd"),
     ("layers/resample", "+ 0.25f * line", "- 0.25f * line", "layers: upsampling"),

@@ -193,7 +193,8 @@ class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
     kernels are launched in parts. launches: so far. waited: CPU seconds of threads that waited for
-    the device; drivers of CPUs have them compute meanwhile.
+    the device; drivers of CPUs have them compute meanwhile. recorded: a list to which launches are
+    added, and functions that repeat fills; None: they are not.
     """
 
     def __init__(self, device: cl.Device):
@@ -210,7 +211,7 @@ class Device:
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
         self.bytes = self.peak_bytes = self.launches = 0
         self.waited = 0.0
-        self._recorded: list[Any] | None = None  # what recorded() yields
+        self.recorded: list[Any] | None = None
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
@@ -338,8 +339,8 @@ class Device:
 
     def fill(self, array: Array, value: float) -> None:
         """Set all elements of an array of this device to one value."""
-        if self._recorded is not None:
-            self._recorded.append(partial(self._fill, array, value))
+        if self.recorded is not None:
+            self.recorded.append(partial(self._fill, array, value))
         self._fill(array, value)
 
     def _fill(self, array, value):
@@ -383,18 +384,6 @@ class Device:
         self.attempt("finish its work", function)
         self.waited += time.thread_time() - start
 
-    @contextmanager
-    def recorded(self) -> Iterator[list[Any]]:
-        """Yields the list of the launches inside the block, which enqueue() repeats, and of
-        functions that repeat its fills. They keep their arguments alive.
-        """
-        launches: list[Any] = []
-        self._recorded = launches
-        try:
-            yield launches
-        finally:
-            self._recorded = None
-
     def enqueue(self, launch: Launch) -> None:
         """Enqueue a launch, which has been checked. Raises UserError as attempt()."""
         kernel = launch.kernel
@@ -408,8 +397,8 @@ class Device:
             launch.offset,
         )
         self.launches += 1
-        if self._recorded is not None:
-            self._recorded.append(launch)
+        if self.recorded is not None:
+            self.recorded.append(launch)
         if launch.watched:  # what drivers hand to the system together is timed together
             self.queue.flush()
         if self.debug:

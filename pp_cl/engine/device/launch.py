@@ -95,8 +95,12 @@ class Prepared:
         if self._launches is None or not all(map(_is_same, asked, self._given)):
             self._launches = self._result = None  # frees their arrays
             self._given = asked
-            with self._dev.recorded() as launches:
+            launches: list[Any] = []
+            self._dev.recorded = launches
+            try:
                 self._result = function(*given, **named)
+            finally:
+                self._dev.recorded = None
             self._launches = launches
             return self._result
         for i, launch in enumerate(self._launches):
