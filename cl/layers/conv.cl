@@ -20,5 +20,5 @@ kernel void conv_forward(
 {
     convolve_pixels(
         x, x2, c1, c2, weight, bias, relu, 0, 0, out, 0, co, 0, tile_count,
-        get_global_id(0) * PIXELS, get_global_id(1), get_global_id(2) * BLOCKS, height, width);
+        (int3)(get_global_id(0), get_global_id(1), get_global_id(2)), height, width);
 }

@@ -3,9 +3,7 @@
 #include "layers/direct.h"
 
 #ifndef CI_GROUP
-// input channels of one work-item; divides those of each source. K * CI_GROUP accumulators fit
-// AVX-512
-#define CI_GROUP 8
+#define CI_GROUP 8  // input channels of a work-item; K * CI_GROUP accumulators fit AVX-512
 #endif
 // pixels of a row summed in registers: one sum over an image of background would lose digits
 #define SUMMED 128
@@ -18,8 +16,7 @@ static inline float16 counted(global const float *grad, const float count, const
 // The first work-items: one per (CI_GROUP channels of [x, x2] and ky, 16 output channels, `rows`
 // rows of the image): reads its rows and the gradients of the K output pixels that see each pixel,
 // writes its part of the sums: dL/dweight in rows (ky, kx, channel) of partial, dL/dbias in the last
-// row. Needs no border test: it visits only pixels that exist. A gradient counts as often as its
-// tile.
+// row. Only pixels that exist are visited. A gradient counts as often as its tile.
 //
 // The others: one per (PIXELS pixels, row, BLOCKS * 16 channels of x or x2): reads grad_out, writes
 // those of grad_x or grad_x2 that lie in a tile to compute: the convolution of grad_out with the
@@ -104,6 +101,6 @@ kernel void conv_backward(
     const int columns = (width + PIXELS - 1) / PIXELS;
     convolve_pixels(
         grad_out, 0, co, 0, flipped, 0, 0, masked & 1 ? x : 0, masked & 2 ? x2 : 0, grad_x, grad_x2,
-        c1, c2, grad_tiles, item % columns * PIXELS, item / columns % height,
-        item / columns / height * BLOCKS, height, width);
+        c1, c2, grad_tiles,
+        (int3)(item % columns, item / columns % height, item / columns / height), height, width);
 }

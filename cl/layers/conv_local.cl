@@ -125,9 +125,8 @@ ALWAYS_INLINE void find_corners(local int2 *corner, global const int *tile_list)
 
 // One work-item per (4 channels of out or out2, ROWS lines of a tile), a work-group per (4 * QUADS
 // channels, GROUP_TILES tiles of the list): reads what the lines see in x, then in x2 (the
-// concatenation [x, x2] without making it), and writes them to out or out2. In the backward pass x
-// is the gradient of the output, and out and out2 are those of the inputs: its convolution with the
-// flipped and transposed weights (weights.cl).
+// concatenation [x, x2] without making it), and writes them to out or out2. For input gradients, out
+// and out2, x is the gradient of the output, and the weights are flipped (weights.cl).
 kernel void conv_local(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read

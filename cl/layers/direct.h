@@ -1,10 +1,9 @@
 // Direct K x K convolution (K = KERNEL_SIZE), stride 1, zero padding K / 2, of pixels of one row:
 // what the forward pass (conv.cl) and the gradient of its input (conv_backward.cl) share.
 //
-// A work-item keeps BLOCKS x 16 output channels of PIXELS neighbouring pixels of a row in
-// registers. For each input channel it loads K weight vectors per block and PIXELS + K - 1
-// scalars, and does K * BLOCKS * PIXELS vector multiply-adds with them. PIXELS and BLOCKS are
-// chosen so that accumulators and weights fit a device's registers (Blocking in
+// A work-item keeps BLOCKS x 16 output channels of PIXELS neighbouring pixels of a row in registers.
+// For each input channel it loads K weight vectors per block and PIXELS + K - 1 scalars, for
+// K * BLOCKS * PIXELS vector multiply-adds. All must fit a device's registers (Blocking in
 // pp_cl/engine/layers/conv.py).
 #ifndef PP_DIRECT_H
 #define PP_DIRECT_H
@@ -79,10 +78,9 @@ any_is_computed(global const float *tile_count, const int x0, const int y, const
 }
 
 // One work-item's part of a convolution of [x, x2] (c2 = 0: of x), which is not made, to out and
-// out2: PIXELS pixels from tile_x on of row y, BLOCKS * 16 channels from `first` groups on, of which
-// those in a tile to compute are written. weight: ((co1+15)/16+(co2+15)/16, K, K, c1 + c2, 16);
-// bias: 0 = none; relu: negative results become 0; mask of either: 0 = none, results become 0 where
-// it is not positive.
+// out2: PIXELS pixels of a row, BLOCKS * 16 channels, of which those in a tile to compute are
+// written. weight: ((co1+15)/16+(co2+15)/16, K, K, c1 + c2, 16); bias: 0 = none; relu: negative
+// results become 0; mask of either: 0 = none, results become 0 where it is not positive.
 ALWAYS_INLINE void convolve_pixels(
     global const float *x,
     global const float *x2,
@@ -98,11 +96,10 @@ ALWAYS_INLINE void convolve_pixels(
     const int co1,
     const int co2,
     global const float *tile_count,
-    const int tile_x,
-    const int y,
-    const int first,
+    const int3 item,
     const int height,
     const int width) {
+    const int tile_x = item.x * PIXELS, y = item.y, first = item.z * BLOCKS;
     const bool second = first >= (co1 + 15) / 16;
     const int block = second ? first - (co1 + 15) / 16 : first, co = second ? co2 : co1;
     if (tile_x >= width || y >= height || block * 16 >= co) return;

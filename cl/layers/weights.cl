@@ -1,5 +1,5 @@
-// Weights as kernels read them, if not as they are; and the sums of the parts of their gradients.
-// Each for all convolutions of a network at once, of which a table has rows.
+// Weights as kernels read them, if not as they are; the sums of the parts of their gradients. Each
+// for all convolutions at once, of which a table has rows.
 #include "lanes.h"
 
 #ifndef WINOGRAD
@@ -37,13 +37,12 @@ static inline float16 across(
 }
 
 // One work-item per vector of 16 channels of the result and channel that it is computed from; one
-// for all taps where weights are transformed. For an input gradient kernels are mirrored, and input
-// and output channels exchange their roles; they are halved where what follows the convolution
-// halves its output. Rows of `table`: first work-item; 0 for weights of an
-// input gradient (blocks, K, K, co, 16), 1 for the transform G g G^T that winograd.cl reads
-// (winograd.h), 2 for that of an input gradient; taps (K * K); channels that the result is computed
-// from, and of the result, the first of these among the input channels; input channels of the
-// weights; where weights and vectors begin; 1 if they are halved.
+// for all taps where weights are transformed. For an input gradient kernels are mirrored, input and
+// output channels exchange their roles, and what is halved behind the convolution is halved here.
+// Rows of `table`: first work-item; 0 for weights of an input gradient (blocks, K, K, co, 16), 1 for
+// the transform G g G^T (winograd.h), 2 for that of an input gradient; taps (K * K); channels that
+// the result is computed from, and of the result, the first of these among the input channels; input
+// channels of the weights; where weights and vectors begin; 1 if they are halved.
 kernel void lay_out_weights(
     const uint n,  // work-items
     const uint rows,
@@ -80,7 +79,7 @@ kernel void lay_out_weights(
 // One work-item per part of (weights, row of partial, 16 output channels): adds the parts in order;
 // writes LANES values of a gradient. Rows of `table`: first row of partial of all weights, rows of
 // one part and group of 16 output channels (K * K * ci + 1), such groups, parts, where the parts,
-// the gradient of the weights and that of the biases begin.
+// the gradient of the weights and that of the biases begin; 1 if the sums are halved.
 kernel void sum_parts(
     const uint n,  // rows of partial, of one part of all weights
     const uint rows,

@@ -334,8 +334,7 @@ ALWAYS_INLINE void convolve(
     const int share = (tiles + get_global_size(0) - 1) / get_global_size(0);
     const int rounds = (share + TILES - 1) / TILES;  // of about the same size
     const int step = ((share + rounds - 1) / rounds + TOGETHER - 1) / TOGETHER * TOGETHER;
-    for (int first = take(scratch, TILE_WORK, step); first < tiles;
-         first = take(scratch, TILE_WORK, step)) {
+    for (int first; (first = take(scratch, TILE_WORK, step)) < tiles;) {
         const int count = min(step, tiles - first),
                   padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
         for (int source = 0; source < (c2 ? 2 : 1); source++)

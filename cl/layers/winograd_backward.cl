@@ -1,6 +1,5 @@
-// 3x3 convolution by Winograd's minimal filtering (winograd.h): the backward pass, of the weights and
-// the bias and of the input. One launch does both: a compute unit that has no part of the weights'
-// left begins with the input's tiles.
+// 3x3 convolution by Winograd's minimal filtering (winograd.h): the backward pass. One launch has the
+// gradients of weights and inputs: a compute unit without a part of those begins with these.
 //
 // With inputs V = B^T d B and gradients Z = A g A^T of a tile, the gradient of the transformed
 // weights is the sum of V o Z over all tiles: position by position a product of matrices (CI x
@@ -129,13 +128,12 @@ ALWAYS_INLINE void store_gradients(
     }
 }
 
-// One work-item per compute unit (work-groups of 1): takes one part of the weights' gradients after
-// the other, each of them ci_part x CO_PART channels and one of tile_parts stretches of tile_list:
-// walks those tiles in [x, x2] (without making it) and grad_out, and writes its part of the sums:
-// dL/dweight in rows (ky, kx, channel) of partial, dL/dbias in the last row. Then takes tiles of
-// grad_list, reads their neighbourhood in grad_out, and writes those tiles of grad_x and grad_x2,
-// which are the convolution of grad_out with the flipped weights. masked: 1 if x is the output of a
-// ReLU and grad_x the gradient of its input; plus 2 if x2 is.
+// One work-item per compute unit: takes parts of the weights' gradients, of ci_part x CO_PART
+// channels and one of tile_parts stretches of tile_list: walks those tiles in [x, x2] (without
+// making it) and grad_out, writes its part of the sums: dL/dweight in rows (ky, kx, channel) of
+// partial, dL/dbias in the last row. Then takes tiles of grad_list, reads their neighbourhood in
+// grad_out, writes those tiles of grad_x and grad_x2: the convolution of grad_out with the flipped
+// weights. masked: as in conv_backward.cl.
 kernel void winograd_backward(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
@@ -165,7 +163,7 @@ kernel void winograd_backward(
     global float16 *bias = sums + POSITIONS * ci_part * (CO_PART / 16);
     global float *patch = (global float *)(bias + CO_PART / 16);
     const int parts = weight_parts * tile_parts;
-    for (int part = take(scratch, SUM_WORK, 1); part < parts; part = take(scratch, SUM_WORK, 1)) {
+    for (int part; (part = take(scratch, SUM_WORK, 1)) < parts;) {
         const int tile_part = part / weight_parts, weight_part = part % weight_parts;
         const int c0 = weight_part / co_parts * ci_part, rows = min(ci_part, ci - c0);
         const int rows_of_x = clamp(c1 - c0, 0, rows);

@@ -64,15 +64,12 @@ def backward(
     order of the sums depends on the shapes alone, with other variants on the number of tiles too.
     Raises ValueError as forward().
     """
-    shape, (parts, rows) = conv.shape, _image_parts(conv.shape)
-    height, width = shape.size
+    shape, (height, width), parts = conv.shape, conv.shape.size, parts_of(conv.shape)
     # input channels of a work-item, whose sums, k for each, fit the registers
     most = conv.blocking.accumulators // shape.k
     group = next(n for n in (16, 8, 4, 2, 1) if n <= most and math.gcd(*shape.sources) % n == 0)
-    more = {"CI_GROUP": group}
-    program, size = _program(
-        conv, "layers/conv_backward", shape.sources, (tiles, grad_tiles), **more
-    )
+    file, maps = "layers/conv_backward", (tiles, grad_tiles)
+    program, size = _program(conv, file, shape.sources, maps, CI_GROUP=group)
     sums, others = shape.ci // group * shape.k * -(-shape.co // VECTOR) * parts, math.prod(size)
     program.launch(
         "conv_backward",
@@ -86,7 +83,7 @@ def backward(
         c2=sum(shape.sources[1:]),
         co=shape.co,
         masked=mask_bits(masks),
-        rows=rows,
+        rows=_rows(shape),
         x=sources[0],
         x2=sources[-1],
         flipped=conv.work,
@@ -102,13 +99,12 @@ def backward(
 
 def parts_of(shape: ConvShape) -> int:
     """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
-    return _image_parts(shape)[0]
+    return -(-shape.size[0] // _rows(shape))
 
 
-def _image_parts(shape: ConvShape) -> tuple[int, int]:
-    """(parts, rows of each) into which the sum over an image for the gradient of weights is cut."""
-    rows = max(ROWS_PER_PART, -(-shape.size[0] // most_parts(shape)))
-    return -(-shape.size[0] // rows), rows
+def _rows(shape):
+    """Of one part."""
+    return max(ROWS_PER_PART, -(-shape.size[0] // most_parts(shape)))
 
 
 def _program(

@@ -48,21 +48,10 @@ def avgpool2_backward(
     mask: what was pooled, where it is a ReLU's output, else None; grad_x: gradient of its other
     use; grad_out: (H, W, C).
     """
-    h, w, c = grad_out.shape
-    size, work_group = channel_ranges(dev, *grad_x.shape)
-    dev.program(RESAMPLE, LANES=lanes(dev)).launch(
-        "avgpool2_backward",
-        size,
-        work_group,
-        h=h,
-        w=w,
-        c=c,
-        masked=mask is not None,
-        x=grad_x if mask is None else mask,
-        grad_out=grad_out,
-        tile_count=(tiles or all_tiles(dev, *grad_x.shape[:2])).count,
-        grad_x=grad_x,
-    )
+    masking = {"masked": mask is not None, "x": grad_x if mask is None else mask}
+    arrays, of_items = {"grad_out": grad_out, "grad_x": grad_x}, grad_x.shape
+    shape = grad_out.shape
+    _launch(dev, RESAMPLE, "avgpool2_backward", shape, grad_x, tiles, of_items, **masking, **arrays)
 
 
 def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
@@ -90,12 +79,12 @@ def upsample2_backward(
     _launch(dev, RESAMPLE, "upsample2_backward", grad_x.shape, grad_x, tiles, **arrays)
 
 
-def _launch(dev, file, kernel, shape, result, tiles, **arguments):
+def _launch(dev, file, kernel, shape, result, tiles, of_items=None, **arguments):
     """Launch a kernel that computes `tiles` of the array `result`. shape: its h, w, c, those of the
-    smaller map.
+    smaller map. of_items: shape of the map that has the work-items, if it is another.
     """
     h, w, c = shape
-    size, work_group = channel_ranges(dev, h, w, c)
+    size, work_group = channel_ranges(dev, *(of_items or shape))
     count = (tiles or all_tiles(dev, *result.shape[:2])).count
     dev.program(file, LANES=lanes(dev)).launch(
         kernel, size, work_group, h=h, w=w, c=c, tile_count=count, **arguments
@@ -107,56 +96,31 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
     - the background's 1), if they are given: a residual connection past the network. For the
     gradient see Conv.is_halved and residual_backward().
     """
-    height, width, channels = (image if features is None else features).shape
-    dev.program("layers/output").launch(
-        "output_forward",
-        height * width,
-        n=height * width,
-        channels=channels,
-        residual=features is not None,
-        share=SHARE,
-        features=image if features is None else features,
-        image=image,
-    )
+    known = image if features is None else features
+    named = {"residual": features is not None, "share": SHARE, "features": known, "image": image}
+    _per_pixel(dev, "output_forward", known.shape, **named)
 
 
 def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
     """Add the gradient through the residual connection, of grad_image (H, W, 3), to grad_features
     (H, W, C).
     """
-    height, width, channels = grad_features.shape
-    dev.program("layers/output").launch(
-        "residual_backward",
-        height * width,
-        n=height * width,
-        channels=channels,
-        share=SHARE,
-        grad_image=grad_image,
-        grad_features=grad_features,
-    )
+    grads = {"grad_image": grad_image, "grad_features": grad_features}
+    _per_pixel(dev, "residual_backward", grad_features.shape, share=SHARE, **grads)
 
 
 def first_features_forward(dev: Device, features: Array, image: Array) -> None:
     """image (H, W, 3) = the first three of the features (H, W, C)."""
-    channels = features.shape[2]
-    dev.program("layers/output").launch(
-        "first_features_forward",
-        features.size // channels,
-        n=features.size // channels,
-        channels=channels,
-        features=features,
-        image=image,
-    )
+    _per_pixel(dev, "first_features_forward", features.shape, features=features, image=image)
 
 
 def first_features_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
     """Write grad_features (H, W, C), 0 beyond the first three, from grad_image (H, W, 3)."""
-    channels = grad_features.shape[2]
-    dev.program("layers/output").launch(
-        "first_features_backward",
-        grad_features.size // channels,
-        n=grad_features.size // channels,
-        channels=channels,
-        grad_image=grad_image,
-        grad_features=grad_features,
-    )
+    grads = {"grad_image": grad_image, "grad_features": grad_features}
+    _per_pixel(dev, "first_features_backward", grad_features.shape, **grads)
+
+
+def _per_pixel(dev, kernel, shape, **arguments):
+    """Launch a kernel of output.cl. shape: of the features."""
+    n = shape[0] * shape[1]
+    dev.program("layers/output").launch(kernel, n, n=n, channels=shape[2], **arguments)
