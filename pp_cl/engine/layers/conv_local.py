@@ -33,6 +33,8 @@ MOST_GROUPS = 512
 def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
     """See conv_direct."""
     shape = conv.shape
+    if conv.bias.size != -(-shape.co // VECTOR) * VECTOR:  # which the kernel takes in any length
+        raise ValueError(f"bias has shape {conv.bias.shape}, expected that of {shape.co} channels")
     _launch(conv, shape.sources, (shape.co,), sources, (out,), (out,), (False,), relu, tiles)
 
 
