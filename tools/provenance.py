@@ -22,15 +22,11 @@ KINDS = (".py", ".cl", ".h", ".npz", ".json")
 
 def digest(root: Path = ROOT) -> str:
     """Hex digest of what decides a training in a checkout."""
-    files = {
-        file.relative_to(root).as_posix(): file
-        for place in DECIDES
-        for file in _files(root / place)
-    }
+    files = [file for place in DECIDES for file in _files(root / place)]
     found = hashlib.sha256()
-    for name, file in sorted(files.items()):
-        if name.endswith(KINDS):
-            content = file.read_bytes()
+    for file in sorted(files, key=lambda one: one.relative_to(root).as_posix()):
+        if file.suffix in KINDS:
+            name, content = file.relative_to(root).as_posix(), file.read_bytes()
             found.update(f"{name} {len(content)} ".encode() + content)
     return found.hexdigest()[:16]
 

@@ -104,7 +104,6 @@ QUALITY = [
     {"head": "points", "cell": "{points:,}"},
     {"head": "ms a frame", "cell": "{frame_ms:.0f}"},
 ]
-FORWARD = ("project", "pairs", "weights", "shade", "blend")
 # by preset, the training whose last steps are timed; a paper's begins
 STEPS = {"tiny": "lego_8000", "full": "lego_15000", "paper": "lego_paper"}
 RASTERISER = [
@@ -112,19 +111,9 @@ RASTERISER = [
     {"head": "points", "cell": "{points:,}"},
     {"head": "side", "cell": "{size}"},
     {"head": "blend", "cell": "{blend}"},
-    *({"head": f"{stage}, ms", "cell": f"{{{stage}_ms:.1f}}"} for stage in FORWARD),
-    {"head": "forward", "cell": "{forward_ms:.1f}"},
-    {"head": "backward", "cell": "{backward_ms:.1f}"},
+    {"head": "forward, ms", "cell": "{forward_ms:.1f}"},
+    {"head": "backward, ms", "cell": "{backward_ms:.1f}"},
     {"head": "error", "cell": "{max_err:.1e}"},
-]
-NETWORK = [
-    {"head": "widths", "cell": "{widths}"},
-    {"head": "side", "cell": "{side}"},
-    {"head": "variant", "cell": "`{variant}`"},
-    {"head": "pass", "cell": "{direction}"},
-    {"head": "ms", "cell": "{ms:.1f}"},
-    {"head": "GFLOP/s", "cell": "{gflops:.0f}"},
-    {"head": "relative L2 error", "cell": "{rel_l2:.1e}"},
 ]
 PYTORCH = [
     {"head": "widths", "cell": "{widths}"},
@@ -221,23 +210,6 @@ def rasteriser(store: Path) -> list[dict]:
     ):
         words = ["--scene", scene, "--points", points, "--size", sizes]
         rows += read_found(store, *PP_CL, "bench", "raster", *words)["rows"]
-    return [by_stage(row) for row in rows]
-
-
-def by_stage(row: dict) -> dict:
-    """A row of the bench with the time of each stage; `blend` alone is the rule."""
-    return row | {f"{stage}_ms": row["stages_ms"].get(stage, 0) for stage in FORWARD}
-
-
-def network(store: Path) -> list[dict]:
-    """Rows of NETWORK: the paper's network, and that of the other presets."""
-    rows = []
-    for (widths, side), blocks in zip(NETWORKS, ("double", "single"), strict=True):
-        words = ["--widths", widths, "--size", side, "--blocks", blocks]
-        found = read_found(store, *PP_CL, "bench", "unet", *words)["rows"]
-        # auto is one of the others, and which are fast depends on the device
-        found = [row for row in found if row["variant"] in ("direct", "auto")]
-        rows += [row | {"widths": widths, "side": side} for row in found]
     return rows
 
 
@@ -296,7 +268,6 @@ PARTS: dict[str, Callable[[Path], Found]] = {
     **{key_of(training): partial(train, training) for training in TRAININGS},
     "demo": demo,
     "rasteriser": rasteriser,
-    "network": network,
     "pytorch": pytorch,
     "stages": stages,
     "memory": memory,
@@ -399,9 +370,6 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
         "means over the held-out views, 8-bit images composited on white; minutes of training alone"
     )
     blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
-    passes = (
-        "medians of interleaved runs; GFLOP/s count the multiplications of the direct convolution"
-    )
     rows = found | {"trainings": trained(found)}
     steps = ""
     if "stages" in found:
@@ -414,7 +382,6 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     parts = {
         "trainings": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
-        "network": (passes, NETWORK),
         "pytorch": ("ours and PyTorch's, medians of interleaved runs", PYTORCH),
         "stages": (f"medians of a step on lego ({steps})", STAGES),
         "memory": ("the most memory that a few steps take", MEMORY),
@@ -476,13 +443,6 @@ def plot_speed(axes: "Axes", timed: list[dict]) -> None:
     axes.minorticks_off()
 
 
-def videos(store: Path, folder: Path) -> None:
-    """Videos around the demo and around a real object, for README.md."""
-    for name, run in (("demo", "demo_1500"), ("video", "ethiopian_head_6000")):
-        look = ("--size", "320x320", "--seconds", 5, "--fps", 12, "--out", folder / f"{name}.webp")
-        run_program(*PP_CL, "render", store / run, *look)
-
-
 def main() -> int:
     """Measure what is missing, write the documents; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
@@ -507,7 +467,6 @@ def main() -> int:
             write_json(folder / f"{name}.json", about | contents)
     if is_whole and not options.kind:
         draw(trained(found), timed(found), ROOT / "docs")
-        videos(store, ROOT / "docs")
     return 0
 
 
