@@ -136,19 +136,22 @@ def _command(name: str) -> tuple[str, list[tuple[str, str]]]:
 
 
 def api() -> str:
-    """Every public name by module: its signature with types, in the modules of TOLD the first
-    sentence of its docstring, and the signatures of a class's public methods.
+    """The public names of each module: of those in TOLD with their signatures and the first
+    sentence of their docstrings, unless another module has named them before.
     """
     lines: list[str] = []
-    seen: dict[int, str] = {}  # {a class or function: the module that has named it before}
+    seen: set[int] = set()
     for name in PUBLIC:
         module = importlib.import_module(name)
+        names = public_names(module)
         lines += [f"## {name}", "", _first_sentence(module.__doc__), ""]
-        for one in public_names(module):
-            thing = getattr(module, one)
-            first = seen.setdefault(id(thing), name)
-            known = [f"- `{one}`: see {first}"]
-            lines += _described(one, thing, name in TOLD) if first == name else known
+        if name in TOLD:
+            for one in names:
+                thing = getattr(module, one)
+                lines += _described(one, thing) if id(thing) not in seen else [f"- `{one}`: above"]
+                seen.add(id(thing))
+        else:
+            lines += [", ".join(f"`{one}`" for one in names)]
         lines += [""]
     return "\n".join(lines).rstrip()
 
@@ -167,7 +170,7 @@ def _first_sentence(text: str | None) -> str:
     return re.split(r"(?<=\.)\s", paragraph)[0]
 
 
-def _described(name: str, thing: Any, is_told: bool) -> list[str]:
+def _described(name: str, thing: Any) -> list[str]:
     """The lines of a name: a constant, a type, a function, or a class with its public methods."""
     if not (inspect.isroutine(thing) or inspect.isclass(thing)):
         if isinstance(thing, (int, str)):
@@ -175,9 +178,7 @@ def _described(name: str, thing: Any, is_told: bool) -> list[str]:
         is_type = get_origin(thing) is not None
         value = re.sub(r"(collections\.abc|typing)\.", "", str(thing)) if is_type else ""
         return [f"- `{name} = {value}`" if is_type else f"- `{name}: {type(thing).__name__}`"]
-    lines = [f"- `{name}{_signature(thing)}`"]
-    if is_told:
-        lines[0] += f": {_first_sentence(thing.__doc__)}"
+    lines = [f"- `{name}{_signature(thing)}`: {_first_sentence(thing.__doc__)}"]
     members = _members(thing) if inspect.isclass(thing) else []
     return [*lines, "", *(f"        {one}" for one in members), ""] if members else lines
 
@@ -208,7 +209,8 @@ def _signature(thing: Any) -> str:
         (node,) = inits
     node.args.args = [one for one in node.args.args if one.arg not in ("self", "cls")]
     returned = f" -> {ast.unparse(node.returns)}" if node.returns else ""
-    return re.sub(r"'([A-Z]\w+)'", r"\1", f"({ast.unparse(node.args)}){returned}")
+    text = f"({ast.unparse(node.args)}){returned}".removesuffix(" -> None")
+    return re.sub(r"'([A-Z]\w+)'", r"\1", text)
 
 
 def _written(action: argparse.Action) -> str:
