@@ -104,8 +104,8 @@ QUALITY = [
     {"head": "points", "cell": "{points:,}"},
     {"head": "ms a frame", "cell": "{frame_ms:.0f}"},
 ]
-# by preset, the training whose last steps are timed; a paper's begins
-STEPS = {"tiny": "lego_8000", "full": "lego_15000", "paper": "lego_paper"}
+# by preset, the training whose last steps are timed
+STEPS = {"tiny": "lego_8000", "full": "lego_15000"}
 RASTERISER = [
     {"head": "scene", "cell": "{scene}"},
     {"head": "points", "cell": "{points:,}"},
@@ -228,7 +228,6 @@ def pytorch(store: Path) -> list[dict]:
 def stages(store: Path) -> dict[str, dict]:
     """{preset: what tools/stages.py says}."""
     words = {name: (scene_of(LEGO), "--out", store / run) for name, run in STEPS.items()}
-    words["paper"] += ("--preset", "paper")
     return {name: read_found(store, *TOOL, "tools.stages", *w) for name, w in words.items()}
 
 
