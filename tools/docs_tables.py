@@ -43,7 +43,7 @@ PUBLIC = (
     *(f"pp_cl.{name}" for name in ("commands", "commands.options", "commands.signals")),
     "pp_studio",
 )
-TOLD = ("pp_cl", "pp_cl.engine", "pp_studio")
+TOLD = ("pp_cl", "pp_studio")
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
 MARKER = re.compile(r"^<!-- (?:end )?table", re.MULTILINE)
 
