@@ -98,14 +98,14 @@ def settings() -> str:
     """Every setting: its value in the preset tiny and in those that differ, and its help, unless
     an option of its own has the same.
     """
-    rows = []
+    lines = []
     options = {key: f"`--{name.replace('_', '-')}`" for name, key in SHORT.items()}
     for key, _, item in every_setting(Config()):
         others = [f"{n}: {text_of(c[key])}" for n, c in PRESETS.items() if key in c]
-        value = "; ".join([text_of(item.default), *others])
-        meaning = options.get(key, item.metadata["help"].replace("|", "\\|"))
-        rows.append([f"`{key}`", value, meaning])
-    return "\n".join(markdown(["setting", "value", "meaning"], rows))
+        value = "; ".join(filter(None, [text_of(item.default), *others]))
+        meaning = options.get(key, item.metadata["help"])
+        lines += [f"- `{key}`{f' ({value})' if value else ''}: {meaning}"]
+    return "\n".join(lines)
 
 
 def commands() -> str:

@@ -85,6 +85,6 @@ def test_all_results_are_shown_once():
 
 
 def test_settings_and_commands_are_complete():
-    assert all(f"| `{key}` |" in TABLES["settings"] for key, _, _ in every_setting(Config()))
+    assert all(f"- `{key}`" in TABLES["settings"] for key, _, _ in every_setting(Config()))
     assert all(f"## pp-cl {name}\n" in TABLES["commands"] for name in COMMANDS)
     assert "- `--seed N`: " in TABLES["commands"]
