@@ -96,7 +96,6 @@ QUALITY = [
     {"head": "scene", "cell": "{name}"},
     {"head": "size", "cell": "{size}"},
     {"head": "preset, steps", "cell": "`{preset}`, {steps:,}"},
-    {"head": "test views", "cell": "{views}"},
     {"head": "minutes", "cell": "{minutes:.1f}"},
     {"head": "PSNR", "cell": "{psnr:.2f}"},
     {"head": "SSIM", "cell": "{ssim:.4f}"},
