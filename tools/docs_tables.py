@@ -118,7 +118,9 @@ def commands() -> str:
     common = [one for one, names in users.items() if len(names) > 1 and one[0].startswith("-")]
     lines = []
     for name, (what, arguments) in found.items():
-        others = ", ".join(f"`{a.split()[0].rstrip(',')}`" for a, text in arguments if (a, text) in common)
+        others = ", ".join(
+            f"`{a.split()[0].rstrip(',')}`" for a, text in arguments if (a, text) in common
+        )
         lines += [f"## pp-cl {name}", "", f"{what[0].upper()}{what[1:]}. Also: {others}.", ""]
         lines += [f"- `{a}`: {text}" for a, text in arguments if (a, text) not in common]
         lines += [""] * bool(lines[-1])

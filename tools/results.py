@@ -203,11 +203,12 @@ def train(training: Training, store: Path) -> dict:
 def rasteriser(store: Path) -> list[dict]:
     """Rows of RASTERISER."""
     rows = []
-    for scene, points, sizes in (
-        ("grid", "250000,4000000", "200,800"),
-        ("pulsar", "100000", "400,800"),
+    for scene, points, size in (
+        ("grid", 250000, 200),
+        ("grid", 4000000, 800),
+        ("pulsar", 100000, 800),
     ):
-        words = ["--scene", scene, "--points", points, "--size", sizes]
+        words = ["--scene", scene, "--points", points, "--size", size]
         rows += read_found(store, *PP_CL, "bench", "raster", *words)["rows"]
     return rows
 
