@@ -126,11 +126,7 @@ PYTORCH = [
 ]
 STAGES = [
     {"head": "stage", "cell": "{stage}"},
-    *(
-        {"head": head.format(preset), "cell": f"{{{key}_{preset}:.1f}}"}
-        for preset in STEPS
-        for head, key in (("{}, ms", "ms"), ("at least", "least"))
-    ),
+    *({"head": f"{preset}, ms", "cell": f"{{ms_{preset}:.1f}}"} for preset in STEPS),
 ]
 MEMORY = [
     {"head": "training", "cell": "{name}"},
@@ -236,9 +232,7 @@ def by_preset(found: dict) -> list[dict]:
     rows = {}
     for preset, steps in found.items():
         for row in steps["stages"]:
-            cells = {f"ms_{preset}": row["ms"]}
-            cells |= {f"least_{preset}": row["least_ms"]} if "least_ms" in row else {}
-            rows[row["stage"]] = rows.get(row["stage"], {"stage": row["stage"]}) | cells
+            rows.setdefault(row["stage"], {"stage": row["stage"]})[f"ms_{preset}"] = row["ms"]
     return list(rows.values())
 
 
@@ -374,8 +368,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     if "stages" in found:
         rows["stages"] = by_preset(found["stages"])
         steps = "; ".join(
-            f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['copy_gbs']:.1f} GB/s,"
-            f" {run['gflops']:.0f} GFLOP/s"
+            f"{preset}: {run['points']:,} points, {run['size']} pixels"
             for preset, run in found["stages"].items()
         )
     parts = {
