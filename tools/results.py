@@ -359,9 +359,7 @@ def timed(found: dict[str, Found]) -> list[dict]:
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
     """{name: contents} of the tables of which all was found, but for origin()."""
-    quality = (
-        "means over the held-out views, 8-bit images composited on white; minutes of training alone"
-    )
+    quality = "means over the held-out views; minutes of training alone"
     blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
     rows = found | {"trainings": trained(found)}
     steps = ""
@@ -374,7 +372,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     parts = {
         "trainings": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
-        "pytorch": ("ours and PyTorch's, medians of interleaved runs", PYTORCH),
+        "pytorch": ("ours, PyTorch's, PyTorch's time over ours: medians of interleaved runs", PYTORCH),
         "stages": (f"medians of a step on lego ({steps})", STAGES),
         "memory": ("the most memory that a few steps take", MEMORY),
         "demo": ("runs of the demo", DEMO),
