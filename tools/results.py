@@ -372,7 +372,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     parts = {
         "trainings": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
-        "pytorch": ("ours, PyTorch's, PyTorch's time over ours: medians of interleaved runs", PYTORCH),
+        "pytorch": ("ours, PyTorch's, theirs over ours; medians of interleaved runs", PYTORCH),
         "stages": (f"medians of a step on lego ({steps})", STAGES),
         "memory": ("the most memory that a few steps take", MEMORY),
         "demo": ("runs of the demo", DEMO),
