@@ -179,7 +179,7 @@ kernel void blend_backward(
     const uint s,                            // visible points
     const float voxel_size,                  // of the grid, world units
     const float radius,                      // of a point without offsets, world units
-    global const uint *visible,              // (S) their indices
+    global const uint *visible,              // (?) their indices, S
     global const float *camera,              // (21) camera.h, read with MOVES, as the next five
     global const float4 *point_camera,       // (N, 4) x, y, z, distance
     global const float *point_shape,         // (N, SHAPE) footprint.h

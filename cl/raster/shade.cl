@@ -13,7 +13,7 @@
 // features.
 kernel void shade_forward(
     const uint s,                       // visible points
-    global const uint *visible,         // (S) their indices
+    global const uint *visible,         // (?) their indices, S
     global const float *camera,         // (21) camera.h
     global const float4 *point_camera,  // (N, 4) x, y, z, distance
     global const float16 *sh_0,         // (N, 1, 16)

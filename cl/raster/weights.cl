@@ -6,7 +6,7 @@
 // do not drop.
 kernel void clear_pairs(
     const uint s,                     // visible points
-    global const uint *visible,       // (S) their indices
+    global const uint *visible,       // (?) their indices, S
     global const uint *point_offset,  // (N+1)
     global float2 *pair_gradient)     // (P, 2)
 {

@@ -63,7 +63,7 @@ kernel void rmsprop_move(
     const float rate_offset,
     const float rate_opacity,
     const float rate_lobe,       // of the opacity's harmonics of degree 1; half of it of degree 2
-    global const uint *visible,  // (S) their indices
+    global const uint *visible,  // (?) their indices, S
     global const float *camera,  // (21) camera.h
     global const float4 *point_camera,            // (N, 4) x, y, z, distance
     global const float16 *grad_visible_features,  // (?, 16) G, a row for each visible point

@@ -199,12 +199,14 @@ class Renderer:
         if until == "weights":
             return result
         with dev.stage("shade"):
-            visible = weights.visible
+            visible, count = weights.visible_rows, weights.total.get()
             capacity = self._visible_capacity[by_pair] = grown(
-                self._visible_capacity[by_pair], visible.size
+                self._visible_capacity[by_pair], count
             )
             b.require({"visible_features": ((min(capacity, cloud.count), 16), np.float32)})
-            shade_forward(dev, points, visible, cloud.sh, visible_features=b.visible_features)
+            shade_forward(
+                dev, points, visible, count, cloud.sh, visible_features=b.visible_features
+            )
         with dev.stage("blend"):
             blend_forward(dev, pairs, weights, b.visible_features, b.features)
         result.visible_features, result.features = b.visible_features, b.features
@@ -245,7 +247,7 @@ class Renderer:
             tile_mask = None
             if self.model.net.is_planned(size):
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
-            (tile_mask or weights.visible_list).get()  # the host's one wait for the device
+            (tile_mask or weights.total).get()  # the host's one wait for the device
             self._capacity[by_pair] = capacity_needed(pairs)
             if self._capacity[by_pair] == pairs.capacity:
                 return pairs, weights, tile_mask

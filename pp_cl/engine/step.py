@@ -134,7 +134,8 @@ class Trainer:
                 rates,
                 gradients,
                 points=rendered.points,
-                visible=rendered.weights.visible,
+                visible=rendered.weights.visible_rows,
+                count=rendered.weights.total.get(),
                 sh_eps=train.sh_eps / target.size,
             )
         with self.dev.stage("max weights"):

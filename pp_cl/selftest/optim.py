@@ -89,6 +89,7 @@ class Cloud:
             rows["offset"] if rates.offset else None,
             points=self._points,
             visible=self.dev.upload(visible, np.uint32),
+            count=len(visible),
             cloud=self.cloud,
             state=self.state,
             sh_eps=EPSILONS["sh"],

@@ -200,6 +200,7 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
                 dev,
                 points,
                 dev.upload(seen, np.uint32),
+                len(seen),
                 [dev.upload(block) for block in sh],
                 visible_features=features,
             )

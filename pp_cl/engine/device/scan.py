@@ -63,8 +63,3 @@ def nonzero(dev: Device, flags: Array, indices: Array, places: Array, found: Arr
         places=places,
         found=found,
     )
-
-
-def read_front(dev: Device, indices: Array, found: Array) -> Pending[Array]:
-    """(S,) uint32 on the device: what nonzero() wrote to `indices`."""
-    return read_later(dev, found, convert=lambda total: indices[: int(total[0])])

@@ -24,21 +24,22 @@ def shade_forward(
     dev: Device,
     points: ProjectedPoints,
     visible: Array,
+    count: int,
     sh: list[Array],
     *,
     visible_features: Array,
 ) -> None:
     """Write visible_features, (S, 16) float32 or longer, of Gaussians at least 0.
 
-    The direction of a point is normalize(point - eye) in world axes. visible: (S,) uint32, the
-    visible points. sh: of PointCloud.
+    The direction of a point is normalize(point - eye) in world axes. visible: uint32, the visible
+    points, S = count of them. sh: of PointCloud.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
     macros = footprint_macros(points.footprint)
     dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh), **macros).launch(
         "shade_forward",
-        visible.size * row_parts(dev),
-        s=visible.size,
+        count * row_parts(dev),
+        s=count,
         visible=visible,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
@@ -133,7 +134,7 @@ def blend_backward(
         raise ValueError(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )
-    visible = weights.visible
+    count = weights.total.get()
     rows = len(visible_features), pairs.pixels, pairs.capacity
     b.require(blend_backward_table(*rows, weights.blend, points.footprint))
     clear_pairs(dev, pairs, weights, b.pair_gradient)
@@ -172,11 +173,11 @@ def blend_backward(
         )
     program.launch(
         "blend_backward",
-        visible.size * row_parts(dev, ON_GPU),
-        s=visible.size,
+        count * row_parts(dev, ON_GPU),
+        s=count,
         voxel_size=voxel_size,
         radius=points.radius,
-        visible=visible,
+        visible=weights.visible_rows,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         point_shape=points.point_shape,

@@ -13,7 +13,7 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes
-from pp_cl.engine.device.scan import nonzero, read_front
+from pp_cl.engine.device.scan import nonzero, read_total
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import footprint_macros
 
@@ -33,8 +33,8 @@ class BlendWeights:
     (cl/raster/blend.cl); None without derivatives. point_is_visible: (N,) uint8, 1 for visible
     points. point_slot: (N,) uint32, where a visible point stands in `visible`, undefined for
     others. transmittance: (HW,) float32 behind all fragments, None with the softmax. visible_rows:
-    (N,) uint32, `visible` at its front; visible_count: (1,) uint32, how many; visible_list:
-    `visible`, of read_visible().
+    (N,) uint32, `visible` at its front; found: (1,) uint32, how many; total: the same, of
+    read_visible().
     """
 
     blend: str
@@ -45,19 +45,19 @@ class BlendWeights:
     point_slot: Array
     transmittance: Array | None
     visible_rows: Array
-    visible_count: Array
-    visible_list: Any = None
+    found: Array
+    total: Any = None
 
     def read_visible(self, dev: Device) -> None:
         """Enqueue the download of the number of visible points."""
-        self.visible_list = read_front(dev, self.visible_rows, self.visible_count)
+        self.total = read_total(dev, self.found)
 
     @property
     def visible(self) -> Array:
         """(S,) uint32, ascending: the visible points, those with a fragment that is not dropped.
         Only they are shaded and get gradients. Waits until their number is known.
         """
-        return self.visible_list.get()
+        return self.visible_rows[: self.total.get()]
 
 
 def weights_table(n: int, pixels: int, derivatives: int) -> Table:
@@ -152,12 +152,12 @@ def listed_fragments(
 
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
     """Set (P, 2) float32 to 0 at the pairs of visible points."""
-    visible = weights.visible
+    count = weights.total.get()
     dev.program("raster/weights").launch(
         "clear_pairs",
-        visible.size,
-        s=visible.size,
-        visible=visible,
+        count,
+        s=count,
+        visible=weights.visible_rows,
         point_offset=pairs.point_offset,
         pair_gradient=pair_gradient,
     )

@@ -131,7 +131,8 @@ class Loss:
         weight, further, (v, ph) = self.ssim_weight, self._further, self._rows
 
         def by_name(rows: np.ndarray) -> dict[str, float]:
-            sums = [part.sum(0, dtype=np.float64) for part in np.split(rows, (v, v + ph))]
+            parts = rows[:v], rows[v : v + ph], rows[v + ph :]
+            sums = [part.sum(0, dtype=np.float64) for part in parts]
             dissimilarity, (smooth, l1, mse, mask) = sums[0][0], sums[1]
             found = {"mask": mask, "distortion": sums[2][0]}
             more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}

@@ -60,13 +60,14 @@ class Optimiser:
         *,
         points: ProjectedPoints,
         visible: Array,
+        count: int,
         sh_eps: float,
     ) -> None:
         """One step by the gradients of the visible points, and by those of the network, which lie
         in model.net.gradients.
 
-        step: from 1. points: as projected into the rendered view. visible: (S) uint32, the visible
-        ones. sh_eps: eps of the SH coefficients.
+        step: from 1. points: as projected into the rendered view. visible: uint32, the visible
+        ones, S = count of them. sh_eps: eps of the SH coefficients.
         """
         net = self.model.net
         rmsprop_update(
@@ -78,6 +79,7 @@ class Optimiser:
             gradients.offset,
             points=points,
             visible=visible,
+            count=count,
             cloud=self.model.cloud,
             state=self.state,
             sh_eps=sh_eps,
@@ -205,6 +207,7 @@ def rmsprop_update(
     *,
     points: ProjectedPoints,
     visible: Array,
+    count: int,
     cloud: PointCloud,
     state: PointState,
     sh_eps: float,
@@ -214,7 +217,7 @@ def rmsprop_update(
     stay. The gradient of a SH coefficient is the product of its harmonic in the direction from the
     eye to the point and the gradient of the point's feature; it is never formed.
 
-    step: from 1 on. points, visible and sh_eps: as Optimiser.update() takes them.
+    step: from 1 on. points, visible, count and sh_eps: as Optimiser.update() takes them.
     """
     degree = max((d for d in range(stored_degree(cloud.sh) + 1) if rates.sh[d] > 0), default=0)
     root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(cloud.sh)
@@ -233,9 +236,9 @@ def rmsprop_update(
     fits = program.kernels["rmsprop_move"].largest_group >= parts
     program.launch(
         "rmsprop_move",
-        len(visible) * parts,
+        count * parts,
         None if fits else parts,  # is refused: the parts of a point wait for each other
-        s=len(visible),
+        s=count,
         step=step,
         eps=root * sh_eps,
         rate_0=root * rates.sh[0],
