@@ -136,10 +136,8 @@ static inline int2 listed_corner(global const int *tile_list, const int i) {
 // of two kinds, and how many work-items found nothing more to take. Which work-item takes what
 // changes no result: a compute unit that is late or slow takes less.
 #define COUNTERS 1
-#define TILE_WORK 0
-#define SUM_WORK 1
 
-// The first of the next n pieces of work of a kind.
+// The first of the next n pieces of work of a kind, 0: tiles, or 1: parts of sums.
 static inline int take(global float16 *scratch, const int kind, const int n) {
     return atomic_add((volatile global int *)scratch + kind, n);
 }
@@ -334,7 +332,7 @@ ALWAYS_INLINE void convolve(
     const int share = (tiles + get_global_size(0) - 1) / get_global_size(0);
     const int rounds = (share + TILES - 1) / TILES;  // of about the same size
     const int step = ((share + rounds - 1) / rounds + TOGETHER - 1) / TOGETHER * TOGETHER;
-    for (int first; (first = take(scratch, TILE_WORK, step)) < tiles;) {
+    for (int first; (first = take(scratch, 0, step)) < tiles;) {
         const int count = min(step, tiles - first),
                   padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
         for (int source = 0; source < (c2 ? 2 : 1); source++)

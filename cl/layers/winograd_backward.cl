@@ -163,7 +163,7 @@ kernel void winograd_backward(
     global float16 *bias = sums + POSITIONS * ci_part * (CO_PART / 16);
     global float *patch = (global float *)(bias + CO_PART / 16);
     const int parts = weight_parts * tile_parts;
-    for (int part; (part = take(scratch, SUM_WORK, 1)) < parts;) {
+    for (int part; (part = take(scratch, 1, 1)) < parts;) {
         const int tile_part = part / weight_parts, weight_part = part % weight_parts;
         const int c0 = weight_part / co_parts * ci_part, rows = min(ci_part, ci - c0);
         const int rows_of_x = clamp(c1 - c0, 0, rows);
