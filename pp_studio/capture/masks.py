@@ -17,7 +17,7 @@ from skimage.segmentation import find_boundaries
 from pp_cl import track
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, few_names, shown
-from pp_cl.files import contact_sheet, read_mask, read_rgba, write_png
+from pp_cl.files import atomic_folder, contact_sheet, read_mask, read_rgba, write_png
 from pp_cl.scene import (
     ImageFile,
     MaskRule,
@@ -31,14 +31,16 @@ from pp_studio.capture.cut import (
     FORGIVEN,
     GROWTHS,
     cut_out_all,
+    dilated,
     forgiving_hull,
     gap_of,
     grown_box,
+    place_of,
     silhouette,
     whole_mask,
+    window,
 )
 from pp_studio.capture.packages import needed
-from pp_studio.capture.window import dilated, place_of, window
 
 cv2 = needed("cv2")
 
@@ -107,12 +109,23 @@ def write_masks(
         reading = track(in_view, "reading images", "image")
         windows = [_window(scene, one, box) for one in reading]
         of_object = [points[some[inside[some]]] for some in seen]
-        how |= _uniform(scene, in_view, windows, box, of_object)
-        if _without_mask(scene, in_view):
-            box, found = _cut(scene, in_view, windows, box, points, inside, seen, turns, grows)
-            how |= found
+        how["before a uniform background"] = _uniform(scene, in_view, windows, box, of_object)
+        if left := _without_mask(scene, in_view):
+            how["cut out"] = len(left)
+            for growth in range(1 + GROWTHS):
+                cut_out_all(windows, box, points, inside, seen, turns)
+                larger = grown_box(windows, box) if grows and growth < GROWTHS else None
+                if larger is None:
+                    break
+                box = larger
+                windows = [_window(scene, one, box) for one in in_view]
+            cut = {one.name: window for one, window in zip(in_view, windows, strict=True)}
+            for one in track(left, "masks", "image"):
+                mask = whole_mask(cut[one.name], read_rgba(scene / one.name)[..., :3])
+                write_png(mask_file(scene, one.name), mask)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
-    wrong = _contradicting(scene, image_files, box)
+    views = [_reduced(scene, one, CHECKED_SIDE)[0] for one in image_files]
+    wrong = {one.view.name: one.share for one in disagreements(views, box)}
     if wrong:
         shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
         counts += f"; {len(wrong)} contradict the others: {few_names(shares)}"
@@ -194,14 +207,20 @@ def _window(scene, image_file, box):
 
 def _uniform(scene, image_files, windows, box, points):
     """Write the masks of photographs before a uniform background, where nearly all of those without
-    a mask are. points: (M, 3) of the object that each shows. Returns {what: how many}.
+    a mask are; returns their number. points: (M, 3) of the object that each shows, most of which
+    stand out from the background.
     """
     left = [i for i, one in enumerate(windows) if one.mask is None]
     with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
-    found = {i: _before_uniform(windows[i], points[i], with_holes) for i in left}
-    found = {i: mask for i, mask in found.items() if mask is not None}
+    found = {}
+    for i in left:
+        mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
+        if mask is not None:
+            mask, (_, rows, columns) = mask > 127, windows[i].inside(points[i])
+            held = mask[rows, columns].mean() if len(rows) else mask.any()
+            found |= {i: mask} if held >= ON_MASK else {}
     if len(found) < UNIFORM * len(left):
-        return {}
+        return 0
     for i, mask in found.items():
         windows[i].mask = mask
     spots = _spots(windows, found, box) if with_holes and found else {}
@@ -216,7 +235,7 @@ def _uniform(scene, image_files, windows, box, points):
             mask[y0:y1, x0:x1][closed] = 255
         write_png(mask_file(scene, name), mask)
         one.mask = one.reduced(mask) > 127
-    return {"before a uniform background": sum(windows[i].mask is not None for i in found)}
+    return sum(windows[i].mask is not None for i in found)
 
 
 def _spots(windows, numbers, box):
@@ -251,46 +270,27 @@ def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.n
     return cv2.resize(mask, (width, height)) if (border < 128).mean() >= UNIFORM else None
 
 
-def inside(file: Path, is_turntable: bool) -> np.ndarray | None:
-    """(H, W) uint8: where a photograph shows the object by its alpha, which may hide a wall, or on
-    a turntable by its uniform background; None where neither tells.
+def write_inside(frames: Path, names: Sequence[str], folder: Path, is_turntable: bool) -> None:
+    """Write to the new folder NAME.png, 8-bit gray, of each photograph, white where it shows the
+    object by its alpha, which may hide a wall, or on a turntable by its uniform background; of a
+    turntable none where one of them is not uniform.
     """
-    if file.name.lower().endswith(OPAQUE) and not is_turntable:
-        return None
-    image = read_rgba(file)
-    if (image[..., 3] < 255).any():
-        return np.where(image[..., 3] > 127, np.uint8(255), np.uint8(0))
-    return uniform_mask(image, file.name) if is_turntable else None
-
-
-def _before_uniform(window, points, with_holes):
-    """(H, W) bool: the mask of a window whose background is uniform, and from which all points
-    (M, 3) of the object stand out; else None.
-    """
-    mask = uniform_mask(window.image, window.name, with_holes)
-    if mask is None:
-        return None
-    mask = mask > 127
-    _, rows, columns = window.inside(points)
-    held = mask[rows, columns].mean() if len(rows) else mask.any()
-    return mask if held >= ON_MASK else None
-
-
-def _cut(scene, image_files, windows, box, points, inside, seen, turns, grows):
-    """Cut out what has no mask, and write it. Returns the box, and {what: how many}."""
-    left = [i for i, one in enumerate(windows) if one.mask is None]
-    for growth in range(1 + GROWTHS):
-        cut_out_all(windows, box, points, inside, seen, turns)
-        larger = grown_box(windows, box) if grows and growth < GROWTHS else None
-        if larger is None:
-            break
-        box = larger
-        windows = [_window(scene, one, box) for one in image_files]
-    for i in track(left, "masks", "image"):
-        name = image_files[i].name
-        mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
-        write_png(mask_file(scene, name), mask)
-    return box, {"cut out": len(left)}
+    with atomic_folder(folder) as unfinished:
+        for name in names:
+            if name.lower().endswith(OPAQUE) and not is_turntable:
+                continue
+            image = read_rgba(frames / name)
+            alpha, mask = image[..., 3], None
+            if (alpha < 255).any():
+                mask = np.where(alpha > 127, np.uint8(255), np.uint8(0))
+            elif is_turntable:
+                mask = uniform_mask(image, name)
+            if mask is not None:
+                write_png(unfinished / f"{name}.png", mask)
+            elif is_turntable:
+                for file in unfinished.iterdir():
+                    file.unlink()
+                return
 
 
 def outline_sheet(
@@ -304,22 +304,17 @@ def outline_sheet(
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
     for one in chosen:
-        whole, mask = read_rgba(scene / one.name), _written_mask(scene, one)
-        factor = fitting_downscale(mask.shape, SHOWN_SIZE)
-        image = shrink(whole, factor)[..., :3]
-        held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
+        view, factor = _reduced(scene, one, SHOWN_SIZE)
+        image, held = shrink(read_rgba(scene / one.name), factor)[..., :3], view.image[..., 3] > 127
         image[~held] //= 2
         image[find_boundaries(held, mode="thick")] = OUTLINE
         images.append(image)
     return contact_sheet(images, [Path(one.name).name for one in chosen])
 
 
-def _contradicting(scene, image_files, box):
-    """{name: share of the object that its mask alone rejects} of those that contradict others."""
-    views = []
-    for one in image_files:
-        mask = _written_mask(scene, one)
-        factor = fitting_downscale(mask.shape, CHECKED_SIDE)
-        image = shrink(np.dstack([mask] * 4), factor)
-        views.append(View(one.name, one.camera.downscaled(factor), image))
-    return {one.view.name: one.share for one in disagreements(views, box)}
+def _reduced(scene, one, side):
+    """(a View of a photograph's mask, whose longer side is about this; by which factor)."""
+    mask = _written_mask(scene, one)
+    factor = fitting_downscale(mask.shape, side)
+    image = shrink(np.dstack([mask] * 4), factor)
+    return View(one.name, one.camera.downscaled(factor), image), factor

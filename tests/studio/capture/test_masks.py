@@ -26,9 +26,9 @@ from tools.capture_demo import ROOM, cameras, room
 
 pytest.importorskip("cv2")
 
-from pp_studio.capture import backdrop, cut
+from pp_studio.capture import cut
+from pp_studio.capture.cut import Window, window
 from pp_studio.capture.masks import mask_file, outline_sheet, program_words, write_masks
-from pp_studio.capture.window import Window, window
 
 SIZE, VIEWS = 96, 12
 SCREEN = (20, 200, 60)
@@ -182,11 +182,11 @@ def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
         windows[-1].mask = masks[-1][0]
     beside = [~binary_dilation(mask, iterations=3) for mask, _ in masks]
     for found, (mask, same), out in zip(
-        backdrop.differences(windows, capture.points, beside), masks, beside, strict=True
+        cut.differences(windows, capture.points, beside), masks, beside, strict=True
     ):
-        assert (found[out] <= backdrop.SLIGHT).all()
+        assert (found[out] <= cut.SLIGHT).all()
         assert (found[mask & ~binary_dilation(same, iterations=2)] > 50).all()
-        assert (found[binary_erosion(same, iterations=2)] == backdrop.UNSEEN).all()
+        assert (found[binary_erosion(same, iterations=2)] == cut.UNSEEN).all()
 
 
 def share_held(capture, place, wanted):
