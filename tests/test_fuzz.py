@@ -54,7 +54,7 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
 from pp_cl.settings import Config, every_setting
 from pp_studio.sweep.plan import Job
-from pp_studio.sweep.result import finished_row
+from pp_studio.sweep.table import finished_row
 
 MOST_MEMORY = 2**26  # bytes of pixels that a small file may unfold to without a word
 KEYS = [key for key, _, _ in every_setting(Config())]

@@ -196,9 +196,9 @@ def _frame_count(options, kind):
                 " leave it out"
             )
         return 0
-    count = round((seconds or SECONDS) * fps)
+    seconds = seconds or SECONDS
+    count = round(seconds * fps)
     if not 1 <= count <= MOST_FRAMES:
-        seconds = seconds or SECONDS
         raise UserError(
             f"--seconds {seconds:g}: {seconds * fps:g} frames at {fps:g} a second; ask for 1 to"
             f" {MOST_FRAMES}"
@@ -209,7 +209,7 @@ def _frame_count(options, kind):
 def _cameras(run, path, count, *, size, fov):
     """The cameras of a path, `count` of an orbit or spiral, with size and angle of view."""
     from pp_cl.scene import read_cameras
-    from pp_studio.camera_path import Surroundings
+    from pp_studio.camera_path import around
 
     def shaped(camera):
         camera = camera.resized(*size) if size else camera
@@ -220,9 +220,8 @@ def _cameras(run, path, count, *, size, fov):
     if path not in MADE:
         return [shaped(camera) for camera in run.cameras(path)]
     training = run.cameras("train")
-    around, first = Surroundings(training, run.model.positions()), shaped(training[0])
+    first = shaped(training[0])
     if not size and first.height < LEAST_HEIGHT:
         width = 2 * round(first.width / first.height * LEAST_HEIGHT / 2)
         first = first.resized(width, LEAST_HEIGHT)
-    make = around.orbit if path == "orbit" else around.spiral
-    return make(first, count)
+    return around(path, training, run.model.positions(), first, count)

@@ -69,8 +69,15 @@ def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
     from pp_cl import RunFolder
     from pp_cl.files import own
-    from pp_studio.sweep.result import failed_row, finished_row
-    from pp_studio.sweep.table import TABLES, markdown, run_text, values_text, write_tables
+    from pp_studio.sweep.table import (
+        TABLES,
+        failed_row,
+        finished_row,
+        markdown,
+        run_text,
+        values_text,
+        write_tables,
+    )
 
     jobs, out = _jobs(options), Path(options.out)
     rows, states = {}, {}

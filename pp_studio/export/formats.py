@@ -15,7 +15,7 @@ from pp_cl.engine import View
 from pp_cl.errors import UserError, require
 from pp_cl.files import check_file, check_new_folder, check_ours, image_paths, own, write_text
 from pp_cl.scene import write_scene
-from pp_studio.export import AXES_OF, FORMATS, QUICK, VIEWER
+from pp_studio.export import AXES_OF, FORMATS, QUICK, SPLATS, VIEWER
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.length import metres_per_unit
 from pp_studio.export.mesh import coloured_mesh, write_mesh
@@ -105,23 +105,24 @@ def export_run(
         splits = renderings(run)
         write_scene(splits, path)
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
-    if name in ("splat", "splat-spz", "splat-glb"):
+    if name in SPLATS:
         if name == "splat-spz":
             require("splat-spz", "gsply")
         table, origin = splats(run, turn, quality, within)
-        table["position"] *= metres
-        table["deviations"] *= metres
+        for field in ("position", "deviations"):
+            table[field] *= metres
         _begin_default(name, path)
+        if name == "splat-glb":
+            write_splat_glb(path, table, metres * origin)
+            return f"{len(table)} Gaussians{unit}"
         if name == "splat":
             write_splat_ply(path, table)
-        elif name == "splat-spz":
+        else:
             table, times = in_spz(table)
             write_splat_spz(path, table)
             unit += "" if times == 1 else f", times {times:g}"
-        else:
-            write_splat_glb(path, table, metres * origin)
         moved = f", less {', '.join(f'{x:g}' for x in metres * origin)}" if origin.any() else ""
-        return f"{len(table)} Gaussians{unit}{moved if name != 'splat-glb' else ''}"
+        return f"{len(table)} Gaussians{unit}{moved}"
     points = coloured_points(run, min_weight, within)
     points = replace(
         points, positions=placed(points.positions), radius=np.float32(metres) * points.radius
@@ -152,11 +153,9 @@ def renderings(run: Run) -> dict[str, list[View]]:
         splits["test"] = run.image_files("test")
     except UserError as error:
         warnings.warn(f"no test views are exported: {error}", stacklevel=2)
-    return {split: _rendered(run, split, listed) for split, listed in splits.items()}
-
-
-def _rendered(run, split, listed):
-    """The views of a split, named after their files in its folder."""
-    files = image_paths([one.name for one in listed])
-    views = run.rendered(listed, opaque=False)
-    return [replace(v, name=f"{split}/{file}") for v, file in zip(views, files, strict=True)]
+    found = {}
+    for split, listed in splits.items():
+        files, views = image_paths([one.name for one in listed]), run.rendered(listed, opaque=False)
+        named = zip(views, files, strict=True)
+        found[split] = [replace(view, name=f"{split}/{file}") for view, file in named]
+    return found

@@ -1,9 +1,8 @@
 """Gaussians of three axes fitted to a run's images, and where these are few to its renderings
 of as many views between them, as viewers of 3D Gaussian splatting draw them: without a network,
 each widened by a third of a pixel^2, and colours below 0 taken for black. A step draws them for a
-window of another size, so that they look the same in all of them.
-
-The trainer does it, with the footprint "gaussian" and means of features in place of the network.
+window of another size. It is the trainer's, with the footprint "gaussian" and means of features in
+place of the network.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ import math
 import time
 import warnings
 import zipfile
+from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -154,26 +153,31 @@ def fitted_gaussians(
     check_drawable does.
     """
     check_drawable(run)
-    path, origin = run.folder.path / FILE, run.model.grid.centre
-    key = _key(run, quality)
-    table = _kept(path, key)
-    if table is None:
-        table = _table(run, *fit_gaussians(run, *QUALITIES[quality], minutes))
-        try:
-            with atomic_file(path) as file:
-                np.savez(file, key=np.array(key), gaussians=table)
-        except UserError as error:
-            warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
-    return table, origin
+    if found := kept_gaussians(run, [quality]):
+        return found
+    table = _table(run, *fit_gaussians(run, *QUALITIES[quality], minutes))
+    try:
+        with atomic_file(run.folder.path / FILE) as file:
+            np.savez(file, key=np.array(_key(run, quality)), gaussians=table)
+    except UserError as error:
+        warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
+    return table, run.model.grid.centre
 
 
-def kept_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray] | None:
-    """What fitted_gaussians() has kept for the run's checkpoint, of the last quality that was
-    asked for; None where there is nothing.
+def kept_gaussians(
+    run: Run, qualities: Iterable[str] = tuple(QUALITIES)
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """What fitted_gaussians() has kept for the run's checkpoint, if that is of one of these
+    qualities and not damaged, else None.
     """
-    found = (_kept(run.folder.path / FILE, _key(run, quality)) for quality in QUALITIES)
-    table = next((one for one in found if one is not None), None)
-    return None if table is None else (table, run.model.grid.centre)
+    try:
+        with np.load(run.folder.path / FILE) as stored:
+            key = str(stored["key"])
+            is_kept = any(key == _key(run, quality) for quality in qualities)
+            table = stored["gaussians"] if is_kept else np.empty(0)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return (table, run.model.grid.centre) if table.dtype == GAUSSIAN else None
 
 
 def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -192,16 +196,6 @@ def _key(run, quality):
     for array in (cloud.ids, cloud.offset, cloud.opacity):
         digest.update(array.get().tobytes())
     return json.dumps([digest.hexdigest(), run.header["step"], *QUALITIES[quality]])
-
-
-def _kept(path: Path, key: str) -> np.ndarray | None:
-    """The Gaussians of a file that has this key, None where there is none or it is damaged."""
-    try:
-        with np.load(path) as stored:
-            table = stored["gaussians"] if str(stored["key"]) == key else None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-    return table if table is not None and table.dtype == GAUSSIAN else None
 
 
 def _table(run, cloud, deviation):

@@ -42,8 +42,7 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
     how many a unit of the scene is; all exports of coordinates are in metres from then on. first,
     second: PHOTO:X,Y, as `surface_point`. Raises UserError for two points at one place.
     """
-    points = [surface_point(run, text) for text in (first, second)]
-    apart = float(np.linalg.norm(points[0] - points[1]))
+    apart = float(np.linalg.norm(surface_point(run, first) - surface_point(run, second)))
     if apart < run.model.grid.voxel_size:
         raise UserError(f"--length {first} {second}: show the same place; name two far apart")
     found = float(metres) / apart
@@ -85,32 +84,25 @@ def surface_point(run: Run, text: str) -> np.ndarray:
         raise UserError(
             f"--length {shown(text)}: write PHOTO:X,Y, for example a.jpg:812,430"
         ) from None
-    image_files = run.image_files("train")
+    refused, image_files = f"--length {shown(text)}: ", run.image_files("train")
     matches = [one for one in image_files if one.name == name or one.name.endswith(f"/{name}")]
-    if len(matches) != 1:
+    if len(matches) > 1:
+        raise UserError(f"{refused}{name} is in several folders; write more of its path")
+    if not matches:
         names = [one.name for one in image_files]
         near = suggestion(name, names).strip() or f"name one such as {names[0]}"
-        raise UserError(
-            f"--length {shown(text)}: "
-            + (
-                f"{name} is in several folders; write more of its path"
-                if matches
-                else f"no training image of that name; {near}"
-            )
-        )
+        raise UserError(f"{refused}no training image of that name; {near}")
     stored = matches[0].camera
     if not (x < stored.width and y < stored.height):
-        raise UserError(
-            f"--length {shown(text)}: the image has {stored.width}x{stored.height} pixels"
-        )
+        raise UserError(f"{refused}the image has {stored.width}x{stored.height} pixels")
     x, y = _straight(run, matches[0], x, y)
     if not (0 <= x < stored.width and 0 <= y < stored.height):
-        raise UserError(f"--length {shown(text)}: lies beyond what is left of the image")
+        raise UserError(f"{refused}lies beyond what is left of the image")
     camera = stored.downscaled(run.config.scene.downscale)
     rendered = run.render(camera)
     column = min(int(x * camera.fx / stored.fx), camera.width - 1)
     row = min(int(y * camera.fy / stored.fy), camera.height - 1)
     if not rendered.alpha[row, column] > OPAQUE:
-        raise UserError(f"--length {shown(text)}: the model shows no object there")
+        raise UserError(f"{refused}the model shows no object there")
     along = np.array([(x - stored.cx) / stored.fx, (y - stored.cy) / stored.fy, 1.0])
     return stored.eye + rendered.median_depth[row, column] * stored.pose[:, :3] @ along

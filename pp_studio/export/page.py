@@ -47,6 +47,7 @@ FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
 FILLED = 0.8  # of the shorter side, by the object as it is turned round; lines of text are above
 SAMPLED_POINTS = 20_000
 STILL = 600, 315  # pixels; the least that is shown large beside a link
+HERE = Path(__file__).parent
 
 
 class Gaussians(NamedTuple):
@@ -77,12 +78,6 @@ def unfitted(run: Run) -> Gaussians:
     return Gaussians(*first_gaussians(run), (1.0, 1.0), 0.0)
 
 
-def _pixel(run):
-    """What a pixel of the training shows in the middle of the object."""
-    centre, cameras = run.ball[0], run.cameras("train")
-    return float(np.median([np.linalg.norm(c.eye - centre) / min(c.fx, c.fy) for c in cameras]))
-
-
 def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
     """Records of GAUSSIAN as the page keeps them: (N,) rows of PACKED, and what their bytes stand
     for: a place is corner + unit times the number; byte v of coefficient k, low[k] + span[k] v /
@@ -103,8 +98,8 @@ def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
     span = np.maximum(high - low, np.float32(1e-6))
     scaled = (table["harmonics"] - low[:, None]) / span[:, None] * 255
     rows["colour"] = np.rint(scaled.clip(0, 255)).reshape(len(rows), -1)
-    lists = {"low": low.tolist(), "span": span.tolist(), "logarithms": logarithms}
-    return rows, {"corner": corner.tolist(), "unit": unit, **lists}
+    about = {"corner": corner.tolist(), "unit": unit, "low": low.tolist(), "span": span.tolist()}
+    return rows, about | {"logarithms": logarithms}
 
 
 def _nearest_axes(deviations, turn):
@@ -127,32 +122,40 @@ def page_text(run: Run, gaussians: Gaussians, still: str = "", title: str = "") 
     linked to, if any. title: instead of the name of the run's folder.
     """
     rows, about = pack(gaussians.table)
-    data = base64.b64encode(rows.tobytes()).decode()
-    corner = about.pop("corner")
-    header = json.dumps(about | _header(run, gaussians, corner))
-    return filled(
-        "page.html",
-        {
-            "title": html.escape(title or name_of(run.folder.path)),
-            "card": card(still),
-            "about": f"{len(rows):,} Gaussians, {len(data) / 1e6:.1f} MB",
-            "header": header.replace("<", "\\u003c"),
-            "gaussians": data,
-            "script": (Path(__file__).parent / "page.js").read_text("utf-8"),
-        },
-    )
+    data, corner = base64.b64encode(rows.tobytes()).decode(), about.pop("corner")
+    (centre, _), cameras, (eye, up) = run.ball, run.cameras("train"), first_look(run)
+    # what a pixel of the training shows in the middle of the object
+    pixels = [np.linalg.norm(one.eye - centre) / min(one.fx, one.fy) for one in cameras]
+    header = about | {
+        "count": len(rows),
+        "origin": (gaussians.origin + corner).tolist(),
+        "nearest": run.nearest,
+        "centre": centre.tolist(),
+        "pixel": float(np.median(pixels)),
+        "windows": gaussians.windows,
+        "low_pass": gaussians.low_pass,
+        "eye": eye.tolist(),
+        "up": up.tolist(),
+        "fov": FIELD_OF_VIEW,
+    }
+    parts = {
+        "title": html.escape(title or name_of(run.folder.path)),
+        "about": f"{len(rows):,} Gaussians, {len(data) / 1e6:.1f} MB",
+        "header": json.dumps(header).replace("<", "\\u003c"),
+        "gaussians": data,
+        "script": (HERE / "page.js").read_text("utf-8"),
+    }
+    return filled("page.html", parts, still)
 
 
-def card(still: str) -> str:
-    """What programs that show links read of a page's image."""
+def filled(template: str, parts: dict[str, str], still: str) -> str:
+    """A template of this folder with its parts, {name: text}. still: the image that programs show
+    beside a link to the page, if any.
+    """
     large = '<meta name="twitter:card" content="summary_large_image">'
-    return f'<meta property="og:image" content="{still}">\n{large}' if still else ""
-
-
-def filled(template: str, parts: dict[str, str]) -> str:
-    """A template of this folder with its parts, {name: text}."""
-    page = (Path(__file__).parent / template).read_text("utf-8")
-    for name, text in parts.items():
+    card = f'<meta property="og:image" content="{still}">\n{large}' if still else ""
+    page = (HERE / template).read_text("utf-8")
+    for name, text in ({"card": card} | parts).items():
         page = page.replace(f"<!-- {name} -->", text)
     return page
 
@@ -161,50 +164,30 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
     """Write a page and a still of each run into a folder, with an index of them; returns their
     number. Raises UserError as fitted_gaussians and atomic_folder do.
     """
-    cards: dict[str, str] = {}
+    stems: list[str] = []
+    figures = []
     with atomic_folder(folder) as unfinished:
         for run in runs:
-            stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name_of(run.folder.path)).strip("-") or "run"
-            while stem.lower() in {"index", *map(str.lower, cards)}:  # as some disks take names
+            name = name_of(run.folder.path)
+            stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-") or "run"
+            while stem.lower() in {"index", *map(str.lower, stems)}:  # as some disks take names
                 stem += "-2"
+            stems.append(stem)
             write_text(unfinished / f"{stem}.html", page_text(run, fitted(run), f"{stem}.png"))
             write_png(unfinished / f"{stem}.png", still(run))
-            cards[stem] = html.escape(name_of(run.folder.path))
-        figures = [
-            f'<a href="{stem}.html"><img src="{stem}.png" alt="">{name}</a>'
-            for stem, name in cards.items()
-        ]
-        parts = {"card": card(f"{next(iter(cards))}.png"), "figures": "\n".join(figures)}
-        write_text(unfinished / "index.html", filled("gallery.html", parts))
-    return len(cards)
+            image = f'<img src="{stem}.png" alt="">'
+            figures.append(f'<a href="{stem}.html">{image}{html.escape(name)}</a>')
+        page = filled("gallery.html", {"figures": "\n".join(figures)}, f"{stems[0]}.png")
+        write_text(unfinished / "index.html", page)
+    return len(stems)
 
 
 def still(run: Run) -> np.ndarray:
     """(H, W, 3) uint8: the run as a page of it begins, as large as STILL."""
-    centre, _ = run.ball
-    eye, up = first_look(run)
-    width, height = STILL
+    (eye, up), (width, height) = first_look(run), STILL
     focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-    camera = Camera.look_at(eye, centre, up, fx=focal, width=width, height=height)
+    camera = Camera.look_at(eye, run.ball[0], up, fx=focal, width=width, height=height)
     return to_8bit(render_large(run, camera).colour)
-
-
-def _header(run, gaussians, corner):
-    """What the page must know beside the Gaussians' bytes."""
-    centre, _ = run.ball
-    eye, up = first_look(run)
-    return {
-        "count": len(gaussians.table),
-        "origin": (gaussians.origin + corner).tolist(),
-        "nearest": run.nearest,
-        "centre": centre.tolist(),
-        "pixel": _pixel(run),
-        "windows": gaussians.windows,
-        "low_pass": gaussians.low_pass,
-        "eye": eye.tolist(),
-        "up": up.tolist(),
-        "fov": FIELD_OF_VIEW,
-    }
 
 
 def first_look(run: Run) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,7 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,28 +73,31 @@ def render_frames(
         raise UserError(
             f"{folder}: OpenEXR writes no file whose name is no UTF-8; choose another --out"
         )
-    identity = {"frames": _digest(run, cameras, style), "count": len(cameras)}
     paths = [folder / f"{i:05d}.{style.suffix}" for i in range(len(cameras))]
-    with _owned(folder):
-        if _identity_of(folder) not in (None, identity):
-            if not replace:
-                raise UserError(
-                    f"{folder}: holds frames of another model, path or style; choose another --out,"
-                    " or delete it"
-                )
-            check_ours([*paths, folder / IDENTITY])
-            remove_ours(folder.iterdir())
-        own(folder)
-        write_json(folder / IDENTITY, identity)
-        for camera, path in zip(cameras, paths, strict=True):
-            start, there = time.perf_counter(), path.exists()
-            if not there:
-                rendered = render_large(run, camera, samples=style.samples, features=style.features)
-                if style.suffix == "exr":
-                    write_exr(path, rendered.channels())
-                else:
-                    write_png(path, rendered.over(style.background))
-            on_frame(None if there else time.perf_counter() - start)
+    if folder.exists():
+        if not folder.is_dir():
+            raise UserError(f"{folder}: is not a folder; choose another --out")
+        _identity_of(folder)  # no lock is made in a folder of others
+    check_target(folder / IDENTITY)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            _begin(folder, paths, _identity(run, cameras, style), replace)
+            for camera, path in zip(cameras, paths, strict=True):
+                start, there = time.perf_counter(), path.exists()
+                if not there:
+                    rendered = render_large(
+                        run, camera, samples=style.samples, features=style.features
+                    )
+                    if style.suffix == "exr":
+                        write_exr(path, rendered.channels())
+                    else:
+                        write_png(path, rendered.over(style.background))
+                on_frame(None if there else time.perf_counter() - start)
+    except Timeout:
+        raise UserError(
+            f"{folder}: another process renders there; wait for its end, or choose another --out"
+        ) from None
     return paths
 
 
@@ -115,52 +117,42 @@ def render_video(
         )
     folder = video.with_name(f".{video.name}.frames")
     paths = render_frames(run, cameras, folder, style, on_frame, replace=True)
-    images = (read_rgba(path) for path in paths)
-    if style.background is not None:
-        images = (image[..., :3] for image in images)
-    write_video(video, images, fps)
+    channels = 4 if style.background is None else 3
+    write_video(video, (read_rgba(path)[..., :channels] for path in paths), fps)
     remove_ours(folder.iterdir())
     if {path.name for path in folder.iterdir()} <= {LOCK, MANIFEST}:
         shutil.rmtree(folder)
 
 
-def _digest(run, cameras, style):
+def _begin(folder, paths, identity, replace):
+    """Have a folder hold frames of this identity alone."""
+    if _identity_of(folder) not in (None, identity):
+        if not replace:
+            raise UserError(
+                f"{folder}: holds frames of another model, path or style; choose another --out,"
+                " or delete it"
+            )
+        check_ours([*paths, folder / IDENTITY])
+        remove_ours(folder.iterdir())
+    own(folder)
+    write_json(folder / IDENTITY, identity)
+
+
+def _identity(run, cameras, style):
     """Of everything that the frames depend on."""
     checkpoint = run.folder.checkpoint.stat()
     digest = hashlib.sha256(repr((style, run.header["step"])).encode())
     digest.update(f"{checkpoint.st_size} {checkpoint.st_mtime_ns}".encode())
     for camera in cameras:
         digest.update(run.model.packed(camera).tobytes())
-    return digest.hexdigest()
+    return {"frames": digest.hexdigest(), "count": len(cameras)}
 
 
 def _identity_of(folder):
-    """What the frames in a folder show, None where there are none. Raises UserError for a folder
-    that holds something else.
-    """
+    """What the frames in a folder show, None where there are none. Raises UserError for others."""
     if all(path.name.startswith(".") for path in folder.iterdir()):
         return None
     try:
         return json.loads(read_regular(folder / IDENTITY, MOST_IDENTITY))
     except (OSError, ValueError, RecursionError):
         raise UserError(f"{folder}: holds files that are no frames; choose another --out") from None
-
-
-@contextmanager
-def _owned(folder) -> Iterator[None]:
-    """While the block runs, no other process renders into the folder, which is made where it is
-    missing.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder}: is not a folder; choose another --out")
-    if folder.exists():
-        _identity_of(folder)  # no lock is made in a folder of others
-    check_target(folder / IDENTITY)
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(folder / LOCK, timeout=0):
-            yield
-    except Timeout:
-        raise UserError(
-            f"{folder}: another process renders there; wait for its end, or choose another --out"
-        ) from None

@@ -15,7 +15,7 @@ from pp_studio.export import QUICK
 from pp_studio.export.gaussians import CONSTANT, FACTORS, ORDER, fitted_gaussians
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.harmonics import COUNT, basis
-from pp_studio.export.points import in_world, inside, table_of, write_elements
+from pp_studio.export.points import in_world, inside, write_vertices
 
 # In a .spz: steps of a place in the widest deviation of the smallest Gaussian, and of harmonics
 # above degree 0, half of all bytes: a multiple of 1/128, of which its bytes are. With 1/16 they are
@@ -80,7 +80,7 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     columns |= {f"scale_{i}": np.log(table["deviations"][:, i]) for i in range(3)}
     columns |= {f"rot_{i}": table["turn"][:, i] for i in range(4)}
     # brush turns a model by this comment; others take y for the vertical axis anyway
-    write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
+    write_vertices(path, columns, comments=["Vertical axis: y"])
 
 
 def in_spz(table: np.ndarray) -> tuple[np.ndarray, float]:

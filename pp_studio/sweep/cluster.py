@@ -19,7 +19,7 @@ from pp_cl import evaluate_run, train_scene
 from pp_cl.errors import UserError, one_line
 from pp_cl.scene import scene_splits
 from pp_studio.sweep.plan import Job
-from pp_studio.sweep.result import failed_row, finished_row
+from pp_studio.sweep.table import failed_row, finished_row
 
 try:
     import dask

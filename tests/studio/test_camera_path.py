@@ -9,7 +9,7 @@ from support.scenes import ring_cameras
 
 from pp_cl.engine.camera import Camera
 from pp_cl.scene.gaze import looked_at, up_of
-from pp_studio.camera_path import MARGIN, Surroundings, between, through
+from pp_studio.camera_path import MARGIN, around, between, through
 
 
 def turned(cameras, rotation, shift):
@@ -50,8 +50,7 @@ def test_up_is_not_fooled_by_cameras_that_all_look_down():
 @pytest.mark.parametrize("path", ["orbit", "spiral"])
 def test_the_object_is_whole_and_nothing_jumps(tilted, path):
     cameras, points, up = tilted
-    around = Surroundings(cameras, points)
-    frames = getattr(around, path)(cameras[0].resized(120, 60), 48)
+    frames = around(path, cameras, points, cameras[0].resized(120, 60), 48)
     assert len(frames) == 48
     for camera in frames:
         assert (camera.width, camera.height) == (120, 60)
@@ -71,7 +70,7 @@ def test_the_object_is_whole_and_nothing_jumps(tilted, path):
 def test_a_camera_above_the_object_is_no_division_by_zero():
     camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), fx=50, width=64, height=64)
     points = np.array([[-1.0, -1, -1], [1, 1, 1]])
-    for frame in Surroundings([camera], points).orbit(camera, 5):
+    for frame in around("orbit", [camera], points, camera, 5):
         assert np.isfinite(frame.pose).all()
 
 

@@ -8,7 +8,7 @@ import pytest
 from support.models import blend_matrix
 
 from pp_cl.run import load_run
-from pp_studio.export.observe import observe
+from pp_studio.export.harmonics import observe
 
 
 def check(run):

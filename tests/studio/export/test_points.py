@@ -8,7 +8,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.files.srgb import linear_to_srgb
 from pp_studio.export.gltf import gltf_colours
-from pp_studio.export.observe import observe
+from pp_studio.export.harmonics import observe
 from pp_studio.export.points import coloured_points, write_ply
 
 

@@ -15,7 +15,7 @@ from support.sweeps import jobs_of
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_studio.sweep import cluster
-from pp_studio.sweep.result import finished_row
+from pp_studio.sweep.table import finished_row
 
 pytestmark = pytest.mark.slow
 

@@ -4,7 +4,7 @@ import pytest
 from support.sweeps import jobs_of, pretend
 
 from pp_cl.files.run_folder import RunFolder
-from pp_studio.sweep.result import finished_row
+from pp_studio.sweep.table import finished_row
 
 
 @pytest.fixture
