@@ -38,13 +38,10 @@ def around(
     elevations = np.arcsin(np.clip(offsets @ up / distances, -1, 1)).clip(-HIGHEST, HIGHEST)
     ahead = level(offsets[0], up)
     aside = np.cross(up, ahead)
-    angles, heights = (
-        2 * math.pi * np.arange(frames) / frames,
-        np.full(frames, np.median(elevations)),
-    )
+    angles, low = 2 * math.pi * np.arange(frames) / frames, np.median(elevations)
+    high = low
     if path == "spiral":
-        angles, ends = TURNS * angles, np.quantile(elevations, [0.1, 0.9])
-        heights = np.linspace(*ends, frames)
+        angles, (low, high) = TURNS * angles, np.quantile(elevations, [0.1, 0.9])
     towards = [
         math.cos(e) * (math.cos(a) * ahead + math.sin(a) * aside) + math.sin(e) * up
         for a, e in zip(angles, np.linspace(low, high, frames), strict=True)

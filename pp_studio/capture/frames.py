@@ -73,15 +73,14 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
     None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
     """
     with atomic_folder(images) as unfinished:
-        is_video = not source.is_dir()
-        taken = _frames(source, unfinished) if is_video else _photographs(source, unfinished)
-        found = list(taken)
+        take = _photographs if source.is_dir() else _frames
+        found = list(take(source, unfinished))
         _leave_out(found)
-        for one in found:
-            if "reason" in one and "name" in one:
-                (unfinished / one["name"]).unlink()
         usable = [one for one in found if "reason" not in one]
         left_out = [one for one in found if "reason" in one]
+        for one in left_out:
+            if "name" in one:
+                (unfinished / one["name"]).unlink()
         if len(usable) < LEAST:
             why = [f"{one['source']} {one['reason']}" for one in left_out[:3]]
             raise UserError(
@@ -91,11 +90,8 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
             )
     for one in usable:
         del one["small"]
-    reasons = [{"source": one["source"], "reason": one["reason"]} for one in left_out]
+    reasons = [{key: one[key] for key in ("source", "reason")} for one in left_out]
     return {"images": usable, "left_out": reasons}
-
-
-# Photographs --------------------------------------------------------------------------------------
 
 
 def _photographs(folder, images):
@@ -141,13 +137,13 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]
         found += [here / f for f in files if f.lower().endswith(tuple(endings)) and f[0] != "."]
-    return sorted(found, key=lambda file: _natural(file.relative_to(folder).as_posix()))
 
+    def natural(file):
+        name = file.relative_to(folder).as_posix()
+        parts = re.split(r"(\d+)", name)
+        return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
 
-def _natural(name):
-    """A key by which numbers in names sort as numbers."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
+    return sorted(found, key=natural)
 
 
 def _take(folder, file, target):
@@ -158,20 +154,20 @@ def _take(folder, file, target):
         with opened_regular(file) as opened:
             image = Image.open(opened, formats=FORMATS)
             image.load()
-            turned = ImageOps.exif_transpose(image)
+            turned, told = ImageOps.exif_transpose(image), image.getexif()
             upright = in_srgb(file, turned)
-            is_copied = image.format in COPIED and upright is turned
-            is_copied = is_copied and image.mode in ("RGB", "RGBA", "L")
             is_copied = (
-                is_copied
-                and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+                image.format in COPIED
+                and upright is turned
+                and image.mode in ("RGB", "RGBA", "L")
+                and told.get(ExifTags.Base.Orientation, 1) == 1
                 and not is_deep_png(file)
             )
             content = opened.seek(0) or opened.read() if is_copied else None
-            lens, exif = _lens(image.getexif())
+            lens, exif = _lens(told)
             # folders are of a round each, or of a camera
             facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
-            facts["focal"] = _focal_of_larger(image.getexif().get_ifd(EXIF), image.size)
+            facts["focal"] = _focal_of_larger(told.get_ifd(EXIF), image.size)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
     except Exception as error:  # decoders meet broken bytes with whatever comes up
@@ -217,17 +213,13 @@ def _focal_of_larger(exposure, size):
     return focal if is_told and POSSIBLE[0] < focal / max(size) < POSSIBLE[1] else None
 
 
-# Videos -------------------------------------------------------------------------------------------
-
-
 def _frames(video, images):
     """The facts of the sharpest frame of each interval, written to `images`."""
     chosen, is_hdr = _sharpest(video)
     equal = [f"eq(n,{number})" for number in chosen]
     # in groups, since ffmpeg sums no more than a hundred
-    some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
-    wanted = "+".join(f"({one})" for one in some)
-    frames = _decoded(video, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
+    some = [f"({'+'.join(equal[i : i + GROUP])})" for i in range(0, len(equal), GROUP)]
+    frames = _decoded(video, f"select='{'+'.join(some)}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
     next(frames)  # what is said of the video
     for number, frame in zip(track(chosen, "frames", "image"), frames, strict=False):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
@@ -245,9 +237,8 @@ def _sharpest(video):
     meta = next(frames)
     # an estimate, for the bar alone: what browsers record states no length
     total = round(meta["duration"] * meta["fps"]) or None
-    looking = track(frames, "looking at frames", "frame", total)
     sharpness, pictures, shown = [], [], None  # pictures: that each frame shows, numbered
-    for frame in looking:
+    for frame in track(frames, "looking at frames", "frame", total):
         look = _look(Image.fromarray(frame[..., 0]))
         is_new = shown is None or _difference(shown, look) >= SAME
         shown = look if is_new else shown
@@ -286,9 +277,6 @@ def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[
         ) from None
 
 
-# What is left out ---------------------------------------------------------------------------------
-
-
 def _look(image):
     """What is compared of an image: its sharpness (the variance of its Laplacian), its size and a
     small copy.
@@ -303,10 +291,14 @@ def _look(image):
 
 def _leave_out(found):
     """Give a reason to each image that is empty, blurred or there twice."""
+
+    def near(values, i):
+        return np.median(values[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+
     good = [one for one in found if "reason" not in one]
-    sharpness = np.array([one["sharpness"] for one in good])
+    sharpness = [one["sharpness"] for one in good]
     for i, one in enumerate(good):
-        usual = np.median(sharpness[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+        usual = near(sharpness, i)
         if one["sharpness"] < EMPTY:
             one["reason"] = "shows nothing sharp"
         elif one["sharpness"] < BLURRED * usual:
@@ -315,8 +307,7 @@ def _leave_out(found):
     steps = [_difference(*two) for two in pairwise(good)]
     last = good[0] if good else None
     for i, one in enumerate(good[1:]):
-        usual = np.median(steps[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
-        if _difference(last, one) < max(SAME, ALIKE * usual):
+        if _difference(last, one) < max(SAME, ALIKE * near(steps, i)):
             one["reason"] = f"shows the same as {last['source']}"
         else:
             last = one

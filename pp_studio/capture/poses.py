@@ -119,15 +119,13 @@ def _reasons(database, taken, placed):
         features = {name: db.num_keypoints_for_image(i) for name, i in ids.items()}
     usual = np.median([one["sharpness"] for one in taken])
     reasons = {}
-    for one in taken:
-        name = one["name"]
-        if name in placed:
-            continue
-        matches = best.get(ids.get(name), 0)
-        if one["sharpness"] < BLURRED * usual:
-            reasons[name] = f"is blurred (sharpness {one['sharpness'] / usual:.0%} of the usual)"
-        elif features.get(name, 0) < FEW_FEATURES:
-            reasons[name] = f"has few features ({features.get(name, 0)}): blurred, dark or plain"
+    for one in (one for one in taken if one["name"] not in placed):
+        name, sharpness = one["name"], one["sharpness"] / usual
+        found, matches = features.get(name, 0), best.get(ids.get(name), 0)
+        if sharpness < BLURRED:
+            reasons[name] = f"is blurred (sharpness {sharpness:.0%} of the usual)"
+        elif found < FEW_FEATURES:
+            reasons[name] = f"has few features ({found}): blurred, dark or plain"
         elif matches < FEW_MATCHES:
             reasons[name] = f"has few matches with any other ({matches}): too little overlap"
         else:
@@ -137,10 +135,11 @@ def _reasons(database, taken, placed):
 
 def _most_matches(database):
     """{image's id: its matches with the image with which it has most}."""
-    with needed("pycolmap").Database.open(database) as db:
+    colmap = needed("pycolmap")
+    with colmap.Database.open(database) as db:
         best = {image.image_id: 0 for image in db.read_all_images()}
         for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
-            for one in needed("pycolmap").pair_id_to_image_pair(pair):
+            for one in colmap.pair_id_to_image_pair(pair):
                 best[one] = max(best[one], matches)
     return best
 
@@ -150,9 +149,7 @@ def image_files(model: Any) -> list[ImageFile]:
     lists them that has them in its folder `images`.
     """
     found = []
-    for image in sorted(model.images.values(), key=lambda image: image.name):
-        if not image.has_pose:
-            continue
+    for image in _placed(model):
         lens = model.cameras[image.camera_id]
         focal, cx, cy, k1 = lens.params  # of features.LENS
         world = image.cam_from_world().inverse().matrix()
@@ -169,7 +166,10 @@ def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
     index = {number: k for k, number in enumerate(chosen)}
     shown = [
         np.array([index[p.point3D_id] for p in image.points2D if p.point3D_id in index], int)
-        for image in sorted(model.images.values(), key=lambda image: image.name)
-        if image.has_pose
+        for image in _placed(model)
     ]
     return np.array([model.points3D[number].xyz for number in chosen]), shown
+
+
+def _placed(model):
+    return sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name)

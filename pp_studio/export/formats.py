@@ -1,7 +1,5 @@
 """The formats of `pp-cl export`: which files each one writes."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ window of another size. It is the trainer's, with the footprint "gaussian" and m
 place of the network.
 """
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json

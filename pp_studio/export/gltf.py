@@ -1,7 +1,5 @@
 """glTF 2.0 in one binary file (GLB): points, Gaussians or triangles with attributes."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

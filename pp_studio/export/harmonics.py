@@ -6,8 +6,6 @@ times the colours of the points in the directions from the eye. The coefficients
 squared differences from the run's own renderings of the training views, by conjugate gradients.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property

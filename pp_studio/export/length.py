@@ -1,7 +1,5 @@
 """True size: how many metres a unit of a run's scene is, from one length that is known."""
 
-from __future__ import annotations
-
 import json
 import re
 

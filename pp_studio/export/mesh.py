@@ -2,8 +2,6 @@
 which are fused into one signed distance field, a TSDF (Curless and Levoy 1996).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs as HTML files that a browser draws with WebGL2, without the network; a gallery of them."""
 
-from __future__ import annotations
-
 import base64
 import html
 import json

@@ -1,7 +1,5 @@
 """The points of a run with the colours that its network gives them, as PLY files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -2,8 +2,6 @@
 written at any time, and shows what is there by then.
 """
 
-from __future__ import annotations
-
 import html
 import json
 import shutil

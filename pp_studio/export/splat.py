@@ -1,7 +1,5 @@
 """A run as 3D Gaussians without a network: the .ply of 3D Gaussian splatting, .spz, and glTF."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

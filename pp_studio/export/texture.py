@@ -2,8 +2,6 @@
 renderings of its training views.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
