@@ -1,6 +1,4 @@
-"""Camera paths: around an object (orbit, spiral), made from the cameras of its images, and
-through given cameras.
-"""
+"""Camera paths: around an object, by the cameras of its images, and through given cameras."""
 
 import math
 from collections.abc import Sequence

@@ -1,6 +1,4 @@
-"""Videos from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF and WebP with
-Pillow.
-"""
+"""Videos from frames: MP4 and WebM with the ffmpeg of imageio's wheel, GIF and WebP with Pillow."""
 
 from collections.abc import Iterable
 from itertools import chain, pairwise

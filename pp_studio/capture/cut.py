@@ -117,9 +117,7 @@ class Window:
 
 
 def place_of(image_file: ImageFile, box: np.ndarray) -> tuple[int, int, int, int] | None:
-    """(x0, y0, x1, y1) around the projected box (2, 3) in a photograph; None where it is
-    outside.
-    """
+    """(x0, y0, x1, y1) around the box (2, 3) in a photograph; None where it is outside."""
     camera = image_file.camera
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y, depth = camera.project(corners_of(box))
@@ -132,9 +130,7 @@ def place_of(image_file: ImageFile, box: np.ndarray) -> tuple[int, int, int, int
 
 
 def window(image: np.ndarray, image_file: ImageFile, box: np.ndarray) -> Window:
-    """The Window of a photograph, (H, W, 3) uint8. Raises UserError where it does not show the box
-    (2, 3).
-    """
+    """The Window of a photograph, (H, W, 3) uint8. Raises UserError where the box is outside."""
     place = place_of(image_file, box)
     if place is None:
         raise UserError(f"{image_file.name}: the object's box is outside; give another with --box")

@@ -260,9 +260,7 @@ def pairs_of(
 
 
 def _alikeness(places, descriptors):
-    """(V, V) how many of their LARGE features images have in common that are not at the same place;
-    0 where these are few.
-    """
+    """(V, V) how many of their LARGE features images share at different places; 0 for few."""
     count = len(places)
     large = np.zeros((count, LARGE, 128), np.float32)  # what is missing is like nothing
     at = np.zeros((count, LARGE, 2), np.float32)

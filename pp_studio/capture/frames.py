@@ -95,9 +95,7 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
 
 
 def _photographs(folder, images):
-    """The facts of each photograph, written to `images` where it can be read; of raw ones that they
-    are left out.
-    """
+    """The facts of each photograph, written to `images` where it can be read, and of raw ones."""
     needed("pillow_heif").register_heif_opener()
     files = listed(folder)
     if not files:
@@ -278,9 +276,7 @@ def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[
 
 
 def _look(image):
-    """What is compared of an image: its sharpness (the variance of its Laplacian), its size and a
-    small copy.
-    """
+    """Of an image: its sharpness (the variance of its Laplacian), its size and a small copy."""
     cv2 = needed("cv2")
     gray = image.convert("L")
     gray.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
@@ -314,8 +310,6 @@ def _leave_out(found):
 
 
 def _difference(one, other):
-    """Mean difference of the small copies, in levels, which a change of brightness does not
-    raise.
-    """
+    """Mean difference of the small copies, in levels, whatever their brightness."""
     a, b = (image["small"] - image["small"].mean() for image in (one, other))
     return float(np.abs(a - b).mean())

@@ -137,9 +137,7 @@ def _without_mask(scene, image_files):
 
 
 def _found(scene, image_file, given, sources, fitted, words):
-    """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
-    if it has not.
-    """
+    """(where from, (H, W) uint8 mask, or None) of a photograph, without the others."""
     file, size = scene / image_file.name, (image_file.camera.width, image_file.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)

@@ -1,6 +1,4 @@
-"""A drawing of a whole scene from the side and from above: points, cameras as small frusta, and the
-object's box.
-"""
+"""A drawing of a scene from the side and from above: points, cameras, and the object's box."""
 
 import itertools
 from collections.abc import Sequence

@@ -1,6 +1,4 @@
-"""The packages of the extra `capture`: imported where they are needed, pycolmap in a process of its
-own.
-"""
+"""The packages of the extra `capture`, imported where needed; pycolmap in a process of its own."""
 
 import importlib
 import os

@@ -1,6 +1,4 @@
-"""The images of a scene: photographs free of the distortion of their lens, which others need not
-know of.
-"""
+"""The images of a scene: photographs free of the distortion of their lens."""
 
 import os
 from collections.abc import Sequence

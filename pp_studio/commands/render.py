@@ -101,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a video of them where one is asked for."""
-    from pp_cl import Progress, load
+    from pp_cl import load
     from pp_cl.files import own
     from pp_studio.export.render_video import render_frames, render_video
     from pp_studio.video import check_video
@@ -121,23 +121,14 @@ def run(options: argparse.Namespace) -> None:
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
     if kind in VIDEOS and not options.out:
         own(out.parent, [out], "move it away, or choose another --out")
-    seconds = []
-    with Progress("rendering", len(cameras), "frame") as bar:
-
-        def on_frame(took):
-            bar.update()
-            if took is not None:
-                seconds.append(took)
-
-        if kind in VIDEOS:
-            render_video(run, cameras, out, options.fps, style, on_frame)
-        else:
-            render_frames(run, cameras, out, style, on_frame)
+    if kind in VIDEOS:
+        seconds = render_video(run, cameras, out, options.fps, style)
+    else:
+        seconds, _ = render_frames(run, cameras, out, style)
     made = f"{len(seconds)} of {len(cameras)} frames"
     if seconds:
         made += f", {statistics.median(seconds) * 1e3:.0f} ms each on {run.dev.name}"
-    print(f"rendered {made}")
-    print(f"wrote {out}")
+    print(f"rendered {made}\nwrote {out}")
 
 
 def _format(options):

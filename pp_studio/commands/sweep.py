@@ -135,9 +135,7 @@ def _jobs(options):
 
 
 def _run(options, jobs, total):
-    """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after Ctrl-C or
-    SIGTERM.
-    """
+    """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after a signal."""
     from pp_cl import separate_devices
     from pp_cl.commands.signals import first_signal
     from pp_studio.sweep.cluster import client_of, local_client, run_jobs

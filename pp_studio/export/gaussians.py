@@ -236,9 +236,7 @@ def triangles(offset: np.ndarray) -> np.ndarray:
 
 
 def _fitted_views(run):
-    """The run's training views, none if their exposures differ, or with a warning if they are not
-    there.
-    """
+    """The run's training views; none if exposures differ, or, with a warning, they are gone."""
     if run.header.get("exposed"):
         return []
     try:

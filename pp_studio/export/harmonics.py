@@ -74,9 +74,7 @@ class Observation:
 def observe(
     run: Run, cameras: list[Camera], text: str, *, blending: bool = False
 ) -> Iterator[Observation]:
-    """What the points contribute to each camera's view, in turn; a progress bar with a text shows
-    on a terminal.
-    """
+    """What the points contribute to each camera's view, in turn. text: of the progress bar."""
     seen = None
     for camera in track(cameras, text, "view"):
         if seen:

@@ -18,9 +18,7 @@ OPAQUE = 0.5  # least alpha of a pixel that shows the object
 
 
 def metres_per_unit(run: Run) -> float:
-    """What set_length() has found, 1 where it has not been called. Raises UserError for a broken
-    file.
-    """
+    """What set_length() has found, 1 before it was called. Raises UserError for a broken file."""
     path = run.folder.path / FILE
     if not path.exists():
         return 1.0

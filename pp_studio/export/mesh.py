@@ -68,9 +68,7 @@ def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.nda
 
 
 def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
-    """surface(), each vertex in the mean colour of the nearest points by their weight over the
-    squared distance.
-    """
+    """surface(), with the mean colours of the nearest points by weight over squared distance."""
     (vertices, faces), points = surface(run, box), coloured_points(run)
     count = min(NEIGHBOURS, len(points.rows))
     distance, near = cKDTree(points.positions).query(vertices, list(range(1, count + 1)))

@@ -70,9 +70,7 @@ def fitted(run: Run) -> Gaussians:
 
 
 def unfitted(run: Run) -> Gaussians:
-    """The run's points as Gaussians, for a page before there is time to fit them. Raises UserError
-    as first_gaussians does.
-    """
+    """The run's points as Gaussians that are not fitted. Raises UserError as first_gaussians."""
     return Gaussians(*first_gaussians(run), (1.0, 1.0), 0.0)
 
 

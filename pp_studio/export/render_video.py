@@ -1,18 +1,16 @@
-"""Renders a run along a camera path: frames in a folder, resumed by a later call, and videos of
-them.
-"""
+"""Renders a run along a camera path: frames, resumed by a later call, and videos of them."""
 
 import hashlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from pp_cl import Camera, Run
+from pp_cl import Camera, Run, track
 from pp_cl.errors import UserError
 from pp_cl.files import (
     MANIFEST,
@@ -35,7 +33,6 @@ MOST_IDENTITY = 1000  # bytes of it
 PIXEL_BYTES, MOST_HELD = {".webp": 4, ".gif": 1}, 2**31
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
 LOCK = ".pp-cl.lock"
-OnFrame = Callable[[float | None], None]
 
 
 @dataclass(frozen=True)
@@ -53,20 +50,14 @@ class Style:
 
 
 def render_frames(
-    run: Run,
-    cameras: Sequence[Camera],
-    folder: Path,
-    style: Style,
-    on_frame: OnFrame,
-    *,
-    replace: bool = False,
-) -> list[Path]:
-    """Render the frames of the cameras that are not there yet into a folder; returns the files.
+    run: Run, cameras: Sequence[Camera], folder: Path, style: Style, *, replace: bool = False
+) -> tuple[list[float], list[Path]]:
+    """Render the frames of the cameras that are not there yet into a folder; returns the seconds of
+    each that was not, and all files.
 
-    on_frame: called after each one with its seconds, None for one that was there. replace: frames
-    that are there and show something else make room. Raises UserError for a folder that cannot be
-    made, holds other files, or other frames that are not replaced, and where another process
-    renders into it.
+    replace: frames that are there and show something else make room. Raises UserError for a folder
+    that cannot be made, holds other files, or other frames that are not replaced, and where another
+    process renders into it.
     """
     # Python stands for bytes that are no UTF-8 by these
     if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
@@ -80,33 +71,34 @@ def render_frames(
         _identity_of(folder)  # no lock is made in a folder of others
     check_target(folder / IDENTITY)
     folder.mkdir(parents=True, exist_ok=True)
+    seconds = []
     try:
         with FileLock(folder / LOCK, timeout=0):
             _begin(folder, paths, _identity(run, cameras, style), replace)
-            for camera, path in zip(cameras, paths, strict=True):
-                start, there = time.perf_counter(), path.exists()
-                if not there:
-                    rendered = render_large(
-                        run, camera, samples=style.samples, features=style.features
-                    )
-                    if style.suffix == "exr":
-                        write_exr(path, rendered.channels())
-                    else:
-                        write_png(path, rendered.over(style.background))
-                on_frame(None if there else time.perf_counter() - start)
+            frames = zip(cameras, paths, strict=True)
+            for camera, path in track(frames, "rendering", "frame", len(paths)):
+                if path.exists():
+                    continue
+                start = time.perf_counter()
+                rendered = render_large(run, camera, samples=style.samples, features=style.features)
+                if style.suffix == "exr":
+                    write_exr(path, rendered.channels())
+                else:
+                    write_png(path, rendered.over(style.background))
+                seconds.append(time.perf_counter() - start)
     except Timeout:
         raise UserError(
             f"{folder}: another process renders there; wait for its end, or choose another --out"
         ) from None
-    return paths
+    return seconds, paths
 
 
 def render_video(
-    run: Run, cameras: Sequence[Camera], video: Path, fps: float, style: Style, on_frame: OnFrame
-) -> None:
+    run: Run, cameras: Sequence[Camera], video: Path, fps: float, style: Style
+) -> list[float]:
     """Render a video, whose frames are in a hidden folder beside it until it is written, for a
-    later call to go on with. Raises UserError as render_frames and write_video do, and for a video
-    whose frames would fill the memory.
+    later call to go on with; returns the seconds of each frame that was not there. Raises UserError
+    as render_frames and write_video do, and for a video whose frames would fill the memory.
     """
     check_file(video)
     held = PIXEL_BYTES.get(video.suffix.lower(), 0) * sum(c.width * c.height for c in cameras)
@@ -116,12 +108,13 @@ def render_video(
             " make it shorter or smaller, or write --format mp4"
         )
     folder = video.with_name(f".{video.name}.frames")
-    paths = render_frames(run, cameras, folder, style, on_frame, replace=True)
+    seconds, paths = render_frames(run, cameras, folder, style, replace=True)
     channels = 4 if style.background is None else 3
     write_video(video, (read_rgba(path)[..., :channels] for path in paths), fps)
     remove_ours(folder.iterdir())
     if {path.name for path in folder.iterdir()} <= {LOCK, MANIFEST}:
         shutil.rmtree(folder)
+    return seconds
 
 
 def _begin(folder, paths, identity, replace):

@@ -63,9 +63,7 @@ def _turned(coefficients, turn):
 
 
 def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
-    """Write splats() as the training code of 3D Gaussian splatting does. Raises UserError as
-    atomic_file does.
-    """
+    """Write splats() as 3D Gaussian splatting's own code does. Raises UserError as atomic_file."""
     nothing = np.zeros(len(table), np.float32)
     columns = dict(zip(("x", "y", "z"), table["position"].T, strict=True))
     columns |= dict.fromkeys(("nx", "ny", "nz"), nothing)
@@ -96,9 +94,7 @@ def in_spz(table: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def write_splat_spz(path: Path, table: np.ndarray) -> None:
-    """Write splats() with y up, as in_spz() gives them, as Niantic's .spz. Raises UserError as
-    atomic_path does.
-    """
+    """Write splats() with y up, of in_spz(), as Niantic's .spz. Raises UserError as atomic_path."""
     from gsply import GSData, write_spz
 
     place = table["position"]
@@ -124,9 +120,7 @@ def write_splat_spz(path: Path, table: np.ndarray) -> None:
 
 
 def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> None:
-    """Write splats() and their origin as glTF 2.0 with KHR_gaussian_splatting. Raises UserError as
-    atomic_file does.
-    """
+    """Write splats() as glTF 2.0 (KHR_gaussian_splatting). Raises UserError as atomic_file."""
     extension, place = "KHR_gaussian_splatting", table["position"]
     attributes = {
         "POSITION": place + origin if origin.any() else place,

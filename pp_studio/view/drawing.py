@@ -1,6 +1,4 @@
-"""What a run shows to a camera, as 8-bit images: colours, depth, normals, ..., or a photograph
-beside them.
-"""
+"""What a run shows to a camera, as 8-bit images: colours, depth, normals, or a photograph."""
 
 from collections.abc import Callable
 from dataclasses import replace

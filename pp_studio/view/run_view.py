@@ -45,9 +45,7 @@ class RunView:
                 self.page.woken.wait(0.1)
 
     def look(self) -> None:
-        """Take up the checkpoint and the log where they have changed. A broken checkpoint leaves
-        the last model in place.
-        """
+        """Take up the checkpoint and the log where they have changed; no broken checkpoint."""
         if self._is_new(self._folder.checkpoint):
             try:
                 self._take(load(self._folder.path, self._dev, scene=self._scene))
