@@ -85,18 +85,6 @@ class Window:
             x, y, depth = self.camera.project(positions)
         return np.where(depth > 0, [x, y], np.nan).T
 
-    def pixels_in(self, other: "Window") -> np.ndarray:
-        """(H, W, 2) float32 x and y of this one's pixels in another window that lies at the same
-        places of its photograph, 0 in the middle of the first pixel.
-        """
-        at = []
-        for axis in (0, 1):
-            (begin, end), (first, last) = self.place[axis::2], other.place[axis::2]
-            size, others = self.image.shape[1 - axis], other.image.shape[1 - axis]
-            places = begin + (np.arange(size) + 0.5) * (end - begin) / size
-            at.append((places - first) * others / (last - first) - 0.5)
-        return np.stack(np.meshgrid(*at), axis=-1).astype(np.float32)
-
     def reduced(self, image: np.ndarray) -> np.ndarray:
         """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
         x0, y0, x1, y1 = self.place
@@ -425,7 +413,14 @@ def _difference_of_still(one, others, beside):
     """
     found, off = [], []
     for other in others:
-        levels = _levels(one, other, one.pixels_in(other), np.ones(other.mask.shape, bool))
+        at = []  # x and y of this one's pixels at the same places of the other's photograph
+        for axis in (0, 1):
+            (begin, end), (first, last) = one.place[axis::2], other.place[axis::2]
+            size, there = one.image.shape[1 - axis], other.image.shape[1 - axis]
+            places = begin + (np.arange(size) + 0.5) * (end - begin) / size
+            at.append((places - first) * there / (last - first) - 0.5)
+        same = np.stack(np.meshgrid(*at), axis=-1).astype(np.float32)
+        levels = _levels(one, other, same, np.ones(other.mask.shape, bool))
         seen = beside & (levels < UNSEEN)
         found.append(levels)
         off.append(np.median(levels[seen]) if seen.any() else UNSEEN)

@@ -1,5 +1,5 @@
 """The images of a scene from what a camera gives: upright copies of photographs, or the sharpest
-frames of a video; what is blurred, broken or there twice is left out.
+frames of a video, without what is blurred, broken or there twice; then free of lens distortion.
 """
 
 import logging
@@ -9,12 +9,14 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby, pairwise
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from pp_cl import track
+from pp_cl.engine import Device
 from pp_cl.errors import UserError, shown
 from pp_cl.files import (
     atomic_file,
@@ -23,8 +25,10 @@ from pp_cl.files import (
     is_deep_png,
     is_owned,
     opened_regular,
+    read_rgba,
+    write_png,
 )
-from pp_cl.scene import MASK_FOLDERS
+from pp_cl.scene import MASK_FOLDERS, ImageFile, undistort
 from pp_studio.capture.packages import needed
 
 ENDINGS = (
@@ -51,6 +55,7 @@ EMPTY = 1.0  # sharpness, levels squared: noise alone has more
 NEIGHBOURS = 10  # on either side
 ALIKE = 0.15  # of the neighbours' usual difference
 SAME = 0.3  # levels of 255 by which small copies of one photograph differ at most
+DECODED, MOST_DECODED = 18, 3 * 2**28  # bytes of a pixel that is decoded, and of all at once
 FRAMES, GROUP = 120, 12  # of a video
 LOCAL = ["-protocol_whitelist", "file,pipe"]  # a video names no other machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
@@ -313,3 +318,49 @@ def _difference(one, other):
     """Mean difference of the small copies, in levels, whatever their brightness."""
     a, b = (image["small"] - image["small"].mean() for image in (one, other))
     return float(np.abs(a - b).mean())
+
+
+def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[ImageFile]) -> int:
+    """Write those photographs that are not there yet, free of distortion, to the folder `images`:
+    each under the name, in the format and for the camera that it has; returns their number.
+
+    frames: the folder of the photographs as the lens has them. Raises UserError for one that its
+    distortion folds over, and as read_rgba() and write_png() do.
+    """
+    for one in image_files:
+        if one.lens.folds(one.camera):
+            raise UserError(
+                f"{frames / Path(one.name).name}: the lens that was found folds the image over;"
+                " take more photographs with more overlap, and do not zoom"
+            )
+    images.mkdir(exist_ok=True)
+    left = [one for one in image_files if not (images / Path(one.name).name).is_file()]
+    lock = Lock()  # one of several threads uses the device
+
+    def write(one):
+        name = Path(one.name).name
+        image = read_rgba(frames / name)
+        if one.lens:
+            with lock:
+                image = undistort(dev, image, one.camera, one.lens)
+        if name.endswith(".png"):
+            is_opaque = (image[..., 3] == 255).all()
+            write_png(images / name, image[..., :3] if is_opaque else image)
+        else:
+            with atomic_file(images / name) as file:
+                Image.fromarray(image[..., :3]).save(file, "JPEG", **QUALITY)
+
+    most = max(one.camera.width * one.camera.height for one in image_files)
+    threads = min(os.cpu_count() or 1, MOST_DECODED // (DECODED * most))
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        made = pool.map(write, left)
+        list(track(made, "images", "image", len(left)))
+    return len(left)
+
+
+def undistorted_mask(dev: Device, mask: np.ndarray, image_file: ImageFile) -> np.ndarray:
+    """(H, W) uint8 mask of a photograph as the lens has it, (H, W) uint8, for its image."""
+    if not image_file.lens:
+        return mask
+    planes = np.dstack([mask] * 4)
+    return undistort(dev, planes, image_file.camera, image_file.lens)[..., 3]

@@ -173,3 +173,18 @@ def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
 
 def _placed(model):
     return sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name)
+
+
+def undistort_model(model: Any) -> None:
+    """Give pycolmap's model of features.LENS cameras without distortion, and move what its images
+    show to where that is without.
+    """
+    for image in model.images.values():
+        lens = image.camera
+        focal, cx, cy, _ = lens.params
+        directions = lens.cam_from_img(np.array([point.xy for point in image.points2D]))
+        for point, place in zip(image.points2D, focal * directions + [cx, cy], strict=True):
+            point.xy = place
+    for lens in model.cameras.values():
+        focal, cx, cy, _ = lens.params
+        lens.model, lens.params = needed("pycolmap").CameraModelId.PINHOLE, [focal, focal, cx, cy]

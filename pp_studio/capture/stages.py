@@ -30,7 +30,7 @@ from pp_cl.files import (
     write_png,
 )
 from pp_cl.scene import LensDistortion, frame_keys, named_mask, read_edits, read_json, shrink
-from pp_studio.capture import STAGES, box, features, frames, masks, pinhole, poses
+from pp_studio.capture import STAGES, box, features, frames, masks, poses
 from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
@@ -119,8 +119,12 @@ class Capture:
         if changed or not self._file("options").exists():
             write_json(self._file("options"), self.options)
         for stage in done:
-            new = self._new() if stage == "frames" else ""
-            self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
+            found, came = self._found(stage), ""
+            if stage == "frames":
+                known = {one["source"] for one in (*found["images"], *found["left_out"])}
+                if new := [name for name in self._names() if name not in known]:
+                    came = f"; {few_names(new)} came later: --from frames takes all of them anew"
+            self.tell(f"{stage}: {found['line']} (done before{came})")
         for name in changed:
             option = "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
             redone = OPTIONS[name][0]
@@ -145,13 +149,6 @@ class Capture:
         """Of the photographs that the source has now; none of a video."""
         files = frames.listed(self.source) if self.source.is_dir() else []
         return [file.relative_to(self.source).as_posix() for file in files]
-
-    def _new(self):
-        """What photographs have come since they were taken, in words."""
-        found = self._found("frames")
-        known = {one["source"] for one in (*found["images"], *found["left_out"])}
-        new = [name for name in self._names() if name not in known]
-        return f"; {few_names(new)} came later: --from frames takes all of them anew" if new else ""
 
     def _take_options(self, begin):
         """Fill in the options of this capture; returns the names of those that have changed."""
@@ -280,7 +277,7 @@ class Capture:
 
     def _images(self):
         taken = poses.image_files(self._model())
-        made = pinhole.write_images(self._dev, self.frames, self.scene / "images", taken)
+        made = frames.write_images(self._dev, self.frames, self.scene / "images", taken)
         earlier = f", {len(taken) - made} of them before" if made < len(taken) else ""
         return {"line": f"{len(taken)} without distortion{earlier}"}
 
@@ -319,7 +316,7 @@ class Capture:
                 [seen[i] for i in chosen],
                 given=self.options["masks"] and Path(self.options["masks"]),
                 sources={one["name"]: one["source"] for one in files},
-                fitted=lambda name, mask: pinhole.undistorted_mask(self._dev, mask, taken[name]),
+                fitted=lambda name, mask: frames.undistorted_mask(self._dev, mask, taken[name]),
                 command=self.options["mask_command"],
                 turns=self._found("matches")["turns"],
                 grows=self.options["box"] is None and edits.box is None,
@@ -346,7 +343,7 @@ class Capture:
             mask = masks.mask_file(Path(), one.name).as_posix()
             keys = {key: _rounded(value) for key, value in frame_keys(one.camera).items()}
             places.append({"file_path": one.name, "mask_path": mask, **keys})
-        pinhole.undistort_model(model)
+        poses.undistort_model(model)
         with atomic_folder(self.scene / "sparse") as unfinished:
             (unfinished / "0").mkdir()
             model.write(unfinished / "0")

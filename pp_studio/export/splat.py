@@ -42,7 +42,12 @@ def splats(
     near = in_world(positions, run.model.grid.voxel_size).dtype == np.float32
     origin = np.zeros(3) if near else np.rint(positions.mean(0))
     table["position"] = positions - origin
-    table["harmonics"] = _turned(table["harmonics"], turn)
+    # coefficients of turned directions, by some of these
+    seen = np.random.default_rng(0).normal(size=(64, 3))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
+    matrix = np.linalg.lstsq(after, before, rcond=None)[0]
+    table["harmonics"] = np.einsum("jk,nkc->njc", matrix, table["harmonics"])
     axes = Rotation.from_matrix(turn) * Rotation.from_quat(np.roll(table["turn"], -1, axis=1))
     table["turn"] = np.roll(axes.as_quat(), 1, axis=1)
     return table, origin
@@ -51,15 +56,6 @@ def splats(
 def upright(run: Run, up: tuple[float, float, float]) -> np.ndarray:
     """(3, 3) rotation that makes what is up in the training views `up`."""
     return Rotation.align_vectors([up], [up_of(run.cameras("train"))])[0].as_matrix()
-
-
-def _turned(coefficients, turn):
-    """Coefficients (M, 9, 3) of turned directions."""
-    seen = np.random.default_rng(0).normal(size=(64, 3))
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
-    matrix = np.linalg.lstsq(after, before, rcond=None)[0]
-    return np.einsum("jk,nkc->njc", matrix, coefficients)
 
 
 def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
