@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, require
 from pp_cl.files import atomic_path
 
 LOOPED = ("gif", "webp")  # as pages show without a player
@@ -24,16 +24,13 @@ def check_video(suffix: str) -> None:
     """Raise UserError with what mends it where a video of this format cannot be made."""
     if suffix in LOOPED:
         return
-    try:
-        import imageio.v2  # noqa: F401
-        import imageio_ffmpeg
+    require("a video, unlike --format webp or frames,", "imageio", "imageio-ffmpeg")
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-        imageio_ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError):
-        raise UserError(
-            "videos need imageio and imageio-ffmpeg; install them with `pip install imageio"
-            " imageio-ffmpeg`, or write --format webp, or png for frames"
-        ) from None
+    try:
+        get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise UserError(f"imageio-ffmpeg: {error}; write --format webp or png") from None
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:

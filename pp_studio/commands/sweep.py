@@ -122,6 +122,11 @@ def _run(options, jobs, total):
     """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after a signal."""
     from pp_cl import separate_devices
     from pp_cl.commands.signals import first_signal
+    from pp_cl.errors import require
+
+    require(
+        "pp-cl sweep", "dask", "distributed", "cryptography"
+    )  # by which Dask makes certificates
     from pp_studio.sweep.cluster import client_of, local_client, run_jobs
     from pp_studio.sweep.table import run_text, values_text
 

@@ -1,8 +1,9 @@
 """The formats of `pp-cl export`: which files each one writes."""
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -33,10 +34,8 @@ from pp_studio.export.texture import textured_mesh, write_textured
 
 
 def check_target(name: str, folder: Path, out: Path | None) -> Path:
-    """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says.
-
-    Raises UserError unless it can be written there, and no other file is lost that `out` does not
-    name.
+    """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says. Raises
+    UserError unless it can be written there, and no file is lost that `out` does not name.
     """
     default, suffixes, _ = FORMATS[name]
     path = folder / "export" / default if out is None else out
@@ -79,66 +78,58 @@ def export_run(
     def placed(positions):
         return metres * in_world(positions @ turn.T, run.model.grid.voxel_size)
 
-    if name == "mesh":
-        mesh = coloured_mesh(run, within)
-        _begin_default(name, path)
-        write_mesh(path, replace(mesh, vertices=placed(mesh.vertices)))
-        unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
-        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unlit}{unit}"
-    if name == "textured":
-        solid = textured_mesh(run, turn, within)
-        solid.apply_scale(metres)
-        _begin_default(name, path)
-        write_textured(path, solid)
-        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
-    if name == "html":
-        gaussians = fitted(run)
-        text = page_text(run, gaussians)
-        _begin_default(name, path)
-        write_text(path, text)
-        return f"{len(gaussians.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     if name == "gallery":
         return f"{write_gallery(path, chain([run], others))} pages and their index"
     if name == "scene":
         splits = renderings(run)
         write_scene(splits, path)
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
-    if name in SPLATS:
+    write: Callable[[], None]
+    if name == "mesh":
+        mesh = coloured_mesh(run, within)
+        write = partial(write_mesh, path, replace(mesh, vertices=placed(mesh.vertices)))
+        unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
+        told = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unlit}{unit}"
+    elif name == "textured":
+        solid = textured_mesh(run, turn, within)
+        solid.apply_scale(metres)
+        write = partial(write_textured, path, solid)
+        told = f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
+    elif name == "html":
+        gaussians = fitted(run)
+        text = page_text(run, gaussians)
+        write = partial(write_text, path, text)
+        told = f"{len(gaussians.table)} Gaussians, {len(text) / 1e6:.1f} MB"
+    elif name in SPLATS:
         if name == "splat-spz":
             require("splat-spz", "gsply")
         table, origin = splats(run, turn, quality, within)
         for field in ("position", "deviations"):
             table[field] *= metres
-        _begin_default(name, path)
-        if name == "splat-glb":
-            write_splat_glb(path, table, metres * origin)
-            return f"{len(table)} Gaussians{unit}"
-        if name == "splat":
-            write_splat_ply(path, table)
-        else:
+        if name == "splat-spz":
             table, times = in_spz(table)
-            write_splat_spz(path, table)
             unit += "" if times == 1 else f", times {times:g}"
-        moved = f", less {', '.join(f'{x:g}' for x in metres * origin)}" if origin.any() else ""
-        return f"{len(table)} Gaussians{unit}{moved}"
-    points = coloured_points(run, min_weight, within)
-    points = replace(
-        points, positions=placed(points.positions), radius=np.float32(metres) * points.radius
-    )
-    _begin_default(name, path)
-    if name == "ply":
-        axes = "turned upright, y up" if axes == VIEWER else "its scene's"
-        write_ply(path, points, run.model.cloud, f"{axes}{unit}")
+        write = partial(write_splat_spz if name == "splat-spz" else write_splat_ply, path, table)
+        told = f"{len(table)} Gaussians{unit}"
+        if name == "splat-glb":
+            write = partial(write_splat_glb, path, table, metres * origin)
+        elif origin.any():
+            told += f", less {', '.join(f'{x:g}' for x in metres * origin)}"
     else:
-        colours = gltf_colours(points.colours / 255)
-        write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})
-    return f"{len(points.rows)} of {count} points{unit}"
-
-
-def _begin_default(name, path):
-    """Make the folder of a file that has no --out, as its name says."""
-    if path.parts[-2:] == ("export", FORMATS[name][0]):
+        points = coloured_points(run, min_weight, within)
+        radius = np.float32(metres) * points.radius
+        points = replace(points, positions=placed(points.positions), radius=radius)
+        told = f"{len(points.rows)} of {count} points{unit}"
+        if name == "ply":
+            axes = "turned upright, y up" if axes == VIEWER else "its scene's"
+            write = partial(write_ply, path, points, run.model.cloud, f"{axes}{unit}")
+        else:
+            colours = gltf_colours(points.colours / 255)
+            write = partial(write_glb, path, {"POSITION": points.positions, "COLOR_0": colours})
+    if path.parts[-2:] == ("export", FORMATS[name][0]):  # of a file that has no --out
         own(path.parent)
+    write()
+    return told
 
 
 def renderings(run: Run) -> dict[str, list[View]]:

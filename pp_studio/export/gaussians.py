@@ -94,17 +94,13 @@ def windows(longest: float) -> tuple[float, float]:
     return least, least * 2**DOUBLINGS
 
 
-def fit_gaussians(
-    run: Run, steps: int, cell: float, minutes: float = math.inf
-) -> tuple[PointCloud, float]:
-    """(Gaussians, the deviation of one without offsets): fitted in so many steps, or as many as
-    take these minutes, from the points that training views show, those in a cubic `cell`, in voxel
-    sizes, as one; 0: each point. Of the features of their SH, which are 3D Gaussian splatting's,
-    the first three are sRGB colour.
+def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) -> PointCloud:
+    """Gaussians that are fitted in so many steps, or as many as take these minutes, from the points
+    that training views show, those in a cubic `cell`, in voxel sizes, as one; 0: each point. Of the
+    features of their SH, which are 3D Gaussian splatting's, the first three are sRGB colour.
     """
     end = time.monotonic() + 60 * minutes
-    dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
-    cloud = begun(run, coefficients, cell)
+    dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell)  # the first of many steps
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:
@@ -114,9 +110,8 @@ def fit_gaussians(
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
     sides = [side for view in views for side in (view.camera.width, view.camera.height)]
     factor = max(1, min(round(max(sides) / LARGEST), min(sides) // MIN_SIDE))
-    views = [view.reduced(factor * view.downscale) for view in views]
     config = config_of(run, steps)
-    trainer = Trainer(dev, config, model, views)
+    trainer = Trainer(dev, config, model, [one.reduced(factor * one.downscale) for one in views])
     trainer.crops = WindowCrops(trainer.views, config)
     with Progress("fitting Gaussians", steps, "step") as progress:
         while trainer.step < config.train.iterations:
@@ -130,7 +125,7 @@ def fit_gaussians(
                 progress.total = config.train.iterations = min(max(fitting, FEWEST), steps)
     trainer.check()
     trainer.finish()
-    return cloud, config.raster.radius * run.model.grid.voxel_size
+    return cloud
 
 
 def fitted_gaussians(
@@ -153,7 +148,7 @@ def fitted_gaussians(
     check_drawable(run)
     if found := kept_gaussians(run, [quality]):
         return found
-    table = _table(run, *fit_gaussians(run, *QUALITIES[quality], minutes))
+    table = _table(run, fit_gaussians(run, *QUALITIES[quality], minutes))
     try:
         with atomic_file(run.folder.path / FILE) as file:
             np.savez(file, key=np.array(_key(run, quality)), gaussians=table)
@@ -183,20 +178,19 @@ def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
     the colours that the network gives them. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    radius = run.config.raster.radius * run.model.grid.voxel_size
     cloud = begun(run, fit_harmonics(run, steps=0, most=FIRST_VIEWS), 0)
-    return _table(run, cloud, DEVIATION * radius), run.model.grid.centre
+    return _table(run, cloud), run.model.grid.centre
 
 
 def _key(run, quality):
     """What the Gaussians depend on, as text."""
-    cloud, digest = run.model.cloud, hashlib.sha256()
-    for array in (cloud.ids, cloud.offset, cloud.opacity):
-        digest.update(array.get().tobytes())
-    return json.dumps([digest.hexdigest(), run.header["step"], *QUALITIES[quality]])
+    cloud = run.model.cloud
+    arrays = [array.get().tobytes() for array in (cloud.ids, cloud.offset, cloud.opacity)]
+    digest = hashlib.sha256(b"".join(arrays)).hexdigest()
+    return json.dumps([digest, run.header["step"], *QUALITIES[quality]])
 
 
-def _table(run, cloud, deviation):
+def _table(run, cloud):
     """The visible ones as records of GAUSSIAN, relative to the centre of the run's grid."""
     opacity, offset = cloud.opacity.get()[:, 0].clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
@@ -206,7 +200,11 @@ def _table(run, cloud, deviation):
     table["harmonics"] = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
     table["harmonics"][:, 0] -= 0.5 / CONSTANT
     table["opacity"] = opacity[rows]
-    axes, table["deviations"], _ = np.linalg.svd(deviation * triangles(offset[rows]))
+    deviation = run.config.raster.radius * DEVIATION * grid.voxel_size  # of one without offsets
+    lower = np.zeros((len(rows), 3, 3))  # L of the covariances L L^T, by cl/cloud.h
+    lower[:, range(3), range(3)] = np.exp(offset[rows, 3:6])
+    lower[:, [1, 2, 2], [0, 0, 1]] = offset[rows, 6:9]
+    axes, table["deviations"], _ = np.linalg.svd(deviation * lower)
     axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
     table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
     return table
@@ -225,22 +223,10 @@ def check_drawable(run: Run) -> None:
         )
 
 
-def triangles(offset: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) L of the covariances L L^T of Gaussians, in deviations of one without offsets.
-    offset: (N, 16), cl/cloud.h.
-    """
-    lower = np.zeros((len(offset), 3, 3))
-    lower[:, range(3), range(3)] = np.exp(offset[:, 3:6])
-    lower[:, [1, 2, 2], [0, 0, 1]] = offset[:, 6:9]
-    return lower
-
-
 def _fitted_views(run):
     """The run's training views; none if exposures differ, or, with a warning, they are gone."""
-    if run.header.get("exposed"):
-        return []
     try:
-        views = run.scene("train").splits["train"]
+        views = [] if run.header.get("exposed") else run.scene("train").splits["train"]
     except UserError as error:
         told = f"the Gaussians are fitted to renderings of the training views alone: {error}"
         warnings.warn(told, stacklevel=2)

@@ -13,6 +13,8 @@ from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdo
 from datetime import datetime
 from typing import Any
 
+import dask
+from distributed import Client, Event, LocalCluster, WorkerPlugin, get_worker
 from tqdm import tqdm
 
 from pp_cl import evaluate_run, train_scene
@@ -20,16 +22,6 @@ from pp_cl.errors import UserError, one_line
 from pp_cl.scene import scene_splits
 from pp_studio.sweep.plan import Job
 from pp_studio.sweep.table import failed_row, finished_row
-
-try:
-    import dask
-    from cryptography import x509  # noqa: F401 what Dask makes certificates with
-    from distributed import Client, Event, LocalCluster, WorkerPlugin, get_worker
-except ImportError as error:
-    raise UserError(
-        f"pp-cl sweep needs Dask ({error.name} is missing); install it with"
-        " `pip install dask distributed cryptography`"
-    ) from None
 
 LOOPBACK = "127.0.0.1"
 ANSWER = 20  # seconds that a scheduler, and its first worker, have to answer
