@@ -24,10 +24,9 @@ def around(
     """So many cameras with the size and angle of view of `camera` that look at the middle of an
     object from one distance: that of its images, or farther where it would be cut off.
 
-    path: orbit, a circle at the images' median elevation that begins where the first of them was
-    taken, the last frame one step before the first; spiral, two turns from the lowest tenth of the
-    images' elevations to the highest. cameras: those of the images. points: (N, 3), world positions
-    of the object's points.
+    path: orbit, a circle at the images' median elevation that begins where the first was taken, the
+    last frame one step before the first; spiral, two turns from the lowest tenth of the elevations
+    to the highest. cameras: those of the images. points: (N, 3), the object's, in the world.
     """
     up, centre = up_of(cameras), (points.min(axis=0) + points.max(axis=0)) / 2
     points = points[:: max(1, len(points) // SAMPLED_POINTS)] - centre

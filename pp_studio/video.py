@@ -35,11 +35,8 @@ def check_video(suffix: str) -> None:
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Write a video of uint8 frames of one size, (H, W, 3), or (H, W, 4) with straight alpha, which
-    WebM keeps; atomically. An odd side is extended by a copy of its last row or column, as video
-    needs even ones.
-
-    path: its suffix, one of FORMATS, chooses the format. Raises UserError naming the file when it
-    cannot be written.
+    WebM keeps, in the format of the path's suffix, one of FORMATS. An odd side is extended by its
+    last row or column. Raises UserError naming the file when it cannot be written.
     """
     frames = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), "edge") for f in frames)
     looped = path.suffix.lower()[1:] in LOOPED

@@ -69,10 +69,7 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
 
 
 def _on_object(points, seen):
-    """(M, 3) of the points: those that nearly all cameras see and that are not alone, without the
-    table that they stand on. points: (N, 3), z up, the cameras at a distance of 1 from the origin;
-    seen: (N,) share of the cameras whose image has room for each.
-    """
+    """(M, 3) of the points that nearly all cameras see and that are not alone, without a table."""
     near = np.linalg.norm(points, axis=1) < 1
     if not near.any():
         return points[near]

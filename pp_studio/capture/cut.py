@@ -158,10 +158,8 @@ def cut_out_all(
     seen: Sequence[np.ndarray],
     turns: bool,
 ) -> None:
-    """Set the masks of the windows that have none. Raises UserError for a box in which nothing
-    stands.
-
-    box, points, seen, turns: of write_masks(). inside: (N,) bool, the object's points.
+    """Set the masks of the windows that have none. box, points, seen, turns: of write_masks().
+    inside: (N,) bool, the object's points. Raises UserError for a box in which nothing stands.
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
@@ -240,9 +238,7 @@ def without_islands(mask: np.ndarray) -> np.ndarray:
 
 
 def _seeds(one, box, points, inside, seen):
-    """(H, W) uint8 of GrabCut's labels: points of the object that the photograph shows, those of
-    the background, what is outside the box; what is close to the object's points is probable.
-    """
+    """(H, W) uint8 of GrabCut's labels, by the box and the sparse points in a photograph."""
     labels = np.full(one.image.shape[:2], cv2.GC_BGD, np.uint8)
     outline = one.pixels(corners_of(box))
     if np.isnan(outline).any():
@@ -273,9 +269,7 @@ def _closed(marked, radius):
 
 
 def _colours(windows, labels):
-    """(the background's, the object's) colours, (1, 65) float64 each: GrabCut's mixture of five
-    normal distributions, fitted to SAMPLES^2 pixels of all windows.
-    """
+    """(the background's, the object's) mixture of GrabCut, (1, 65) each, of all windows' pixels."""
     rng, drawn = np.random.default_rng(0), []
     each = -(-(SAMPLES**2) // len(windows))
     for wanted in (0, 1):  # the lowest bit of a label
@@ -317,9 +311,7 @@ def forgiving_hull(
 
 
 def _relabelled(one, seeds, hull, rejections, voxel_size):
-    """(H, W) uint8 of GrabCut's labels of a window from what all views agree on: what is well
-    outside the hull is background, what is well within what no other view rejects is the object.
-    """
+    """(H, W) uint8 of GrabCut's labels, by the hull, and by what no other view of it rejects."""
     gap = gap_of(one, hull, voxel_size)
     found, rows, columns = one.inside(hull)
     agreed = found[rejections[found] == ~one.mask[rows, columns]]
@@ -407,10 +399,7 @@ def _difference(one, others, background):
 
 
 def _difference_of_still(one, others, beside):
-    """From those that show the same wall: what some of them do not exceed, whatever their masks
-    say, as these may hold the gaps. UNSEEN where few show the same, the wall that is mostly hidden;
-    or nearly all, as that may be a part of the object without a pattern.
-    """
+    """From those that show the same wall: what some do not exceed, whatever their masks say."""
     found, off = [], []
     for other in others:
         at = []  # x and y of this one's pixels at the same places of the other's photograph
@@ -431,15 +420,14 @@ def _difference_of_still(one, others, beside):
         return np.full(beside.shape, UNSEEN, np.uint8)
     few, some, nearly_all = _smallest(found, SHOWN)
     usual, most = (ALIKE * np.median(one[beside]) + SLIGHT for one in (some, nearly_all))
+    # few show the wall that is mostly hidden; nearly all, a part of the object without a pattern
     rarely, always = (few <= usual) & (some > usual), nearly_all <= most
     some[rarely | (always & ~beside)] = UNSEEN
     return some
 
 
 def _levels(one, other, at, usable):
-    """(H, W) uint8 differences from what another window shows at places (H, W, 2) of its pixels
-    that are usable, (H, W) bool of the other; elsewhere UNSEEN.
-    """
+    """(H, W) uint8 differences from usable pixels of another window at (H, W, 2), else UNSEEN."""
     usable = cv2.remap(255 * usable.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=0)
     behind = cv2.remap(other.image, at, None, cv2.INTER_LINEAR)
     levels = np.maximum.reduce(cv2.split(cv2.absdiff(one.image, behind)))
@@ -455,9 +443,7 @@ def _smallest(found, shares):
 
 
 def _places_behind(one, background):
-    """(rows, columns, 3) world positions on the background, of pixels STEP apart, between the
-    sparse points there; None where these are too few.
-    """
+    """(rows, columns, 3) positions between the background's points, None where these are few."""
     camera = one.camera
     size = np.array([camera.width, camera.height])
     depth = (background - camera.eye) @ camera.pose[:, 2]

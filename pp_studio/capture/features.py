@@ -62,8 +62,7 @@ def quiet(work: Path) -> Iterator[Any]:
 def find_features(
     database: Path, images: Path, taken: Sequence[dict[str, Any]], masks: Path | None = None
 ) -> dict[str, int]:
-    """Add the features of each image to the database, where they are not there yet, the largest
-    first.
+    """Add the features of each image to the database, the largest first, where they are not there.
 
     taken: what take_images() says of the images; those of equal lens and size have one camera.
     masks: NAME.png of each image, black where no features are wanted. Returns {name: features}.
@@ -101,9 +100,7 @@ def _camera(one):
 
 
 def _features(file, masks):
-    """((N, 4) float32 x, y, scale and angle of an image's features, COLMAP's first pixel being
-    centred at 0.5, (N, 128) uint8 descriptors), the largest first.
-    """
+    """((N, 4) float32 x, y, scale, angle, (N, 128) uint8 descriptors), the largest first."""
     cv2 = needed("cv2")
     with Image.open(file) as image:
         size = np.array(image.size)
@@ -123,7 +120,7 @@ def _features(file, masks):
     best = np.argsort(-keypoints[:, 2], kind="stable")[:FEATURES]
     keypoints, descriptors = keypoints[best], descriptors[best]
     larger = size / reduced
-    keypoints[:, :2] = (keypoints[:, :2] + 0.5) * larger
+    keypoints[:, :2] = (keypoints[:, :2] + 0.5) * larger  # COLMAP's first pixel is centred at 0.5
     keypoints[:, 2] *= larger.mean()
     # the root of what they share, by which a few strong gradients count less (Arandjelovic 2012)
     shares = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
@@ -186,8 +183,9 @@ def matches_of(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _best(products):
-    """((...) places of the largest of the last axis of descriptors' products (..., K), (...) bool
-    whether it is close, and clearly the best). The products, whole numbers below 2^24, are exact.
+    """((...) places of the largest of products (..., K), (...) whether it is close and the best).
+
+    Products of descriptors, whole numbers below 2^24, are exact.
     """
     best = products.argmax(-1)[..., None]
     largest = np.take_along_axis(products, best, -1)
@@ -326,9 +324,7 @@ def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
 
 
 def _aligned(places: list[np.ndarray], pairs: list[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """((V,) complex scales with turns, (V,) complex shifts) that lay the images over each other
-    where most pairs agree, by least squares with weights that fall off.
-    """
+    """((V,) complex scales with turns, (V,) shifts) that lay images over each other, robustly."""
     rng, count = np.random.default_rng(0), len(places)
     drawn = []
     for _, i, j, matches in pairs:

@@ -190,10 +190,9 @@ def _take(folder, file, target):
 
 
 def _lens(exif):
-    """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a focal
-    length): the rest may be broken, or longer than a JPEG has room for.
-    """
+    """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a length)."""
     exposure, copied = exif.get_ifd(EXIF), Image.Exif()
+    # the rest may be broken, or longer than a JPEG has room for
     copied.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
     wanted = (FOCAL, FOCAL_35, *SENSOR)
     copied.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
@@ -202,10 +201,7 @@ def _lens(exif):
 
 
 def _focal_of_larger(exposure, size):
-    """The focal length in pixels of a photograph that was reduced, or cropped to another shape and
-    reduced, while its EXIF still tells of the sensor's pixels, which COLMAP takes for the
-    photograph's; None where EXIF says nothing of the kind.
-    """
+    """The focal length in pixels of a reduced photograph whose EXIF tells the sensor's, or None."""
     try:
         across, down, density, unit = (float(exposure[tag]) for tag in SENSOR)
         reduced = max(size[0] / across, size[1] / down)
@@ -233,9 +229,7 @@ def _frames(video, images):
 
 
 def _sharpest(video):
-    """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR).
-    Frames that repeat the one before, as films of a constant rate have them, lengthen none.
-    """
+    """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR)."""
     frames = _decoded(video, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
     meta = next(frames)
     # an estimate, for the bar alone: what browsers record states no length
@@ -249,6 +243,7 @@ def _sharpest(video):
         pictures.append(pictures[-1] + is_new if pictures else 0)
     if not sharpness:
         raise UserError(f"{video}: holds no frames; give another video")
+    # frames that repeat the one before, as films of a constant rate have them, lengthen none
     count = max(pictures[-1] + 1, FRAMES)
     intervals = groupby(range(len(pictures)), lambda number: pictures[number] * FRAMES // count)
     is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)

@@ -188,9 +188,7 @@ def program_words(command: str) -> list[str]:
 
 
 def _written_mask(scene, image_file):
-    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written. Raises
-    UserError for one of another shape.
-    """
+    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written."""
     file = mask_file(scene, image_file.name)
     return read_mask_of_size(file, (image_file.camera.width, image_file.camera.height))
 
@@ -204,10 +202,7 @@ def _window(scene, image_file, box):
 
 
 def _uniform(scene, image_files, windows, box, points):
-    """Write the masks of photographs before a uniform background, where nearly all of those without
-    a mask are; returns their number. points: (M, 3) of the object that each shows, most of which
-    stand out from the background.
-    """
+    """Write the masks of photographs where nearly all have a uniform background; their number."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
     with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
     found = {}
@@ -237,9 +232,7 @@ def _uniform(scene, image_files, windows, box, points):
 
 
 def _spots(windows, numbers, box):
-    """{number of a window: (H, W) bool, the regions in the background's colour that its mask
-    encloses, but behind which the other views see the object}.
-    """
+    """{number of a window: (H, W) bool, holes of its mask where other views see the object}."""
     hull, _, voxel_size = forgiving_hull([one for one in windows if one.mask is not None], box)
     found = {}
     for i in numbers:

@@ -72,17 +72,15 @@ def place(
 
 
 def _mapped(database, images, folder, count, turns):
-    """pycolmap's models of what fits together.
-
-    Without a background, images that are as far apart as those that COLMAP begins with have fewer
-    matches than a pattern has with itself, and closer ones do not tell focal length from lens.
-    """
+    """pycolmap's models of what fits together."""
     with quiet(database) as colmap:
         options = colmap.IncrementalPipelineOptions(
             min_model_size=3, num_threads=cores(), random_seed=0
         )
         # all cameras are refined at the end, and before that whenever there are so many more
         options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH
+        # Without a background, images as far apart as those that COLMAP begins with have fewer
+        # matches than a pattern has with itself; closer ones do not tell focal length from lens.
         if turns:
             usual = np.median(list(_most_matches(database).values()))
             options.min_num_matches = max(options.min_num_matches, int(FEW * usual))

@@ -180,9 +180,7 @@ class Capture:
         return changed
 
     def _check_options(self, left, mended):
-        """Raise UserError where what the options of the stages that are left name is not there.
-        mended: masks that are kept.
-        """
+        """Raise UserError where what the options of the stages that are left name is not there."""
         count, is_new = len(self._names()), "frames" in left and self._is_done("frames")
         if is_new and self.source.is_dir() and count < frames.LEAST:
             raise UserError(
@@ -203,9 +201,8 @@ class Capture:
                     named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
-        """What a stage has left, and what else lies in its folders, but for masks of others and
-        what changes in place. Its JSON comes first: without it the stage is not done.
-        """
+        """What lies in a stage's folders, but for masks of others and what changes in place."""
+        # its JSON comes first: without it the stage is not done
         found = [self._file(stage), self._file(stage, ".png")]
         for path in (self.scene / name for name in LEFT[stage] if name not in CHANGING):
             inside = path.rglob("*") if path.is_dir() else [path]
@@ -361,9 +358,7 @@ class Capture:
         write_png(self._file(stage, ".png"), drawn)
 
     def _world(self):
-        """(pycolmap's model in the scene's world, (2, 3) box of the object there: the user's, if
-        one was chosen in the page of `pp-cl view`; once masks are made, the one that they need).
-        """
+        """(pycolmap's model in the scene's world, (2, 3) box: the user's, or that of the masks)."""
         model, found = self._model(), self._found("box")
         _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
         edited = read_edits(self.scene).box

@@ -221,9 +221,7 @@ def _hints(options):
 
 
 def _fps(run, split, minutes):
-    """Frames a second of a video that takes so many minutes, about: by the time that a frame of the
-    evaluation took, of which larger ones are woven.
-    """
+    """Frames a second of a video that takes so many minutes, by what the evaluation took."""
     from pp_cl.scene import read_json
     from pp_studio.large import parts
 

@@ -124,9 +124,8 @@ def _run(options, jobs, total):
     from pp_cl.commands.signals import first_signal
     from pp_cl.errors import require
 
-    require(
-        "pp-cl sweep", "dask", "distributed", "cryptography"
-    )  # by which Dask makes certificates
+    # the last one makes certificates
+    require("pp-cl sweep", "dask", "distributed", "cryptography")
     from pp_studio.sweep.cluster import client_of, local_client, run_jobs
     from pp_studio.sweep.table import run_text, values_text
 

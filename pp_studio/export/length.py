@@ -50,9 +50,7 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
 
 
 def _straight(run, image_file, x, y):
-    """The pixel that shows without distortion what (x, y) shows of the image; (x, y) itself
-    where the scene, which knows the lens, is not there.
-    """
+    """The pixel without distortion; (x, y) itself where the scene, which knows it, is gone."""
     try:
         listed = scene_frames(run.config.scene.path, edited=False)
     except UserError:

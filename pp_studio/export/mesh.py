@@ -103,9 +103,8 @@ def box_around(grid: Grid, ids: np.ndarray) -> Grid:
 def fuse(
     grid: Grid, views: Iterable[tuple[Camera, RenderedView]], hidden: float = HIDDEN
 ) -> np.ndarray:
-    """(nz, ny, nx) float32 in [-1, 1]: the mean over the views of each vertex's distance to the
-    surface that the renderings show, along the cameras' axes, in TRUNCATION voxel sizes, negative
-    inside.
+    """(nz, ny, nx) float32 in [-1, 1]: the mean over the views of each vertex's distance to what
+    they show, along the cameras' axes, in TRUNCATION voxel sizes, negative inside.
 
     A view says nothing of vertices outside its image, and counts as `hidden` views for those more
     than TRUNCATION voxel sizes behind its surface. What no view says anything of is inside.

@@ -99,9 +99,7 @@ def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def _nearest_axes(deviations, turn):
-    """(deviations (N, 3), bytes (N, 3) of their axes): axes may be swapped with their deviations,
-    and be turned round; of the 24 ways that which turns them least.
-    """
+    """(deviations (N, 3), bytes (N, 3) of their axes), swapped so that they turn least."""
     ways = Rotation.create_group("O")
     own = Rotation.from_quat(np.roll(turn, -1, axis=1))
     # w of the product of two quaternions (x, y, z, w)

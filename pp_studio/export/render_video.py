@@ -55,9 +55,8 @@ def render_frames(
     """Render the frames of the cameras that are not there yet into a folder; returns the seconds of
     each that was not, and all files.
 
-    replace: frames that are there and show something else make room. Raises UserError for a folder
-    that cannot be made, holds other files, or other frames that are not replaced, and where another
-    process renders into it.
+    replace: frames of something else make room. Raises UserError for a folder that cannot be made,
+    holds other files or frames, or that another process renders into.
     """
     # Python stands for bytes that are no UTF-8 by these
     if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):

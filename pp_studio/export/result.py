@@ -50,8 +50,7 @@ def write_result(
     scene: str = "",
 ) -> None:
     """Write index.html, the model's page and the images that it shows, beside the video and the
-    splats, of which those that are older than the run's checkpoint do not count. What is not there
-    yet is said to come, so that this can be called after each step of the work.
+    splats, if those are newer than the run's checkpoint. What is not there yet is said to come.
 
     run: None before there is a checkpoint; then the cameras and masks of the scene are shown.
     split: whose evaluation is shown. video: the file's name. told: what is to be known of the

@@ -30,10 +30,9 @@ Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in
 def splats(
     run: Run, turn: np.ndarray, quality: str = QUICK, box: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() of a quality in the world
-    turned by (3, 3), those in a box (2, 3) of the scene or all. Positions are relative to the
-    origin, which is 0 unless float32 is too coarse there. Raises UserError as fitted_gaussians and
-    inside() do.
+    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() of a quality in the world turned
+    by (3, 3), those in a box (2, 3) of the scene or all. The origin is 0 unless float32 is too
+    coarse there. Raises UserError as fitted_gaussians() and inside() do.
     """
     table, centre = fitted_gaussians(run, quality)
     positions = table["position"] + centre

@@ -36,10 +36,9 @@ def draw(
     on_part: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, str]:
     """((H, W, 3) uint8, a line on what it shows). views: the run's training views, none where its
-    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. share: of
-    the points, the most opaque ones, in (0, 1]. exposure: in stops. on_part: called before each
-    part of the work. Raises UserError where there is no photograph to show, and where the model
-    computes NaN.
+    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. share: of the
+    most opaque points, in (0, 1]. exposure: in stops. on_part: called before each part of the work.
+    Raises UserError where there is no photograph to show, and where the model computes NaN.
     """
     truth, line = np.empty(0), ""
     if show in OWN_CAMERA:
@@ -120,8 +119,7 @@ def colour_scale(values: Any, low: float, high: float, is_known: np.ndarray) -> 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W, 3) float64 unit normals in world axes, towards the camera, of the surface that a depth
     map (H, W) along the camera's axis shows; NaN where a pixel or a neighbour that is needed has
-    none. Of the two neighbours in each direction the one of the nearer depth is taken, so that
-    edges stay sharp.
+    none. Of two neighbours the one of the nearer depth is taken, so that edges stay sharp.
     """
     positions = depth[..., None] * (camera.rays() @ camera.pose[:, :3])
 

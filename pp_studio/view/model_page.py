@@ -255,9 +255,7 @@ class ModelPage:
         return tab.camera.resized(*(max(MIN_SIDE, round(scale * side)) for side in (width, height)))
 
     def _gaussians(self):
-        """Arguments of viser's add_gaussian_splats: those that were fitted to the run, if any; of
-        their colours the mean of all directions.
-        """
+        """Arguments of viser's add_gaussian_splats, with mean colours, if any are fitted."""
         if (found := kept_gaussians(self.run)) is None:
             return None
         table, origin = found
@@ -281,9 +279,7 @@ class ModelPage:
             return None
 
     def _send(self, tab, is_draft):
-        """Draw the rendering that a tab shows behind its frustums; what takes longer than a draft
-        is given up when the tab's camera moves.
-        """
+        """Draw what a tab shows behind its frustums; but for drafts until its camera moves."""
         start, moved, camera = time.perf_counter(), tab.moved, self._camera(tab)
         if is_draft:
             most = min(camera.width, camera.height) // MIN_SIDE

@@ -123,9 +123,7 @@ class ScenePage:
     # ---- what viser's threads call
 
     def _change(self, toggled=None, **changed):
-        """Write what the user has changed: box, dropped, or `toggled`, a view that is dropped or
-        kept after all. What cannot be is not written.
-        """
+        """Write what the user has changed, if it can be. toggled: a view, dropped or kept."""
         line = f"written to {EDITS}"
         with self._lock:
             try:
