@@ -27,19 +27,7 @@ from pp_cl.scene import (
     read_mask_of_size,
     shrink,
 )
-from pp_studio.capture.cut import (
-    FORGIVEN,
-    GROWTHS,
-    cut_out_all,
-    dilated,
-    forgiving_hull,
-    gap_of,
-    grown_box,
-    place_of,
-    silhouette,
-    whole_mask,
-    window,
-)
+from pp_studio.capture import cut
 from pp_studio.capture.packages import needed
 
 cv2 = needed("cv2")
@@ -92,7 +80,7 @@ def write_masks(
     (scene / "masks").mkdir(exist_ok=True)
     left = _without_mask(scene, image_files)
     how = {"kept": len(image_files) - len(left)}
-    shown = [i for i, one in enumerate(image_files) if place_of(one, box)]
+    shown = [i for i, one in enumerate(image_files) if cut.place_of(one, box)]
     shown = shown or list(range(len(image_files)))  # which window() refuses
     beside = {one.name for one in image_files} - {image_files[i].name for i in shown}
     for one in track(left, "masks", "image"):
@@ -112,16 +100,16 @@ def write_masks(
         how["before a uniform background"] = _uniform(scene, in_view, windows, box, of_object)
         if left := _without_mask(scene, in_view):
             how["cut out"] = len(left)
-            for growth in range(1 + GROWTHS):
-                cut_out_all(windows, box, points, inside, seen, turns)
-                larger = grown_box(windows, box) if grows and growth < GROWTHS else None
+            for growth in range(1 + cut.GROWTHS):
+                cut.cut_out_all(windows, box, points, inside, seen, turns)
+                larger = cut.grown_box(windows, box) if grows and growth < cut.GROWTHS else None
                 if larger is None:
                     break
                 box = larger
                 windows = [_window(scene, one, box) for one in in_view]
-            cut = {one.name: window for one, window in zip(in_view, windows, strict=True)}
+            of_name = dict(zip([one.name for one in in_view], windows, strict=True))
             for one in track(left, "masks", "image"):
-                mask = whole_mask(cut[one.name], read_rgba(scene / one.name)[..., :3])
+                mask = cut.whole_mask(of_name[one.name], read_rgba(scene / one.name)[..., :3])
                 write_png(mask_file(scene, one.name), mask)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     views = [_reduced(scene, one, CHECKED_SIDE)[0] for one in image_files]
@@ -195,7 +183,7 @@ def _written_mask(scene, image_file):
 
 def _window(scene, image_file, box):
     """The Window of a photograph, with its mask if that is written."""
-    found = window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
+    found = cut.window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
     if mask_file(scene, image_file.name).is_file():
         found.mask = found.reduced(_written_mask(scene, image_file)) > 127
     return found
@@ -204,7 +192,7 @@ def _window(scene, image_file, box):
 def _uniform(scene, image_files, windows, box, points):
     """Write the masks of photographs where nearly all have a uniform background; their number."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
+    with_holes = len(windows) * cut.FORGIVEN >= 1  # as one that is a spot has one view against it
     found = {}
     for i in left:
         mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
@@ -233,15 +221,15 @@ def _uniform(scene, image_files, windows, box, points):
 
 def _spots(windows, numbers, box):
     """{number of a window: (H, W) bool, holes of its mask where other views see the object}."""
-    hull, _, voxel_size = forgiving_hull([one for one in windows if one.mask is not None], box)
+    hull, _, voxel_size = cut.forgiving_hull([one for one in windows if one.mask is not None], box)
     found = {}
     for i in numbers:
         one = windows[i]
         regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
-        held = silhouette(one, hull, gap_of(one, hull, voxel_size))
+        held = cut.silhouette(one, hull, cut.gap_of(one, hull, voxel_size))
         is_spot = np.bincount(regions.ravel(), held.ravel()) > SPOT * np.bincount(regions.ravel())
         is_spot[0] = False
-        found[i] = dilated(is_spot[regions], 1)
+        found[i] = cut.dilated(is_spot[regions], 1)
     return found
 
 

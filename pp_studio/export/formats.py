@@ -14,23 +14,20 @@ from pp_cl.engine import View
 from pp_cl.errors import UserError, require
 from pp_cl.files import check_file, check_new_folder, check_ours, image_paths, own, write_text
 from pp_cl.scene import write_scene
-from pp_studio.export import AXES_OF, FORMATS, QUICK, SPLATS, VIEWER
-from pp_studio.export.gltf import gltf_colours, write_glb
-from pp_studio.export.length import metres_per_unit
-from pp_studio.export.mesh import coloured_mesh, write_mesh
-from pp_studio.export.page import fitted, page_text, write_gallery
-from pp_studio.export.points import coloured_points, in_world, inside, write_ply
-from pp_studio.export.splat import (
-    Y_DOWN,
-    Y_UP,
-    in_spz,
-    splats,
-    upright,
-    write_splat_glb,
-    write_splat_ply,
-    write_splat_spz,
+from pp_studio.export import (
+    AXES_OF,
+    FORMATS,
+    QUICK,
+    SPLATS,
+    VIEWER,
+    gltf,
+    length,
+    mesh,
+    page,
+    points,
+    splat,
+    texture,
 )
-from pp_studio.export.texture import textured_mesh, write_textured
 
 
 def check_target(name: str, folder: Path, out: Path | None) -> Path:
@@ -66,66 +63,68 @@ def export_run(
     """
     if name not in FORMATS:
         raise UserError(f"no format {name}; choose from {', '.join(FORMATS)}")
-    path, count, metres = Path(path), run.model.cloud.count, metres_per_unit(run)
+    path, count, metres = Path(path), run.model.cloud.count, length.metres_per_unit(run)
     unit = "" if metres == 1 else ", in metres"
     within, turn = None, np.eye(3)
     if box is not None:
         within = np.sort(np.reshape(box, (2, 3)), axis=0)
-        inside(run.model.positions(), within)  # an empty one is refused before any work
+        points.inside(run.model.positions(), within)  # an empty one is refused before any work
     if (axes or AXES_OF.get(name)) == VIEWER:
-        turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
+        turn = splat.upright(run, splat.Y_DOWN if name == "splat" else splat.Y_UP)
 
     def placed(positions):
-        return metres * in_world(positions @ turn.T, run.model.grid.voxel_size)
+        return metres * points.in_world(positions @ turn.T, run.model.grid.voxel_size)
 
     if name == "gallery":
-        return f"{write_gallery(path, chain([run], others))} pages and their index"
+        return f"{page.write_gallery(path, chain([run], others))} pages and their index"
     if name == "scene":
         splits = renderings(run)
         write_scene(splits, path)
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
     write: Callable[[], None]
     if name == "mesh":
-        mesh = coloured_mesh(run, within)
-        write = partial(write_mesh, path, replace(mesh, vertices=placed(mesh.vertices)))
+        made = mesh.coloured_mesh(run, within)
+        write = partial(mesh.write_mesh, path, replace(made, vertices=placed(made.vertices)))
         unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
-        told = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unlit}{unit}"
+        told = f"{len(made.vertices)} vertices, {len(made.faces)} faces{unlit}{unit}"
     elif name == "textured":
-        solid = textured_mesh(run, turn, within)
+        solid = texture.textured_mesh(run, turn, within)
         solid.apply_scale(metres)
-        write = partial(write_textured, path, solid)
+        write = partial(texture.write_textured, path, solid)
         told = f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
     elif name == "html":
-        gaussians = fitted(run)
-        text = page_text(run, gaussians)
+        gaussians = page.fitted(run)
+        text = page.page_text(run, gaussians)
         write = partial(write_text, path, text)
         told = f"{len(gaussians.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     elif name in SPLATS:
         if name == "splat-spz":
             require("splat-spz", "gsply")
-        table, origin = splats(run, turn, quality, within)
+        table, origin = splat.splats(run, turn, quality, within)
         for field in ("position", "deviations"):
             table[field] *= metres
         if name == "splat-spz":
-            table, times = in_spz(table)
+            table, times = splat.in_spz(table)
             unit += "" if times == 1 else f", times {times:g}"
-        write = partial(write_splat_spz if name == "splat-spz" else write_splat_ply, path, table)
         told = f"{len(table)} Gaussians{unit}"
         if name == "splat-glb":
-            write = partial(write_splat_glb, path, table, metres * origin)
-        elif origin.any():
-            told += f", less {', '.join(f'{x:g}' for x in metres * origin)}"
+            write = partial(splat.write_splat_glb, path, table, metres * origin)
+        else:
+            kind = splat.write_splat_ply if name == "splat" else splat.write_splat_spz
+            write = partial(kind, path, table)
+            if origin.any():
+                told += f", less {', '.join(f'{x:g}' for x in metres * origin)}"
     else:
-        points = coloured_points(run, min_weight, within)
-        radius = np.float32(metres) * points.radius
-        points = replace(points, positions=placed(points.positions), radius=radius)
-        told = f"{len(points.rows)} of {count} points{unit}"
+        found = points.coloured_points(run, min_weight, within)
+        radius = np.float32(metres) * found.radius
+        found = replace(found, positions=placed(found.positions), radius=radius)
+        told = f"{len(found.rows)} of {count} points{unit}"
         if name == "ply":
             axes = "turned upright, y up" if axes == VIEWER else "its scene's"
-            write = partial(write_ply, path, points, run.model.cloud, f"{axes}{unit}")
+            write = partial(points.write_ply, path, found, run.model.cloud, f"{axes}{unit}")
         else:
-            colours = gltf_colours(points.colours / 255)
-            write = partial(write_glb, path, {"POSITION": points.positions, "COLOR_0": colours})
+            colours = gltf.gltf_colours(found.colours / 255)
+            write = partial(gltf.write_glb, path, {"POSITION": found.positions, "COLOR_0": colours})
     if path.parts[-2:] == ("export", FORMATS[name][0]):  # of a file that has no --out
         own(path.parent)
     write()
