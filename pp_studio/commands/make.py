@@ -15,6 +15,7 @@ from pp_cl.errors import UserError
 from pp_studio.capture import STAGES
 from pp_studio.commands import render
 from pp_studio.commands.capture import add_hints
+from pp_studio.export import QUICK
 
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
 EPILOG = """FOLDER then holds
@@ -113,7 +114,7 @@ def run(options: argparse.Namespace) -> None:
         show(split)
         if not is_newer(out / SPLAT, folder.checkpoint):
             # of which export makes the file
-            fitted_gaussians(load(folder.path, options.device), minutes=OF_SPLAT * clock.left)
+            fitted_gaussians(load(folder.path, options.device), QUICK, OF_SPLAT * clock.left)
             words = ["--format", "splat"]
             _step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
             show(split)

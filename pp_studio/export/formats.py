@@ -20,6 +20,7 @@ from pp_studio.export import (
     QUICK,
     SPLATS,
     VIEWER,
+    gaussians,
     gltf,
     length,
     mesh,
@@ -93,10 +94,10 @@ def export_run(
         write = partial(texture.write_textured, path, solid)
         told = f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
     elif name == "html":
-        gaussians = page.fitted(run)
-        text = page.page_text(run, gaussians)
+        fitted = gaussians.fitted_gaussians(run)
+        text = page.page_text(run, fitted)
         write = partial(write_text, path, text)
-        told = f"{len(gaussians.table)} Gaussians, {len(text) / 1e6:.1f} MB"
+        told = f"{len(fitted.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     elif name in SPLATS:
         if name == "splat-spz":
             require("splat-spz", "gsply")

@@ -14,6 +14,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,7 +28,6 @@ from pp_studio.export import BEST, QUALITIES, QUICK
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 FILE = "gaussians.npz"  # in the folder of a run
-# Of a Gaussian, see fitted_gaussians()
 GAUSSIAN = np.dtype(
     [
         ("position", "<f4", 3),
@@ -69,6 +69,27 @@ FACTORS = np.array(
         *(-1.0925484305920792, 0.5462742152960396),
     ]
 )
+
+
+class Gaussians(NamedTuple):
+    """A run as Gaussians that are drawn without its network, in the axes and units of its scene, as
+    3D Gaussian splatting defines them.
+
+    table: (M,) records of GAUSSIAN. position: (3,) float32, the mean, relative to the origin, (3,)
+    float64. deviations: (3,) float32, standard deviations along a Gaussian's own axes (what files
+    call scales, without a logarithm). turn: (4,) float32, the unit quaternion (w, x, y, z) that
+    turns these axes to the world's. opacity: float32 in (1/255, 0.99], after the sigmoid.
+    harmonics: (9, 3) float32, coefficients of degrees 0 to 2 for the three channels of sRGB less
+    0.5, basis and signs of 3D Gaussian splatting, of the unit direction from the eye to the mean.
+
+    windows: least and most pixels of a window, for one of the run's images each way, in which they
+    look right with all variances on the screen widened by low_pass, pixels^2.
+    """
+
+    table: np.ndarray
+    origin: np.ndarray
+    windows: tuple[float, float] = (1.0, 1.0)
+    low_pass: float = 0.0
 
 
 class WindowCrops(Crops):
@@ -128,38 +149,24 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
     return cloud
 
 
-def fitted_gaussians(
-    run: Run, quality: str = QUICK, minutes: float = math.inf
-) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of GAUSSIAN, (3,) float64 origin): the run as Gaussians that are drawn without
-    its network, in the axes and units of its scene, as 3D Gaussian splatting defines them.
-
-    position: (3,) float32, the mean, relative to the origin. deviations: (3,) float32, standard
-    deviations along a Gaussian's own axes (what files call scales, without a logarithm). turn: (4,)
-    float32, the unit quaternion (w, x, y, z) that turns these axes to the world's. opacity: float32
-    in (1/255, 0.99], after the sigmoid. harmonics: (9, 3) float32, coefficients of degrees 0 to 2
-    for the three channels of sRGB less 0.5, basis and signs of 3D Gaussian splatting, of the unit
-    direction from the eye to the mean.
-
-    Fitted once for a checkpoint and kept in the run's folder as FILE; later calls read that.
-    quality: one of QUALITIES. minutes: at most, which costs steps. Raises UserError as
-    check_drawable does.
+def fitted_gaussians(run: Run, quality: str | None = None, minutes: float = math.inf) -> Gaussians:
+    """The run's Gaussians, fitted once for a checkpoint and kept in the run's folder as FILE, which
+    later calls read. quality: one of QUALITIES; None: what is kept, else QUICK. minutes: at most,
+    which costs steps. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    if found := kept_gaussians(run, [quality]):
+    if found := kept_gaussians(run, [quality] if quality else QUALITIES):
         return found
-    table = _table(run, fit_gaussians(run, *QUALITIES[quality], minutes))
+    table = _table(run, fit_gaussians(run, *QUALITIES[quality or QUICK], minutes))
     try:
         with atomic_file(run.folder.path / FILE) as file:
-            np.savez(file, key=np.array(_key(run, quality)), gaussians=table)
+            np.savez(file, key=np.array(_key(run, quality or QUICK)), gaussians=table)
     except UserError as error:
         warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
-    return table, run.model.grid.centre
+    return _fitted(run, table)
 
 
-def kept_gaussians(
-    run: Run, qualities: Iterable[str] = tuple(QUALITIES)
-) -> tuple[np.ndarray, np.ndarray] | None:
+def kept_gaussians(run: Run, qualities: Iterable[str] = QUALITIES) -> Gaussians | None:
     """What fitted_gaussians() has kept for the run's checkpoint, if that is of one of these
     qualities and not damaged, else None.
     """
@@ -170,16 +177,23 @@ def kept_gaussians(
             table = stored["gaussians"] if is_kept else np.empty(0)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    return (table, run.model.grid.centre) if table.dtype == GAUSSIAN else None
+    return _fitted(run, table) if table.dtype == GAUSSIAN else None
 
 
-def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
+def _fitted(run, table):
+    longest = max(max(camera.width, camera.height) for camera in run.cameras("train"))
+    reduced = max(1, round(longest / LARGEST))  # as the fit reduces them
+    least, most = (one / reduced for one in windows(longest / reduced))
+    return Gaussians(table, run.model.grid.centre, (least, most), LOW_PASS)
+
+
+def first_gaussians(run: Run) -> Gaussians:
     """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
     the colours that the network gives them. Raises UserError as check_drawable does.
     """
     check_drawable(run)
     cloud = begun(run, fit_harmonics(run, steps=0, most=FIRST_VIEWS), 0)
-    return _table(run, cloud), run.model.grid.centre
+    return Gaussians(_table(run, cloud), run.model.grid.centre)
 
 
 def _key(run, quality):

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,14 +16,7 @@ from pp_cl.errors import name_of
 from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
 from pp_cl.scene import up_of
 from pp_studio.camera_path import level
-from pp_studio.export.gaussians import (
-    LARGEST,
-    LOW_PASS,
-    first_gaussians,
-    fitted_gaussians,
-    kept_gaussians,
-    windows,
-)
+from pp_studio.export.gaussians import Gaussians, fitted_gaussians
 from pp_studio.export.harmonics import COUNT
 from pp_studio.large import render_large
 
@@ -46,32 +39,6 @@ FILLED = 0.8  # of the shorter side, by the object as it is turned round; lines 
 SAMPLED_POINTS = 20_000
 STILL = 600, 315  # pixels; the least that is shown large beside a link
 HERE = Path(__file__).parent
-
-
-class Gaussians(NamedTuple):
-    """table, origin: as fitted_gaussians() gives them. windows: least and most pixels of a window,
-    for one of the run's images each way, in which they look right with all variances on the screen
-    widened by low_pass, pixels^2.
-    """
-
-    table: np.ndarray
-    origin: np.ndarray
-    windows: tuple[float, float]
-    low_pass: float
-
-
-def fitted(run: Run) -> Gaussians:
-    """The run's Gaussians for viewers. Raises UserError as fitted_gaussians does."""
-    longest = max(max(camera.width, camera.height) for camera in run.cameras("train"))
-    reduced = max(1, round(longest / LARGEST))  # as the fit reduces them
-    least, most = windows(longest / reduced)
-    table, origin = kept_gaussians(run) or fitted_gaussians(run)
-    return Gaussians(table, origin, (least / reduced, most / reduced), LOW_PASS)
-
-
-def unfitted(run: Run) -> Gaussians:
-    """The run's points as Gaussians that are not fitted. Raises UserError as first_gaussians."""
-    return Gaussians(*first_gaussians(run), (1.0, 1.0), 0.0)
 
 
 def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
@@ -167,7 +134,9 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
             while stem.lower() in {"index", *map(str.lower, stems)}:  # as some disks take names
                 stem += "-2"
             stems.append(stem)
-            write_text(unfinished / f"{stem}.html", page_text(run, fitted(run), f"{stem}.png"))
+            write_text(
+                unfinished / f"{stem}.html", page_text(run, fitted_gaussians(run), f"{stem}.png")
+            )
             write_png(unfinished / f"{stem}.png", still(run))
             image = f'<img src="{stem}.png" alt="">'
             figures.append(f'<a href="{stem}.html">{image}{html.escape(name)}</a>')

@@ -17,7 +17,8 @@ from pp_cl.errors import name_of
 from pp_cl.files import atomic_path, own, write_png, write_text
 from pp_cl.scene import scene_frames
 from pp_studio.capture.overview import overview
-from pp_studio.export.page import filled, fitted, page_text, still, unfitted
+from pp_studio.export.gaussians import first_gaussians, fitted_gaussians
+from pp_studio.export.page import filled, page_text, still
 
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS, CAMERAS, MASKS = "thumbnail.png", "views.png", "cameras.png", "masks.png"
@@ -69,7 +70,7 @@ def write_result(
         shown = {name for name in (video, SPLAT) if is_newer(folder / name, done)}
         if not is_newer(folder / MODEL, folder / SPLAT if SPLAT in shown else done):
             write_png(folder / STILL, still(run))
-            gaussians = fitted(run) if SPLAT in shown else unfitted(run)
+            gaussians = (fitted_gaussians if SPLAT in shown else first_gaussians)(run)
             write_text(folder / MODEL, page_text(run, gaussians, title=title))
         shown |= {MODEL, STILL}
         model = '<iframe src="model.html" title="The model; drag to turn it"></iframe>'

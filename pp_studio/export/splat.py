@@ -34,7 +34,7 @@ def splats(
     by (3, 3), those in a box (2, 3) of the scene or all. The origin is 0 unless float32 is too
     coarse there. Raises UserError as fitted_gaussians() and inside() do.
     """
-    table, centre = fitted_gaussians(run, quality)
+    table, centre, *_ = fitted_gaussians(run, quality)
     positions = table["position"] + centre
     held = inside(positions, box)
     table, positions = table[held], positions[held] @ turn.T

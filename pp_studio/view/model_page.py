@@ -258,11 +258,11 @@ class ModelPage:
         """Arguments of viser's add_gaussian_splats, with mean colours, if any are fitted."""
         if (found := kept_gaussians(self.run)) is None:
             return None
-        table, origin = found
+        table = found.table
         turn = Rotation.from_quat(np.roll(table["turn"], -1, axis=1)).as_matrix()
         axes = turn * table["deviations"][:, None] / self._space.radius
         return {
-            "centers": self._space.page(table["position"] + origin).astype(np.float32),
+            "centers": self._space.page(table["position"] + found.origin).astype(np.float32),
             "covariances": (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
             "rgbs": (0.5 + CONSTANT * table["harmonics"][:, 0]).clip(0, 1),
             "opacities": table["opacity"][:, None],

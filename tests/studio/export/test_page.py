@@ -19,15 +19,18 @@ from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import load_run
 from pp_studio.export import QUALITIES, QUICK
-from pp_studio.export.gaussians import GAUSSIAN, check_drawable
+from pp_studio.export.gaussians import (
+    GAUSSIAN,
+    Gaussians,
+    check_drawable,
+    first_gaussians,
+    fitted_gaussians,
+)
 from pp_studio.export.page import (
     PACKED,
-    Gaussians,
     first_look,
-    fitted,
     pack,
     page_text,
-    unfitted,
     write_gallery,
 )
 
@@ -37,7 +40,7 @@ def page(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "view.html"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(QUALITIES, QUICK, (300, 0.0))  # as many steps as make it look like the run
-        path.write_text(page_text(run, fitted(run)))
+        path.write_text(page_text(run, fitted_gaussians(run)))
     return path
 
 
@@ -136,7 +139,7 @@ def test_a_browser_draws_gaussians_by_their_rules_in_all_sizes(run, page):
 
 def test_before_the_fit_it_shows_the_points(run, tmp_path):
     path = tmp_path / "first.html"
-    path.write_text(page_text(run, unfitted(run)))
+    path.write_text(page_text(run, first_gaussians(run)))
     camera = run.cameras("test")[0]
     [image] = drawn(path, [camera])
     assert psnr(image, to_8bit(run.render(camera).colour)) > 22

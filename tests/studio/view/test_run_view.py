@@ -165,7 +165,7 @@ def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monke
 
 
 def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copied, monkeypatch):
-    table, _ = fitted_gaussians(load_run(dev, copied))
+    table, *_ = fitted_gaussians(load_run(dev, copied))
     view = RunView(served[0], dev, RunFolder(copied))
     view.look()
     monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)
