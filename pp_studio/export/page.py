@@ -134,9 +134,8 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
             while stem.lower() in {"index", *map(str.lower, stems)}:  # as some disks take names
                 stem += "-2"
             stems.append(stem)
-            write_text(
-                unfinished / f"{stem}.html", page_text(run, fitted_gaussians(run), f"{stem}.png")
-            )
+            page = page_text(run, fitted_gaussians(run), f"{stem}.png")
+            write_text(unfinished / f"{stem}.html", page)
             write_png(unfinished / f"{stem}.png", still(run))
             image = f'<img src="{stem}.png" alt="">'
             figures.append(f'<a href="{stem}.html">{image}{html.escape(name)}</a>')
