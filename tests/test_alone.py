@@ -1,5 +1,3 @@
-"""A run folder by itself: what works without the scene, and on another machine."""
-
 import json
 import shutil
 
@@ -14,7 +12,6 @@ from pp_cl.scene.outline import OUTLINE
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    """Folder of a finished run that was sent without its scene."""
     folder = tmp_path_factory.mktemp("alone")
     scene = write_ball_scene(folder / "here" / "ball")
     assert main(arguments(scene, folder / "here" / "run", train__iterations=80)) == 0
@@ -24,7 +21,6 @@ def alone(tmp_path_factory):
 
 
 def test_a_run_alone_is_exported(alone, tmp_path):
-    """The other formats: tests/studio/commands/test_export.py."""
     mesh, scene = tmp_path / "mesh.ply", tmp_path / "scene"
     for kind, out in {"mesh": mesh, "scene": scene}.items():
         assert main(["export", str(alone), "--format", kind, "--out", str(out)]) == 0

@@ -1,8 +1,3 @@
-"""Checkpoints of runs: the same content gives the same bytes, and nothing is half-written; what a
-training writes is what is expected; anything else is refused in one line that names the file,
-whoever reads it, before memory is taken for it.
-"""
-
 import errno
 import io
 import shutil
@@ -45,7 +40,6 @@ from pp_cl.files.run_folder import RunFolder
 
 @pytest.fixture
 def folder(tmp_path):
-    """A run's folder that does not exist yet."""
     return RunFolder(tmp_path / "run")
 
 
@@ -55,7 +49,6 @@ def config():
 
 
 def rewritten(path, change, form=zipfile.ZIP_STORED):
-    """Write the members of a checkpoint anew: change({name: bytes}) -> the same."""
     with zipfile.ZipFile(path) as old:
         members = {zip_info.filename: old.read(zip_info) for zip_info in old.infolist()}
     with zipfile.ZipFile(path, "w", form) as new:
@@ -68,8 +61,6 @@ def npy(array, **options):
     np.save(file, array, **options)
     return file.getvalue()
 
-
-# ---- the file
 
 SOME = {
     "points.ids": np.arange(5, dtype=np.uint32),
@@ -144,9 +135,6 @@ def test_a_full_disk_keeps_the_old_file(tmp_path, monkeypatch):
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-# ---- whole ones
-
-
 @pytest.mark.parametrize("step", [1, STEP, 51, 59, STEPS])
 def test_what_fits_is_read_as_it_was_written(folder, config, step):
     header, arrays = contents(config, step)
@@ -179,8 +167,6 @@ def test_a_training_writes_what_is_expected(scene, tmp_path, monkeypatch, every,
     assert {name: (a.shape, a.dtype) for name, a in arrays.items()} == expected
     load_run_state(folder, load_config(folder.config))
 
-
-# ---- broken headers
 
 HEADERS = {
     "far before near": {"depth_range": [6.0, 2.0]},
@@ -226,9 +212,6 @@ def test_a_header_of_other_text_is_refused(folder, config, text):
     header = npy(np.frombuffer(text, np.uint8))
     rewritten(folder.checkpoint, lambda members: members | {"header.npy": header})
     refusal(folder, config)
-
-
-# ---- broken arrays
 
 
 ARRAYS = {
@@ -298,9 +281,6 @@ def test_coefficients_of_a_finished_run_are_rounded_and_of_no_other(folder, conf
     assert "points.sh0 is float16" in refusal(folder, config)
 
 
-# ---- files that are not whole: refused before memory is taken for them
-
-
 def bomb(path):
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("bomb.npy", npy(np.zeros(2**24)))
@@ -363,12 +343,8 @@ def test_a_file_that_may_not_be_read_is_not_called_corrupt(folder, config, monke
     assert "cannot be read (Permission denied)" in line and "delete" not in line
 
 
-# ---- whoever reads it
-
-
 @pytest.fixture(scope="module")
 def trained(scene, finished, tmp_path_factory):
-    """(folder of a finished run, of one interrupted at step 20)."""
     young = tmp_path_factory.mktemp("runs") / "young"
     with pytest.MonkeyPatch.context() as patch:
         train_and_interrupt(scene, young, 25, patch)
@@ -399,7 +375,6 @@ def test_every_reader_says_the_same(scene, trained, tmp_path):
 
 
 def overflow(path):
-    """Make the weights of a checkpoint so large that its network computes NaN."""
     header, arrays = load_checkpoint(path)
     header.pop("format")
     for name, array in arrays.items():

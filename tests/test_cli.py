@@ -1,7 +1,3 @@
-"""The command line as a user meets it: what it prints, its exit status, and one line for whatever
-is wrong.
-"""
-
 import json
 import signal
 import subprocess

@@ -1,5 +1,3 @@
-"""Settings: presets, text conversion, JSON round trip, and one-line errors that name the key."""
-
 import json
 
 import pytest
@@ -82,7 +80,6 @@ def test_assign_refuses(key, text, message):
 
 
 def refusal(path):
-    """The one line by which the settings are refused."""
     with pytest.raises(UserError) as caught:
         load_config(path)
     line = str(caught.value)
@@ -111,7 +108,6 @@ def test_a_broken_config_file_is_one_line(tmp_path, text):
 
 
 def stored_settings():
-    """What a run of the demo stores."""
     config = preset("tiny")
     config.scene.path = "demo"
     return json.loads(config.to_json())
@@ -171,7 +167,6 @@ def test_names_of_files_that_are_no_text_survive(tmp_path):
 
 
 def test_help_covers_every_setting():
-    """With its default as --set takes it."""
     text, count = "\n".join(help_lines()), 0
     for section, values in json.loads(Config().to_json()).items():
         if isinstance(values, dict):

@@ -1,5 +1,3 @@
-"""What others wrote is quoted on one line."""
-
 import pytest
 
 from pp_cl.errors import MOST_LINE, Stopped, UserError, one_line, quoted, require, shown

@@ -1,5 +1,3 @@
-"""`pp-cl info`: what a run or a scene is, and the image of its points."""
-
 import json
 import math
 import shutil
@@ -23,15 +21,12 @@ BALL = 0.8  # its radius, support.scenes
 
 @pytest.fixture(scope="module")
 def finished(finished):
-    """Folder of a finished and evaluated run."""
     assert main(["eval", str(finished), "--metrics", "psnr"]) == 0
     return finished
 
 
 @pytest.fixture
 def facts(capsys):
-    """Reads the facts that `pp-cl info ... --json` prints."""
-
     def read(*words):
         capsys.readouterr()
         assert main(["info", *map(str, words), "--json"]) == 0
@@ -77,7 +72,6 @@ def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, 
 
 
 def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts):
-    """info tells what it knows; eval asks for --scene."""
     run, old, new = tmp_path / "run", tmp_path / "ball", tmp_path / "sphere"
     shutil.copytree(scene, old)
     assert main(arguments(str(old), run, train__iterations=6)) == 0

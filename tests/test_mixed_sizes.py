@@ -1,5 +1,3 @@
-"""Scenes whose images differ in size: every command takes them."""
-
 import json
 
 import numpy as np

@@ -55,7 +55,6 @@ OLD = 1_000_000_000
 
 @pytest.fixture
 def work(finished, tmp_path, monkeypatch):
-    """The folder that one is in, with a run."""
     shutil.copytree(finished, tmp_path / "run")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -78,7 +77,6 @@ def files(folder):
 
 
 def made(paths, folder):
-    """Make files of the user's, or change them; returns files() of them."""
     for path in paths:
         with path.open("ab") as file:
             file.write(b"mine")
@@ -88,7 +86,6 @@ def made(paths, folder):
 
 @pytest.mark.parametrize("name", [n if n in ONE_EACH else slow(n) for n in COMMANDS])
 def test_what_is_the_users_stays(work, scene, name, capsys):
-    """Files beside those of the command, and those of the command that the user has changed."""
     before, words = files(work), words_for(name, scene)
     assert main(words) == 0
     written = files(work)

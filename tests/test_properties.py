@@ -1,5 +1,3 @@
-"""Properties of what reads and writes texts, for whatever texts and numbers there are."""
-
 import json
 import math
 

@@ -1,5 +1,3 @@
-"""pp-cl from Python: the same runs, without text."""
-
 import json
 import os
 import socket
@@ -81,9 +79,6 @@ def test_the_package_and_its_help_need_no_opencl():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=root, stdout=subprocess.DEVNULL)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def test_a_folder_has_one_training_at_a_time(scene, tmp_path):
     out = tmp_path / "run"
     with RunFolder(out).owned():
@@ -109,7 +104,6 @@ def test_a_killed_owner_owns_nothing_any_more(scene, tmp_path):
 
 
 def test_a_folder_that_went_on_since_it_was_looked_at(scene, tmp_path, monkeypatch):
-    """Two trainings look at an empty folder; the slower one finds what the other has left."""
     out, folder = tmp_path / "run", RunFolder(tmp_path / "run")
     config = run_config(folder, scene, None, [("scene.downscale", 2, "test")])
     for key, value in (SETTINGS | {"train.iterations": 3}).items():

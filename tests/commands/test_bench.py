@@ -1,5 +1,3 @@
-"""`pp-cl bench`: tables, files, and options that are refused."""
-
 import json
 import sys
 
@@ -13,7 +11,6 @@ from pp_cl.commands import bench as command
 
 
 def bench(tmp_path, *words):
-    """The rows that the bench wrote with --json."""
     file = tmp_path / "b.json"
     assert main(["bench", *words, "--json", str(file)]) == 0
     result = json.loads(file.read_text())

@@ -1,5 +1,3 @@
-"""The types by which argparse reads options, and options that commands share."""
-
 import argparse
 import json
 import sys
@@ -42,7 +40,6 @@ def test_texts_become_what_is_meant(tmp_path):
 
 
 def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypatch):
-    """One rule for every command."""
     monkeypatch.setattr("pp_cl.drivers.list_devices", lambda **_: [])
     file = tmp_path / "a.json"
     for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):

@@ -1,5 +1,3 @@
-"""How often the grid is refined where the settings leave it open."""
-
 import re
 
 import pytest

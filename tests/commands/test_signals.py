@@ -1,5 +1,3 @@
-"""Ctrl-C and SIGTERM: one line, soon; a training ends its step and writes a checkpoint."""
-
 import signal
 import subprocess
 import sys
@@ -18,12 +16,10 @@ from pp_cl.errors import UserError
 
 @pytest.fixture(scope="module")
 def whole(finished):
-    """The checkpoint of a training that was not stopped."""
     return (finished / "checkpoint.npz").read_bytes()
 
 
 def signalling(monkeypatch, at, number):
-    """Trainer.train_step that sends this process a signal in the middle of a step."""
     train_step = Trainer.train_step
 
     def stepping(self):

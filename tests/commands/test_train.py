@@ -1,5 +1,3 @@
-"""`pp-cl train`: what it prints about how settings were read."""
-
 import json
 
 import numpy as np
@@ -18,7 +16,6 @@ from pp_cl.session.training import train_scene
 
 
 def trained_lines(capsys, *words):
-    """Lines on stdout of a training of two steps that must go well."""
     few = ["--iterations", "2", "--points", "300", "--set", "network.widths=16,16,16"]
     assert main(["train", *map(str, words), *few]) == 0
     return capsys.readouterr().out.splitlines()
@@ -64,7 +61,6 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
 
 
 def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
-    """Of images of another size: by a start without a checkpoint, and with --config."""
     scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
     words = arguments(scene, folder.path, train__refine_at="0,0", raster__radius=0)
     with monkeypatch.context() as patch:
@@ -113,7 +109,6 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
 
 
 def test_a_run_begins_with_the_settings_of_another(tmp_path, capsys):
-    """All but those of its scene; resumed with the same words, and others on top."""
     scene, file = write_ball_scene(tmp_path / "ball", views=4), tmp_path / "first" / "config.json"
     changed = ("--set", "train.sh_eps=0.02", "--downscale", "1")
     trained_lines(capsys, scene, "--out", tmp_path / "first", *changed)

@@ -1,5 +1,3 @@
-"""Which devices there are, whether they work, and which one is chosen."""
-
 import os
 import re
 import subprocess
@@ -85,9 +83,6 @@ def test_what_cannot_be_opened_is_told_and_not_replaced(listed):
 
 
 def test_devices_that_can_work_side_by_side(listed, monkeypatch):
-    """GPUs alone if there are any; what two platforms list under one name is one; a processor is
-    shared by all its platforms.
-    """
     h200 = [fake("NVIDIA CUDA", "H200", gpu=True, index=f"0:{i}") for i in range(2)]
     again = [fake("PoCL", "H200 ", gpu=True, index=f"1:{i}") for i in range(2)]
     broken = fake("C", "other", gpu=True, problem="does not run: x", index="2:0")
@@ -144,7 +139,6 @@ def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_p
 
 
 def test_a_device_without_room_for_constants_does_not_work():
-    """64 KiB is what OpenCL asks for; 64 bytes are enough."""
     problem = find_problem(SimpleNamespace(max_constant_buffer_size=63))
     assert problem == "holds 63 bytes of constants, 64 needed"
 

@@ -42,7 +42,6 @@ def measured(monkeypatch, tmp_path):
 
 
 def first(found):
-    """The index of the device that is taken."""
     return speeds.by_speed(found)[0][0]
 
 
@@ -124,7 +123,6 @@ NAMES = ("name", "platform", "compute_units", "memory_bytes")
 
 
 def test_processes_measure_once_and_choose_alike(session_device, tmp_path):
-    """Four at the same time, with the kept speed of the first; one device counts as two."""
     code = """
         import sys
         from pp_cl import drivers, speeds

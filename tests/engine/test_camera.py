@@ -1,5 +1,3 @@
-"""The camera and its device layout, poses, crops, shifts, downscaling and padding."""
-
 from dataclasses import replace
 
 import numpy as np

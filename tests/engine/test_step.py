@@ -1,7 +1,3 @@
-"""Training: it learns, it is deterministic, and a run that was killed ends like one that was
-not.
-"""
-
 import re
 import shutil
 
@@ -68,7 +64,6 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(scene, tmp
 
 
 def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_path, monkeypatch):
-    """Which it needs no more once it has begun."""
     run, whole, other = tmp_path / "run", tmp_path / "whole", tmp_path / "other"
     shutil.copytree(finished, other)
     given = {"network__rate": "1e-12,1e-12", "train__ema": "false"}
@@ -147,7 +142,6 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, monkeypatch):
 
 
 def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
-    """The ball fills about half of its box, so 1500 cells hold some 750 points."""
     monkeypatch.setattr("pp_cl.scene.hull.CELL_CAP", 1500)
     assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
     told = re.search(r"^points: only (\d+) of the 1500 asked .*$", capsys.readouterr().out, re.M)
@@ -166,7 +160,6 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
 
 
 def test_the_distortion_loss_brings_the_fragments_of_a_pixel_together(scene, tmp_path):
-    """Their mean depth and their median depth differ less."""
     apart = []
     for weight in (0, 30):
         out = tmp_path / str(weight)

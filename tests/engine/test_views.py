@@ -1,5 +1,3 @@
-"""Views: reduction and its limits, the pixels that show the object."""
-
 import numpy as np
 import pytest
 
@@ -41,9 +39,6 @@ def test_image_too_small_for_any_reduction():
 @pytest.mark.parametrize("downscale", (1, 2, 3))
 @pytest.mark.parametrize("margin", (0, 2, 100))
 def test_object_bounds_are_the_tightest(view, rng, downscale, margin):
-    """Against a search over the reduced pixels one by one; the image's leftover columns and rows do
-    not count.
-    """
     for _ in range(5):
         view.image[..., 3] = rng.integers(0, MASK_THRESHOLD + 1, view.image.shape[:2])
         view.image[rng.integers(5, 50, 4), rng.integers(9, 70, 4), 3] = MASK_THRESHOLD + 1

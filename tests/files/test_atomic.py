@@ -1,5 +1,3 @@
-"""Files written to a temporary name: file systems that cannot do all, and what a kill leaves."""
-
 import errno
 import os
 import stat
@@ -26,7 +24,6 @@ DEAD = 2**22 + 1  # the number of no process: Linux has none above 2^22
 
 
 def failing_folder_sync(monkeypatch, number):
-    """os.fsync that fails for folders."""
     fsync = os.fsync
 
     def syncing(descriptor):
@@ -127,11 +124,7 @@ def test_json_never_holds_nan(tmp_path):
     assert not (tmp_path / "a.json").exists()
 
 
-# ---- whose files are whose
-
-
 def test_what_was_written_is_ours_until_somebody_changes_it(tmp_path):
-    """In a folder that the program fills, however deep; not beside it, and not behind a link."""
     filled = tmp_path / "filled"
     own(filled)
     (filled / "a" / "b").mkdir(parents=True)

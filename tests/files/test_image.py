@@ -1,5 +1,3 @@
-"""Images on disk: every kind of PNG, broken files, writing without leaving halves behind."""
-
 import os
 import warnings
 import zlib
@@ -24,7 +22,6 @@ from pp_cl.files.image import (
 
 @pytest.fixture
 def rgba(rng):
-    """(5, 7, 4) random image."""
     return rng.integers(0, 256, (5, 7, 4), np.uint8)
 
 
@@ -57,9 +54,6 @@ def test_modes_become_rgba(tmp_path, rgba):
 
 
 def test_masks_of_other_programs(tmp_path, rgba):
-    """Gray ones; cut-outs, whose alpha is the mask; labels, of which a JPEG's may be noise; what is
-    none of these is refused with the mend.
-    """
     gray, path = rgba[..., 0], tmp_path / "a.png"
     for image in (gray, np.dstack([gray] * 3), np.dstack([rgba[..., :3], gray])):
         Image.fromarray(image).save(path)
@@ -108,7 +102,6 @@ def test_sixteen_bits_become_eight(tmp_path, rgba):
 
 
 def test_colours_of_other_spaces_become_srgb(tmp_path):
-    """As phones write them, with sRGB's own profile, of four inks, or multiplied with alpha."""
     own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     image = Image.new("RGB", (40, 30), (200, 90, 60))
     image.save(tmp_path / "p3.png", icc_profile=display_p3())
@@ -158,7 +151,6 @@ def test_a_broken_animation_is_read_without_a_word(tmp_path, rgba, recwarn):
 @pytest.mark.unix
 @pytest.mark.parametrize("read", (read_rgba, image_size))
 def test_not_an_image(tmp_path, read):
-    """A pipe is not waited for."""
     (tmp_path / "text.png").write_text("not an image")
     (tmp_path / "empty.png").touch()
     for name in ("pipe.png", "pipe.exr"):

@@ -1,5 +1,3 @@
-"""The folder of a run: its log survives whatever stands in it, and a full disk is told."""
-
 import errno
 import json
 import os
@@ -22,7 +20,6 @@ def write(folder, *lines):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A run's folder with three rows in its log."""
     folder = RunFolder(tmp_path)
     write(folder, *(json.dumps(row).encode() for row in ROWS))
     return folder
@@ -33,9 +30,6 @@ def rows(folder):
 
 
 def test_rows_after_the_step_are_cut_off_and_made_again(folder, recwarn):
-    """Also what a kill left of a row, and the row of the end; a row that is being written is not
-    there yet.
-    """
     with folder.log.open("ab") as file:
         file.write(b'{"step": 20, "sec')
     assert folder.rows() == ROWS
@@ -77,7 +71,6 @@ def test_a_log_of_at_most_so_many_bytes(folder, monkeypatch):
     ],
 )
 def test_a_damaged_log_is_cut_off_there(folder, line):
-    """And told in one line."""
     write(folder, json.dumps(ROWS[0]).encode(), line, json.dumps(ROWS[2]).encode())
     with pytest.warns(UserWarning, match="line 2 is no row of a log"):
         assert folder.rows() == ROWS[:1]
@@ -107,7 +100,6 @@ def test_a_full_disk_is_one_line_that_names_the_log(folder):
 
 
 def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_path, monkeypatch):
-    """Where config.json cannot be written, nothing else is there that would look foreign."""
     folder = RunFolder(tmp_path / "run")
 
     def fail(*_):
@@ -126,9 +118,6 @@ def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_p
 
 
 def test_images_without_a_checkpoint_go_and_others_stay(tmp_path):
-    """They may show other settings; a file of the user is none of them, nor is one that the user
-    has changed.
-    """
     folder = RunFolder(tmp_path)
     folder.create("{}")
     ours = [tmp_path / "masks.png", folder.previews / "step_000030.png"]

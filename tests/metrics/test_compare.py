@@ -1,5 +1,3 @@
-"""Comparing images on disk."""
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,7 +10,6 @@ from pp_cl.metrics.psnr_ssim import Metrics
 
 @pytest.fixture
 def folders(rng, tmp_path):
-    """Two folders, pred and truth, each with b.png, a.png and a text file."""
     for folder in ("pred", "truth"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "notes.txt").write_text("no image")
@@ -29,7 +26,6 @@ def test_two_images(folders):
 
 
 def test_every_image_of_a_folder_is_compared_or_refused(folders):
-    """A format that is not read is not left out in silence; a hidden file is no image."""
     for folder in folders:
         Image.open(folder / "a.png").save(folder / "c.webp", lossless=True)
         Image.open(folder / "a.png").save(folder / "d.JPG")

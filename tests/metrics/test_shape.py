@@ -1,5 +1,3 @@
-"""The vertices nearest to a mesh, sample by sample against float64."""
-
 import os
 
 import numpy as np
@@ -89,9 +87,6 @@ def test_overlap_by_hand():
         Grid((-1.0, -1, 0), 1.0, (4, 3, 1)), np.array([[0], [0b100], [0b110]], np.uint32), 3
     )
     assert overlap(larger, grid, ids)["recall"] == 2 / 3
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_what_cannot_be_sampled(dev):

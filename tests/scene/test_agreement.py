@@ -1,5 +1,3 @@
-"""Masks that contradict the others are found, and none else."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +19,6 @@ BOX = np.stack([CENTRE - RADIUS, CENTRE + RADIUS])
 
 
 def shifted(view, share):
-    """The view with its mask moved to the right."""
     image = view.image.copy()
     image[..., 3] = np.roll(image[..., 3], round(share * image.shape[1]), axis=1)
     return replace(view, image=image)
@@ -33,7 +30,6 @@ def test_masks_of_one_object_agree(count):
 
 
 def test_a_hull_of_one_point_is_looked_at():
-    """Its box has no size."""
     assert disagreements(ball_views(8), np.stack([CENTRE, CENTRE])) == []
 
 
@@ -47,7 +43,6 @@ def test_a_shifted_mask_is_named(dev, count, bad):
 
 
 def test_the_share_is_that_of_the_object():
-    """A mask that lacks its left half rejects half of the ball."""
     views = ball_views(60)
     image = views[7].image.copy()
     image[:, :32, 3] = 0
@@ -59,7 +54,6 @@ def test_the_share_is_that_of_the_object():
 
 
 def bitten(view, share):
-    """The view with a mask that lacks its right half in a share of the rows, in the middle."""
     image = view.image.copy()
     height, width = image.shape[:2]
     rows = slice(round((0.5 - share / 2) * height), round((0.5 + share / 2) * height))
@@ -84,7 +78,6 @@ def test_masks_that_lie_elsewhere_are_left_out(dev):
 
 
 def test_a_hull_forgives_masks_that_lack_a_part(dev):
-    """Four of 60 masks lack a part of the ball: it is whole in the hull all the same."""
     views = ball_views(60)
     for index in (3, 17, 29, 40):
         views[index] = bitten(views[index], 0.25)
@@ -157,7 +150,6 @@ def test_a_mask_that_lacks_a_part_is_named(dev):
 
 @pytest.fixture
 def scene(tmp_path):
-    """A ball's scene with one shifted mask."""
     folder = write_ball_scene(tmp_path / "ball", views=24, size=48)
     file = tmp_path / "ball/train/r_4.png"
     image = read_rgba(file)

@@ -1,5 +1,3 @@
-"""What a user has decided about a scene is obeyed, and a broken file is one line."""
-
 import json
 import shutil
 from pathlib import Path
@@ -20,7 +18,6 @@ BOX = [[-0.5, -1, -1], [1, 1, 0.25]]
 
 @pytest.fixture
 def folder(scene, tmp_path):
-    """A copy of the ball."""
     return Path(shutil.copytree(scene, tmp_path / "ball"))
 
 

@@ -1,7 +1,3 @@
-"""Visual hull and grid: the kernels against the float64 oracle, the search for the voxel size, the
-errors.
-"""
-
 from dataclasses import replace
 
 import numpy as np
@@ -59,7 +55,6 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
 
 
 def test_what_two_of_many_images_see_is_dropped(dev):
-    """Two cameras look at one place, three at another."""
     here, there, one = np.zeros(3), np.array([9.0, 9, 9]), Grid((0, 0, 0), 0.1, (1, 1, 1))
     ahead = [(place, place + 4 * axis) for place in (here, there) for axis in np.eye(3)][1:]
     image = np.full((64, 64, 4), 255, np.uint8)
@@ -83,7 +78,6 @@ def test_the_left_and_upper_borders_belong_to_an_image(dev):
 
 @pytest.fixture
 def carvings(monkeypatch):
-    """The (Grid, number of vertices inside) of all carvings of a test, in their order."""
     made, carve = [], Carver.carve
 
     def recorded(self, grid, forgiven=0):
@@ -162,7 +156,6 @@ def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
 
 
 def cropped(view):
-    """The view cropped to its mask, which touches all borders."""
     used = [np.flatnonzero((view.image[..., 3] > 0).any(axis)) for axis in (0, 1)]
     (x0, x1), (y0, y1) = ((int(u[0]), int(u[-1]) + 1) for u in used)
     camera = view.camera.crop(x0, y0, x1 - x0, y1 - y0)
@@ -194,7 +187,6 @@ def test_close_ups_bound_the_object_only_where_no_image_shows_it_whole(dev, whol
 @pytest.mark.large
 @pytest.mark.parametrize("stated", [None, (1.0, 9.0), (3.9, 4.1)])
 def test_depth_range_holds_every_point(dev, stated):
-    """One that the dataset states is kept, or widened."""
     views = [replace(view, depth_range=stated) for view in ball_views()]
     found = build_grid(dev, views, 2000)
     distances = [np.linalg.norm(positions_of(found) - v.camera.eye, axis=1) for v in views]

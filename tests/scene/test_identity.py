@@ -1,5 +1,3 @@
-"""What tells whether a scene is the one that a run has learned."""
-
 import hashlib
 import json
 from dataclasses import replace
@@ -26,7 +24,6 @@ def views_of(folder, **options):
 
 
 def repaint(file, channel):
-    """Change one channel of one pixel by one."""
     pixels = np.array(Image.open(file))
     pixels[20, 20, channel] ^= 1
     Image.fromarray(pixels).save(file)

@@ -1,5 +1,3 @@
-"""Masks from files, from a uniform background, and none."""
-
 import json
 import warnings
 
@@ -29,7 +27,6 @@ TOLERANCE = 10.0
 
 
 def disc(size=60, radius=20.0, soft=0.0):
-    """(size, size) alpha of a disc in the middle."""
     y, x = np.mgrid[:size, :size] + 0.5 - size / 2
     alpha = (np.hypot(x, y) < radius).astype(float)
     return gaussian_filter(alpha, soft) if soft else alpha
@@ -41,12 +38,8 @@ def over(alpha, colour, background):
     return np.dstack([np.rint(255 * image), np.full(alpha.shape, 255)]).astype(np.uint8)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("background", [(1, 1, 1), (0, 0, 0), (0.1, 0.8, 0.2), (0.4, 0.4, 0.45)])
 def test_a_uniform_background_is_cut_out(rng, background):
-    """With the noise of a camera, and shading of a few levels across the image."""
     alpha = disc()
     image = over(alpha, (0.7, 0.2, 0.25), background).astype(float)
     image[..., :3] += rng.normal(0, 2, image[..., :3].shape) + np.linspace(-3, 3, 60)[:, None]
@@ -96,12 +89,8 @@ def test_an_object_at_the_border_does_not_decide():
     assert (found[:25, :30] == 255).all() and (found[25:] == 0).all()
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("named", ["{stem}.png", "{name}.png", "{stem}.jpg"])
 def test_a_folder_of_masks(tmp_path, rng, named):
-    """Outside of the scene's folder, which the format's own masks and alpha give way to."""
     (tmp_path / "scene").mkdir()
     write_scene(tmp_path / "scene")
     masks = tmp_path / "masks"
@@ -146,7 +135,6 @@ def test_alpha_is_taken_or_left(tmp_path, source, opaque):
 
 @pytest.fixture
 def masked(tmp_path):
-    """(folder of a scene without alpha, folder of its masks)."""
     write_scene(tmp_path)
     masks = tmp_path / "masks"
     masks.mkdir()
@@ -175,11 +163,7 @@ def test_bad_masks(masked, case):
         load_scene(scene, masks=MaskRule(folder=str(masks)))
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def opaque_ball(folder, background=(255, 255, 255)):
-    """The ball's scene with opaque images over a colour."""
     write_ball_scene(folder, views=10, size=40)
     for file in folder.rglob("*.png"):
         rgba = read_rgba(file)

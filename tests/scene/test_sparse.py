@@ -1,5 +1,3 @@
-"""Sparse points that scenes bring along."""
-
 import json
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Trainings that are given minutes: how many steps these allow, and that a run keeps to them."""
-
 import json
 import signal
 from types import SimpleNamespace

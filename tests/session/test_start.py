@@ -1,5 +1,3 @@
-"""What a training decides of its beginning."""
-
 import pytest
 from support.runs import spoken
 from support.scenes import write_ball_scene

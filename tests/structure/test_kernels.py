@@ -1,5 +1,3 @@
-"""The rules of the OpenCL sources, and that each finds what breaks it."""
-
 import re
 from pathlib import Path
 
@@ -72,7 +70,6 @@ def test_the_rule_holds_everywhere(check):
 
 
 def included(name):
-    """The headers that a file includes, and those that these do."""
     found = set(re.findall(r'#include "(.*)"', SOURCES[name]))
     return found.union(*map(included, found))
 

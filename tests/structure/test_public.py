@@ -1,5 +1,3 @@
-"""pp_studio is made on what docs/api.md lists, as any other package would be."""
-
 import ast
 import importlib
 import re

@@ -1,5 +1,3 @@
-"""Paths around an object: smooth, upright, and with the whole object in view."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,6 @@ from pp_studio.camera_path import MARGIN, Surroundings, between, through
 
 
 def turned(cameras, rotation, shift):
-    """The cameras in a world that was turned and moved."""
     poses = [np.column_stack([rotation @ c.pose[:, :3], rotation @ c.eye + shift]) for c in cameras]
     return [replace(camera, pose=pose) for camera, pose in zip(cameras, poses, strict=True)]
 

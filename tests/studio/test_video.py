@@ -1,5 +1,3 @@
-"""Videos have the frames, the size and the speed that were asked for."""
-
 import re
 import subprocess
 import sys
@@ -15,7 +13,6 @@ from pp_studio.video import LOOPED, check_video, write_video
 
 
 def frames(height=50, width=64, channels=3, count=9):
-    """Frames of a square that moves on a colour."""
     for i in range(count):
         frame = np.full((height, width, channels), 255, np.uint8)
         frame[..., :3] = (40, 130, 200)
@@ -51,7 +48,6 @@ def test_a_page_plays_a_video_before_it_is_there_as_a_whole(tmp_path):
 @pytest.mark.parametrize("suffix", ["mp4", "webm"])
 @pytest.mark.parametrize("size", [(48, 64)])
 def test_colours_come_back_as_players_show_them(tmp_path, suffix, size):
-    """By the tags of the video, and none are left to guess at; a column each."""
     path = tmp_path / f"video.{suffix}"
     colours = np.array([(200, 60, 30), (30, 180, 60), (40, 70, 220), (230, 200, 40), (128,) * 3])
     width = size[1] // len(colours)

@@ -1,5 +1,3 @@
-"""The exact depth of the demo against the mesh of the same object, and the measures."""
-
 import numpy as np
 import pytest
 import trimesh

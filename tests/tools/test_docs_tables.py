@@ -1,5 +1,3 @@
-"""tools/docs_tables.py: the documents hold the tables that it writes."""
-
 import json
 import re
 from pathlib import Path

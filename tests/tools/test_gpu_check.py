@@ -1,5 +1,3 @@
-"""tools/gpu_check.py: what compilers say is read right; what must not build does not."""
-
 import pytest
 
 from pp_cl.drivers import open_device

@@ -1,7 +1,3 @@
-"""tools/results.py: what was measured is kept for the code that it was measured of, and fits the
-tables; a training and its evaluation become a row.
-"""
-
 import pytest
 
 from tools import docs_tables

@@ -1,5 +1,3 @@
-"""A device: its buffers, its errors, its programs and its debug levels."""
-
 import atexit
 import gc
 import re
@@ -33,7 +31,6 @@ kernel void divide(
 
 @pytest.fixture
 def tiny(tmp_path, monkeypatch):
-    """A kernel folder of the test's own."""
     (tmp_path / "tiny.cl").write_text(TINY)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
     return tmp_path
@@ -47,9 +44,6 @@ def test_a_device_that_nobody_has_is_gone_with_its_memory(session_device):
     del device
     gc.collect()
     assert gone() is None
-
-
-# ---- buffers
 
 
 def test_upload_fill_zeros_copy(dev, rng):
@@ -144,8 +138,6 @@ def test_a_cpu_works_as_one_unless_told_otherwise(dev, monkeypatch):
 
 @pytest.mark.parametrize("error", [cl.MemoryError, cl.RuntimeError, cl.LogicError])
 def test_a_driver_that_gives_up_is_a_user_error(plain, error):
-    """And a wrong call of it keeps its traceback."""
-
     def refuse(*_):
         raise error("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
 
@@ -161,9 +153,6 @@ def test_a_driver_that_gives_up_is_a_user_error(plain, error):
 def test_fresh_guarded_buffers_are_nan(dev):
     assert np.isnan(dev.empty((33,)).get()).all()
     assert (dev.empty((33,), np.uint32).get() == 0xFFFFFFFF).all()
-
-
-# ---- programs and debug levels
 
 
 def test_a_build_error_names_file_options_and_cause(plain, tiny):
@@ -216,7 +205,6 @@ def test_a_kernel_folder_with_a_space_is_refused(plain, tmp_path, monkeypatch):
 
 @pytest.fixture
 def debugged(session_device, tiny, monkeypatch):
-    """Makes a device of a given PP_DEBUG that runs TINY on some values."""
     made = []
 
     def make(level, values, guarded=False):
@@ -270,9 +258,6 @@ def test_debug_3_takes_infinity_where_the_kernel_says_so(debugged, tiny):
     debugged("3", [1, 0])
     with pytest.raises(FloatingPointError, match="y has 1 NaN or Inf, first at 0"):
         debugged("3", [np.nan, 0])
-
-
-# ---- stages
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="only Unix has the signal")

@@ -1,5 +1,3 @@
-"""Launches, the launcher's refusals, signatures, and the build of every kernel file."""
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +18,6 @@ STEMS = sorted(
 
 @pytest.fixture
 def program(dev, tmp_path, monkeypatch):
-    """SOURCE built on the guarded device."""
     (tmp_path / "toy.cl").write_text(SOURCE)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
     dev._programs.pop(("toy", frozenset()), None)
@@ -30,7 +27,6 @@ def program(dev, tmp_path, monkeypatch):
 
 @pytest.fixture
 def rows(dev, rng):
-    """Good arguments of the kernel `rows`, n = 33."""
     return {
         "n": 33,
         "scale": 2.0,
@@ -38,9 +34,6 @@ def rows(dev, rng):
         "k": dev.upload(np.arange(3), np.uint32),
         "y": dev.empty((33, 1)),
     }
-
-
-# ---- launching
 
 
 def test_a_launch_computes(program, dev, rows):
@@ -189,9 +182,6 @@ def test_a_work_group_larger_than_the_device_runs_is_one_line(program, dev, rows
         program.launch("rows", 33, local=2 * limit, **rows)
 
 
-# ---- guards
-
-
 @pytest.mark.parametrize("n", [1, 33, 257])
 def test_a_write_behind_a_buffer_is_caught(program, dev, n):
     y = dev.zeros((n,))
@@ -199,8 +189,6 @@ def test_a_write_behind_a_buffer_is_caught(program, dev, n):
     with pytest.raises(AssertionError, match=f"behind a buffer of {4 * n} bytes"):
         dev.check()
 
-
-# ---- every kernel file
 
 INFO, ADDRESS = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
 TYPES = {dtype: name for name, dtype in SCALARS.items()}
@@ -218,7 +206,6 @@ def driver_says(kernel, i):
 
 
 def launcher_says(p):
-    """The same from the parsed signature."""
     kind = TYPES[p.dtype] + (str(p.width) if p.width > 1 else "") + ("*" if p.is_buffer else "")
     space = ADDRESS.GLOBAL if p.is_buffer else ADDRESS.PRIVATE
     return p.name, kind, space, p.const and p.is_buffer
@@ -263,9 +250,6 @@ def test_work_groups_may_have_one_dimension_alone(program, monkeypatch, given):
     assert kernel.ranges((5, 5, 5), given)[1] == ((16, 1, 1) if given is None else (1, 1, 1))
 
 
-# ---- signatures
-
-
 @pytest.mark.parametrize(
     "parameters, message",
     [
@@ -286,9 +270,6 @@ def test_heads_that_are_refused(parameters, message):
         parse_signatures(f"kernel void f(\n{parameters}\n{{}}", "f.cl")
 
 
-# ---- how much a work-item does
-
-
 def test_lanes_on_cpus_and_gpus(dev, monkeypatch):
     monkeypatch.setattr(dev, "is_cpu", True)
     assert (lanes(dev), row_parts(dev)) == (16, 1)
@@ -302,7 +283,6 @@ def test_lanes_on_cpus_and_gpus(dev, monkeypatch):
 
 @pytest.mark.parametrize(("largest", "items"), [(1024, 256), (256, 256), (100, 64), (1, 1)])
 def test_groups(largest, items):
-    """A power of two that the device runs; none on CPUs, which take their work-group."""
     of = SimpleNamespace(is_cpu=False, device=SimpleNamespace(max_work_group_size=largest))
     assert group_items(of) == items
     assert group_ranges(of, 7, 16) == (112, 64)

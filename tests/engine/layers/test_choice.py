@@ -1,5 +1,3 @@
-"""Which variant a convolution takes, and the sizes that its kernels are built with."""
-
 from types import SimpleNamespace
 
 import pytest

@@ -54,7 +54,6 @@ def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
 @pytest.mark.large
 @pytest.mark.parametrize("variant, k", ALL[:4])
 def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, variant, k):
-    """As for a watchdog."""
     layer = Layer.random(rng, (17, 30), (13,), 64, k)
     prefix = "conv" if variant == DIRECT else "conv_local"
     for direction in ("forward", "backward_input", "backward_weights"):
@@ -99,7 +98,6 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch):
 @pytest.mark.parametrize("variant", [DIRECT, LOCAL])
 @pytest.mark.parametrize("most", [20_000, 1])
 def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, variant, most):
-    """Up to a single one."""
     layer = Layer.random(rng, (33, 10), (16, 20), 48)
     shape = ConvShape("weights", 3, (16, 20), 48, (33, 10))
     parts = VARIANTS[variant].parts_of(shape)

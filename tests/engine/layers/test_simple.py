@@ -79,7 +79,6 @@ def test_outputs_of_other_shapes_are_refused(dev):
 
 
 def test_the_residual_connection_adds_to_the_network(dev, rng):
-    """And leaves the background, whose features are 1, as it is."""
     x = rng.standard_normal((8, 12, 16)).astype(np.float32)
     x[0] = 1
     grad_y = rng.standard_normal((8, 12, 3)).astype(np.float32)

@@ -1,5 +1,3 @@
-"""The network with fewer tiles, against the one that computes all."""
-
 from collections import Counter
 
 import numpy as np
@@ -45,7 +43,6 @@ CASES = [
 
 @pytest.fixture
 def always(monkeypatch):
-    """Choose tiles in small images, too, and however many remain."""
     monkeypatch.setattr(pp_cl.engine.network.unet, "LEAST_PIXELS", 0)
     monkeypatch.setattr(pp_cl.engine.network.unet, "MOST_COMPUTED", 1)
 
@@ -68,7 +65,6 @@ def active_mask(x):
 
 
 def run(dev, net, x, grad_y, *, sparse):
-    """[image, gradient of x, gradients of the parameters] as the device computes them."""
     other = halve((grad_y != GRADIENT).any(2), 2)
     plan = net.plan_tiles(x.shape[:2], active_mask(x), other) if sparse else None
     x = dev.upload(x)
@@ -120,9 +116,6 @@ def test_few_tiles_in_large_images_only(dev, rng):
 
 @pytest.mark.parametrize("blocks", BLOCKS)
 def test_radius_is_what_a_change_reaches(rng, blocks):
-    """In float64, for a change at every place of a period of the pooling and the border far
-    away.
-    """
     layers, ones = unet_layers((1, 1, 1), 1, 1, blocks), np.ones((96, 96, 1))
     parameters = {}
     for layer in convolutions(layers):

@@ -1,5 +1,3 @@
-"""The network against float64, its buffers, and what is refused."""
-
 import gc
 import math
 from itertools import pairwise
@@ -83,7 +81,6 @@ def test_sizes_may_change_between_images(dev, rng):
 
 
 def test_its_memory_is_free_as_soon_as_it_is_dropped(plain):
-    """Without a garbage collection: compression and benches make one network after another."""
     x, grad_y = plain.zeros((8, 8, 16)), plain.zeros((8, 8, 3))
 
     def use(net):
@@ -129,9 +126,6 @@ def test_wrong_use_is_refused(dev):
     [("double", 6_968_579, 966e9), ("single", 3_133_443, 494e9), ("gated", 6_102_275, 978e9)],
 )
 def test_size_of_the_papers_network(blocks, parameters, operations):
-    """The parameters worked out by hand, and the multiplications at 800x800, with the 1x1
-    convolutions before the upsampling.
-    """
     layers = unet_layers((128, 256, 512), blocks=blocks)
     shapes = [layer.weight_shape() for layer in convolutions(layers)]
     assert sum(math.prod(shape) + shape[0] for shape in shapes) == parameters

@@ -1,5 +1,3 @@
-"""Points to camera axes: which are culled, and boxes."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -47,7 +45,6 @@ def test_boxes_hold_the_fragments_and_little_more(dev, rng, kind):
 
 @pytest.mark.parametrize("kind", ["disc", "soft"])
 def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, kind):
-    """Crops at all borders of the points; offsets that move them towards these."""
     grid = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
     ids = some_ids(rng, grid, 12_000)
     offset = rng.choice([-0.5, 0.5], (len(ids), 4)).astype(np.float32)
@@ -83,7 +80,6 @@ def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, k
 
 @pytest.mark.parametrize("deviation, bound", [(0.02, 0.1), (0.1, 0.01), (0.4, 0.01)])
 def test_a_pixel_of_samples_is_nearly_the_mean_of_a_viewers(dev, rng, deviation, bound):
-    """Gaussians of a fifth of a pixel, less than a viewer's, of one and of four."""
     camera = replace(make_camera(30, 30), samples=3.0)
     viewer = replace(camera.resized(90, 90), samples=1.0)
     for position in make_points(rng, 20)[:, None]:

@@ -96,7 +96,6 @@ def test_sizes_may_change_between_calls(dev, rng):
 
 
 def test_its_terms_by_name(dev, rng):
-    """As they are when they are asked for, though the next step has begun."""
     loss, images_of = Loss(dev, 0.2), [images(rng, 20, 31) for _ in range(2)]
     readings = []
     for step, (prediction, target) in enumerate(images_of):
@@ -122,7 +121,6 @@ def test_an_overflow_is_told_where_the_loss_is_finite(dev):
 
 
 def test_the_mask_is_learned(tmp_path):
-    """The alpha of the test views is nearer to that of the images, and exceeds it less."""
     scene, errors = write_ball_scene(tmp_path / "ball"), []
     for weight in (0, 3):
         out = tmp_path / str(weight)
@@ -137,7 +135,6 @@ def test_the_mask_is_learned(tmp_path):
 
 
 def reduced_alpha(view):
-    """(H, W) of the reduced image."""
     k, camera = view.downscale, view.camera
     alpha = view.image[..., 3].reshape(camera.height, k, camera.width, k)
     return alpha.mean(axis=(1, 3)) / 255

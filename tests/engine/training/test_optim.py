@@ -17,7 +17,6 @@ pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
 
 
 def test_momentum_goes_on_without_a_gradient(dev, rng):
-    """In arrays of any rank, for as long as training takes."""
     start, scale = rng.standard_normal((2, 3, 11))
     grads = scale * (0.3 + rng.standard_normal((1000, 3, 11)))
     grads[2::3] = 0

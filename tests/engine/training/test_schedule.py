@@ -1,5 +1,3 @@
-"""pp_cl/engine/training/schedule.py: the values of the formulas, worked out by hand."""
-
 import math
 
 import numpy as np

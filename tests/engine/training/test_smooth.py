@@ -1,5 +1,3 @@
-"""cl/training/smooth.cl against dictionaries and loops."""
-
 from itertools import product
 
 import numpy as np
@@ -15,7 +13,6 @@ NONE = 0xFFFFFFFF
 
 
 def cloud(dev, ids, grid):
-    """(device, grid, ids) on the device: the arguments of Smoother."""
     return dev, dev.upload(grid.packed()), dev.upload(ids, np.uint32)
 
 
@@ -34,7 +31,6 @@ def test_full_grid_does_not_wrap(dev):
 
 
 def test_table_of_a_huge_grid(dev):
-    """Ids of nearly 2^32 in all, and of the largest first grid."""
     for dims in ((517, 512, 507), (1620, 1620, 1620)):
         grid = Grid((0, 0, 0), 1, dims)
         assert grid.id_count <= 2**32
@@ -48,7 +44,6 @@ def test_table_of_a_huge_grid(dev):
 
 @pytest.mark.parametrize("dims", [(6, 5, 40), (3, 2, 100), (40, 30, 1), (600, 1, 1)])
 def test_neighbours_are_of_the_other_colour(dev, rng, dims):
-    """With an amount that shows every value that is read too early or too late."""
     n, grid = np.prod(dims) * 9 // 10, Grid((0, 0, 0), 1, dims)
     ids = some_ids(rng, grid, n)
     values = rng.standard_normal((n, 3, 16)).astype(np.float32)

@@ -1,7 +1,3 @@
-"""The training state of the points: which are pruned, that all their rows go alike, and what the
-points of a refined grid take over.
-"""
-
 import numpy as np
 import pytest
 from support.models import fetched, make_model
@@ -35,7 +31,6 @@ def survivors(dev, weights, least_weight, opacities, seen=None, least=1):
 
 
 def filled(dev, cloud, rng):
-    """A state of the cloud, averages among it, of random numbers."""
     state = PointState(dev, cloud)
     averages = PointState.ema_table(cloud.count)
     state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
@@ -61,7 +56,6 @@ def test_one_point_always_survives(dev, weights, survivor):
 
 @pytest.mark.parametrize("share", [2, 10])
 def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share):
-    """Every row of the cloud and of its training state, averages included."""
     scratch = 40_000
     monkeypatch.setattr("pp_cl.engine.device.buffers.SCRATCH_BYTES", scratch)
     cloud = PointCloud.create(dev, np.arange(1000), 2)
@@ -94,7 +88,6 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
 
 
 def test_only_what_was_seen_is_judged(dev):
-    """By the highest weight in a step, and counted anew; the rest keeps its counts."""
     settings = TrainConfig(prune_weight=0.1, sh_rate=(1, 0, 0))
     cloud = PointCloud.create(dev, np.arange(6), 0)
     state = PointState(dev, cloud)
@@ -112,7 +105,6 @@ def test_only_what_was_seen_is_judged(dev):
 
 @pytest.mark.parametrize("peak, opacity", [(np.nan, 1), (np.inf, 1), (0.5, np.nan), (0.5, -np.inf)])
 def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
-    """Also of points that nobody has seen."""
     cloud = PointCloud.create(dev, np.arange(2), 0)
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0, peak]))
@@ -146,7 +138,6 @@ def test_a_grid_beyond_32_bits_is_refused():
 
 
 def test_the_state_follows(dev, rng):
-    """Each point's rows, averages among them; weights and looks start anew."""
     model = make_model(dev, rng)
     state = filled(dev, model.cloud, rng)
     grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
@@ -164,7 +155,6 @@ def test_the_state_follows(dev, rng):
 
 @pytest.mark.parametrize("blend", ["alpha", "softmax"])
 def test_refined_points_let_as_much_light_through(dev, scene, tmp_path, blend):
-    """Two behind one another what one did, in alpha compositing; averages among them."""
     given = {"points.count": 300, "raster.blend": blend, "train.refine_at": "0.5,1"}
     given["scene.downscale"] = 1
     config = configure(preset("tiny"), scene, [(k, v, "test") for k, v in given.items()])

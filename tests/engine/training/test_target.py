@@ -1,7 +1,3 @@
-"""Targets of crops of reduced images against the float64 oracle, and against the geometry of their
-cameras.
-"""
-
 import numpy as np
 import pytest
 
@@ -14,14 +10,12 @@ TOLERANCE = 5e-7  # a few roundings of a float32 in [0, 1]
 
 
 def make_view(image, name="image.png"):
-    """A View of an image, with some camera that is not centred."""
     height, width = image.shape[:2]
     pose = np.hstack([np.eye(3), [[0.1], [0.2], [0.3]]])
     return View(name, Camera(pose, 90.0, 95.0, 0.47 * width, 0.55 * height, width, height), image)
 
 
 def random_view(rng, width, height):
-    """A View of random colours and alphas, a third of them 0 and a third 255."""
     image = rng.integers(0, 256, (height, width, 4), np.uint8)
     image[..., 3] = rng.choice(
         [0, 255, 7, 130, 254], (height, width), p=[0.33, 0.33, 0.1, 0.14, 0.1]
@@ -55,9 +49,6 @@ def test_transparent_is_exactly_white_whatever_its_colour(dev, rng):
     ),
 )
 def test_camera_sees_what_the_target_shows(dev, downscale, jitter):
-    """Colours that are linear in the stored pixel's position come back where the target's camera
-    says they are.
-    """
     x, y = np.meshgrid(np.arange(80), np.arange(64))
     image = np.stack([3 * x, 4 * y, x + y, np.full_like(x, 255)], -1).astype(np.uint8)
     view, box = make_view(image).reduced(downscale), (2, 2, 12, 9)

@@ -1,5 +1,3 @@
-"""Cameras of other programs' files, against poses worked out by hand."""
-
 import json
 
 import numpy as np
@@ -20,12 +18,10 @@ def written(folder, content):
 
 
 def world(camera):
-    """4x4 camera-to-world, OpenGL's axes, as a list."""
     return (np.vstack([camera.pose, [0, 0, 0, 1]]) @ TO_GL).tolist()
 
 
 def splatting(camera):
-    """A camera of cameras.json: OpenCV's axes."""
     return {
         "id": 0,
         "img_name": "a",
@@ -81,7 +77,6 @@ def test_a_size_is_taken_from_the_command_where_the_file_has_none(tmp_path):
 
 
 def changed(name, key, value):
-    """CONTENTS[name] with one key of its second camera changed."""
     content = json.loads(json.dumps(CONTENTS[name]))
     listed = content if isinstance(content, list) else content.get("frames", ())
     listed = listed or content["camera_path"]

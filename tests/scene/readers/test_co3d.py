@@ -1,7 +1,3 @@
-"""The reader of CO3D's sequences: PyTorch3D's conventions, set lists, and every kind of bad
-input.
-"""
-
 import gzip
 import json
 import os
@@ -21,7 +17,6 @@ ANNOTATIONS = "frame_annotations.jgz"
 
 @pytest.fixture
 def sequence(tmp_path):
-    """The folder of a sequence, version 2."""
     co3d.write(tmp_path, held_out(views()))
     return tmp_path / "object" / "sequence"
 
@@ -37,13 +32,9 @@ def annotate(folder, data):
 
 
 def edit(folder, change):
-    """change(annotation) of the fourth frame."""
     data = annotations(folder)
     change(data[3])
     annotate(folder, data)
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [(40, 24), (24, 40), (33, 33)])
@@ -80,7 +71,6 @@ def test_projection_follows_pytorch3d(tmp_path, rng, size, kind):
 
 
 def test_set_lists_of_version_1(tmp_path):
-    """Known frames are for training, unseen ones for testing, whatever the other word."""
     many = views()
     co3d.write(tmp_path, {"train": many[:6], "test": many[6:]}, 1)
     folder = tmp_path / "object" / "sequence"
@@ -124,9 +114,6 @@ def test_a_linked_sequence(sequence):
     sequence.rename(elsewhere)
     sequence.symlink_to(elsewhere)
     assert [len(read_split(sequence, split, [])) for split in ("train", "test")] == [9, 2]
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def view_change(**keys):

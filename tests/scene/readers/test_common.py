@@ -1,7 +1,3 @@
-"""What readers share: images inside the scene's folder, masks by name, splits, arrays of other
-programs, all read without trust.
-"""
-
 import shutil
 import zipfile
 from pathlib import Path
@@ -57,7 +53,6 @@ def made(tmp_path):
 
 @pytest.mark.parametrize("name", FOLDERS)
 def test_links_of_the_user_are_followed(made, name):
-    """Of one image, and of whole folders, as large data lies on another disk."""
     folder, *places = made(name)
     before = load_scene(folder).splits["train"]
     escape(sorted(places[0].iterdir())[2])
@@ -99,7 +94,6 @@ HARMED = [
 def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(
     made, name, place, harm
 ):
-    """By its image, or by its mask; of nine views for training eight must be left."""
     folder, images, masks = made(name)
     where, (do, why) = images if place == "image" else masks, HARM[harm]
     before = {view.name: view.stored_camera for view in load_scene(folder).splits["train"]}
@@ -142,14 +136,10 @@ def test_masks_of_another_size(made, name):
 
 @pytest.mark.parametrize("name", ["colmap", "llff", "neus"])
 def test_no_folder_of_masks_at_all(made, name):
-    """The images' own alpha counts, where no file names masks."""
     folder, _, masks = made(name)
     shutil.rmtree(masks)
     for view in load_scene(folder).splits["train"]:
         assert (view.image[..., 3] == 255).all()
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_every_eighth_is_held_out():
@@ -177,7 +167,6 @@ def test_every_eighth_is_held_out():
     ],
 )
 def test_which_image_a_name_means(tmp_path, given, there):
-    """As other programs write them on other machines; masks and depths are never taken for one."""
     for path in ("masks/a.png", "depth/a.png", there):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_bytes(b"")
@@ -238,9 +227,6 @@ def test_a_mask_is_named_like_its_image(tmp_path, mask):
         find_masks(tmp_path, images)
     (tmp_path / "masks" / "sub" / mask).write_bytes(b"")
     assert find_masks(tmp_path, images) == {images[0]: f"masks/sub/{mask}"}
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_what_numpy_writes(tmp_path, rng):
@@ -323,7 +309,6 @@ def test_what_holds_no_finite_numbers(tmp_path, array):
 
 
 def test_all_arrays_of_a_file_count(tmp_path, monkeypatch):
-    """Small as each may be: 16 numbers fit, two arrays of 9 do not."""
     monkeypatch.setattr(common, "MOST_ARRAYS", 128)
     np.savez(tmp_path / "a.npz", cam_1=np.zeros(16), other=np.zeros(9))
     assert len(read_npz(tmp_path / "a.npz", "cam_")) == 1

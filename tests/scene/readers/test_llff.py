@@ -1,5 +1,3 @@
-"""The reader of LLFF's format."""
-
 import numpy as np
 import pytest
 from support.same_scene import held_out, views
@@ -19,11 +17,7 @@ def scene(tmp_path):
 
 
 def edit(folder, change):
-    """change(rows) gives the rows to store."""
     np.save(folder / FILE, change(np.load(folder / FILE)))
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_axes_are_down_right_and_back(tmp_path):
@@ -40,9 +34,6 @@ def test_axes_are_down_right_and_back(tmp_path):
     np.testing.assert_allclose((right, down, depth), (0.3, -0.2, 4), atol=1e-12)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15, 11)
     assert image_file.depth_range is None and image_file.mask is None
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def cell(column, value):

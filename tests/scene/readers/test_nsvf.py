@@ -1,5 +1,3 @@
-"""The reader of NSVF's format."""
-
 import pytest
 from support.same_scene import same, views
 from support.transforms_scenes import refused
@@ -18,9 +16,6 @@ def scene(tmp_path):
 def lens_of(folder):
     camera = read_split(folder, "train", [])[0].camera
     return camera.fx, camera.fy, camera.cx, camera.cy
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_splits_are_those_of_the_names(scene):
@@ -60,8 +55,6 @@ def test_near_and_far(scene):
     (scene / "near_and_far.txt").write_text("1.5 6\n")
     assert read_split(scene, "test", [])[0].depth_range == (1.5, 6.0)
 
-
-# --------------------------------------------------------------------------------------------------
 
 POSE = "pose/0_train_000002.txt"
 BAD = {

@@ -1,5 +1,3 @@
-"""The reader of NeRF-synthetic's format: its conventions, and every kind of bad input."""
-
 import json
 import math
 import os
@@ -13,8 +11,6 @@ from pp_cl.files.image import read_rgba
 from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
-
-# -------------------------------------------------------------------------------------------------
 
 
 def test_views_and_names(tmp_path, capfd):
@@ -111,7 +107,6 @@ def test_angle_of_height_and_single_focal_length(tmp_path):
 
 
 def test_rows_and_rounding_of_the_pose(tmp_path, rng):
-    """3x4 is read as 4x4 is; a rotation that is rounded, or scaled, comes out orthonormal."""
     exact = opengl_pose([1, 2, 0.5])
     rough, scaled = exact.copy(), exact * [3.7, 3.7, 3.7, 1]
     rough[:3, :3] += rng.uniform(-1e-4, 1e-4, (3, 3))
@@ -124,8 +119,6 @@ def test_rows_and_rounding_of_the_pose(tmp_path, rng):
         assert np.abs(rotation - exact[:3, :3] * [1, -1, -1]).max() < 2e-4
         assert np.array_equal(pose[:, 3], exact[:3, 3])
 
-
-# --------------------------------------------------------------------------------------------------
 
 MATRIX = opengl_pose([3, 0, 1])
 BAD_FRAMES = {
@@ -170,7 +163,6 @@ def test_motion_is_told(tmp_path):
 
 @pytest.mark.parametrize("case", BAD_FRAMES)
 def test_bad_frame(tmp_path, case):
-    """The message names the file, the frame and the key."""
     key, value = BAD_FRAMES[case]
     write_scene(tmp_path, edit=lambda data: data["frames"][1].update({key: value}))
     refused(tmp_path, tmp_path / "transforms_train.json", f"frames[1].{key}:")
@@ -243,7 +235,6 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
 
 @pytest.mark.unix
 def test_a_pipe_is_no_file_of_cameras(tmp_path):
-    """Nor is it waited for."""
     write_scene(tmp_path)
     os.mkfifo(tmp_path / "transforms_val.json")
     assert "val" not in transforms.splits(tmp_path)

@@ -1,7 +1,3 @@
-"""From photographs and videos to scenes: known cameras are found, each stage is done once, and what
-goes wrong ends in one line.
-"""
-
 import json
 import re
 import shutil
@@ -36,7 +32,6 @@ WRONG = 6.0  # of the true focal length
 
 
 def near():
-    """Cameras around the demo, 10 degrees apart, at several heights and distances."""
     found = []
     for i in range(COUNT):
         turn, height, distance = i * np.pi / 18, 0.25 + 0.1 * (i % 3), 3 + 0.25 * (i % 3)
@@ -47,7 +42,6 @@ def near():
 
 
 def photograph(folder):
-    """Make photographs of the demo in a room, their masks, and the scene of both."""
     for name in ("photographs", "masks"):
         (folder / name).mkdir(parents=True)
     for i, camera in enumerate(near()):
@@ -64,7 +58,6 @@ def photograph(folder):
 
 @pytest.fixture(scope="module")
 def captured(runs, tmp_path_factory):
-    """A scene that was made of photographs."""
     made, folder = runs.made("captured", photograph), tmp_path_factory.mktemp("captured") / "made"
     shutil.copytree(made, folder)
     options = folder / "scene" / "capture" / "options.json"
@@ -74,7 +67,6 @@ def captured(runs, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def shot(captured):
-    """The folder of the photographs, and that of their masks."""
     return captured.parent / "photographs", captured.parent / "masks"
 
 
@@ -85,7 +77,6 @@ def capture(source, scene, *more):
 
 
 def refused(source, scene, *more, named):
-    """The command ends in one line that names something."""
     status, lines = capture(source, scene, *more)
     assert status == 2 and len(lines) == 1 and str(named) in lines[0], lines
 
@@ -95,19 +86,16 @@ def found(scene, stage):
 
 
 def changed(scene):
-    """{path: time of its last change} of the scene's files."""
     return {p: p.stat().st_mtime_ns for p in scene.rglob("*") if p.is_file() and p.name[0] != "."}
 
 
 def off(scene, true=None):
-    """How far the scene's cameras are from the true ones."""
     placed = [one for split in ("train", "test") for one in scene_frames(scene, split)]
     places = [int(Path(one.name).stem) for one in placed]
     return align([one.camera for one in placed], [(true or near())[i] for i in places])
 
 
 def test_photographs_become_a_scene(captured):
-    """Cameras agree with the true ones; the object is upright, in the middle, and of unit size."""
     assert scene_format(captured) == "transforms" and off(captured).position < 0.03
     assert off(captured).degrees < 4  # their places on an arc hardly tell how it is turned
     views = load_scene(captured, ("train", "test")).splits
@@ -128,7 +116,6 @@ def test_the_scene_states_no_digits_that_threads_decide(captured):
 
 
 def test_nothing_in_the_scene_is_distorted(captured):
-    """Images, cameras, masks and what COLMAP's model says of its points are of pinholes."""
     splits = [scene_frames(captured, split) for split in ("train", "test")]
     one = splits[0][0]
     assert not any(view.lens for split in splits for view in split)
@@ -194,7 +181,6 @@ def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
 
 
 def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys):
-    """Others redo what depends on them, and say so; a word takes them back."""
     scene = shutil.copytree(captured, tmp_path / "scene")
     words, before = ["capture", str(shot[0]), "--out", str(scene)], changed(scene)
     assert main(words) == 0 and changed(scene) == before
@@ -212,7 +198,6 @@ def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys)
 
 
 def test_photographs_that_have_moved_are_the_same(captured, shot, tmp_path):
-    """Where they have the same names, and are not where they were."""
     scene = shutil.copytree(captured, tmp_path / "scene")
     moved, options = shutil.copytree(shot[0], tmp_path / "moved"), scene / "capture/options.json"
     refused(moved, scene, named="was made from")
@@ -239,7 +224,6 @@ def test_photographs_that_have_moved_are_the_same(captured, shot, tmp_path):
 def test_an_option_that_cannot_do_changes_nothing(
     captured, shot, tmp_path, monkeypatch, source, words, named
 ):
-    """Neither the scene nor the options that are kept for the next capture."""
     scene = shutil.copytree(captured, tmp_path / "scene")
     (tmp_path / "few").mkdir()
     shutil.copy(shot[0] / "000.png", tmp_path / "few")
@@ -250,7 +234,6 @@ def test_an_option_that_cannot_do_changes_nothing(
 
 
 def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
-    """Also where its photographs are called like our own folder."""
     mug = tmp_path / "mug"
     for name in ("capture", "images", "masks"):
         (mug / name).mkdir(parents=True)
@@ -263,7 +246,6 @@ def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
 
 
 def test_what_is_the_users_stays(captured, shot, tmp_path):
-    """Files beside those of the capture, and what the user has changed of these, but for masks."""
     scene = shutil.copytree(captured, tmp_path / "scene")
     own = scene / "capture" / "frames" / "003.png"
     own.write_bytes(own.read_bytes() + b"mine")
@@ -315,7 +297,6 @@ def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
 
 
 def strangers(files, folder):
-    """Photographs of different things."""
     for k, file in enumerate(files):
         colours = np.random.default_rng(k).integers(0, 255, (40, 40, 3), np.uint8)
         Image.fromarray(colours).resize((SIZE, SIZE), Image.Resampling.BICUBIC).save(
@@ -342,7 +323,6 @@ def test_photographs_of_no_use(shot, tmp_path, make):
 
 
 def test_videos(shot, tmp_path):
-    """The sharpest frames are taken; a black video, and a missing one, end in one line."""
     pytest.importorskip("imageio_ffmpeg")
     sharp = [np.array(Image.open(file)) for file in sorted(shot[0].iterdir())]
     soft = [np.array(Image.fromarray(one).filter(ImageFilter.GaussianBlur(3))) for one in sharp]
@@ -376,7 +356,6 @@ def test_a_full_disk(shot, tmp_path):
 
 @pytest.mark.slow
 def test_half_of_the_images_have_no_place(shot, tmp_path):
-    """They are named, and the scene is made of the others."""
     folder, scene = tmp_path / "folder", tmp_path / "scene"
     shutil.copytree(shot[0], folder)
     names = [f"x{k:02d}.png" for k in range(COUNT)]
@@ -390,7 +369,6 @@ def test_half_of_the_images_have_no_place(shot, tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_capture_goes_on(shot, tmp_path):
-    """In the middle of three stages; the same command ends with the scene of one that was not."""
     scene = tmp_path / "scene"
     words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
     for begun in ("capture/database.db", "capture/features.json", "images", "masks"):
@@ -412,7 +390,6 @@ def test_a_killed_capture_goes_on(shot, tmp_path):
 
 
 def test_what_the_page_changed_is_obeyed(captured, shot, tmp_path):
-    """A box of the user's becomes the scene's, and a view that was dropped keeps its mask."""
     scene = shutil.copytree(captured, tmp_path / "scene")
     edits = {"box": [[-0.6] * 3, [0.7] * 3], "dropped": ["images/003.png"]}
     (scene / "pp_cl.json").write_text(json.dumps(edits))
@@ -423,7 +400,6 @@ def test_what_the_page_changed_is_obeyed(captured, shot, tmp_path):
 
 
 def turned(dev, folder, steps, wall=None):
-    """Photographs of the demo on a turntable before a wall that stands still, and their masks."""
     true = cameras(SIZE, "turntable")
     wall = room(true[0]) if wall is None else wall
     for name in ("photographs", "masks"):

@@ -1,7 +1,3 @@
-"""Photographs and videos as cameras, phones and other programs write them: all are taken, or left
-out with a reason.
-"""
-
 import os
 import subprocess
 
@@ -32,7 +28,6 @@ def shots():
 
 @pytest.fixture
 def folder(tmp_path):
-    """An empty folder of photographs."""
     (tmp_path / "photographs").mkdir()
     return tmp_path / "photographs"
 
@@ -87,7 +82,6 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
 
 
 def test_colours_of_another_profile_become_srgb(folder, tmp_path):
-    """Also of photographs that are turned."""
     pytest.importorskip("pillow_heif")
     noise = np.random.default_rng(0).integers(-9, 10, (12, 48, 64, 1))
     for i, one in enumerate(noise):
@@ -179,7 +173,6 @@ def test_names_that_colmap_can_list(shots, tmp_path):
 
 @pytest.fixture
 def video(shots, tmp_path):
-    """A video of 48 frames."""
     pytest.importorskip("imageio_ffmpeg")
     write_video(
         tmp_path / "video.webm", [np.roll(one, k, 0) for one in shots for k in range(4)], 24
@@ -188,7 +181,6 @@ def video(shots, tmp_path):
 
 
 def remade(video, name, *options):
-    """The video written anew by ffmpeg."""
     import imageio_ffmpeg
 
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *options[:-1], "-i", video]

@@ -52,7 +52,6 @@ def begins(process, stage):
 
 
 def result(out):
-    """{path: bytes} of what no clock decides."""
     files = content(out)
     return {
         name: data for name, data in files.items() if not name.endswith((".html", "minutes.json"))

@@ -1,5 +1,3 @@
-"""`pp-cl render`: videos and frames as asked for, what is taken up again, what is refused."""
-
 import json
 import shutil
 from pathlib import Path
@@ -19,7 +17,6 @@ from pp_studio.export import render_video
 
 @pytest.fixture(scope="module")
 def trained(finished):
-    """Folder of a small run, as text."""
     return str(finished)
 
 
@@ -83,7 +80,6 @@ def test_a_video_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeyp
 
 
 def test_sizes_have_folders_of_their_own_and_need_no_scene(trained):
-    """The run's name is no UTF-8, and its scene is gone."""
     run = Path(trained)
     run = shutil.copytree(run, run.with_name("run \udcff"))
     config = json.loads((run / "config.json").read_text())
@@ -154,6 +150,5 @@ def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
 
 
 def test_a_path_of_no_frame_is_refused(trained):
-    """Four seconds at a frame in ten."""
     told = failure("render", trained, "--fps", "0.1")
     assert "--seconds 4: 0.4 frames at 0.1 a second; ask for 1 to" in told

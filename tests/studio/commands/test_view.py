@@ -1,5 +1,3 @@
-"""`pp-cl view` as a process, and `pp-cl train --view`."""
-
 import json
 import signal
 import socket
@@ -23,14 +21,12 @@ SECONDS = 60
 
 @pytest.fixture
 def begun(tmp_path):
-    """A run that has its settings and no checkpoint."""
     folder = RunFolder(tmp_path / "run")
     folder.create(run_config(folder, write_ball_scene(tmp_path / "ball")).to_json())
     return folder.path
 
 
 def started(*words):
-    """A process `pp-cl view`."""
     return subprocess.Popen(
         [sys.executable, "-m", "pp_cl", "view", *map(str, words)],
         stdout=subprocess.PIPE,
@@ -101,7 +97,6 @@ def test_without_viser_the_first_line_says_so(begun, tmp_path, capsys, monkeypat
 
 
 def test_a_training_shows_itself_in_the_browser_until_it_ends(tmp_path, capfd, monkeypatch):
-    """The browser is a script that notes the address it gets, and what answers there."""
     browser, noted = tmp_path / "browser.py", tmp_path / "noted"
     browser.write_text(
         "import sys, urllib.request\n"
@@ -120,7 +115,6 @@ def test_a_training_shows_itself_in_the_browser_until_it_ends(tmp_path, capfd, m
 
 
 def wait_for_the_browser(monkeypatch, noted):
-    """Let the training's first step take until the page was opened."""
     from pp_cl.engine.step import Trainer
 
     train_step = Trainer.train_step

@@ -1,5 +1,3 @@
-"""True size: a length of which two pixels tell, and exports in metres."""
-
 import json
 import shutil
 from dataclasses import replace
@@ -20,7 +18,6 @@ RADIUS = 0.8  # of the ball, scene units
 
 @pytest.fixture
 def mine(run, run_folder, tmp_path):
-    """A copy of the run, whose folder is the test's."""
     shutil.copytree(run_folder, tmp_path / "run")
     return load_run(run.dev, tmp_path / "run")
 

@@ -1,5 +1,3 @@
-"""What a view's blend weights say of its points, as a matrix."""
-
 import json
 import shutil
 

@@ -1,10 +1,8 @@
-"""The page: what it holds, and what a browser draws of it."""
-
-import asyncio
 import base64
 import json
 import re
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -42,7 +40,6 @@ def page(run, tmp_path_factory):
 
 
 def element(page, name):
-    """The content of a script element."""
     return re.search(rf'id="{name}">(.*?)</script>', page.read_text("utf-8"), re.DOTALL)[1]
 
 
@@ -77,7 +74,6 @@ def predicted(page, camera):
 
 
 def page_camera(camera):
-    """The argument of ppcl.setCamera."""
     names = ("fx", "fy", "cx", "cy", "width", "height")
     values = {name: float(getattr(camera, name)) for name in names}
     return json.dumps({"pose": camera.pose.ravel().tolist()} | values)
@@ -112,7 +108,6 @@ def test_gaussians_are_kept_to_within_a_step(rng):
 
 
 def drawn(page, cameras):
-    """(H, W, 3) uint8 of each camera: what a browser draws."""
     script = f"""return [{",".join(page_camera(camera) for camera in cameras)}].map(
         (camera) => {{ ppcl.setCamera(camera); return ppcl.canvas.toDataURL(); }});"""
     return [image_of(url) for url in ask(page, script)]
@@ -170,7 +165,6 @@ def test_a_browser_draws_the_same_far_from_the_origin(run, page, tmp_path):
 
 
 def test_a_browser_sorts_the_gaussians_from_far_to_near(page):
-    """By their depth along an axis, in the page and in its worker."""
     script = """const axis = [0.6, 0, 0.8], order = ppcl.sorted(axis);
         return Array.from(order, (i) => 0.6 * ppcl.positions[3 * i]
             + 0.8 * ppcl.positions[3 * i + 2]).concat([order.length, new Set(order).size]);"""
@@ -229,7 +223,6 @@ CONTROLS = """
 
 
 def in_address(found, name):
-    """(3,) that the address says."""
     words = re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")
     return np.array([float(word) for word in words])
 
@@ -254,21 +247,15 @@ def test_mouse_and_keys_move_the_camera(page):
 
 def test_what_rests_after_a_movement_is_drawn_in_full(page):
     """Though the frames of a movement may be coarser, and in an order that is a little old."""
-
-    async def scenario():
-        async with new_page() as tab:
-            await tab.open(page.as_uri())
-            seen = [await tab.screenshot()]
-            await tab.drag((300, 300), [(12, 3)] * 10)
-            await asyncio.sleep(3)
-            seen.append(await tab.screenshot())
-            await tab.evaluate("ppcl.show()")
-            await asyncio.sleep(1)
-            seen.append(await tab.screenshot())
-            assert not [line for line in tab.said if line.startswith("error")]
-            return seen
-
-    first, rested, full = asyncio.run(scenario())
+    with new_page(page.as_uri()) as tab:
+        first = tab.screenshot()
+        tab.drag((300, 300), [(12, 3)] * 10)
+        time.sleep(3)
+        rested = tab.screenshot()
+        tab.evaluate("ppcl.show()")
+        time.sleep(1)
+        full = tab.screenshot()
+        assert not tab.wrong
     assert np.array_equal(rested, full) and np.abs(first - rested.astype(int)).max() > 60
 
 

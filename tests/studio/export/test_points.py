@@ -1,5 +1,3 @@
-"""Each point has the colour of the view in which it weighs most; the files hold what went in."""
-
 import numpy as np
 import plyfile
 import pytest
@@ -42,7 +40,6 @@ def test_no_points_are_one_line(run):
 
 @pytest.fixture(scope="module")
 def written(run, tmp_path_factory):
-    """(file, points)."""
     path, points = tmp_path_factory.mktemp("ply") / "a.ply", coloured_points(run, min_weight=0.05)
     write_ply(path, points, run.model.cloud)
     return path, points

@@ -1,5 +1,3 @@
-"""Splat files: the layout that others read, and what they show when drawn as others draw them."""
-
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -45,7 +43,6 @@ LAYOUT += [f"rot_{i}" for i in range(4)]
 
 @pytest.fixture(scope="module", autouse=True)
 def steps():
-    """As many as make them look like the run."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(QUALITIES, QUICK, (400, 0.0))
         yield
@@ -53,7 +50,6 @@ def steps():
 
 @pytest.fixture(scope="module")
 def y_up(run, steps):
-    """(table, origin)."""
     return splats(run, upright(run, Y_UP))
 
 
@@ -65,7 +61,6 @@ def ply(run, steps, tmp_path_factory):
 
 
 def turned(run, camera):
-    """The camera in the world of the .ply."""
     up = up_of(run.cameras("train"))
     turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
     return replace(camera, pose=turn @ camera.pose)
@@ -159,9 +154,6 @@ def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
 
 
 def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatch):
-    """And to as many renderings between them if they are few; to renderings alone where exposures
-    differ, or where the scene is gone.
-    """
     monkeypatch.setattr(gaussians, "Trainer", fitted := Mock(side_effect=InterruptedError))
 
     def views():

@@ -1,5 +1,3 @@
-"""Which runs a sweep has, and where."""
-
 import pytest
 from support.refused import refusing
 from support.sweeps import jobs_of
@@ -9,7 +7,6 @@ from pp_studio.sweep.plan import read_varied
 
 @pytest.fixture
 def scenes(tmp_path):
-    """Two folders, a and b."""
     folders = [tmp_path / "scenes" / name for name in "ab"]
     for folder in folders:
         folder.mkdir(parents=True)

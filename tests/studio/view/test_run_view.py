@@ -1,5 +1,3 @@
-"""A run and a training as tabs see them, without a browser."""
-
 import contextlib
 import io
 import json
@@ -29,7 +27,6 @@ CAMERA = ring_cameras(3, 96)[2]  # of tabs, finer than the training, as JPEG los
 
 @pytest.fixture
 def view(served, dev, copied):
-    """The small run, loaded."""
     found = RunView(served[0], dev, RunFolder(copied))
     found.look()
     return found
@@ -45,7 +42,6 @@ def looking(view, address, camera=CAMERA):
 
 
 def drawn(view):
-    """Draw what is wanted until nothing is, a while after the last movement."""
     time.sleep(1.5 * STILL)
     while view.page.draw_next():
         pass

@@ -1,5 +1,3 @@
-"""The page of a scene: what it shows, and what its users write."""
-
 import json
 import shutil
 from pathlib import Path
@@ -15,7 +13,6 @@ from pp_studio.view.scene_page import DROPPED, ScenePage, hull_points
 
 @pytest.fixture
 def folder(scene, tmp_path):
-    """A copy of the ball with three sparse points."""
     shutil.copytree(scene, tmp_path / "ball")
     model = tmp_path / "ball" / "sparse" / "0"
     model.mkdir(parents=True)
@@ -33,7 +30,6 @@ def page(served, folder):
 
 @pytest.fixture
 def opened(page, served):
-    """A Tab of the page."""
     with tab(served[1]) as found:
         yield found
 
@@ -44,7 +40,6 @@ def edits(folder):
 
 
 def told(opened, words):
-    """Wait until the page says something."""
     opened.receive("GuiUpdateMessage", lambda m: words in str(m["updates"].get("_markdown")))
 
 

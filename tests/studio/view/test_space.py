@@ -1,5 +1,3 @@
-"""Cameras on their way to the page and back."""
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,12 +13,10 @@ CAMERA = replace(ring_cameras(3, 48)[1].moved(SPACE.centre), height=40, cy=20)
 
 @pytest.fixture
 def frustum(served):
-    """The handle of CAMERA's frustum."""
     return SPACE.add_frustum(served[0], "/one", CAMERA)
 
 
 def seen(frustum, **changes):
-    """What a tab at the place of a frustum says."""
     return SimpleNamespace(
         **{
             "wxyz": frustum.wxyz,
