@@ -57,11 +57,6 @@ def test_a_kernel_that_does_not_build_is_one_line_below_the_log(scene, tmp_path,
     )
 
 
-def test_what_was_typed_breaks_no_line(tmp_path):
-    line = failure("eval", f"{tmp_path}/a\nb\x1b[31m")
-    assert f"{tmp_path}/a b?[31m/config.json" in line
-
-
 SIGINT = "signal.raise_signal(signal.SIGINT)"
 
 

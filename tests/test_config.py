@@ -60,13 +60,9 @@ def test_assign_converts_text(key, text, value):
     "key, text, message",
     [
         ("train.iteration", "5", "unknown key"),
-        ("trains.iterations", "5", "unknown key"),
-        ("preset", "x", "unknown key"),
         ("train.iterations", "many", "whole number"),
         ("train.iterations", "1.5", "whole number"),
-        ("train.iterations", "inf", "whole number"),
         ("network.widths", "8,16", "3 values"),
-        ("network.widths", 8, "3 values"),
         ("train.pixel_jitter", "perhaps", "true or false"),
         ("raster.radius", "nan", "finite number"),
         ("network.rate", "0.1,x", "finite number"),
@@ -95,7 +91,6 @@ TEXTS = {
     "nothing in it": b"{}",
     "a list for the preset": b'{"format": 1, "preset": ["tiny"]}',
     "an unknown preset": b'{"format": 1, "preset": "huge"}',
-    "no more than a preset": b'{"format": 1, "preset": "tiny"}',
     "a number for a section": b'{"format": 1, "preset": "tiny", "train": 3}',
     "out of line": b'{"format": 1, "preset": "tiny", "a\\nb\\u001b[31m": {}}',
 }
@@ -116,7 +111,6 @@ def stored_settings():
 VALUES = {
     "format": [5, 0, True, "1", None],
     "train.iterations": [True, "60", 60.5, 10**400, None, 0],
-    "train.crop": [130],
     "train.ema": [1, "true"],
     "train.smooth_l1": [float("nan"), float("inf")],
     "raster.radius": [False, [1.0]],
@@ -156,14 +150,6 @@ def test_a_section_and_each_of_its_keys_must_be_there(tmp_path, section):
     del stored[section]
     path.write_text(json.dumps(stored))
     assert f"{section}." in refusal(path)
-
-
-def test_names_of_files_that_are_no_text_survive(tmp_path):
-    """A system may give bytes that are no UTF-8."""
-    stored, path = stored_settings(), tmp_path / "config.json"
-    stored["scene"]["path"] = "/data/\udce4\udcff"
-    path.write_text(json.dumps(stored))
-    assert load_config(path).scene.path == "/data/\udce4\udcff"
 
 
 def test_help_covers_every_setting():

@@ -36,7 +36,7 @@ from support.sparse import write_model, write_ply, write_some_edits
 
 from pp_cl.checkpoint import load_run_state
 from pp_cl.commands import COMMANDS
-from pp_cl.config import load_config, run_config
+from pp_cl.config import load_config
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.step import Trainer
 from pp_cl.engine.views import View
@@ -51,7 +51,7 @@ from pp_cl.scene.load import find_reader, load_scene
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
-from pp_cl.settings import Config, every_setting
+from pp_cl.settings import every_setting
 from pp_studio.sweep.plan import Job
 from pp_studio.sweep.result import finished_row
 from tools.convert_scene import dealt
@@ -81,7 +81,6 @@ SETTINGS = {
 }
 # --set words of a training that takes a moment
 set_words = functools.partial(runs.set_words, SETTINGS)
-keys = st.sampled_from([key for key, _, _ in every_setting(Config())]) | damage.words
 # what makes a command end soon, whatever else it is told; others are refused in any case
 ENDING = {
     "render": ["--seconds", "0.1", "--fps", "10"],
@@ -438,7 +437,7 @@ def check_config(config):
 def test_a_config(world, data):
     with world.watched() as folder:
         run = world.run(folder)
-        damage.damage_file(data.draw, run.config)
+        damage.damage_file(data.draw, one(data.draw, run.config, run.config, run.metrics("test")))
         config = taken(lambda: load_config(run.config))
         if config is not None:
             check_config(config)
@@ -491,23 +490,6 @@ def test_a_mesh(world, data):
             assert 0 < surface.count <= 2000
             assert found.pop("points") == 9**3
             assert all(0 <= share <= 1 for share in found.values())
-
-
-@fuzzed(2)
-@given(st.lists(st.tuples(keys, damage.words), min_size=1, max_size=3), st.integers(0, 9))
-def test_settings(world, pairs, what):
-    with world.watched() as folder:
-        run, scene = RunFolder(folder / "out"), str(world.scene())
-        given = [(*pair, "--set") for pair in pairs]
-        config = taken(lambda: run_config(run, scene, None, given))
-        if config is None:
-            return
-        check_config(config)
-        if config.points.count < 10**4 and max(config.network.widths) < 64 and what > 8:
-            words = [word for key, text in pairs for word in ("--set", f"{key}={text}")]
-            words += set_words(train__iterations=2)
-            if command("train", scene, "--out", run, *words) == 0:
-                check_written(run.path)
 
 
 @fuzzed()

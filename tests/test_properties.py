@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as arrays
 from support.checkpoints import load_checkpoint
 
 from pp_cl.checkpoint import FORMAT, save_checkpoint
-from pp_cl.config import assign, load_config, preset, text_of
+from pp_cl.config import assign, load_config, preset
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
@@ -54,15 +54,6 @@ def given_settings(draw):
     }[kind]
     value = draw(st.tuples(*[one] * len(item.default)) if several else one)
     return key, value
-
-
-@given(given_settings())
-def test_a_setting_is_itself_again_from_its_text(pair):
-    key, value = pair
-    section, _, name = key.partition(".")
-    config = preset("tiny")
-    assign(config, key, text_of(value), "a test")
-    assert getattr(getattr(config, section), name) == value
 
 
 @given(given_settings())

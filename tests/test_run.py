@@ -3,7 +3,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -87,20 +86,6 @@ def test_a_folder_has_one_training_at_a_time(scene, tmp_path):
     assert not (out / "config.json").exists(), "nothing was written beside the owner's"
     assert main(arguments(scene, out, train__iterations=2)) == 0
     assert not (out / ".pp-cl.owner").exists()
-
-
-def test_a_killed_owner_owns_nothing_any_more(scene, tmp_path):
-    out = tmp_path / "run"
-    words = [sys.executable, "-m", "pp_cl", *arguments(scene, out, train__iterations=5000)]
-    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
-        while process.poll() is None and not (out / "log.jsonl").exists():
-            time.sleep(0.05)
-        second = subprocess.run(words, capture_output=True, text=True, check=False)
-        assert second.returncode == 2 and f"process {process.pid} on " in second.stderr
-        assert process.poll() is None, "the second start ended the first"
-        process.kill()
-    with RunFolder(out).owned():
-        assert (out / ".pp-cl.owner").read_text().startswith(f"process {os.getpid()} ")
 
 
 def test_a_folder_that_went_on_since_it_was_looked_at(scene, tmp_path, monkeypatch):

@@ -75,8 +75,6 @@ def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
         ("compare", "a", "b", "--json"),
         ("eval", "a", "--scene"),
         ("info", "a", "--device"),
-        ("export", "a", "--format", "ply", "--out"),
-        ("train", "a", "--out"),
     ],
 )
 def test_an_empty_value_is_refused(words, capsys):
@@ -94,7 +92,6 @@ def test_an_empty_value_is_refused(words, capsys):
         ("A B --json out", {"subject": "A", "truth": "B", "json": "out"}),
         ("--json out RUN", {"subject": "RUN", "json": "out"}),
         ("A B --metrics", {"truth": "B", "metrics": options.METRICS}),
-        ("A B --metrics --json", {"metrics": options.METRICS, "json": None}),
         ("A B --metrics psnr", {"truth": "B", "metrics": ("psnr",)}),
     ],
 )

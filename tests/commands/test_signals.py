@@ -81,15 +81,6 @@ def test_a_second_signal_stops_at_once_and_so_does_one_in_the_first_step(
     assert load_checkpoint(file)[0]["step"] == saved if saved else not file.exists()
 
 
-def test_other_commands_promise_nothing(capsys, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("pp_cl.commands.compare.run", interrupted)
-    assert main(["compare", "a", "b"]) == 130
-    assert capsys.readouterr().err == "pp-cl: interrupted\n"
-
-
 @pytest.mark.parametrize("number", STOPPING)
 def test_what_follows_from_a_signal_is_not_told(capsys, monkeypatch, number):
     """Another process was ended by it, too, or a module was half imported."""

@@ -1,7 +1,6 @@
 import json
 
 import numpy as np
-import pytest
 from support.refused import failure
 from support.runs import SETTINGS, arguments
 from support.scenes import write_ball_scene
@@ -76,12 +75,6 @@ def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
     assert run_config(folder, scene, None, own).raster.radius == 0.9
 
 
-def test_a_setting_has_one_origin(tmp_path):
-    given = [("train.seed", "3", "--set"), ("train.seed", "4", "--seed")]
-    with pytest.raises(UserError, match="--seed: train.seed is set by --set, too"):
-        run_config(RunFolder(tmp_path / "run"), "demo", None, given)
-
-
 def test_a_checkpoint_goes_on_with_what_the_model_does_not_depend_on(tmp_path):
     scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
     train_scene(scene, folder.path, settings=SETTINGS, is_stopped=lambda: True)
@@ -125,10 +118,3 @@ def test_a_run_begins_with_the_settings_of_another(tmp_path, capsys):
     assert main([*words, "--seed", "3"]) == 0 and "finished" in capsys.readouterr().out
     assert main([*words, "--seed", "3", "--iterations", "4"]) == 0
     assert "trained 4 steps" in capsys.readouterr().out
-
-
-def test_a_file_and_a_preset_are_refused(tmp_path):
-    scene = write_ball_scene(tmp_path / "ball", views=4)
-    words = ["train", scene, "--out", str(tmp_path / "run"), "--config", str(tmp_path / "no.json")]
-    assert "--preset" in failure(*words, "--preset", "tiny")
-    assert "no.json" in failure(*words)

@@ -3,9 +3,6 @@ anew for another version of a driver.
 """
 
 import json
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -120,31 +117,3 @@ def test_commands_say_which_one_and_why(measured, monkeypatch, capsys):
 
 
 NAMES = ("name", "platform", "compute_units", "memory_bytes")
-
-
-def test_processes_measure_once_and_choose_alike(session_device, tmp_path):
-    code = """
-        import sys
-        from pp_cl import drivers, speeds
-        listed = [one for one in drivers.list_devices() if one[2] is None]
-        measured = speeds._measured
-        speeds._measured = lambda: print("measured", file=sys.stderr) or measured()
-        print(speeds.kept_speeds([device for _, device, _ in listed]))
-    """
-    environment = {**os.environ, "PP_CACHE": str(tmp_path)}
-    lines = "\n".join(line.strip() for line in code.splitlines())
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-c", lines],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(4)
-    ]
-    told = [process.communicate() for process in started]
-    assert len({out for out, _ in told}) == 1 and [p.returncode for p in started] == [0] * 4
-    assert sum(err.count("measured") for _, err in told) == 1
-    kept = json.loads((tmp_path / speeds.SPEEDS).read_text())
-    assert kept[speeds._key(session_device.device)] > 0.1

@@ -156,6 +156,11 @@ def test_not_an_image(tmp_path, read):
     for name in ("pipe.png", "pipe.exr"):
         os.mkfifo(tmp_path / name)
     Image.new("RGB", (5, 7)).save(tmp_path / "a.gif")
+    write_png(tmp_path / "huge.png", np.zeros((5, 7)))
+    whole = (tmp_path / "huge.png").read_bytes()
+    head = b"IHDR" + bytes([0, 0, 255, 255] * 2) + whole[24:29]
+    head += zlib.crc32(head).to_bytes(4, "big")
+    (tmp_path / "huge.png").write_bytes(whole[:12] + head + whole[33:])
     with refusing(tmp_path / "a.gif", "is no PNG, JPEG, WEBP, ", "; convert it"):
         read(tmp_path / "a.gif")
     for path in (*sorted(tmp_path.iterdir()), tmp_path, tmp_path / "none.png"):

@@ -1,6 +1,5 @@
 import errno
 import json
-import os
 import signal
 
 import numpy as np
@@ -146,31 +145,3 @@ def test_a_file_system_without_locks_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.files.run_folder.FileLock.acquire", acquire)
     with pytest.raises(UserError, match="run/.pp-cl.lock: cannot be locked .No locks available"):
         RunFolder(tmp_path / "run").owned().__enter__()
-
-
-def test_the_name_of_the_owner_is_not_worth_a_finished_training(tmp_path, monkeypatch):
-    def unlink(self, missing_ok=False):
-        raise OSError(errno.EIO, "Input/output error")
-
-    folder = RunFolder(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr("pathlib.Path.unlink", unlink)
-        with folder.owned():
-            pass
-    with folder.owned():
-        assert (tmp_path / ".pp-cl.owner").read_text().startswith(f"process {os.getpid()} ")
-    assert not (tmp_path / ".pp-cl.owner").exists()
-
-
-def test_a_log_that_fails_when_it_is_closed_is_one_line(folder):
-    class Failing:
-        name = str(folder.log)
-
-        def close(self):
-            raise OSError(errno.EIO, "Input/output error")
-
-    log = folder.open_log(10)
-    log.__exit__()
-    vars(log)["_file"] = Failing()
-    with pytest.raises(UserError, match="log.jsonl: cannot be written .Input/output error"), log:
-        pass

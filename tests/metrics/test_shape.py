@@ -110,6 +110,11 @@ def test_meshes_are_read(tmp_path, suffix):
 
 BAD_FILES = {
     "empty": ("mesh.ply", b""),
+    "1e9 vertices": (
+        "mesh.ply",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000\nproperty float x\n"
+        b"property float y\nproperty float z\nend_header\n" + bytes(1000),
+    ),
     "points only": ("mesh.off", b"OFF\n1 0 0\n0 0 0\n"),
     "NaN": ("mesh.off", b"OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n"),
     "a face beyond": ("mesh.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"),

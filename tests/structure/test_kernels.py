@@ -28,13 +28,11 @@ def silent_kernels(source):
 
 
 PLANTED = [
-    (helpers_without_static, "inline float f(float x) {\n}", "f is not static"),
     (
         helpers_without_static,
         "#define MAKE(T, name) \\\n    inline T f(const T x,  // (N)  \\\n  int n) {  \\\n    }\n",
         "f is not static",
     ),
-    (silent_kernels, "kernel void f(\n    const int n)\n{\n}", "f: no comment above it"),
     (
         silent_kernels,
         "// f\n\nkernel void f(\n    const int n)\n{\n}",

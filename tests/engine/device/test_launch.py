@@ -1,5 +1,3 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -7,7 +5,6 @@ from support.toy_kernels import SOURCE
 
 from pp_cl.engine.device import device as device_module
 from pp_cl.engine.device.kernel import SCALARS, parse_signatures
-from pp_cl.engine.device.launch import channel_ranges, group_items, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
@@ -268,24 +265,3 @@ def test_work_groups_may_have_one_dimension_alone(program, monkeypatch, given):
 def test_heads_that_are_refused(parameters, message):
     with pytest.raises(ValueError, match=message):
         parse_signatures(f"kernel void f(\n{parameters}\n{{}}", "f.cl")
-
-
-def test_lanes_on_cpus_and_gpus(dev, monkeypatch):
-    monkeypatch.setattr(dev, "is_cpu", True)
-    assert (lanes(dev), row_parts(dev)) == (16, 1)
-    # 40 channels: two vectors and a half; pixels in one group
-    assert channel_ranges(dev, 30, 20, 40) == ((3, 20, 30), (1, 16, 4))
-    monkeypatch.setattr(dev, "is_cpu", False)
-    assert (lanes(dev), row_parts(dev)) == (1, 16)
-    # the first dimension, in which neighbours run in step, is that of the channels
-    assert channel_ranges(dev, 30, 20, 40) == ((40, 20, 30), (16, 4, 1))
-
-
-@pytest.mark.parametrize(("largest", "items"), [(1024, 256), (256, 256), (100, 64), (1, 1)])
-def test_groups(largest, items):
-    of = SimpleNamespace(is_cpu=False, device=SimpleNamespace(max_work_group_size=largest))
-    assert group_items(of) == items
-    assert group_ranges(of, 7, 16) == (112, 64)
-    of.is_cpu = True
-    assert group_ranges(of, 7, 16) == (7, None)
-    assert group_items(of) == 1

@@ -2,8 +2,6 @@
 launches and blockings, NaN, wrong shapes.
 """
 
-from functools import partial
-
 import numpy as np
 import pytest
 from support.comparisons import relative_error
@@ -13,9 +11,9 @@ from support.tiles import pixels_of, random_counts
 
 from pp_cl.bench.conv import Layer
 from pp_cl.engine.layers import conv
-from pp_cl.engine.layers.choice import CPUS, GPU, VARIANTS, lay_out, work_shape
-from pp_cl.engine.layers.conv import Conv, ConvShape
-from pp_cl.engine.layers.tiles import all_tiles, some_tiles
+from pp_cl.engine.layers.choice import CPUS, GPU, VARIANTS
+from pp_cl.engine.layers.conv import ConvShape
+from pp_cl.engine.layers.tiles import some_tiles
 from pp_cl.engine.network.tile_plan import grow
 from pp_cl.selftest.layers import within
 
@@ -139,52 +137,3 @@ def test_a_relu_hides_no_nan(dev, rng, variant, k):
     bad = np.isnan(layer.computed(dev, variant, CPU)[0]).all(axis=2)
     assert bad[3:6, 4:7].all() and not bad[:, 10].any()
     assert bad.sum() == 9 or variant == WINOGRAD  # more of the tiles that saw it
-
-
-@pytest.mark.parametrize("variant, k", OF_3X3)
-def test_what_does_not_fit_together_is_refused(dev, variant, k):
-    zeros, kernels = dev.zeros, VARIANTS[variant]
-    x, out = zeros((4, 4, 16)), zeros((4, 4, 32))
-    tiles, grown = all_tiles(dev, 4, 4), some_tiles(dev, (4, 8), np.ones((1, 2)))
-    weight, bias = zeros((2, k, k, 16, 16)), zeros(32)
-
-    def made(direction, **replaced):
-        shape = ConvShape(direction, k, (16,), 32, (4, 4))
-        conv = Conv(dev, CPU, variant, shape, weight, bias)
-        needed = work_shape(variant, shape)
-        if needed:
-            conv.work = zeros(needed)
-            lay_out(dev, [conv], weight.reshape(-1), conv.work)
-        for name, value in replaced.items():
-            setattr(conv, name, value)
-        return conv
-
-    def forward(sources=(x,), out=out, tiles=tiles, **replaced):
-        kernels.forward(made("forward", **replaced), sources, out, relu=False, tiles=tiles)
-
-    def backward_input(grad_out=out, grad_x=x, tiles=tiles, **replaced):
-        conv = made("input", **replaced)
-        kernels.backward_input(conv, grad_out, grad_x, mask=None, tiles=tiles)
-
-    def backward_weights(sources=(x,), grad_out=out, tiles=tiles, **replaced):
-        kernels.backward_weights(made("weights", **replaced), sources, grad_out, tiles=tiles)
-
-    for call in (forward, backward_input, backward_weights):
-        call()
-    for call in (
-        partial(forward, (zeros((4, 4, 32)),)),
-        partial(forward, work=zeros((1, k, k, 16, 16))),
-        partial(forward, bias=zeros(16)),
-        partial(forward, out=zeros((4, 5, 32))),
-        partial(forward, tiles=grown),
-        partial(backward_input, work=zeros((2, k, k, 16, 16))),
-        partial(backward_input, grad_out=zeros((4, 4, 20))),
-        partial(backward_input, grad_x=zeros((4, 4, 32))),
-        partial(backward_input, tiles=grown),
-        partial(backward_weights, (zeros((4, 4, 32)),)),
-        partial(backward_weights, grad_out=zeros((4, 4, 16))),
-        partial(backward_weights, work=zeros((1, 1, k * k * 16 + 1, 16))),
-        partial(backward_weights, tiles=grown),
-    ):
-        with pytest.raises(ValueError, match="tiles|expected"):
-            call()

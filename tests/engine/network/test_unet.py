@@ -1,6 +1,5 @@
 import gc
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from pp_cl.bench.unet import plain_parameters
 from pp_cl.engine.network.layers import (
     convolutions,
     multiplications,
-    share_buffers,
     unet_layers,
 )
 from pp_cl.engine.network.unet import UNet
@@ -130,16 +128,3 @@ def test_size_of_the_papers_network(blocks, parameters, operations):
     shapes = [layer.weight_shape() for layer in convolutions(layers)]
     assert sum(math.prod(shape) + shape[0] for shape in shapes) == parameters
     assert multiplications(layers, 800, 800) == pytest.approx(operations, rel=1e-3)
-
-
-def test_arrays_of_one_buffer_never_overlap(rng):
-    firsts = np.sort(rng.integers(0, 20, 40))
-    spans = [(i, first, first + rng.integers(0, 6)) for i, first in enumerate(firsts)]
-    shapes = {i: (rng.integers(1, 9), 3) for i in range(40)}
-    buffers = share_buffers(spans, shapes)
-    assert sorted(name for buffer in buffers for name in buffer.names) == list(range(40))
-    assert len(buffers) < 20
-    for buffer in buffers:
-        held = [spans[name] for name in buffer.names]
-        assert all(a[2] < b[1] for a, b in pairwise(held))
-        assert buffer.floats == max(np.prod(shapes[name]) for name in buffer.names)

@@ -81,39 +81,3 @@ def test_more_pairs_than_can_be_numbered(dev):
     straight = camera.eye + 4 * camera.pose[:, 2:3].T
     with pytest.raises(UserError, match="--points"):
         PairedPoints(dev, camera, np.repeat(straight, 4097, axis=0), 1.9)
-
-
-@pytest.mark.large
-def test_an_image_of_millions_of_pixels(dev):
-    side, patch = 4096, 24
-    camera = replace(make_camera(side, side, 3000.0), fy=3000.0, cx=side / 2, cy=side / 2)
-    places = [
-        (0, 0),
-        (side - patch, 0),
-        (0, side - patch),
-        (side - patch, side - patch),
-        (2000, 2040),
-    ]
-    centres = np.array(places)[:, None] + np.random.default_rng(2).uniform(0, patch, (5, 40, 2))
-    slopes = (centres.reshape(-1, 2) - side / 2) / 3000.0
-    rays = np.column_stack([slopes, np.ones(len(slopes))])
-    depth = np.linspace(2.5, 5.5, len(rays))[:, None]
-    positions = (
-        camera.eye
-        + depth * (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ camera.pose[:, :3].T
-    )
-    scene = PairedPoints(dev, camera, positions, 0.004, kind="disc")
-    offsets = scene.pairs.pixel_offset.get().astype(np.int64)
-    points = scene.pairs.pair_point_falloff.get()[:, 0][
-        scene.pairs.pair_key.get()[: scene.pairs.total] & 0xFFFFFFFF
-    ]
-    found = 0
-    for x0, y0 in places:
-        cut = camera.crop(x0, y0, patch, patch)
-        geometry = oracle.geometry(cut, positions, 0.004, "disc")
-        for q in np.flatnonzero((geometry["margin"] > 0.02).all(axis=0)):
-            at = (y0 + q // patch) * side + x0 + q % patch
-            expected = np.flatnonzero(geometry["fragment"][:, q])
-            assert set(points[offsets[at] : offsets[at + 1]]) == set(expected)
-            found += len(expected)
-    assert found > 1000

@@ -145,16 +145,6 @@ BAD_FRAMES = {
 }
 
 
-def test_the_mend_fits_the_lens(tmp_path):
-    for key, value, told in (
-        ("camera_model", "EQUIRECTANGULAR", "is panoramic"),
-        ("equirectangular", True, "is panoramic"),
-        ("k4", 0.01, "let it fit the lens without"),
-    ):
-        write_scene(tmp_path, edit=lambda data, k=key, v=value: data.update({k: v}))
-        refused(tmp_path, told)
-
-
 def test_motion_is_told(tmp_path):
     write_scene(tmp_path, edit=lambda data: data["frames"][1].update(time=0.5))
     with pytest.warns(UserWarning, match="motion is not modelled"):

@@ -1,10 +1,8 @@
 import json
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -304,16 +302,11 @@ def strangers(files, folder):
         )
 
 
-def three(files, folder):
-    for file in files[:3]:
-        shutil.copy(file, folder)
-
-
 def nothing(files, folder):
     (folder / "notes.txt").write_text("none")
 
 
-@pytest.mark.parametrize("make", [slow(strangers), three, nothing])
+@pytest.mark.parametrize("make", [slow(strangers), nothing])
 def test_photographs_of_no_use(shot, tmp_path, make):
     folder, scene = tmp_path / "folder", tmp_path / "scene"
     folder.mkdir()
@@ -365,28 +358,6 @@ def test_half_of_the_images_have_no_place(shot, tmp_path):
     assert placed["placed"] == COUNT and sorted(placed["unplaced"]) == names
     assert f"{COUNT} of {2 * COUNT} " in placed["line"] and names[0] in placed["line"]
     assert off(scene).position < 0.03
-
-
-@pytest.mark.slow
-def test_a_killed_capture_goes_on(shot, tmp_path):
-    scene = tmp_path / "scene"
-    words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
-    for begun in ("capture/database.db", "capture/features.json", "images", "masks"):
-        process = subprocess.Popen(
-            [sys.executable, "-m", "pp_cl", *words], stdout=subprocess.DEVNULL
-        )
-        while not (scene / begun).exists() and process.poll() is None:
-            time.sleep(0.01)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL, begun
-        assert not (scene / "transforms.json").exists()
-    before = changed(scene)
-    assert capture(*words[1:2], scene, *words[4:]) == (0, [])
-    after = changed(scene)
-    for stage in ("frames", "poses"):
-        file = scene / "capture" / f"{stage}.json"
-        assert after[file] == before[file]
-    assert off(scene).position < 0.03 and len(list((scene / "masks").iterdir())) == COUNT
 
 
 def test_what_the_page_changed_is_obeyed(captured, shot, tmp_path):

@@ -137,17 +137,6 @@ def turned(folder, views, box, surface, wall):
     return capture
 
 
-@pytest.mark.slow
-def test_an_object_that_turns_is_told_from_the_wall(dev, tmp_path):
-    """Which shows between the demo's rings in every photograph."""
-    around = cameras(2 * SIZE, "turntable")
-    views = [(one, render(dev, one)) for one in around[::2]]
-    surface, still = demo_mesh(dev, 64)[0][::20], room(around[0])
-    capture = turned(tmp_path / "scene", views, OBJECT_BOX, surface, lambda _: still)
-    capture.write(turns=True)
-    assert capture.agreement().min() > 0.915
-
-
 def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
     """A plain ball upon one with a pattern, before a camera at each of two heights."""
     middle, views, plain = np.array([0, 0, 1.05]), [], []
@@ -267,14 +256,6 @@ def test_masks_that_contradict_the_others_are_named(capture, tmp_path):
     wrong = np.roll(capture.truth[4], SIZE // 3, axis=1)
     Image.fromarray(np.uint8(255 * wrong)).save(folder / "04.png")
     assert "04.png" in capture.write(given=folder)
-
-
-def test_a_given_mask_that_is_missing_is_named(capture, tmp_path):
-    folder = given_masks(capture, tmp_path / "given")
-    (folder / "07.png").unlink()
-    with pytest.raises(UserError, match=r"07\.png"):
-        capture.write(given=folder)
-    assert not capture.file(7).exists()
 
 
 def test_alpha_is_the_mask(capture):

@@ -95,13 +95,6 @@ def test_sizes_have_folders_of_their_own_and_need_no_scene(trained):
     assert "choose another" in failure(*words[:2], "--format", "exr")
 
 
-def test_an_empty_folder_that_one_is_in_takes_frames(trained, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["render", trained, "--path", "test", "--out", "."]) == 0
-    names = {path.name for path in tmp_path.iterdir() if path.name[0] != "."}
-    assert names == {"00000.png", "00001.png", "frames.json"}
-
-
 def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys):
     words = ["render", trained, "--out", str(tmp_path / "o"), "--seconds", "1", "--fps", "4"]
     assert main(words) == 0

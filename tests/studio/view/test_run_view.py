@@ -129,21 +129,6 @@ def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
     assert not view.page.draw_next()
 
 
-def test_the_page_says_what_it_waits_for_until_there_is_a_picture(served, dev, copied):
-    def said(opened):
-        node = opened.nodes.get("/waiting")
-        return node and node["props"]["text"]
-
-    found = RunView(served[0], dev, RunFolder(copied))
-    with tab(served[1]) as opened:
-        assert said(opened) == f"reading {copied}"
-    found.look()
-    with looking(found, served[1]) as opened:
-        assert "kernels" in said(opened)
-        drawn(found)
-        opened.receive("RemoveSceneNodeMessage", lambda message: message["name"] == "/waiting")
-
-
 def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monkeypatch):
     with looking(view, served[1]) as opened:
         [seen] = view.page._tabs.values()
