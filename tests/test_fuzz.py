@@ -127,10 +127,15 @@ class World:
         words = ["train", self.scene(), *set_words(), "--out"]
         finished = self._folder / "finished"
         assert command(*words, finished) == command("eval", finished) == 0
-        step = Trainer.train_step
+        train_step = Trainer.train_step
+
+        def stopping(trainer):
+            if trainer.step == 3:
+                raise KeyboardInterrupt
+            return train_step(trainer)
+
         with pytest.MonkeyPatch.context() as patch:
-            stop = [step] * 3 + [lambda _: signal.raise_signal(signal.SIGINT)]
-            patch.setattr(Trainer, "train_step", lambda trainer: stop[trainer.step](trainer))
+            patch.setattr(Trainer, "train_step", stopping)
             assert command(*words, self._folder / "unfinished") == 130
 
     def run(self, folder, *, finished=True):

@@ -1,4 +1,3 @@
-import gc
 import math
 
 import numpy as np
@@ -76,25 +75,6 @@ def test_sizes_may_change_between_images(dev, rng):
         net.forward(dev.zeros((20, 8, 16)), training=False)
         np.testing.assert_array_equal(net.forward(x).get(), alone.forward(x).get())
         np.testing.assert_array_equal(net.backward(grad_y).get(), alone.backward(grad_y).get())
-
-
-def test_its_memory_is_free_as_soon_as_it_is_dropped(plain):
-    x, grad_y = plain.zeros((8, 8, 16)), plain.zeros((8, 8, 3))
-
-    def use(net):
-        net.forward(x, training=False)
-        net.forward(x)
-        net.backward(grad_y)
-
-    use(UNet(plain, (16, 16, 16)))  # what all networks share stays
-    gc.collect()
-    before = plain.bytes
-    gc.disable()
-    try:
-        use(UNet(plain, (16, 16, 16)))
-        assert plain.bytes == before
-    finally:
-        gc.enable()
 
 
 def test_initial_values_are_pytorchs(dev):

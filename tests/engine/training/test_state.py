@@ -3,7 +3,6 @@ import pytest
 from support.models import fetched, make_model
 
 from pp_cl.config import configure, preset
-from pp_cl.engine.device.buffers import table_bytes
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.points import PointCloud
 from pp_cl.engine.training.prune import final_points_to_keep, points_to_keep
@@ -52,39 +51,6 @@ def test_keep_needs_weight_and_opacity(dev):
 )
 def test_one_point_always_survives(dev, weights, survivor):
     assert survivors(dev, weights, 5, [0, 0, 0]) == [survivor]
-
-
-@pytest.mark.parametrize("share", [2, 10])
-def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share):
-    scratch = 40_000
-    monkeypatch.setattr("pp_cl.engine.device.buffers.SCRATCH_BYTES", scratch)
-    cloud = PointCloud.create(dev, np.arange(1000), 2)
-    for array in cloud.learned().values():
-        array.set(rng.random(array.shape).astype(np.float32))
-    del array  # else it is not released
-    state = filled(dev, cloud, rng)
-    host = fetched(cloud.arrays(dev) | state.arrays())
-    assert len(host) == 6 + 2 + 2 + 3 + 2
-    keep = np.arange(0, 1000, share, dtype=np.uint32)
-    indices = dev.upload(keep)
-    before, dev.peak_bytes = dev.bytes, dev.bytes
-    cloud.compact(dev, indices)
-    state.compact(dev, indices)
-    found = fetched(cloud.arrays(dev) | state.arrays())
-    for name, values in host.items():
-        np.testing.assert_array_equal(found[name], values[keep])
-    assert cloud.count == len(keep)
-    assert dev.peak_bytes <= before + scratch
-    old, new = (
-        PointCloud.table(n, cloud.blocks)
-        | PointState.table(n)
-        | {f"ema.{name}": row for name, row in PointState.ema_table(n).items()}
-        for n in (1000, cloud.count)
-    )
-    small = [name for name in new if table_bytes({name: new[name]}) <= scratch]
-    assert before - dev.bytes == sum(
-        table_bytes({name: old[name]}) - table_bytes({name: new[name]}) for name in small
-    )
 
 
 def test_only_what_was_seen_is_judged(dev):

@@ -250,13 +250,6 @@ def test_panoramas_are_no_unknown_lens(text):
     refused(text, "EQUIRECTANGULAR is panoramic")
 
 
-def test_a_text_model_in_utf_16(text):
-    before = read_split(text, "train", [])
-    for file in (text / "sparse/0").glob("*.txt"):
-        file.write_text(file.read_text(), encoding="utf-16")
-    assert [one.name for one in read_split(text, "train", [])] == [one.name for one in before]
-
-
 def test_more_records_or_letters_than_a_model_has(written, monkeypatch):
     folder, _ = written
     monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_RECORDS", 10)

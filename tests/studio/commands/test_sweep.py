@@ -173,15 +173,3 @@ def test_a_scheduler_started_by_hand(scenes, scheduler, tmp_path, capsys):
     assert "transforms_train.json" in bad["error"] and "psnr" not in bad
     assert 5 < good["psnr"] < 40
     assert "| broken |        0 of 1 |" in told.out and "1 of 2 scenes" in told.out
-
-    (job,) = jobs_of(scenes[1:], out)
-    long = {"train.iterations": 100_000}
-    words = words_of(scenes[1:], out, "--scheduler", scheduler, changes=long)
-    with start(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as sweep:
-        first(Path(job.folder, "checkpoint.npz").exists)
-        sweep.send_signal(signal.SIGINT)
-        told = sweep.stderr.read()
-    assert sweep.returncode == 130 and "the same command goes on" in told
-    with RunFolder(job.folder).owned():  # nobody trains there any more
-        header, _ = load_checkpoint(Path(job.folder, "checkpoint.npz"))
-    assert not header["finished"] and header["step"] > 4

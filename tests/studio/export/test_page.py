@@ -195,13 +195,9 @@ def test_the_address_says_the_camera(run, page):
     fragment = "#eye=1,-3.5,1.2&target=0.1,0,0&up=0,0.1,1&fov=40"
     shown = check_address(page, fragment, camera)
     assert psnr(shown, predicted(page, camera)) > 40  # nearer than a test view: more edges
-
-
-@pytest.mark.parametrize("fragment", ["#eye=1,2&target=x&up=,,&fov=-3", "#eye=1,2,3&target=1,2,3"])
-def test_a_broken_address_shows_the_first_look(page, fragment):
     header = header_of(page)
-    camera = looking(header["eye"], header["centre"], header["up"], header["fov"])
-    check_address(page, fragment, camera)
+    first = looking(header["eye"], header["centre"], header["up"], header["fov"])
+    check_address(page, "#eye=1,2&target=x&up=,,&fov=-3", first)
 
 
 CONTROLS = """

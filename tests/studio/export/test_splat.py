@@ -165,16 +165,16 @@ def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatc
     assert len(found) == 2 * len(images)
     for one, other in zip(images, found, strict=False):
         assert one.name == other.name and (one.image == other.image).all()
-    with monkeypatch.context() as patch:  # as if they were large
+    rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
+    assert [view.image.shape for view in found[len(images) :]] == rendered
+    with monkeypatch.context() as patch:  # as if they were large, and enough
         patch.setattr("pp_cl.engine.views.MIN_SIDE", 8)
         patch.setattr(gaussians, "MIN_SIDE", 8)
         patch.setattr(gaussians, "LARGEST", 15)
-        assert {view.camera.width for view in views()} == {15}
-    rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
-    assert [view.image.shape for view in found[len(images) :]] == rendered
-    with monkeypatch.context() as patch:
         patch.setattr(gaussians, "ENOUGH", len(images))
-        assert [view.name for view in views()] == [view.name for view in images]
+        assert [(view.name, view.camera.width) for view in views()] == [
+            (view.name, 15) for view in images
+        ]
     monkeypatch.setitem(run.header, "left_out", [found[0].name])
     assert [view.name for view in views()][:2] == [found[1].name, found[2].name]
     monkeypatch.setitem(run.header, "exposed", True)

@@ -78,9 +78,6 @@ def test_a_box_is_set_dragged_and_removed(page, opened, folder):
     opened.set("Remove", True)
     told(opened, "box suggested\n\nwritten")
     assert edits(folder) == {}
-
-
-def test_what_is_no_box_is_refused_and_the_page_shows_what_is(page, opened, folder):
     opened.set("From", [9, -1, -1])
     opened.set("Set", True)
     told(opened, "must be two corners")
@@ -104,15 +101,12 @@ def test_views_are_dropped_and_taken_back(page, opened, folder):
     assert edits(folder) == {}
 
 
-def test_one_view_of_each_split_stays(page, opened, folder):
+def test_one_view_of_each_split_stays_and_a_broken_file(page, opened, folder):
     names = [view.name for view in scene_frames(folder)]
     (folder / "pp_cl.json").write_text(json.dumps({"dropped": names[1:]}))
     opened.set("Drop", True)
     told(opened, "no view of split train would be left")
     assert edits(folder) == {"dropped": names[1:]}
-
-
-def test_a_broken_file_is_told(page, opened, folder):
     (folder / "pp_cl.json").write_text("{")
     opened.set("Drop", True)
     told(opened, "pp_cl.json")

@@ -43,12 +43,9 @@ def test_a_camera_comes_back_as_it_went(frustum):
     [
         {"wxyz": np.zeros(4)},
         {"wxyz": np.array([1, 0, 0, np.nan])},
-        {"position": np.array([0, 0, np.inf])},
         {"position": np.array([0, 1e300, 0])},
         {"fov": 0.0},
-        {"fov": np.nan},
         {"fov": 4.0},
-        {"image_width": 0},
         {"image_height": -5},
         {"image_height": 10**9},
     ],
