@@ -324,35 +324,15 @@ def test_a_file_that_may_not_be_read_is_not_called_corrupt(folder, config, monke
     assert "cannot be read (Permission denied)" in line and "delete" not in line
 
 
-@pytest.fixture(scope="module")
-def trained(scene, finished, tmp_path_factory):
-    young = tmp_path_factory.mktemp("runs") / "young"
-    with pytest.MonkeyPatch.context() as patch:
-        train_and_interrupt(scene, young, 25, patch)
-    return finished, young
-
-
-def test_every_reader_says_the_same(scene, trained, tmp_path):
-    finished, young = (tmp_path / name for name in ("run", "young"))
-    for old, new in zip(trained, (finished, young), strict=True):
-        shutil.copytree(old, new)
-        header, arrays = load_checkpoint(new / "checkpoint.npz")
-        header.pop("format")
-        arrays["points.ids"] = arrays["points.ids"][::-1].copy()
-        save_checkpoint(new / "checkpoint.npz", header, arrays)
-    run, out = str(finished), str(tmp_path / "out")
-    commands = [
-        ["eval", run],
-        ["info", run, "--picture", str(tmp_path / "a.png")],
-        ["render", run, "--out", out, "--format", "png"],
-        ["export", run, "--format", "ply", "--out", f"{out}.ply"],
-        arguments(scene, finished),
-        arguments(scene, young),
-    ]
-    for words in commands:
-        file = (young if str(young) in words else finished) / "checkpoint.npz"
-        expected = f"pp-cl: {file}: points.ids are no vertices of its grid in ascending order"
-        assert failure(*words).startswith(expected), words
+def test_a_training_does_not_go_on_from_it(scene, tmp_path, monkeypatch):
+    """What other commands say of a run that cannot be read: tests/commands/test_refused.py."""
+    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
+    file = tmp_path / "run" / "checkpoint.npz"
+    header, arrays = load_checkpoint(file)
+    header.pop("format")
+    save_checkpoint(file, header, arrays | {"points.ids": arrays["points.ids"][::-1].copy()})
+    told = failure(*arguments(scene, tmp_path / "run"))
+    assert told.startswith(f"pp-cl: {file}: points.ids are no vertices of its grid in ascending")
 
 
 def overflow(path):
@@ -373,9 +353,9 @@ def overflow(path):
         ["export", "--format", "scene", "--out", "views"],
     ],
 )
-def test_finite_weights_that_overflow_are_one_line(trained, tmp_path, monkeypatch, words):
+def test_finite_weights_that_overflow_are_one_line(finished, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(trained[0], "run")
+    shutil.copytree(finished, "run")
     overflow(tmp_path / "run" / "checkpoint.npz")
     told = failure(words[0], "run", *words[1:])
     assert "run/checkpoint.npz: its parameters are too large, the image holds NaN" in told

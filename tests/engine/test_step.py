@@ -7,7 +7,6 @@ from support.checkpoints import load_checkpoint
 from support.refused import failure
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
-from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.config import preset
 from pp_cl.engine.grid import Grid
@@ -124,15 +123,3 @@ def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
     assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
     told = re.search(r"^points: only (\d+) of the 1500 asked .*$", capsys.readouterr().out, re.M)
     assert 500 < int(told[1]) < 1500
-
-
-def test_the_distortion_loss_brings_the_fragments_of_a_pixel_together(scene, tmp_path):
-    apart = []
-    for weight in (0, 30):
-        out = tmp_path / str(weight)
-        assert main(arguments(scene, out, train__distortion_weight=weight)) == 0
-        run = load(out)
-        images = [run.render(view.camera) for view in run.scene("test").splits["test"]]
-        seen = [(p.depth[p.alpha > 0.5], p.median_depth[p.alpha > 0.5]) for p in images]
-        apart.append(np.mean([np.abs(mean - median).mean() for mean, median in seen]))
-    assert apart[1] < 0.7 * apart[0]

@@ -119,11 +119,9 @@ PLANE = np.ones((HEIGHT, WIDTH), np.float32)
 NAN = np.where(np.arange(WIDTH) == 3, np.nan, PLANE).astype(np.float32)
 BAD_IMAGES = {
     "no colours": ({"Z": PLANE}, "no images among its channels"),
-    "two colours": ({"R": PLANE, "G": PLANE}, "no images"),
     "two layers": ({f"{a}.{c}": PLANE for a in "ab" for c in "RGB"}, "several images"),
     "NaN": (dict.fromkeys("RGB", NAN), "9 pixels are NaN or infinite"),
     "infinite": (dict.fromkeys("RGBA", PLANE * np.inf), "117 pixels"),
-    "infinite halves": (dict.fromkeys("RGB", (PLANE * np.inf).astype(np.float16)), "117 pixels"),
 }
 
 

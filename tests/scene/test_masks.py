@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
-from support.refused import refusing
 from support.runs import arguments
 from support.scenes import ball_image, ring_cameras, write_ball_scene
-from support.transforms_scenes import SIZE, write_scene
+from support.transforms_scenes import write_scene
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
@@ -133,36 +132,6 @@ def test_alpha_is_taken_or_left(tmp_path, source, opaque):
         assert (view.image[..., 3] == 255).all() == opaque
 
 
-@pytest.fixture
-def masked(tmp_path):
-    write_scene(tmp_path)
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    for i in range(3):
-        image = tmp_path / f"train_{i}.png"
-        write_png(image, read_rgba(image)[..., :3])
-        write_png(masks / f"train_{i}.png", np.ones((SIZE[1], SIZE[0])))
-    return tmp_path, masks
-
-
-BAD = {
-    "missing": (lambda m: (m / "train_1.png").unlink(), "train_1.png: has no mask, as others have"),
-    "a folder": (
-        lambda m: ((m / "train_1.png").unlink(), (m / "train_1.png").mkdir()),
-        "train_1.png: has no mask, as others have",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_masks(masked, case):
-    scene, masks = masked
-    change, words = BAD[case]
-    change(masks)
-    with refusing(scene, words):
-        load_scene(scene, masks=MaskRule(folder=str(masks)))
-
-
 def opaque_ball(folder, background=(255, 255, 255)):
     write_ball_scene(folder, views=10, size=40)
     for file in folder.rglob("*.png"):
@@ -224,6 +193,9 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
         write_png(tmp_path / "masks" / f"r_{i}.png", mask)
     rule = MaskRule(folder=str(tmp_path / "masks"))
     views = load_scene(tmp_path / "ball", masks=rule).splits["train"]
+    (tmp_path / "masks/r_1.png").rename(tmp_path / "masks/other.png")
+    with pytest.raises(UserError, match=r"train/r_1\.png: has no mask, as others have"):
+        load_scene(tmp_path / "ball", masks=rule)
     agreed = agreeing(dev, views)  # a mask that is white says that the object fills the image
     assert (
         agreed.views == views and disagreements(views, build_grid(dev, views, 1000).grid.box) == []

@@ -37,25 +37,8 @@ def test_a_table():
     assert TOOL.table(RESULTS, "0123") == TABLE
 
 
-def test_a_page_says_so_where_the_code_has_changed_since(tmp_path, monkeypatch):
-    """A digest is of all that decides a training, and of nothing else; a commit has one, too."""
+def test_a_page_says_so_where_the_code_has_changed_since():
     assert TOOL.table(RESULTS, "4567").endswith(f"a machine. {LATER}*")
-    for name in (
-        "cl/a.cl",
-        "pp_cl/engine/step.py",
-        "pp_cl/engine/raster/b.py",
-        "pp_studio/view/c.py",
-    ):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("one")
-    before = provenance.digest(tmp_path)
-    (tmp_path / "pp_studio/view/c.py").write_text("two")
-    (tmp_path / "pp_cl/engine/raster/b.pyc").write_text("two")
-    assert provenance.digest(tmp_path) == before
-    for name in ("cl/a.cl", "pp_cl/engine/step.py", "pp_cl/engine/raster/b.py"):
-        (tmp_path / name).write_text("two")
-        assert provenance.digest(tmp_path) != before
-        (tmp_path / name).write_text("one")
 
 
 def test_no_release_states_figures_of_older_code(tmp_path, capsys):
@@ -67,6 +50,7 @@ def test_no_release_states_figures_of_older_code(tmp_path, capsys):
     old = RESULTS | {"decides": provenance.digest(tmp_path)}
     kernel.write_text("after")
     new = RESULTS | {"decides": provenance.digest(tmp_path)}
+    (tmp_path / "README.md").write_text("decides nothing")
     for name, contents in {"old": old, "new": new}.items():
         (results / f"{name}.json").write_text(json.dumps(contents))
     assert provenance.main(tmp_path) == 1

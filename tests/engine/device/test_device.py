@@ -116,9 +116,12 @@ def test_a_smaller_largest_allocation_can_be_asked_for(monkeypatch):
 
 @pytest.mark.parametrize(
     "variable, text",
-    [("PP_MAX_ALLOCATION", t) for t in ("0", "-1", "nan", "much")]
-    + [("PP_DEBUG", t) for t in ("4", "-1", "yes", "1.5")]
-    + [("PP_FORM", "tpu")],
+    [
+        ("PP_MAX_ALLOCATION", "0"),
+        ("PP_MAX_ALLOCATION", "nan"),
+        ("PP_DEBUG", "4"),
+        ("PP_FORM", "tpu"),
+    ],
 )
 def test_a_bad_variable_is_one_line(monkeypatch, variable, text):
     monkeypatch.setenv(variable, text)
@@ -170,7 +173,6 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
     ("platform", "kind", "large"),
     [
         ("Intel(R) OpenCL Graphics", "GPU", True),
-        ("Intel(R) OpenCL HD Graphics", "GPU", True),
         ("Intel(R) OpenCL", "CPU", False),
         ("Apple", "GPU", False),  # which drives Intel's GPUs too, and refuses unknown options
         ("NVIDIA CUDA", "GPU", False),

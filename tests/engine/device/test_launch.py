@@ -152,9 +152,7 @@ FORMULAS = {"offsets": (34,), "halves": (3, 8), "both": (11,), "first": (5,), "s
     [
         ({"offsets": (33,)}, r"offsets has shape \(33,\), expected .* with N\+1 = 34"),
         ({"halves": (4, 8)}, r"halves .* with \(height-1\)/2 = 3"),
-        ({"halves": (3, 4)}, r"halves .* with WIDTH \* 2 = 8"),
         ({"both": (12,)}, r"both .* with a \+ B - 1 = 11"),
-        ({"first": (6,)}, r"both .* with a \+ B - 1 = 12"),
     ],
 )
 def test_a_length_that_is_a_formula_is_checked(dev, tmp_path, monkeypatch, change, message):
@@ -253,12 +251,9 @@ def test_work_groups_may_have_one_dimension_alone(program, monkeypatch, given):
         ("    global float *x)  // no shape", "f.cl: f: buffer 'x' has no shape"),
         ("    global float *x, const uint n)  // (N)", "one parameter per line"),
         ("    const size_t n)", "cannot read parameter"),
-        ("    const float4 colour)", "neither a global"),
         ("    float *x)  // (N)", "neither a global"),
         ("    global float *x)  // (N**2)", r"f.cl: f: x: 'N\*\*2' is no formula"),
         ("    global float *x)  // (len(N))", "is no formula"),
-        ("    global float *x)  // (4, N + 1.5)", "is no formula"),
-        ("    global float *x)  // (4, N and C)", "is no formula"),
         ("    global float *x)  // ((N)", "no shape"),
     ],
 )

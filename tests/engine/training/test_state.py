@@ -67,6 +67,9 @@ def test_only_what_was_seen_is_judged(dev):
     state.times_seen.set(np.float32([200, 99, 99, 200, 0, 0]))
     state.max_weight.set(np.float32([5, 0, 0, 5, 0, 0]))
     assert points_to_keep(dev, state, opacity, settings).get().tolist() == [1, 2, 4, 5]
+    state.times_seen.set(np.float32([100] * 6))
+    state.max_weight.set(np.float32([0.01, 0.03, 0.02, 0, 0, 0]))
+    assert points_to_keep(dev, state, opacity, settings).get().tolist() == [1], "one always is"
 
 
 @pytest.mark.parametrize("peak, opacity", [(np.nan, 1), (np.inf, 1), (0.5, np.nan), (0.5, -np.inf)])
@@ -76,15 +79,6 @@ def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
     state.max_weight.set(np.float32([0, peak]))
     with pytest.raises(Diverged, match="^1 points have"):
         points_to_keep(dev, state, dev.upload(rows([1, opacity])), TrainConfig())
-
-
-def test_one_judged_point_always_survives(dev):
-    settings = TrainConfig(prune_weight=1.0)
-    cloud = PointCloud.create(dev, np.arange(3), 2)
-    state = PointState(dev, cloud)
-    state.max_weight.set(np.float32([0.1, 0.3, 0.2]))
-    state.times_seen.set(np.float32([100, 100, 100]))
-    assert points_to_keep(dev, state, cloud.opacity, settings).get().tolist() == [1]
 
 
 def test_children_are_centred_on_their_parent():

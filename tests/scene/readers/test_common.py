@@ -265,11 +265,9 @@ FLOATS = "{'descr': '<f8', 'fortran_order': False, 'shape': %s}"
 HEADERS = {
     "open bracket": "{'descr': '<f8', 'fortran_order': False, 'shape': (3,",
     "negative": FLOATS % "(-1, 4)",
-    "twice negative": FLOATS % "(-1, -4)",
     "nothing times much": FLOATS % f"(0, {10**30})",
     "too many dimensions": FLOATS % f"({'1, ' * 70})",
     "pairs": "{'descr': ('<f8', (2,)), 'fortran_order': False, 'shape': (2,)}",
-    "bytes beyond memory": FLOATS.replace("<f8", "<u1") % f"({2**26},)",
     "shape beyond all memory": FLOATS % f"({2**40}, {2**20})",
     "too early": FLOATS % "(17,)",
     "nested": "(" * 500,
@@ -293,15 +291,12 @@ def test_headers_that_lie(tmp_path, case):
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\0", b"\x93NUMPY\x02\0" + bytes(100)])
 def test_what_is_no_array(tmp_path, content):
     (tmp_path / "a.npy").write_bytes(content)
-    with refusing(tmp_path / "a.npy"):
-        read_npy(tmp_path / "a.npy")
-    with refusing(tmp_path / "a.npy"):
-        read_npz(tmp_path / "a.npy", "cam")
+    for read in (read_npy, lambda file: read_npz(file, "cam")):
+        with refusing(tmp_path / "a.npy"):
+            read(tmp_path / "a.npy")
 
 
-@pytest.mark.parametrize(
-    "array", [np.array([None]), np.array("K"), 1j * np.ones(3), np.array([np.nan]), [np.inf], 1e31]
-)
+@pytest.mark.parametrize("array", [np.array([None]), np.array("K"), 1j * np.ones(3), [np.inf]])
 def test_what_holds_no_finite_numbers(tmp_path, array):
     np.save(tmp_path / "a.npy", array)
     with refusing(tmp_path / "a.npy"):
