@@ -101,7 +101,6 @@ def test_devices_that_can_work_side_by_side(listed, monkeypatch):
         ("linux", "x86_64", "apt-get", "pip install intel-opencl-rt"),
         ("win32", "AMD64", "", "pip install intel-opencl-rt"),
         ("linux", "aarch64", "apt-get", "apt install pocl-opencl-icd"),
-        ("linux", "aarch64", "", "conda install"),
         ("darwin", "arm64", "", "conda install"),
     ],
 )
