@@ -1,8 +1,6 @@
 import json
-import sys
 
 import pytest
-from support.refused import failure
 from support.scenes import write_ball_scene
 
 from pp_cl.bench import timing
@@ -66,8 +64,3 @@ def test_a_step_on_a_small_scene(tmp_path, capsys):
     assert row["ms"] == pytest.approx(sum(row["stages_ms"].values()))
     assert row["peak_device_bytes"] > 1500 * 4 * 145
     assert f"ball {row['points']} points, 40 pixels" in capsys.readouterr().out
-
-
-def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert "pip install matplotlib" in failure("bench", "--plot", tmp_path / "b.png")

@@ -143,10 +143,3 @@ def test_the_lens_moves_them_as_it_moves_the_image(tmp_path, dev):
         assert ignored.mean() < 0.12
         off = view.image.astype(int) - other.image
         assert np.abs(off[~ignored & (other.image[..., 3] > 128)]).max() < 40
-
-
-def test_a_folder_that_has_none(tmp_path):
-    scene = with_hand(tmp_path / "scene", (0, 0, 0, 255))
-    for folder, told in ((tmp_path / "none", "no such folder"), (tmp_path, "no mask")):
-        status, lines = spoken(["train", scene, "--out", tmp_path / "run", "--ignore", folder])
-        assert status == 2 and told in lines[-1]

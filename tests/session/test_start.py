@@ -21,13 +21,6 @@ def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
     assert load_config(out / "config.json").raster.radius == radius
 
 
-def test_other_footprints_are_given_a_radius(tmp_path):
-    scene = write_ball_scene(tmp_path / "ball")
-    words = ["train", scene, "--out", tmp_path / "run", "--set", "raster.footprint=disc"]
-    status, lines = spoken(words)
-    assert status == 2 and "raster.radius: is automatic" in lines[-1] and "0.0015" in lines[-1]
-
-
 AUTOMATIC = {"points__count": 60, "train__refine_at": "0,0", "train__iterations": 30}
 
 

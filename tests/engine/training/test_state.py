@@ -29,15 +29,6 @@ def survivors(dev, weights, least_weight, opacities, seen=None, least=1):
     return indices.get().tolist()
 
 
-def filled(dev, cloud, rng):
-    state = PointState(dev, cloud)
-    averages = PointState.ema_table(cloud.count)
-    state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
-    for array in state.arrays().values():
-        array.set((1e3 * rng.random(array.shape)).astype(array.dtype))
-    return state
-
-
 def test_keep_needs_weight_and_opacity(dev):
     assert survivors(dev, [1, 0, 1, 0.5, 2], 0.5, [1, 1, 0.009, 0.01, 0.6]) == [0, 3, 4]
     assert survivors(dev, [1, 0, 1], 0, [1, 1, 0]) == [0, 1]
@@ -99,7 +90,11 @@ def test_a_grid_beyond_32_bits_is_refused():
 
 def test_the_state_follows(dev, rng):
     model = make_model(dev, rng)
-    state = filled(dev, model.cloud, rng)
+    state = PointState(dev, model.cloud)
+    averages = PointState.ema_table(model.cloud.count)
+    state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
+    for array in state.arrays().values():
+        array.set((1e3 * rng.random(array.shape)).astype(array.dtype))
     grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
     ids, parents = grid.children(before["points.ids"])
     state.refine(dev, model.refine())

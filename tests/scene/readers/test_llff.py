@@ -10,16 +10,6 @@ from tools.scene_formats import llff
 FILE = "poses_bounds.npy"
 
 
-@pytest.fixture
-def scene(tmp_path):
-    llff.write(tmp_path, held_out(views(centred=True)))
-    return tmp_path
-
-
-def edit(folder, change):
-    np.save(folder / FILE, change(np.load(folder / FILE)))
-
-
 def test_axes_are_down_right_and_back(tmp_path):
     """A camera at (0, 0, 5) that looks along -z with x to the right: its axes in the world are
     down (0, -1, 0), right (1, 0, 0), back (0, 0, 1).
@@ -53,8 +43,9 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_poses(scene, case):
+def test_bad_poses(tmp_path, case):
     change, word = BAD[case]
-    edit(scene, change)
+    llff.write(tmp_path, held_out(views(centred=True)))
+    np.save(tmp_path / FILE, change(np.load(tmp_path / FILE)))
     check = left_out if word == "row 2" else refused
-    check(scene, scene / FILE, word)
+    check(tmp_path, tmp_path / FILE, word)

@@ -13,11 +13,6 @@ def scene(tmp_path):
     return tmp_path
 
 
-def lens_of(folder):
-    camera = read_split(folder, "train", [])[0].camera
-    return camera.fx, camera.fy, camera.cx, camera.cy
-
-
 def test_splits_are_those_of_the_names(scene):
     assert splits(scene) == ["test", "train", "val"]
     (scene / "rgb" / "9_other.png").write_bytes(b"")
@@ -48,7 +43,8 @@ def test_where_there_is_no_2_test_is_1(tmp_path):
 )
 def test_intrinsics(scene, text, expected):
     (scene / "intrinsics.txt").write_text(text)
-    assert lens_of(scene) == expected
+    camera = read_split(scene, "train", [])[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
 
 
 def test_near_and_far(scene):
@@ -76,12 +72,9 @@ def test_bad_files(scene, case):
     refused(scene, scene / name)
 
 
-def test_a_pose_is_missing(scene):
+def test_a_pose_is_missing_and_no_image_of_any_split(scene):
     (scene / POSE).unlink()
     refused(scene, scene / POSE, "no such file")
-
-
-def test_no_image_of_any_split(scene):
     for file in (scene / "rgb").iterdir():
         file.unlink()
     refused(scene, scene / "rgb", "no images")

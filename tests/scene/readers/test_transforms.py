@@ -140,12 +140,6 @@ BAD_FRAMES = {
 }
 
 
-def test_motion_is_told(tmp_path):
-    write_scene(tmp_path, edit=lambda data: data["frames"][1].update(time=0.5))
-    with pytest.warns(UserWarning, match="motion is not modelled"):
-        load_scene(tmp_path)
-
-
 @pytest.mark.parametrize("case", BAD_FRAMES)
 def test_bad_frame(tmp_path, case):
     key, value = BAD_FRAMES[case]
@@ -199,9 +193,10 @@ def test_a_copy_beside_transforms_json_is_no_split(tmp_path):
     assert len(load_scene(tmp_path).splits["train"]) == 2
 
 
-def test_what_is_perspective_by_its_keys_is_read(tmp_path):
-    keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None}
-    assert len(train_views(tmp_path, **keys)) == 3
+def test_what_is_perspective_by_its_keys_is_read_and_motion_is_told(tmp_path):
+    keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None, "time": 0.5}
+    with pytest.warns(UserWarning, match="motion is not modelled"):
+        assert len(train_views(tmp_path, **keys)) == 3
 
 
 @pytest.mark.parametrize("keys", ({"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}))

@@ -140,8 +140,3 @@ def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
     distance = 4.0  # of the cameras from the ball's centre
     assert there.any() and (np.abs(channels["Z"][there] - distance) < 1).all()
     assert np.isinf(channels["Z"][channels["A"] == 0]).all()
-
-
-def test_a_path_of_no_frame_is_refused(trained):
-    told = failure("render", trained, "--fps", "0.1")
-    assert "--seconds 4: 0.4 frames at 0.1 a second; ask for 1 to" in told

@@ -5,7 +5,7 @@ from support.models import blend_matrix
 from pp_studio.export.observe import observe
 
 
-def check(run):
+def test_rows_sum_to_alpha_up_to_an_early_stop_and_columns_to_the_points_weights(run):
     for seen in observe(run, run.cameras("test"), "test"):
         matrix, weights = blend_matrix(seen), seen.point_weights()
         assert matrix.shape == (30 * 30, run.model.cloud.count) and weights.max() > 0.1
@@ -15,10 +15,6 @@ def check(run):
         stopped = missing > 1e-5
         assert stopped.any() and (alpha[stopped] == 1).all()
         assert missing.min() > -1e-5 and missing.max() < run.config.raster.early_stop
-
-
-def test_rows_sum_to_alpha_up_to_an_early_stop_and_columns_to_the_points_weights(run):
-    check(run)
 
 
 def test_it_blends_what_the_rasteriser_blends(run):

@@ -10,13 +10,8 @@ from pp_studio.export.observe import observe
 from pp_studio.export.points import coloured_points, write_ply
 
 
-@pytest.fixture(scope="module")
-def points(run):
-    return coloured_points(run)
-
-
-def test_colours_are_those_of_the_best_view(run, points):
-    cameras = run.cameras("train")
+def test_colours_are_those_of_the_best_view(run):
+    points, cameras = coloured_points(run), run.cameras("train")
     weights = np.stack([seen.point_weights() for seen in observe(run, cameras, "")])
     images = [to_8bit(run.render(camera).rgba()[..., :3]) for camera in cameras]
     positions = run.model.positions()
@@ -38,15 +33,9 @@ def test_no_points_are_one_line(run):
         coloured_points(run, min_weight=1000)
 
 
-@pytest.fixture(scope="module")
-def written(run, tmp_path_factory):
-    path, points = tmp_path_factory.mktemp("ply") / "a.ply", coloured_points(run, min_weight=0.05)
+def test_the_ply_reads_back_by_plyfile(run, tmp_path):
+    path, points = tmp_path / "a.ply", coloured_points(run, min_weight=0.05)
     write_ply(path, points, run.model.cloud)
-    return path, points
-
-
-def test_the_ply_reads_back_by_plyfile(run, written):
-    path, points = written
     data = plyfile.PlyData.read(str(path))
     vertex = data["vertex"]
     assert not data.text and data.byte_order == "<" and len(vertex) == len(points.rows)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.refused import failure
 from support.viewing import tab, wait
 
 from pp_cl.scene.load import scene_frames
@@ -122,7 +121,3 @@ def test_without_sparse_points_the_hull_is_shown(dev, served, scene):
         assert "/points" not in opened.nodes
         page.fill()
         opened.receive("PointCloudMessage")
-
-
-def test_the_run_of_a_scene_is_not_asked_for(folder):
-    assert "--scene: only of a run" in failure("view", folder, "--scene", folder)
