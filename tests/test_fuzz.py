@@ -51,8 +51,6 @@ from pp_cl.scene.load import find_reader, load_scene
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
-from pp_studio.sweep.plan import Job
-from pp_studio.sweep.result import finished_row
 from tools.convert_scene import dealt
 
 LONGEST = 60  # seconds for an input
@@ -435,12 +433,6 @@ def test_a_config(world, data):
             tell(run)
 
 
-def job(world, run):
-    given = tuple((*word.split("=", 1), "--set") for word in set_words()[1::2])
-    paths = str(world.scene()), "ball", {}, 0, str(run.path)
-    return Job(*paths, "tiny", given, ("psnr", "ssim"))
-
-
 @fuzzed(2)
 @given(data=st.data())
 def test_a_log(world, data):
@@ -449,7 +441,6 @@ def test_a_log(world, data):
         damage.damage_file(data.draw, run.log)
         for row in taken(run.rows) or ():
             check_finite(step=row["step"], seconds=row["seconds"])
-        taken(lambda: finished_row(job(world, run)))
         tell(run)
         log = taken(lambda: Log(run.log, one(data.draw, 0, 2, 4)))
         if log is not None:

@@ -107,8 +107,6 @@ def test_commands_say_which_one_and_why(measured, monkeypatch, capsys):
     monkeypatch.setattr("pp_cl.engine.device.device.describe", lambda d: dict.fromkeys(NAMES, 1))
     assert main(["devices", "--json"]) == 0
     assert [row["default"] for row in json.loads(capsys.readouterr().out)] == [False, True]
-    assert main(["devices"]) == 0
-    assert [line.endswith(", taken by default") for line in capsys.readouterr().out.splitlines()]
     device = SimpleNamespace(name="b", info={"platform": "B"})
     assert drivers.device_line(device, None) == "device: b [B], the fastest of 2"
     assert drivers.device_line(device, "B") == "device: b [B]"

@@ -1,4 +1,3 @@
-import re
 import shutil
 
 import numpy as np
@@ -116,10 +115,3 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
     assert "at once" in failure(*arguments(scene, tmp_path / "smaller", **changes))
     assert not (tmp_path / "smaller").exists()
-
-
-def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pp_cl.scene.hull.CELL_CAP", 1500)
-    assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
-    told = re.search(r"^points: only (\d+) of the 1500 asked .*$", capsys.readouterr().out, re.M)
-    assert 500 < int(told[1]) < 1500

@@ -107,13 +107,6 @@ def test_buffers_are_held_to_the_largest_allocation_and_to_the_memory(plain):
     plain.empty((50,))
 
 
-def test_a_smaller_largest_allocation_can_be_asked_for(monkeypatch):
-    largest = open_device().info["max_allocation_bytes"]
-    for text, expected in (("0.5", 2**19), ("1e9", largest)):
-        monkeypatch.setenv("PP_MAX_ALLOCATION", text)
-        assert open_device().info["max_allocation_bytes"] == expected
-
-
 @pytest.mark.parametrize(
     "variable, text",
     [
