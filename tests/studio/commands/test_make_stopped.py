@@ -63,7 +63,7 @@ def test_any_moment_will_do(runs, tmp_path):
 
     words, wrong, stopped = begun(scene, tmp_path / "out"), [], 0
     for moment in range(MOMENTS):
-        stage, number = STAGES[moment % len(STAGES)], NUMBERS[moment % 3 % 2]
+        stage, number = STAGES[moment % len(STAGES)], NUMBERS[moment // len(STAGES) % 2]
         for name in MADE.get(stage, ()):  # by an attempt that came further
             (tmp_path / "out" / name).unlink(missing_ok=True)
         with subprocess.Popen(words, stdout=PIPE, stderr=PIPE, text=True) as process:

@@ -43,16 +43,8 @@ def test_a_video_whose_frames_would_fill_the_memory_is_not_begun(trained, tmp_pa
 
 
 def test_a_video_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypatch):
-    words = [
-        "render",
-        trained,
-        "--out",
-        str(tmp_path / "video.gif"),
-        "--seconds",
-        "1",
-        "--fps",
-        "4",
-    ]
+    words = ["render", trained, "--out", str(tmp_path / "video.gif")]
+    words += ["--seconds", "1", "--fps", "4"]
     write, done = render_video.write_png, []
 
     def stopping(path, image):
