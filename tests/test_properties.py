@@ -12,7 +12,6 @@ from pp_cl.config import assign, load_config, preset
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
-from pp_cl.scene.readers.frame import rigid
 from pp_cl.settings import Config, every_setting
 
 json_values = st.recursive(
@@ -98,20 +97,3 @@ def test_a_checkpoint_comes_back(tmp_path, stored):
     assert header == {"format": FORMAT, "step": 1} and found.keys() == stored.keys()
     for name, array in stored.items():
         assert found[name].dtype == array.dtype and np.array_equal(found[name], array)
-
-
-@given(arrays.arrays(np.float64, (3, 4), elements=st.floats(-2, 2)))
-def test_what_is_taken_for_a_pose_is_rigid(matrix):
-    """Near to what was given, for random matrices and for rotations that are off by little."""
-    u, _, vt = np.linalg.svd(matrix[:, :3])
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    near = np.column_stack([turn + 1e-5 * matrix[:, :3], matrix[:, 3]])
-    for given_matrix in (matrix, near):
-        try:
-            pose = rigid(given_matrix, UserError)
-        except UserError:
-            assert given_matrix is matrix
-            continue
-        assert np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(pose[:, :3]) > 0
-        assert np.abs(pose - given_matrix).max() < 1e-3

@@ -89,23 +89,6 @@ def test_sizes_may_change_between_calls(dev, rng):
         assert relative_error(grad.get(), expected_grad) < 2e-6
 
 
-def test_its_terms_by_name(dev, rng):
-    loss, images_of = Loss(dev, 0.2), [images(rng, 20, 31) for _ in range(2)]
-    readings = []
-    for step, (prediction, target) in enumerate(images_of):
-        loss.forward_backward(dev.upload(prediction), dev.upload(target))
-        if step == 0:
-            loss.add_distortion(dev.upload(np.full(620, 0.5), np.float32), 2.0, scale=1 / 620)
-        readings.append(loss.read(step + 1))
-    for step, (prediction, target) in enumerate(images_of):
-        expected, _ = oracle_loss.loss(prediction, target, 0.2)
-        found = readings[step].get()
-        assert found.pop("loss") == pytest.approx(expected[0] + 1.0 * (step == 0), rel=1e-5)
-        assert found.pop("ssim") == pytest.approx(1 - expected[2], rel=1e-5)
-        assert found.pop("psnr") == pytest.approx(-10 * np.log10(expected[3]), rel=1e-5)
-        assert found == pytest.approx({"l1": expected[1]} | ({} if step else {"distortion": 0.5}))
-
-
 def test_an_overflow_is_told_where_the_loss_is_finite(dev):
     """The square of 1e30 overflows, its absolute value does not."""
     loss = Loss(dev, 0.0)

@@ -23,24 +23,6 @@ def random_view(rng, width, height):
     return make_view(image)
 
 
-@pytest.mark.parametrize(("x0", "y0"), ((-9, 0), (30, 0), (0, -9), (0, 30), (1000, 1000)))
-def test_wholly_outside_is_white(dev, x0, y0):
-    view = make_view(np.zeros((32, 32, 4), np.uint8) + np.array([9, 8, 7, 255], np.uint8))
-    target, view = Target(dev), view.reduced(2)
-    assert (target.crop(view, (x0, y0, 8, 8))[0].get() == 1).all()
-    inside = target.crop(view, (4, 4, 8, 8))[0].get()
-    assert (np.abs(inside - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
-    partly = target.crop(view, (-2, -3, 8, 8), (1, 1))[0].get()  # a block counts what is inside
-    assert (partly[:2] == 1).all() and (partly[:, :1] == 1).all()
-    assert (np.abs(partly[2:, 1:] - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
-
-
-def test_transparent_is_exactly_white_whatever_its_colour(dev, rng):
-    image = rng.integers(0, 256, (64, 64, 4), np.uint8)
-    image[..., 3] = 0
-    assert (Target(dev).whole(make_view(image).reduced(4)) == 1).all()
-
-
 @pytest.mark.parametrize(
     ("downscale", "jitter"),
     (
