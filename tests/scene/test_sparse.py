@@ -39,7 +39,7 @@ def test_points_of_nerfstudio(tmp_path):
 
 def test_no_points_and_broken_ones(tmp_path):
     assert [len(part) for part in sparse_points(tmp_path)] == [0, 0]
-    for name, data in (("txt", b"1 nan 0 0 0 0 0 0\n"), ("bin", bytes(30))):
+    for name, data in (("txt", b"1 nan 0 0 0 0 0 0\n"), ("bin", b"\2" + bytes(30))):
         write_model(tmp_path / name / "sparse", binary=name == "bin")
         (tmp_path / name / "sparse" / f"points3D.{name}").write_bytes(data)
         with pytest.raises(UserError, match=f"points3D.{name}"):

@@ -165,15 +165,6 @@ def without_masks_named(folder):
     frames(folder, lambda _, frame: frame.pop("mask_path"))
 
 
-def failed_calibration(folder):
-    def change(i, frame):
-        if i == 3:
-            frame |= {"k1": -44.9, "k2": 600.0, "cx": 15.0}
-
-    frames(folder, change)
-
-
-NAN = float("nan")
 # {report: (format, what is done to the folder, what is said)}
 TRAINS = {
     "a workspace of COLMAP": (
@@ -183,13 +174,11 @@ TRAINS = {
     ),
     "undistorted images beside photographs": ("colmap", undistorted, ""),
     "cut-outs, masks for some": ("colmap", cut_out, ""),
-    "images in a folder of another case": ("colmap", moved(("images", "Images")), ""),
+    "folders of another case": ("colmap", moved(("images", "Images"), ("masks", "Masks")), ""),
     "transform.json": ("nerfstudio", moved(("transforms.json", "transform.json")), ""),
     "two cameras, equal names": ("nerfstudio", two_cameras, "masks are taken from"),
     "turned by EXIF, which the program had done": ("nerfstudio", images(turned, ".jpg"), ""),
     "TIFF, BMP, AVIF and inks": ("nerfstudio", several_kinds, ""),
-    "masks in a folder of another case": ("colmap", moved(("masks", "Masks")), ""),
-    "LLFF, reduced images alone": ("llff", moved(("images", "images_4")), ""),
     "masks that no frame names": ("nerfstudio", without_masks_named, "masks are taken from"),
     "masks that no frame names, images with a useless alpha": (
         "nerfstudio",
@@ -206,24 +195,8 @@ TRAINS = {
         frame_by_frame("transform_matrix", far_off),
         "left out of the training: images/000003.png (100% of it)",
     ),
-    "a pose that is missing": (
-        "nerfstudio",
-        frame_by_frame("transform_matrix", lambda i, m: None if i == 3 else m),
-        "1 of 12 views left out: no pose",
-    ),
-    "a focal length that is NaN": (
-        "nerfstudio",
-        lambda folder: frames(folder, lambda i, frame: frame.update(fl_x=NAN if i == 3 else 60)),
-        "1 of 12 views left out: a camera that is broken",
-    ),
-    "a calibration that failed": ("nerfstudio", failed_calibration, "distortion that folds"),
 }
 REFUSED = {
-    "most images are gone": (
-        "nerfstudio",
-        lambda folder: [file.unlink() for file in sorted((folder / "images").iterdir())[1:8]],
-        "no image at 'images/",
-    ),
     "OpenCV's axes": ("nerfstudio", read_wrongly(False, True), 'of the kind "opencv"'),
     "matrices from the world": (
         "nerfstudio",

@@ -209,18 +209,6 @@ def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
     assert voted > 0.8
 
 
-def test_what_is_there_is_kept_and_helps(capture):
-    """A second start makes what is missing, the same but for what the kept masks change."""
-    capture.write()
-    first, mask = capture.agreement(), capture.file(3).read_bytes()
-    capture.file(5).unlink()
-    line = capture.write()
-    assert f"{VIEWS - 1} kept" in line
-    assert "1 cut out" in line
-    assert capture.file(3).read_bytes() == mask
-    assert capture.agreement()[5] > first[5] - 0.05
-
-
 def test_a_mask_that_the_user_has_written_has_the_shape_of_its_image(capture):
     capture.write()
     with Image.open(capture.file(3)) as mask:
