@@ -1,4 +1,3 @@
-import errno
 import io
 import shutil
 import tracemalloc
@@ -34,7 +33,6 @@ from pp_cl.config import load_config
 from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.errors import Diverged, UserError
-from pp_cl.files import atomic
 from pp_cl.files.run_folder import RunFolder
 
 
@@ -118,21 +116,6 @@ def test_what_is_not_finite_is_never_written(tmp_path, value):
     with pytest.raises(Diverged, match="^broken holds"):
         check_finite(broken)
     check_finite(SOME)
-
-
-def test_a_full_disk_keeps_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "checkpoint.npz"
-    save_checkpoint(path, {"step": 1}, SOME)
-    before = path.read_bytes()
-
-    def full(*_args, **_kwargs):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(atomic.os, "fsync", full)
-    with pytest.raises(UserError, match="free some space") as caught:
-        save_checkpoint(path, {"step": 2}, SOME)
-    assert str(path) in str(caught.value)
-    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 @pytest.mark.parametrize("step", [1, STEP, 51, 59, STEPS])

@@ -2,7 +2,7 @@ import json
 
 import pytest
 from support.refused import failure
-from support.runs import arguments, checkpoint, train_and_interrupt
+from support.runs import arguments
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.cli import main
@@ -45,10 +45,7 @@ def trained(scene, tmp_path_factory):
     return out
 
 
-def test_a_training_learns_and_resumes_to_the_same_bytes(scene, trained, tmp_path, monkeypatch):
-    train_and_interrupt(scene, tmp_path / "run", 33, monkeypatch, downscale=1)
-    assert main(arguments(scene, tmp_path / "run", 1)) == 0
-    assert checkpoint(tmp_path / "run") == checkpoint(trained)
+def test_a_training_learns(trained):
     psnr = [row["psnr"] for row in RunFolder(trained).rows() if "psnr" in row]
     assert psnr[-1] > psnr[0] + 3
 

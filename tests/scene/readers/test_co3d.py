@@ -1,13 +1,11 @@
 import gzip
 import json
-import os
 
 import numpy as np
 import pytest
 from support.same_scene import held_out, views
 from support.transforms_scenes import left_out, refused
 
-from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.readers.co3d import read_split
 from tools.scene_formats import co3d
@@ -170,12 +168,3 @@ def test_bad_file(sequence, case):
 def test_annotations_beyond_all_bounds(sequence, monkeypatch, bound, words):
     monkeypatch.setattr(f"pp_cl.scene.readers.co3d.MOST_{bound}", int(words[:-2]))
     refused(sequence, sequence.parent / ANNOTATIONS, words)
-
-
-@pytest.mark.unix
-def test_a_set_list_that_is_a_pipe_is_not_waited_for(sequence):
-    file = next((sequence.parent / "set_lists").iterdir())
-    file.unlink()
-    os.mkfifo(file)
-    with pytest.raises(UserError, match=f"{file.name}: cannot be read .Not a regular file"):
-        read_split(sequence, "train", [])
