@@ -1,6 +1,4 @@
-"""The device that was the fastest when measured is taken: once for all commands and processes, and
-anew for another version of a driver.
-"""
+"""The device that was the fastest when measured is taken."""
 
 import json
 from types import SimpleNamespace

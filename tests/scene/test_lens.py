@@ -22,6 +22,24 @@ LENSES = {
 }
 
 
+def test_the_formula_by_hand():
+    """x = 0.3, y = -0.2: r^2 = 0.13."""
+    x, y = LensDistortion(0.1, 0.01, 0.002, -0.003, 0.5).apply(np.array(0.3), np.array(-0.2))
+    radial = 1 + 0.1 * 0.13 + 0.01 * 0.13**2 + 0.5 * 0.13**3
+    assert x == pytest.approx(0.3 * radial + 2 * 0.002 * -0.06 - 0.003 * (0.13 + 2 * 0.09))
+    assert y == pytest.approx(-0.2 * radial + 0.002 * (0.13 + 2 * 0.04) + 2 * -0.003 * -0.06)
+
+
+def test_a_fisheye_by_hand():
+    """A direction t radians off the axis lies t + k1 t^3 + ... + k4 t^9 focal lengths off the
+    centre.
+    """
+    lens, turn = LENSES["bent fisheye"], np.array([np.cos(0.7), np.sin(0.7)])
+    for t in (0, 0.3, 1.2):
+        expected = t + 0.04 * t**3 - 0.02 * t**5 + 0.01 * t**7 - 0.004 * t**9
+        assert lens.apply(*(np.tan(t) * turn)) == pytest.approx(expected * turn, abs=1e-14)
+
+
 def test_without_coefficients_nothing_changes(dev, rng):
     image = rng.integers(0, 256, (120, 161, 4), np.uint8)
     image[..., 3] = 255

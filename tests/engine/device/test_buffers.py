@@ -1,6 +1,4 @@
-"""Tables of arrays, packed arrays, transfers that are not waited for, and rows moved without a
-second array; the selftest has sizes and gathers.
-"""
+"""What the selftest leaves open: it has sizes and gathers."""
 
 import weakref
 from types import SimpleNamespace

@@ -1,6 +1,4 @@
-"""The three convolutions beyond what the selftest compares with float64: some tiles, other
-launches and blockings, NaN, wrong shapes.
-"""
+"""Some tiles, other launches and blockings, NaN: what the selftest does not compare with float64."""
 
 import numpy as np
 import pytest

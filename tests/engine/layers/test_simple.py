@@ -1,6 +1,4 @@
-"""Gates, pooling, upsampling and the output where the selftest does not look: values beyond
-float32's range, NaN, wrong shapes.
-"""
+"""Where the selftest does not look: values beyond float32's range, NaN."""
 
 import numpy as np
 import pytest

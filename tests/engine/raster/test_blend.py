@@ -1,6 +1,4 @@
-"""Both blends: gradients against finite differences of the float64 twins with which the selftest
-compares them, weights by hand, the bits; the basis of the shading.
-"""
+"""Gradients against finite differences of the float64 twins that the selftest compares with."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,4 @@
-"""Views that no photographer takes: from inside the object, of millions of pixels, through one huge
-point.
-"""
+"""Views that no photographer takes: from inside the object, through one huge point."""
 
 from dataclasses import replace
 
