@@ -1,4 +1,4 @@
-"""Some tiles, other launches and blockings, NaN: what the selftest does not compare with float64."""
+"""Some tiles, other launches and blockings, NaN: what the selftest compares with no float64."""
 
 import numpy as np
 import pytest
