@@ -130,6 +130,9 @@ def test_text_as_other_programs_write_it(text):
         file.write_bytes(b"\xef\xbb\xbf" + lines.replace("\n", "\r\n").encode())
     for got, expected in zip(read_split(text, "train", []), before, strict=True):
         assert got.name == expected.name and np.array_equal(got.camera.pose, expected.camera.pose)
+    for file in (text / "sparse/0").glob("*.txt"):
+        file.write_text(file.read_text("utf-8-sig"), encoding="utf-16")
+    assert [one.name for one in read_split(text, "train", [])] == [one.name for one in before]
 
 
 def test_2d_points_take_no_memory(tmp_path):
