@@ -21,7 +21,7 @@ def test_what_has_no_end_is_named_by_its_kind():
 def test_every_message_is_one_line():
     line = "a b?[31m??"
     assert str(UserError("a\u2028b\x1b[31m\0\ud800")) == line
-    stopped = Stopped("a\r\nb", 143)
+    stopped = Stopped("a\nb", 143)
     assert str(stopped) == "a b" and stopped.status == 143
 
 

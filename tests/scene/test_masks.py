@@ -189,8 +189,8 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
         write_png(tmp_path / "masks" / f"r_{i}.png", mask)
     rule = MaskRule(folder=str(tmp_path / "masks"))
     views = load_scene(tmp_path / "ball", masks=rule).splits["train"]
-    (tmp_path / "masks/r_1.png").rename(tmp_path / "masks/other.png")
-    with pytest.raises(UserError, match=r"train/r_1\.png: has no mask, as others have"):
+    (tmp_path / "masks/r_2.png").rename(tmp_path / "masks/other.png")
+    with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, as others have"):
         load_scene(tmp_path / "ball", masks=rule)
     agreed = agreeing(dev, views)  # a mask that is white says that the object fills the image
     assert (

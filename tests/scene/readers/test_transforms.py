@@ -192,9 +192,15 @@ def test_a_copy_beside_transforms_json_is_no_split(tmp_path):
 
 
 def test_what_is_perspective_by_its_keys_is_read_and_motion_is_told(tmp_path):
-    keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None, "time": 0.5}
+    keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None}
+
+    def edit(data):
+        for i, frame in enumerate(data["frames"]):
+            frame.update(keys, time=i / 2)
+
+    write_scene(tmp_path, edit=edit)
     with pytest.warns(UserWarning, match="motion is not modelled"):
-        assert len(train_views(tmp_path, **keys)) == 3
+        assert len(load_scene(tmp_path).splits["train"]) == 3
 
 
 @pytest.mark.parametrize("keys", ({"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}))
