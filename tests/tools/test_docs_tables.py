@@ -21,38 +21,33 @@ RESULTS = {
     "columns": [{"head": "n", "cell": "{n:,} points"}, {"head": "error", "cell": "{error:.1e}"}],
     "rows": [{"n": 1000, "error": 2e-6}, {"n": 2, "error": 0.0}, {"n": 3}],
 }
-TABLE = """Times.
+TABLE = """Times. *Commit abc, 2026-01-01, a machine.*
 
 | n | error |
 |---|---|
 | 1,000 points | 2.0e-6 |
 | 2 points | 0 |
-| 3 points |  |
-
-*Commit abc, 2026-01-01, a machine.*"""
-LATER = "Later commits have changed what decides a training."
+| 3 points |  |"""
 
 
 def test_a_table():
-    assert TOOL.table(RESULTS, "0123") == TABLE
+    assert TOOL.table(RESULTS) == TABLE
 
 
-def test_a_page_says_so_where_the_code_has_changed_since():
-    assert TOOL.table(RESULTS, "4567").endswith(f"a machine. {LATER}*")
-
-
-def test_no_release_states_figures_of_older_code(tmp_path, capsys):
-    """Of two files one is of the code as it was before a kernel changed."""
-    results, kernel = tmp_path / "docs" / "results", tmp_path / "cl" / "a.cl"
+@pytest.mark.parametrize("name", ["cl/a.cl", "pp_cl/engine/raster/b.py", "pp_cl/run.py"])
+def test_no_release_states_figures_of_older_code(tmp_path, capsys, name):
+    """Of two files one is of the code as it was before a file that decides changed."""
+    results, code = tmp_path / "docs" / "results", tmp_path / name
     results.mkdir(parents=True)
-    kernel.parent.mkdir()
-    kernel.write_text("before")
+    code.parent.mkdir(parents=True)
+    code.write_text("before")
     old = RESULTS | {"decides": provenance.digest(tmp_path)}
-    kernel.write_text("after")
+    code.write_text("after")
     new = RESULTS | {"decides": provenance.digest(tmp_path)}
-    (tmp_path / "README.md").write_text("decides nothing")
-    for name, contents in {"old": old, "new": new}.items():
-        (results / f"{name}.json").write_text(json.dumps(contents))
+    for other in (tmp_path / "README.md", code.with_suffix(".pyc")):
+        other.write_text("decides nothing")
+    for file, contents in {"old": old, "new": new}.items():
+        (results / f"{file}.json").write_text(json.dumps(contents))
     assert provenance.main(tmp_path) == 1
     told = capsys.readouterr().err
     assert "old.json: of commit abc" in told and "new.json" not in told
@@ -72,6 +67,6 @@ def test_all_results_are_shown_once():
 
 
 def test_settings_and_commands_are_complete():
-    assert all(f"| `{key}` |" in TABLES["settings"] for key, _, _ in every_setting(Config()))
+    assert all(f"- `{key}`" in TABLES["settings"] for key, _, _ in every_setting(Config()))
     assert all(f"## pp-cl {name}\n" in TABLES["commands"] for name in COMMANDS)
     assert "- `--seed N`: " in TABLES["commands"]
