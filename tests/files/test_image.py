@@ -150,6 +150,8 @@ def test_not_an_image(tmp_path, read):
     (tmp_path / "huge.png").write_bytes(whole[:12] + head + whole[33:])
     with refusing(tmp_path / "a.gif", "is no PNG, JPEG, WEBP, ", "; convert it"):
         read(tmp_path / "a.gif")
+    with refusing(tmp_path / "huge.png", " pixels; reduce the image"):
+        read(tmp_path / "huge.png")
     for path in (*sorted(tmp_path.iterdir()), tmp_path, tmp_path / "none.png"):
         with refusing(path):
             read(path)

@@ -42,5 +42,5 @@ def test_no_points_and_broken_ones(tmp_path):
     for name, data in (("txt", b"1 nan 0 0 0 0 0 0\n"), ("bin", b"\2" + bytes(30))):
         write_model(tmp_path / name / "sparse", binary=name == "bin")
         (tmp_path / name / "sparse" / f"points3D.{name}").write_bytes(data)
-        with pytest.raises(UserError, match=f"points3D.{name}"):
+        with pytest.raises(UserError, match="points3D"):
             sparse_points(tmp_path / name)
