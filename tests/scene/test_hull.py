@@ -211,6 +211,13 @@ def test_a_box_that_is_stated_bounds_what_the_masks_allow(dev):
     assert (found.grid.box[1] < CENTRE + [1.6, 0.4 + 2 * found.grid.voxel_size, 1.6]).all()
 
 
+@pytest.mark.large
+def test_without_masks_a_box_that_is_stated_is_filled(dev):
+    views = [replace(view, image=np.full_like(view.image, 255)) for view in ball_views()]
+    box = np.stack([CENTRE - 0.5, CENTRE + 0.5])
+    np.testing.assert_allclose(build_grid(dev, views, 2000, box).grid.box, box, atol=0.1)
+
+
 @pytest.mark.parametrize("points", (0, -3, 2**27 + 1))
 def test_impossible_counts(dev, points):
     with pytest.raises(UserError, match="--points .*between 1 and"):

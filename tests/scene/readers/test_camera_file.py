@@ -94,6 +94,7 @@ def changed(name, key, value):
         (changed("cameras.json", "rotation", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "no rotation"),
         (changed("cameras.json", "fx", None), "fx: is missing"),
         (changed("cameras.json", "height", 1e9), "height"),
+        (changed("camera_path.json", "fov", None), "fov: is missing"),
         (changed("camera_path.json", "fov", 200), "fov"),
         (changed("camera_path.json", "camera_type", "fisheye"), "camera_type"),
         (changed("transforms.json", "latlong", True), "latlong"),

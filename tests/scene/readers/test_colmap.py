@@ -170,6 +170,7 @@ def replaced(place, value):
 
 BAD_TEXT = {
     "model": ("cameras.txt", replaced(1, "PINHOL"), "line 2"),
+    "a focal length that is no number": ("cameras.txt", replaced(4, "f"), "line 2"),
     "a parameter is missing": ("cameras.txt", second(lambda w: w[:-1]), "line 2"),
     "huge principal point": ("cameras.txt", replaced(6, "1e300"), "line 2"),
     "camera twice": ("cameras.txt", replaced(0, "1"), "camera 1"),

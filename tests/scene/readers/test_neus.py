@@ -102,7 +102,10 @@ BAD = {
     "numbered from 1": (lambda a: a.update(world_mat_11=a.pop("world_mat_2")), "world_mat_2"),
     "mirrored": (world(lambda m: m @ np.diag([-1, 1, 1, 1])), "world_mat_2"),
     "negated": (world(np.negative), "world_mat_2"),
+    "shape": (world(lambda m: m[:2]), "world_mat_2"),
+    "singular": (world(np.zeros_like), "world_mat_2"),
     "skew": (world(skewed), "world_mat_2"),
+    "scale of another shape": (scale(np.eye(2)), "scale_mat_2"),
     "scale 0": (scale(np.zeros((4, 4))), "scale_mat_2"),
     "scale sheared": (scale(np.diag([1.0, 2, 1, 1])), "scale_mat_2"),
 }

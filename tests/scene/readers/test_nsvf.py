@@ -59,6 +59,7 @@ BAD = {
     "no intrinsics": ("intrinsics.txt", ""),
     "focal length 0": ("intrinsics.txt", "0 14 12 0\n"),
     "skew": ("intrinsics.txt", "40 2 14\n0 41 12\n0 0 1\n"),
+    "height 0": ("intrinsics.txt", "40 14 12 0.\n0. 0. 0.\n0.\n1.\n0 30\n"),
     "another shape": ("intrinsics.txt", "40 14 12 0.\n30 22\n"),
     "far before near": ("near_and_far.txt", "3 2\n"),
     "infinite far": ("near_and_far.txt", "1 inf\n"),

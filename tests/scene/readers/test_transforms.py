@@ -123,12 +123,14 @@ def test_rows_and_rounding_of_the_pose(tmp_path, rng):
 MATRIX = opengl_pose([3, 0, 1])
 BAD_FRAMES = {
     "no path": ("file_path", None),
+    "a number as path": ("file_path", 7),
     "no such image": ("file_path", "./train_9"),
     "an image twice": ("file_path", "train_0.png"),
     "no matrix": ("transform_matrix", None),
     "NaN": ("transform_matrix", np.where(np.eye(4) == 1, np.nan, MATRIX).tolist()),
     "scaled": ("transform_matrix", (MATRIX * [1.01, 1.01, 1.05, 1]).tolist()),
     "mirrored": ("transform_matrix", (MATRIX * [-1, 1, 1, 1]).tolist()),
+    "transposed": ("transform_matrix", MATRIX.T.tolist()),
     "negative focal length": ("fl_x", -5),
     "NaN number": ("cx", math.nan),
     "huge number": ("fl_y", 10**400),
