@@ -47,12 +47,12 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
     for i, name in enumerate(("a.avif", "b.bmp", "c.jfif"), 4):
         Image.fromarray(shots[i, ::-1]).save(folder / name)
     heif.from_pillow(Image.fromarray(shots[7, ::-1])).save(folder / "d.heic")
-    plain = np.uint8([110, 70, 60] + shots[8, ..., :1] % 101)
-    Image.fromarray(plain).save(folder / "p3.png", icc_profile=display_p3())
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
     exif.get_ifd(frames.EXIF).update({FOCAL: 4.2, MAKER_NOTE: b"x" * 60_000})
     Image.fromarray(shots[3, ::-1]).save(folder / "turned.jpg", exif=exif)
+    plain = np.uint8([110, 70, 60] + shots[8, ..., :1] % 101)
+    Image.fromarray(plain).save(folder / "p3.png", icc_profile=display_p3(), exif=exif)
     content = (folder / "turned.jpg").read_bytes()
     (folder / "broken.jpg").write_bytes(content[:30] + b"\xff" * 40 + content[70:])
     (folder / "cut off.jpg").write_bytes(content[: len(content) - 3000])
@@ -66,7 +66,8 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
     assert left_out["11b.png"] == "shows the same as 11.png"
     for one in made.values():
         size = read_rgba(tmp_path / "images" / one["name"]).shape[1::-1]
-        assert size == tuple(one["size"]) == (SIZE if one["source"] != "turned.jpg" else SIZE[::-1])
+        is_turned = one["source"] in ("turned.jpg", "p3.png")
+        assert size == tuple(one["size"]) == (SIZE[::-1] if is_turned else SIZE)
     colour = read_rgba(tmp_path / "images" / made["p3.png"]["name"])[..., :3].mean((0, 1))
     assert np.abs(colour - in_srgb(plain.reshape(-1, 3).T).mean(1)).max() < 3
     copy = Image.open(tmp_path / "images" / made["turned.jpg"]["name"]).getexif()
