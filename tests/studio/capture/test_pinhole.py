@@ -1,5 +1,3 @@
-"""Photographs, masks and COLMAP's model without the distortion of the lens."""
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -60,7 +58,6 @@ def test_masks_move_as_their_photographs_do(dev):
 
 
 def seen(model, image):
-    """(number, point) of what an image of pycolmap's model shows."""
     return enumerate(model.image(image).points2D)
 
 

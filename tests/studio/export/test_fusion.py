@@ -1,5 +1,3 @@
-"""Depth maps become signed distances."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Harmonics that reproduce the images."""
-
 import numpy as np
 import pytest
 from support.models import blend_matrix

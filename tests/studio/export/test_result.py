@@ -1,5 +1,3 @@
-"""The folder that `make` fills, at any moment of the work."""
-
 import os
 import re
 import shutil
@@ -41,7 +39,6 @@ def test_before_the_training_it_shows_cameras_and_masks(tmp_path):
 
 @pytest.fixture
 def trained(run_folder, session_device, tmp_path):
-    """A run of its own, whose files are all as old."""
     folder = shutil.copytree(run_folder, tmp_path / "run")
     shutil.rmtree(folder / "eval", ignore_errors=True)
     os.utime(folder / "checkpoint.npz", ns=(10**18, 10**18))

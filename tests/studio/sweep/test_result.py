@@ -1,5 +1,3 @@
-"""What a run's folder tells of it."""
-
 import pytest
 from support.sweeps import jobs_of, pretend
 
@@ -9,7 +7,6 @@ from pp_studio.sweep.table import finished_row
 
 @pytest.fixture
 def job(tmp_path):
-    """A planned run of the demo."""
     return jobs_of(["demo"], tmp_path / "out", [4])[0]
 
 
