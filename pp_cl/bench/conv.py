@@ -43,11 +43,8 @@ RESULTS = {"forward": slice(0, 1), "weights": slice(1, 2), "input": slice(3, Non
 
 @dataclass
 class Layer:
-    """A convolution with its input.
-
-    parts: (H, W, C) float32, what is concatenated to the input. weight: (CO, CI, K, K). bias:
-    (CO,). grad_out: (H, W, CO). relu: whether the output passes through one; the gradient of the
-    input is masked by the input's own.
+    """A convolution with its input: parts (H, W, C) float32, weight (CO, CI, K, K), bias (CO,),
+    grad_out (H, W, CO). relu: of the output, and of the input, which masks its gradient.
     """
 
     parts: Sequence[np.ndarray]
@@ -65,9 +62,7 @@ class Layer:
         co: int,
         k: int = 3,
     ) -> "Layer":
-        """Of a ReLU's outputs of so many `channels`, with weights of PyTorch's initial size and
-        normal gradients.
-        """
+        """Of a ReLU's outputs, with weights of PyTorch's initial size and normal gradients."""
         bound = 1 / np.sqrt(sum(channels) * k * k)
         weight = rng.uniform(-bound, bound, (co, sum(channels), k, k)).astype(np.float32)
         bias = rng.uniform(-bound, bound, co).astype(np.float32)
@@ -76,9 +71,7 @@ class Layer:
 
     @cached_property
     def expected(self) -> list[np.ndarray]:
-        """Float64 [output, gradients of the weights and the bias as the device lays them out,
-        gradient of each part].
-        """
+        """Float64 [output, gradients of packed weights and bias, gradient of each part]."""
         x = np.concatenate(self.parts, 2)
         out = reference.convolution(x, self.weight, self.bias)
         grad_x = reference.convolution(self.grad_out, reference.flipped(self.weight))
@@ -105,9 +98,7 @@ class Layer:
 
 
 class UploadedLayer:
-    """The arrays of a Layer on the device, and those that its convolution fills. variants: names of
-    those that are offered to the device and can run it.
-    """
+    """A Layer's arrays on the device. variants: those offered to the device that can run it."""
 
     def __init__(self, dev: Device, layer: Layer):
         self.dev, self.relu = dev, layer.relu
@@ -135,9 +126,7 @@ class UploadedLayer:
     def compute(
         self, variant: str, blocking: Blocking, direction: str, tiles: Tiles | None
     ) -> None:
-        """Compute a direction by a variant, as the network does in each step of a training, with
-        the weights laid out anew.
-        """
+        """Compute a direction by a variant, as each step of a training does."""
         dev, parts, grad_out, kernels = self.dev, self.parts, self.grad_out, VARIANTS[variant]
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
@@ -165,7 +154,7 @@ class UploadedLayer:
 
 
 def layer_errors(layer: Layer, computed: list[np.ndarray], direction: str) -> tuple[float, float]:
-    """errors() of what Layer.computed() returned, of one direction."""
+    """errors() of one direction of what Layer.computed() returned."""
     own = RESULTS[direction]
     actual, expected = (
         np.concatenate([array.ravel() for array in arrays[own]])
@@ -177,17 +166,12 @@ def layer_errors(layer: Layer, computed: list[np.ndarray], direction: str) -> tu
 def bench_conv(
     dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
-    """Rows of every distinct convolution of the network at size x size, by direction and variant.
-
-    blocks: as UNet takes them.
-    """
-    rng, seen, blocking = np.random.default_rng(0), set(), blocking_of(dev)
+    """Rows of every distinct convolution of the network at size x size, by direction, variant."""
+    rng, blocking, distinct = np.random.default_rng(0), blocking_of(dev), {}
     for layer in convolutions(unet_layers(widths, blocks=blocks)):
+        distinct.setdefault((layer.kernel_size, layer.level, layer.sources, layer.channels), layer)
+    for layer in distinct.values():
         side, k = size >> layer.level, layer.kernel_size
-        key = (k, side, layer.sources, layer.channels)
-        if key in seen:
-            continue
-        seen.add(key)
         timed, checked = (
             Layer.random(rng, (n, n), layer.sources, layer.channels, k)
             for n in (side, min(side, CHECK_SIDE))

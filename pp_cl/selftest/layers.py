@@ -81,7 +81,7 @@ def _layers():
 
 
 @cache
-def _hard_layers() -> dict[str, Layer]:
+def _hard_layers():
     """3x3 convolutions whose inputs or weights are made to hurt float32 or Winograd."""
     rng = np.random.default_rng(7)
 
@@ -242,9 +242,7 @@ def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray,
 
 
 def _tiles(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Which tiles hold something, which have fragments, copies of them; tiles cut off by the
-    border.
-    """
+    """Which tiles hold something, which have fragments, copies of them, also at the border."""
     for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
         odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))
         x = np.where(rng.random((h, w, c)) < 0.02, odd, 1).astype(np.float32)

@@ -33,9 +33,7 @@ def images(rng: np.random.Generator, height: int, width: int) -> tuple[np.ndarra
 
 
 def _loss_checks(dev, prediction, target, weights, *bounds):
-    """weights: of 1 - SSIM, and beta. bounds: of the terms, and of the gradient where it is
-    another.
-    """
+    """weights: of 1 - SSIM, and beta. bounds: of the terms, maybe another of the gradient."""
     loss = Loss(dev, *weights)
     grad, _ = loss.forward_backward(dev.upload(prediction), dev.upload(target))
     terms, expected = reference_loss.loss(prediction, target, *weights)
@@ -61,20 +59,14 @@ def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         prediction = (target + noise[1]).astype(np.float32)
         # rounding of values of 1 in variances of 1e-6, as shares of C2
         yield from _loss_checks(dev, prediction, target, (1.0, 0.0), 1e-5, 3e-5)
-        yield from _equal_images(dev, target)
-
-
-def _equal_images(dev, image):
-    loss = Loss(dev, 0.2)
-    grad, _ = loss.forward_backward(dev.upload(image), dev.upload(image))
-    yield exact(four_terms(loss)[:3], np.zeros(3))
-    yield exact(grad.get(), np.zeros_like(image))
+        loss = Loss(dev, 0.2)  # of equal images
+        grad, _ = loss.forward_backward(dev.upload(target), dev.upload(target))
+        yield exact(four_terms(loss)[:3], np.zeros(3))
+        yield exact(grad.get(), np.zeros_like(target))
 
 
 def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """weight * mean (alpha - mask)^2 of a part of the image, where alpha is too low times the
-    shortfall's weight, beside no other error; nothing outside of it.
-    """
+    """Of a part of the image, where alpha is too low times the shortfall's; nothing outside."""
     weight, shortfall, width, left, top = 0.7, 0.3, 29, 3, 1
     for side in SIZES:
         size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
@@ -135,9 +127,7 @@ def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The gains of three views, of which one is seen twice and one never, and images that are
-    divided by them.
-    """
+    """The gains of three views, one seen twice and one never, and images divided by them."""
     known, left, top = np.zeros((3, 3, 3)), 3, 1
     exposure = Exposure(dev, 3, is_applied=True)
     for view, side in zip((0, 2, 0), (1, 33, 257), strict=True):

@@ -32,9 +32,8 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 
 class Cloud:
-    """n points on the grid, with random offsets, opacities and coefficients up to a degree, and
-    their float64 twin. width: of an offset. positions: (N, 3) in the world. start, learned(): of
-    "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
+    """n random points on the grid, and their float64 twin. width: of an offset. start, learned():
+    of "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
     """
 
     def __init__(
@@ -75,9 +74,7 @@ class Cloud:
         *,
         rates: Rates = RATES,
     ) -> None:
-        """One step, or that of another number. grads: as gradients() has them; those of `visible`
-        count.
-        """
+        """One step, or that of another number. grads: of gradients(), used of the visible."""
         self.steps = step or self.steps + 1
         rows = {name: self.dev.upload(g[visible], np.float32) for name, g in grads.items()}
         rmsprop_update(
@@ -121,9 +118,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
 
 
 def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int = 4) -> Gradients:
-    """{"sh": (n, 16) of the features, "offset": (n, width), "opacity": (n,)} float32; every third
-    point's are 0.
-    """
+    """{"sh": (n, 16), "offset": (n, width), "opacity": (n,)}; every third point's are 0."""
     grads = {}
     for name, shape in (("sh", (n, 16)), ("offset", (n, width)), ("opacity", (n,))):
         grads[name] = (scale * rng.standard_normal(shape)).astype(np.float32)
@@ -151,9 +146,7 @@ def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def adam_steps(
     dev: Device, start: np.ndarray, grads: np.ndarray, **options: Any
 ) -> tuple[optim.Adam, np.ndarray, dict[str, Array]]:
-    """(float64 twin, parameter, moments) after a step with each gradient. options: of
-    adam_update().
-    """
+    """(float64 twin, parameter, moments) after a step with each gradient."""
     parameter = dev.upload(start, np.float32)
     twin, state = optim.Adam(parameter.get()), {kind: dev.zeros(parameter.shape) for kind in "mv"}
     for step, grad in enumerate(grads.astype(np.float32), 1):
@@ -177,9 +170,7 @@ def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _rmsprop(degree: int, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Of harmonics by the direction from the eye; points without a gradient keep their values, and
-    their second moments decay.
-    """
+    """Points without a gradient keep their values, and their second moments decay."""
     for n in SIZES:
         cloud = Cloud(dev, rng, n, degree)
         for _ in range(8):
@@ -203,9 +194,7 @@ def _rmsprop_checks(cloud):
 
 
 def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Gradients of 1e-20 to 1e10, of which float32 cannot square all; of 0 and -0; NaN stays; a
-    gradient of one parameter alone moves it alone.
-    """
+    """Some squares leave float32; NaN stays; a gradient of one parameter alone moves it alone."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         cloud = Cloud(dev, rng, 31)
         for _ in range(10):
@@ -226,9 +215,7 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Huge gradients keep opacities and offsets in their bounds, those of Gaussians and their SH
-    above degree 0, too, at the values of float64.
-    """
+    """Huge gradients keep opacities, offsets and Gaussians' SH above degree 0 in their bounds."""
     for footprint in ("soft", "gaussian"):
         width = offset_width(footprint)
         cloud = Cloud(dev, rng, 257, width=width)

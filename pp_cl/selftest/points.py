@@ -25,18 +25,9 @@ Gradients = dict[str, np.ndarray]
 
 
 def make_camera(width: int = 24, height: int = 20, focal: float = 30.0) -> Camera:
-    """A camera four units away from the origin, off the axes, with different focal lengths and an
-    odd principal point.
-    """
-    return Camera(
-        look_at([2.3, -2.6, 1.9], [0.0, 0.1, 0.0]),
-        focal,
-        focal * 1.1,
-        width * 0.45,
-        height * 0.55,
-        width,
-        height,
-    )
+    """A camera four units away, off the axes, with two focal lengths and an odd principal point."""
+    pose = look_at([2.3, -2.6, 1.9], [0.0, 0.1, 0.0])
+    return Camera(pose, focal, 1.1 * focal, 0.45 * width, 0.55 * height, width, height)
 
 
 def make_points(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -56,10 +47,7 @@ def some_opacities(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 class PairedPoints:
-    """Points projected and paired with the pixels of a camera; arrays are float64 or float32 numpy.
-
-    positions: (N, 3). radius: one number or (N,), world units. depth_range: (near, far).
-    """
+    """Points (N, 3) of radius, one or (N,), projected and paired with the pixels of a camera."""
 
     backward: BlendGradients  # of the last gradients()
 
@@ -115,8 +103,8 @@ class PairedPoints:
         return matrix
 
     def geometry(self) -> dict[str, np.ndarray]:
-        """dense.geometry with the device's fragments, and at these its falloff and depth: at the
-        rim of a footprint a falloff is rounding, and a softmax may make it half a pixel.
+        """dense.geometry with the device's fragments, falloff and depth: at the rim of a footprint
+        a falloff is rounding, and a softmax may make it half a pixel.
         """
         total, fragment = self.pairs.total, self.fragments()
         falloff = self.pairs.pair_point_falloff.get()[:total, 1].view(np.float32)
@@ -186,9 +174,8 @@ class PairedPoints:
         distortion_weight: float = 0.0,
         voxel_size: float = 0.0,
     ) -> Gradients:
-        """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
-        sum(alpha * grad_alpha) and the pixels' distortion loss times its weight, after blend(); on
-        a grid of a voxel size also "offset", (N, 4).
+        """{"features": (N, 16), "opacity": (N,), on a grid of a voxel size "offset": (N, 4)} of
+        sum(features * grad_features), sum(alpha * grad_alpha) and the weighted distortion loss.
         """
         grad_features = np.reshape(grad_features, (*self.shape, 16))
         found = self.backward = blend_backward(
@@ -230,9 +217,7 @@ class PairedPoints:
 
 
 class PairedGaussians(PairedPoints):
-    """Gaussians in the cells of a grid. ids: (N,). offset: (N, 16), cl/cloud.h. radius: of one
-    without offsets, world units.
-    """
+    """Gaussians in the cells of a grid. ids: (N,). offset: (N, 16), as in cl/cloud.h."""
 
     def __init__(
         self,
@@ -268,27 +253,21 @@ AXIS_RADIUS = 0.001  # of points on the axis, world units
 AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 
 
-def depth_at(z: ArrayLike) -> np.ndarray:
-    """Distance from the eye of normalised depth z."""
-    return FAR - np.asarray(z) * (FAR - NEAR)
-
-
 def blend_on_axis(
     dev: Device, z: Sequence[float] | np.ndarray, opacity: ArrayLike, gamma: float, **options: Any
 ) -> tuple[PairedPoints, np.ndarray]:
     """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
     in its own channel.
     """
-    positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
+    positions = np.zeros((len(z), 3))
+    positions[:, 2] = FAR - np.asarray(z) * (FAR - NEAR)
     scene = PairedPoints(dev, AXIS, positions, AXIS_RADIUS)
     scene.blend(np.asarray(opacity), gamma, np.eye(16)[np.arange(len(z)) % 16], **options)
     return scene, scene.weight()[:, 0]
 
 
 class Blended:
-    """A random scene blended by the kernels and in float64, both with the kernels' fragments,
-    falloff and depth.
-    """
+    """A random scene blended by the kernels and in float64, with the kernels' geometry()."""
 
     def __init__(
         self,
@@ -323,9 +302,7 @@ class Blended:
         self.dropped = self.scene.dropped()
 
     def gradients(self, distortion_weight: float = 0.0) -> Gradients:
-        """The kernels' gradients of sum(features * grad) and the distortion loss times its
-        weight.
-        """
+        """The kernels' gradients of sum(features * grad) and the weighted distortion loss."""
         return self.scene.gradients(self.grad, distortion_weight=distortion_weight)
 
     def reference_gradients(

@@ -40,8 +40,8 @@ SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
 
 
 def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Points in the cells of a grid; spheres of which the depth range culls some, by their front.
-    Where points are is known of those that cover a pixel, and all cover one that lie in the image.
+    """Points in the cells of a grid, and spheres, of which the depth range culls some. Those that
+    lie in the image cover a pixel, and the places of these are known.
     """
     camera, depth_range = make_camera(), (3.5, 4.8)
     for n in SIZES:
@@ -82,9 +82,7 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _opacities(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Opacities in the direction from the eye: random ones; along the axes, where all harmonics
-    together take opacities to their bounds, beyond them and to little more or less than these.
-    """
+    """Random ones; along the axes, where harmonics take opacities to their bounds and beyond."""
     for n in SIZES:
         ids = some_ids(rng, GRID, n)
         yield from _check_opacities(dev, make_camera(), ids, some_opacities(rng, n))
@@ -125,9 +123,7 @@ def _inside(camera, place):
 
 
 def _left_out(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Points behind the eye, on its plane and at it, and positions that are NaN, infinite or too
-    large, reach nothing.
-    """
+    """Points behind the eye, on its plane, at it, NaN, infinite or too large reach nothing."""
     positions = [[0, 0, 3.0], [0.001, 0, 4.0], [0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9]]
     for bad in (np.nan, np.inf, -np.inf, 3e38, -3e38):
         positions += [[bad, 0, 3.0], [0, bad, 3.0], [0, 0, bad]]
@@ -185,9 +181,7 @@ def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Harmonics of all degrees; those of 16 bits give what the same numbers in 32 bits give, of
-    Gaussians at least 0. No row is written for points that are not listed.
-    """
+    """Harmonics of all degrees, of Gaussians at least 0. No row but of listed points is written."""
     camera = make_camera()
     for n, degree in product(SIZES, SH_DEGREES):
         positions = make_points(rng, n)
@@ -240,13 +234,9 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _medians(blended, weight, z):
-    """Two (HW,) between which the medians lie: where shares just below and above one half are
-    reached. weight, z: (N, HW).
-    """
-    fragments, bounds = (
-        blended.geometry["fragment"] & ~blended.dropped,
-        np.zeros((2, len(weight.T))),
-    )
+    """Two (HW,) between which the medians lie: of shares just below and above one half."""
+    fragments = blended.geometry["fragment"] & ~blended.dropped
+    bounds = np.zeros((2, len(weight.T)))
     for q in np.flatnonzero(weight.any(axis=0)):
         order = np.argsort(blended.geometry["depth"][:, q], kind="stable")
         listed = order[fragments[order, q]]
@@ -262,9 +252,7 @@ def _depths(dev, scene):
 
 
 def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The highest weight of each point, and how often it was seen, by the tracked fragments; the
-    same from the weights that the backward pass leaves.
-    """
+    """The highest weight of each point, and how often it was seen, by the tracked fragments."""
     options: dict[str, Any] = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
     before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))

@@ -37,9 +37,7 @@ DEMO = 2e-6  # distances of up to 2, by some ten roundings
 
 
 def _views(rng, share):
-    """Views of three sizes, one of them close, with `share` of the pixels in the mask, at random,
-    with alphas at and beside the threshold.
-    """
+    """Views of three sizes, one of them close, with a random `share` of the pixels in the mask."""
     views = []
     for eye, (width, height) in (
         ((3.0, 1, 0.5), (64, 48)),
@@ -128,9 +126,7 @@ def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Noise without distortion, at its size and at a half and a third; a tall image takes several
-    bands.
-    """
+    """Noise, at its size and at a half and a third; a tall image takes several bands."""
     sizes = [(n, 31) for n in SIZES] + [(33, 257), (1030, 700)]
     for (width, height), lens in itertools.product(sizes, LENSES):
         camera = Camera(np.eye(3, 4), 0.9 * height, 0.8 * height, 0.53 * width, 14.2, width, height)
