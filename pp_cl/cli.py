@@ -26,9 +26,7 @@ class _UsageError(UserError):
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse with one-line errors that name the nearest word, without values that are empty, and
-    with a status that tells whether the help was printed.
-    """
+    """argparse with one-line errors that name the nearest word, and without empty values."""
 
     def error(self, message):
         taker = next((word for word in ("--json", "--metrics") if word in self._words), "")
@@ -65,9 +63,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def program(argv: Sequence[str] | None = None) -> int:
-    """main() of a process of its own: it ends soon after Ctrl-C or SIGTERM whatever it is doing, a
-    further Ctrl-C ends what Python does after it, and streams may be as shells give them: closed,
-    full, without a reader.
+    """main() of a process of its own: it ends soon after Ctrl-C or SIGTERM whatever it is doing,
+    and streams may be as shells give them: closed, full, without a reader.
     """
     signals.watch()
     for name in ("stdout", "stderr"):

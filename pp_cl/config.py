@@ -106,9 +106,7 @@ KINDS = {
 
 
 def validate(config: Config, origin: str, origins: Mapping[str, str] | None = None) -> None:
-    """Raise UserError naming the origin and the first key whose value is not allowed. origins: of
-    keys that come from elsewhere.
-    """
+    """Raise UserError naming the origin, that of `origins` first, of a key that is not allowed."""
 
     def where(key):
         return f"{(origins or {}).get(key, origin)}: {key}"
@@ -138,9 +136,8 @@ def _check(value, where, *, least, most, choices, **_):
 
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
     """The config with another scene, to which masks in its folder move along, and the given
-    settings: (key, value or its text, origin).
-
-    Raises UserError naming the first that makes no sense, and for scene.path among them.
+    settings: (key, value or its text, origin). Raises UserError naming the first that makes no
+    sense, and for scene.path among them.
     """
     given, origins = list(given), dict[str, str]()
     for key, _, origin in given:
@@ -176,7 +173,7 @@ def begin_with(
     path: Path | str, given: list[tuple[str, Any, str]]
 ) -> tuple[str, list[tuple[str, Any, str]]]:
     """(preset, settings) of another run's config.json, all but those of its scene, with the given
-    ones on top: (key, value or its text, origin). Raises UserError as load_config.
+    ones on top. Raises UserError as load_config.
     """
     config = load_config(path)
     length = "train.minutes" if config.train.minutes else "train.iterations"
@@ -265,9 +262,7 @@ def field_of(key: str) -> dataclasses.Field:
 
 
 def help_lines() -> list[str]:
-    """Lines `section.key = default  (help)` of all settings, each with the values of the presets
-    that differ: the text of `--help`.
-    """
+    """Lines `section.key = default  (help)` of all settings, with presets' values that differ."""
     return [
         f"  {key} = {text_of(item.default)}  ({item.metadata['help']})"
         + "".join(
@@ -296,12 +291,9 @@ def run_config(
     given: Iterable[tuple[str, Any, str]] = (),
 ) -> Config:
     """Config of a training in `folder`: that of the run there, else the preset's, with the given
-    settings.
-
-    scene: a folder, or the word demo. given: (key, value or its text, origin). A run that has a
-    checkpoint must have the same values, but a finished one may be asked for other
-    train.iterations: with more of them it goes on. Raises UserError naming the first setting that
-    differs or makes no sense, or what is wrong with the scene's files.
+    settings: (key, value or its text, origin). A run that has a checkpoint must have the same
+    values, but a finished one may have another length. Raises UserError naming the first setting
+    that differs or makes no sense, or what is wrong with the scene's files.
     """
     given, stored = list(given), load_config(folder.config) if folder.config.exists() else None
     other_preset = stored is not None and preset_name not in (None, stored.preset)
@@ -327,8 +319,8 @@ def scene_config(
     scene: str, preset_name: str, given: Iterable[tuple[str, Any, str]] = ()
 ) -> Config:
     """Config of a preset for a scene, with the given settings: unless scene.downscale is among
-    them, images are reduced to about the preset's size, by the largest training image, as long as
-    the smallest keeps enough pixels. Raises UserError as configure() and scene_frames() do.
+    them, images are reduced to about the preset's size. Raises UserError as configure() and
+    scene_frames() do.
     """
     # here, so that --help needs neither numpy nor OpenCL
     from pp_cl.engine.views import MIN_SIDE, fitting_downscale
@@ -346,9 +338,7 @@ def scene_config(
 
 
 def _resumed(folder, stored, scene, given):
-    """The settings of a run with a checkpoint, which may change in FREE alone, and where it is
-    finished in its length.
-    """
+    """The settings of a run with a checkpoint: FREE may change, of a finished one LENGTH, too."""
     from pp_cl.checkpoint import opened_run
 
     config, free = configure(load_config(folder.config), scene, given), {*FREE}

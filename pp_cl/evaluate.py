@@ -21,10 +21,8 @@ SHOWN_VIEWS = 4  # rows of the comparison image
 
 
 class Rendered(NamedTuple):
-    """A view as the run renders it.
-
-    image, truth: (H, W, 3) float32 in [0, 1]. alpha: (H, W) of the truth. computed: fraction of the
-    network's multiplications that were computed; the others would have seen background alone.
+    """A view as the run renders it. image, truth: (H, W, 3) float32 in [0, 1]. alpha: (H, W) of the
+    truth. computed: fraction of the network's multiplications; the others saw background alone.
     """
 
     name: str
@@ -45,32 +43,16 @@ def evaluate_run(
     scene: str | None = None,
     out: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Measure a run, or the one in a folder, as `pp-cl eval` does, into `out`, else into its own
-    folder; returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write
-    every view, too. device, scene: of a folder, as load() takes them.
+    """Measure a run, or the one in a folder, as `pp-cl eval` does; writes metrics.json, whose
+    content it returns, and comparison.png into the folder `out`, else RUN/eval, or RUN/eval/SPLIT
+    for other splits than test. Where the run's images had gains, views are also measured after the
+    best ones, exposed_alike().
+
+    metrics: out of psnr, ssim, lpips. save_images: write every view to images/ there, too. device,
+    scene: of a folder, as load() takes them. Raises UserError for a missing or broken split, and
+    for files that would be lost.
     """
     run = run if isinstance(run, Run) else load(run, device, scene=scene)
-    return evaluate(run, split, metrics, save_images=save_images, out=out)
-
-
-def evaluate(
-    run: Run,
-    split: str,
-    metrics: tuple[str, ...],
-    *,
-    save_images: bool = False,
-    out: Path | str | None = None,
-) -> dict[str, Any]:
-    """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
-    RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former. Where the
-    run's images had gains, views are also measured after the best ones, exposed_alike().
-
-    metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. Progress shows on stderr. Raises UserError
-    for a missing or broken split, a folder that may not be written, an `out` that holds something
-    else than an evaluation, and a file in the place of one that it writes which no evaluation has
-    written as it is now.
-    """
     target = run.folder.evaluation(split) if out is None else Path(out)
     scene = run.scene(split)
     views = scene.splits[split]
@@ -106,9 +88,7 @@ def evaluate(
 
 
 def _published(scene, split, views):
-    """{"published": rows of the scene, "published_differs": how this measurement differs from
-    them}.
-    """
+    """{"published": rows of the scene, "published_differs": how this measurement differs}."""
     cameras = [view.file_camera for view in views]
     rows = published_rows(scene.name, cameras)
     differs = differences(scene.name, cameras, views[0].file_downscale, split) if rows else ""

@@ -25,15 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.drivers import open_device
-    from pp_cl.evaluate import evaluate
-    from pp_cl.run import load_run
+    from pp_cl.evaluate import evaluate_run
+    from pp_cl.run import load
 
-    metrics = options.metrics
-    dev = open_device(options.device)
-    run = load_run(dev, options.run_folder, scene=options.scene)
-    result = evaluate(run, options.split, metrics, save_images=options.save_images, out=options.out)
-    folder = run.folder
+    run = load(options.run_folder, options.device, scene=options.scene)
+    metrics, folder = options.metrics, run.folder
+    result = evaluate_run(
+        run, options.split, metrics, save_images=options.save_images, out=options.out
+    )
     state = "" if result["finished"] else f", unfinished, step {result['step']}"
     own = f"{folder} ({len(result['per_image'])} views{state})"
     published = {} if result["published_differs"] else result["published"]
@@ -71,7 +70,6 @@ def _cell(values, name):
 
 
 def _summary(result):
-    """Points, work and time."""
     points, computed = result["points"], result["computed_fraction"]
     share = f"{computed:.0%} of the network's work, " if computed < 1 else ""
     return (

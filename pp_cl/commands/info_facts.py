@@ -31,10 +31,8 @@ Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
 
 
 def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
-    """What a run is, from its files alone; what they do not tell is None.
-
-    scene: where its scene is now, if it has moved. Raises UserError naming the file that is missing
-    or broken.
+    """What a run is, from its files alone; what they do not tell is None. scene: where its scene
+    is now. Raises UserError naming the file that is missing or broken.
     """
     config, rows, measured = stored_config(folder, scene), folder.rows(), folder.measured()
     last, network = rows[-1] if rows else {}, config.network
@@ -78,9 +76,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
 
 
 def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
-    """outline_sheet() of the points that a run has left, over renderings where its scene is
-    missing. Raises UserError as run_facts does, and for a scene that is broken.
-    """
+    """outline_sheet() of the points that a run has left, over renderings without its scene."""
     run = load_run(dev, folder.path, scene=scene)
     path = run.config.scene.path
     points = Hull(run.model.grid, run.model.cloud.ids.get(), capped=False)
@@ -112,12 +108,9 @@ def _image_sizes(image_files):
 def describe_scene(
     dev: Device, scene: str, preset_name: str, given: Iterable[Given] = ()
 ) -> tuple[Facts, list[View], Hull | None, list[Disagreement]]:
-    """(what a scene is, from its training views and the cameras of the others; those views; their
-    hull, None where the masks give none; the masks that the others contradict).
-
-    preset_name: whose number of points the hull gets, and whose size the images. given: settings,
-    as configure takes them. Raises UserError for a scene that is missing or broken; what prevents a
-    hull is a fact.
+    """(what a scene is with the settings of a preset and those given, its training views, their
+    hull, None where the masks give none, the masks that the others contradict). Raises UserError
+    for a scene that is missing or broken; what prevents a hull is a fact.
     """
     config = scene_config(scene, preset_name, given)
     path = config.scene.path
@@ -190,9 +183,7 @@ def _lenses(cameras):
 
 
 def _masks(views):
-    """{"with_alpha": share of the views whose image has a transparent pixel, "object": mean share
-    of such an image that shows the object, None where there is none}.
-    """
+    """{"with_alpha": share of the views with a mask, "object": mean share that these hold}."""
     masks = [view.image[..., 3] for view in views if view.has_mask]
     shares = [float((mask > MASK_THRESHOLD).mean()) for mask in masks]
     return {

@@ -1,12 +1,11 @@
-"""Options that commands share, and the types by which argparse reads texts: a function of the text
-that raises argparse.ArgumentTypeError.
-"""
+"""Options that commands share, and argparse's types: functions of the text."""
 
 import argparse
 import json
 import os
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -137,17 +136,19 @@ def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
 
 
 def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> None:
-    """Add --json, for write_json_option and tell: the name of a file, or sys.stdout, which then
-    has nothing but the JSON: cli.main() sends what is printed meanwhile to stderr. known: words of
-    the command, which are no files.
+    """Add --json: a file, or sys.stdout, which then has nothing but the JSON: cli.main() sends what
+    is printed meanwhile to stderr. known: words of the command, which are no files.
     """
 
     def target(text):
         if text == "-":
             return sys.stdout
         is_of_command = text in known or os.path.isdir(text)
-        # output_file() refuses pipes, that reading would wait for
-        if is_of_command or _holds_else_than_json(output_file()(text)):
+        if not is_of_command:
+            output_file()(text)  # it refuses pipes, that reading would wait for
+            with suppress(OSError), open(text, "rb") as file:
+                is_of_command = file.read(1) not in (b"", b"{", b"[")  # it would be lost
+        if is_of_command:
             raise argparse.ArgumentTypeError(
                 f"{quoted(text)}: no JSON may be written there; name another FILE, or write what"
                 " the command works on before --json"
@@ -162,15 +163,6 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
         metavar="FILE",
         help="write the result to FILE as JSON; without FILE (or -) print it in place of the text",
     )
-
-
-def _holds_else_than_json(name):
-    """Whether a file of this name would be lost if JSON took its place."""
-    try:
-        with open(name, "rb") as file:
-            return file.read(1) not in (b"", b"{", b"[")
-    except OSError:
-        return False
 
 
 def write_json_option(target: str | TextIO | None, value: Any) -> None:

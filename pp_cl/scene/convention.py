@@ -40,9 +40,7 @@ def read_as(camera: Camera, axes: str) -> Camera:
 
 
 def meeting(cameras: Sequence[Camera]) -> float:
-    """How well cameras look at one place from around it: the cosine between their axes and what
-    they look at, in the median; 0 where they do not, or look the same way.
-    """
+    """The median cosine between cameras' axes and what they look at from around it, else 0."""
     place = looked_at(cameras)
     towards = place - np.stack([camera.eye for camera in cameras])
     distance = np.linalg.norm(towards, axis=1)
@@ -55,9 +53,8 @@ def meeting(cameras: Sequence[Camera]) -> float:
 
 
 def other_axes(cameras: Sequence[Camera]) -> str | None:
-    """The one of AXES by which the cameras would look at one place from around it, of several the
-    one that meets it best. None where they do so as they are, or by no other reading, as those
-    that look the same way.
+    """The one of AXES by which the cameras would best look at one place from around it. None where
+    they do so as they are, or by no other reading.
     """
     if len(cameras) < LEAST_CAMERAS or meeting(cameras):
         return None

@@ -9,7 +9,7 @@ from pp_cl.engine.camera import Camera
 
 def up_of(cameras: Sequence[Camera]) -> np.ndarray:
     """(3,) unit vector that is up in the images: as far as possible across all horizontal edges of
-    the images (people hold a camera level), on the side of their mean upper edge.
+    the images, on the side of their mean upper edge.
     """
     right, up = (np.stack([camera.pose[:, axis] for camera in cameras]) for axis in (0, 1))
     mean = -up.mean(axis=0)

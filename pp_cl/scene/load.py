@@ -89,11 +89,8 @@ class SplitFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Views of one object.
-
-    folder: None for a scene that the program makes itself. splits: views by split name ("train",
-    "val", "test"). notes: a line for each kind of thing that was done to use them, such as views
-    that were left out.
+    """Views of one object, by split ("train", "val", "test"). folder: None for a scene that the
+    program makes itself. notes: lines of what was done to use them, such as views left out.
     """
 
     name: str
@@ -110,9 +107,7 @@ def open_scene(
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
-    `demo` is rendered on the device.
-
-    most, listed: as load_scene() takes them.
+    `demo` is rendered on the device. most, listed: as load_scene() takes them.
     """
     path, downscale, masks = config.scene.path, config.scene.downscale, mask_rule(config)
     if path == DEMO:
@@ -152,9 +147,8 @@ def mask_rule(config: Config) -> MaskRule:
 
 
 def scene_box(config: Config) -> np.ndarray | None:
-    """(2, 3) lower and upper corner of the setting scene.box, else of what the user has edited,
-    else of what the scene's format states; None where there is none. Raises UserError for a box
-    without volume.
+    """(2, 3) lower and upper corner of the setting scene.box, else of the user's edits, else
+    of what the scene's format states, or None. Raises UserError for a box without volume.
     """
     corners, path = np.array(config.scene.box, np.float64).reshape(2, 3), config.scene.path
     if not corners.any():
@@ -169,9 +163,7 @@ def scene_box(config: Config) -> np.ndarray | None:
 
 
 def scene_format(path: str) -> str:
-    """The name of the reader of a scene; of `demo` the word itself. Raises UserError where there is
-    no scene.
-    """
+    """The name of the reader of a scene; of `demo` the word itself. Raises UserError."""
     return DEMO if path == DEMO else find_reader(path).__name__.rpartition(".")[2]
 
 
@@ -191,9 +183,8 @@ def scene_frames(path: str | Path, split: str = "train", *, edited: bool = True)
 
 
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> SplitFiles:
-    """The images of a split, without their pixels; edited: but for those that the user has
-    dropped. Raises UserError where there are none, where too few are left, and for cameras in other
-    axes than the format's.
+    """The images of a split; edited: but for those that the user has dropped. Raises UserError
+    where too few are left, and for cameras in other axes than the format's.
     """
     if path == DEMO:
         return SplitFiles(demo.demo_frames(split), [], [])
@@ -240,9 +231,7 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
 
 
 def check_lens(file: Path, image_file: ImageFile) -> None:
-    """Raise Unusable naming the file of an image whose camera shows nothing in float32, or
-    whose distortion folds.
-    """
+    """Raise Unusable naming the file where the camera shows nothing in float32, or a lens folds."""
     camera = image_file.camera
     for what, values, least in (
         ("focal lengths", (camera.fx, camera.fy), LEAST_FOCAL),
@@ -263,18 +252,15 @@ def check_lens(file: Path, image_file: ImageFile) -> None:
 
 
 def _check_left(left, left_out, least):
-    """Raise the error of the first view that was left out where fewer than `least`, or less than
-    half, are left.
-    """
+    """Raise the first error of left_out where fewer than `least`, or less than half, are left."""
     if left_out and len(left) < max(least, len(left_out)):
         raise left_out[0][1]
 
 
 def _masked(folder, reader, image_files, split):
     """(The images, with the masks of a folder of masks where the format names none; what was
-    done). Images of a transforms.json have their own alpha, if they have one. Where masks are of
-    the object, what a transforms.json names besides says where images are of use, as nerfstudio
-    takes it.
+    done). Images of a transforms.json have their own alpha, if any, and where masks are of the
+    object, masks that it names say where images are of use, as nerfstudio takes it.
     """
     named, done = [one for one in image_files if one.mask], []
     if named:
@@ -304,9 +290,7 @@ def _are_cut_out(folder, image_files):
 
 
 def _masks_in(folder, image_files, split, places):
-    """{name: its mask} of those that have one in one of the places in a folder. Raises
-    UserError where a place has none for any training image.
-    """
+    """find_masks(); {} for other splits than train where no image has one."""
     try:
         return find_masks(folder, [one.name for one in image_files], places) or {}
     except UserError:
@@ -316,9 +300,7 @@ def _masks_in(folder, image_files, split, places):
 
 
 def _are_besides(folder, image_file):
-    """Whether an image has alpha of which the mask that its frame names is no part, or the scene
-    has a folder of masks in which that mask does not lie.
-    """
+    """Whether the mask that a frame names is none of the object, by alpha or a folder of masks."""
     place, image = folder_named(folder, MASK_FOLDERS), folder / image_file.name
     if place and not image_file.mask.startswith(f"{place}/"):
         return True
@@ -331,9 +313,7 @@ def _are_besides(folder, image_file):
 
 
 def _ignoring(folder, places, image_files, split):
-    """The images, with the masks of what says nothing that lie in one of the places in a
-    folder.
-    """
+    """The images, with the masks of what says nothing in one of the places in a folder."""
     masks = _masks_in(folder, image_files, split, places)
     files = {name: str(folder.absolute() / mask) for name, mask in masks.items()}
     return [
@@ -370,9 +350,7 @@ def _tell(folder, lines):
 
 
 def measured_split(path: str) -> str:
-    """The split that tells how a training goes: val, else test. Raises UserError where the scene
-    has neither.
-    """
+    """The split that tells how a training goes: val, else test. Raises UserError without either."""
     present = scene_splits(path)
     for split in ("val", "test"):
         if split in present:
@@ -444,14 +422,12 @@ def load_scene(
     downscale: int | None = None,
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
-    """Scene of the given splits from a folder; progress shows on stderr.
-
-    most: views to read of each split, spread evenly; None: all. dev: removes distortion, and finds
-    silhouettes for training views whose masks are missing, which are left out without it.
-    downscale: how many times its images are reduced, those of a large scene in part while they are
-    read; None: as they are stored. listed: what list_split() gave of some splits, so that their
-    files are not read again. Raises UserError naming the file, and the key where there is one, for
-    whatever is missing, broken or contradictory, and for distortion without a device.
+    """Scene of the given splits from a folder. most: views to read of each
+    split, spread evenly; None: all. dev: removes distortion, and finds silhouettes for training
+    views without masks, which are left out without it. downscale: how many times images are
+    reduced; None: as they are stored. listed: what list_split() gave of some splits. Raises
+    UserError naming the file, and the key, for whatever is missing, broken or contradictory, and
+    for distortion without a device.
     """
     folder, lines = Path(path), []
     for option, given in (("--masks", masks.folder), ("--ignore", masks.ignore)):
@@ -530,8 +506,8 @@ def _read_views(folder, image_files, masks, dev, factor, left_out):
 
 
 def _all_masked(folder, views, dev, left_out):
-    """(views that all have masks, what was done): those without one are used inside the hull of the
-    others' masks where there is a device and that hull can be had, and left out else.
+    """(views that all have masks, what was done): those without are used inside the hull of the
+    others' masks, on a device, and left out else.
     """
     bare = [view for view in views if not (view.is_masked or view.has_mask)]
     masked = [view for view in views if view.is_masked or view.has_mask]
@@ -549,9 +525,8 @@ def _all_masked(folder, views, dev, left_out):
 def reading_cost(
     image_files: Sequence[ImageFile], masks: MaskRule = AS_GIVEN, factor: int = 1
 ) -> tuple[int, int]:
-    """(how many images are read side by side, bytes that this takes beside the images that
-    stay): as many as there are cores, but no more than READING_BYTES hold. factor: how many times
-    they are reduced meanwhile.
+    """(how many images are read side by side, bytes that this takes beside the images that stay):
+    as many as there are cores and READING_BYTES hold.
     """
     per_pixel = DECODED + (CUT_OUT / factor**2 if masks.is_by_colour else 0)
     pixels = max(one.camera.width * one.camera.height for one in image_files)

@@ -1,6 +1,4 @@
-"""The sparse points that a scene brings along: COLMAP's model, or the .ply that transforms.json
-names.
-"""
+"""The sparse points that a scene brings along: COLMAP's, or the .ply that transforms.json names."""
 
 import os
 from itertools import islice
@@ -22,8 +20,8 @@ GREY = 150  # of points without colour
 
 
 def sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """((N, 3) float64 world positions, (N, 3) uint8 colours), none where the scene has none, or not
-    the file that it names. Raises UserError naming a file that is broken.
+    """((N, 3) float64 world positions, (N, 3) uint8 colours), maybe none. Raises UserError naming a
+    file that is broken.
     """
     shared = {}
     if (file := folder / transforms.SINGLE).is_file():

@@ -96,7 +96,7 @@ def line(row: Row) -> str:
 
 
 def as_json(dev: Device, rows: Iterable[Row]) -> dict[str, Any]:
-    """{"setup", "passed", "seconds", "cases": [a Row's fields]}; errors that are no number: null."""
+    """{"setup", "passed", "seconds", "cases": [a Row's fields]}; null for what is no number."""
     rows = [row if np.isfinite(row.error or 0) else replace(row, error=None) for row in rows]
     return {
         "setup": setup(dev),

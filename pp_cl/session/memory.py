@@ -1,6 +1,5 @@
-"""The memory that a training takes, within 15 % of what it will allocate: the tables of the engine,
-for the numbers of points, fragments and pixels that are expected. A training that does not fit is
-refused before anything is allocated.
+"""The memory that a training takes, within 15 %: the engine's tables, for the numbers of points,
+fragments and pixels that are expected. What does not fit is refused before it is allocated.
 """
 
 import math
@@ -41,8 +40,8 @@ SHOWN = 0.8
 
 
 class Need(NamedTuple):
-    """Bytes that a training takes: of the device at its peak, and then of how many points; of the
-    largest buffer; of the host beside the program itself, whose memory a CPU's buffers are in, too.
+    """Bytes that a training takes: of the device at its peak, with how many points; of the largest
+    buffer; of the host beside the program itself, a CPU's buffers included.
     """
 
     device: int
@@ -52,10 +51,8 @@ class Need(NamedTuple):
 
 
 class MemoryPlan:
-    """Checks that a training fits the available memory; made before the training allocates
-    anything. need: what it takes, by the last check.
-
-    image_files: of the training views.
+    """Checks that a training fits the available memory; made before it allocates anything. need:
+    what it takes, by the last check. image_files: of the training views.
     """
 
     def __init__(self, config: Config, net: UNet, image_files: Sequence[ImageFile]):
@@ -81,16 +78,16 @@ class MemoryPlan:
         return self._program + self.need.host
 
     def check_unseen(self) -> None:
-        """Raise UserError as check_points() does if even the least memory that the training can
-        take does not fit; called before the images are read and the hull is known.
+        """Raise UserError if even the least memory that the training can take does not fit; called
+        before the images are read and the hull is known.
         """
         self._check(self._need(self._points.count, 0.0, step=0))
 
     def check_points(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
     ) -> None:
-        """Raise UserError, naming the settings to change, where a training with these points of a
-        grid does not fit from a step on, or would refine the grid beyond what ids can number.
+        """Raise UserError where a training with these points of a grid does not fit from a step
+        on, or would refine the grid beyond what ids can number.
         """
         to_come = sum(step < at for at in refine_steps(self._train))
         last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
@@ -102,9 +99,7 @@ class MemoryPlan:
         self._check(self.need_of(grid, points, depth_range, step))
 
     def check_growth(self, model: Model, step: int) -> None:
-        """Check again if the step after `step` refines the grid or begins the EMA: only now it is
-        known how many points pruning has left.
-        """
+        """Check again, by what pruning has left, if the next step refines or begins the EMA."""
         points = model.cloud.count
         if step + 1 in [*refine_steps(self._train), averages_from(self._train)]:
             try:
@@ -117,9 +112,7 @@ class MemoryPlan:
     def need_of(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
     ) -> Need:
-        """What a training with these points of a grid takes from a step on, seen from the middle of
-        the depth range.
-        """
+        """What a training with these points of a grid takes from a step on."""
         middle = sum(depth_range) / 2
         # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
         # second order
@@ -128,9 +121,7 @@ class MemoryPlan:
         return self._need(points, radius * self._largest.fx / middle * math.sqrt(growth), step)
 
     def _need(self, points, radius, step):
-        """The Need from a step on. radius: of the footprints then, pixels of the largest image
-        as it is stored.
-        """
+        """The Need from a step on. radius: of the footprints then, pixels of the stored image."""
         stretches = [*expected_stretches(self._train, points, step)]
         found = []
         for stretch in stretches:
@@ -149,9 +140,7 @@ class MemoryPlan:
         )
 
     def _need_of_stretch(self, stretch, radius):
-        """The Need of some steps; of the host only what refining after them takes. radius: of the
-        footprints, pixels of an image.
-        """
+        """The Need of some steps; of the host what refining after them takes."""
         raster, train, n = self._raster, self._train, stretch.points
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
@@ -191,9 +180,7 @@ class MemoryPlan:
         return Need(device, n, largest, n * REFINING_BYTES if stretch.refinements else 0)
 
     def _padded_size(self, halvings, side):
-        """(height, width) of a crop of the largest image, in whole multiples of what the
-        network needs; side 0: of the whole image.
-        """
+        """(height, width) of a crop of the largest image, or of all, in the network's multiples."""
         camera = self._largest.downscaled(self._downscale << halvings)
         height, width = (min(side or size, size) for size in (camera.height, camera.width))
         return height + -height % UNet.multiple, width + -width % UNet.multiple
@@ -231,7 +218,7 @@ def _size(size):
 
 
 def memory_line(memory_plan: MemoryPlan) -> str:
-    """The memory that the last check found to be needed, in words."""
+    """The memory that the last check found to be needed."""
     need, dev = memory_plan.need, memory_plan.dev
     has, on_host = _size(dev.info["memory_bytes"]), f"{_size(need.host)} of the computer's"
     if dev.is_cpu:

@@ -1,6 +1,4 @@
-"""Runs a training in the folder of a run: begun with a visual hull or resumed from a checkpoint,
-then Trainer's steps with log, previews and checkpoints.
-"""
+"""Runs a training in the folder of a run: begun or resumed, with log, previews and checkpoints."""
 
 import math
 import time
@@ -50,10 +48,8 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 
 class HullFacts(NamedTuple):
-    """What a new training says of its visual hull.
-
-    capped: it has fewer points than asked for, as the grid may not be finer. seconds: time that
-    carving took. sheet: of the masks that disagree with the others, None if all agree.
+    """Of the hull of a new training. capped: it has fewer points than asked for. seconds: carving
+    took. sheet: of the masks that disagree with the others, None if all agree.
     """
 
     capped: bool
@@ -63,12 +59,9 @@ class HullFacts(NamedTuple):
 
 @dataclass
 class Training:
-    """A training that is ready to begin or to go on.
-
-    info: what a checkpoint's header holds beside the model's. memory_plan: the available memory and
-    the plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
-    views on which train.eval_every measures PSNR. began: time.monotonic() when it was opened, from
-    which train.minutes count.
+    """A training that is ready to begin or to go on. info: what a checkpoint's header holds beside
+    the model's. hull: None if it resumes. measured: the views on which train.eval_every measures
+    PSNR. began: time.monotonic() when it was opened, from which train.minutes count.
     """
 
     folder: RunFolder
@@ -89,14 +82,11 @@ class Training:
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> float:
         """Train to the end with log, previews and checkpoints; returns the seconds of training,
-        those before an interruption included.
-
-        on_step(step, row) is called after each step, with its row of the log where it has one.
-        is_stopped() is asked after each step: if it is true, a checkpoint is written and the
-        training ends, to be resumed later. Raises UserError before anything is written if another
-        process trains into the folder; later, after writing a checkpoint, if a refinement or the
-        EMA needs more memory than there is; and if numbers are no longer finite, keeping the last
-        checkpoint.
+        those before an interruption included. on_step(step, row) is called after each step, with
+        its row of the log where it has one; if is_stopped() is true then, a checkpoint is written
+        and the training ends. Raises UserError if another process trains into the folder, if the
+        next step needs more memory than there is, and if numbers are no longer finite; the last
+        checkpoint is kept.
         """
         with self.folder.owned():
             self._check_unchanged()
@@ -174,9 +164,7 @@ class Training:
         return key in self.config.automatic
 
     def _after_step(self, log, terms, seconds):
-        """Write the log's row, the preview and the checkpoint that are due; return the row or None.
-        The checkpoint comes last: resuming from it does not make the others again.
-        """
+        """Write the log's row, which it returns, the preview and then the checkpoint, as due."""
         trainer, train = self.trainer, self.config.train
         step, last, row = trainer.step, trainer.step == train.iterations, None
         is_measured = train.eval_every and step % train.eval_every == 0
@@ -241,20 +229,15 @@ class Training:
 def open_training(
     dev: Device, folder: RunFolder, config: Config, stored: Stored | None
 ) -> Training:
-    """resume_training() from the folder's checkpoint `stored` where it has one, else
-    begin_training().
-    """
+    """The training in `folder`: resumed from its checkpoint `stored`, or begun without one."""
     if stored is None:
         return begin_training(dev, folder, config)
     return resume_training(dev, folder, config, stored)
 
 
 def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
-    """A training in `folder` from its beginning; the automatic settings in config (train.refine_at,
-    raster.radius) are chosen.
-
-    Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
-    written, and for images in it that would be lost.
+    """A training in `folder` from its beginning; automatic settings in config are chosen. Raises
+    UserError for a broken scene, too little memory, and a folder that may not be written.
     """
     began = time.monotonic()
     check_target(folder.config)
@@ -282,11 +265,8 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
 
 
 def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
-    """The training in `folder` from its checkpoint on.
-
-    A finished one is extended to config.train.iterations, with new moments and without refinements:
-    every schedule ends at the last step, so it is not what it would have been from its beginning.
-    Raises UserError as begin_training() does, and for a checkpoint of another scene.
+    """The training in `folder` from its checkpoint on; a finished one is extended, with new moments
+    and without refinements. Raises UserError as begin_training(), and for another scene.
     """
     began, (header, arrays) = time.monotonic(), stored
     check_target(folder.config)
@@ -347,12 +327,10 @@ def train_scene(
     **options: Any,
 ) -> Run:
     """Train a scene into the folder `out`, or go on with the run there; a finished one is left
-    alone, unless more iterations are asked for than it has.
-
-    scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
-    value}; options: the same by the names of the command's options, such as iterations.
-    on_step(step, row): called after each step, with its row of the log or None. is_stopped: asked
-    after each step; where it is true, training ends with a checkpoint. Raises UserError.
+    alone, unless more iterations are asked for than it has. scene: a folder, or the word demo.
+    device: as `pp-cl train --device`. settings: {"section.key": value}; options: the same by the
+    names of the command's options, such as iterations. on_step, is_stopped: as Training.run()
+    takes them. Raises UserError.
     """
     unknown = set(options) - set(SHORT)
     if unknown:
@@ -371,8 +349,8 @@ def train_scene(
 
 
 def stored_state(folder: RunFolder, config: Config) -> Stored | None:
-    """(header, arrays) of the folder's checkpoint, None where there is none. A finished run takes
-    note of where its scene is now. Raises UserError for a folder or checkpoint that does not fit.
+    """(header, arrays) of the folder's checkpoint, or None. A finished run takes note of where its
+    scene is now. Raises UserError for a folder or checkpoint that does not fit.
     """
     folder.check_usable()
     there = load_config(folder.config) if folder.config.exists() else config

@@ -86,9 +86,7 @@ class Lens(NamedTuple):
 
 
 class Image(NamedTuple):
-    """An image of the model. pose: (7,) qw, qx, qy, qz, tx, ty, tz, world to camera, as the file
-    has it.
-    """
+    """An image of the model. pose: (7,) qw, qx, qy, qz, tx, ty, tz, world to camera."""
 
     name: str
     camera: int
@@ -104,10 +102,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split: test is every eighth in the order of their names.
-
-    Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
-    Raises UserError naming the file, and the image.
+    """The images of a split: test is every eighth in the order of their names. Cameras are scaled to
+    images that were reduced since. Raises UserError naming the file, and the image.
     """
     model = model_folder(folder) or folder
     if (count := len(_models(folder))) > 1:
@@ -131,9 +127,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Where a scene's model lies, of several that with most images, those first that have a folder
-    of images beside or above them; None where it has none.
-    """
+    """Where a scene's model lies, of several that with images beside it and most of them, or None."""
     models = _models(folder)
     if len(models) < 2:
         return next(iter(models), None)
@@ -141,9 +135,7 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def _images_of(folder, model):
-    """The folder of images nearest to a model, up to the scene's folder: an undistorted model has
-    other images than the one that it was made of. None where there is none.
-    """
+    """The folder of images nearest to a model, up to the scene's folder; None without one."""
     places = [model, *model.parents]
     for place in places[: places.index(folder) + 1]:
         if found := folder_named(place, [IMAGES]):
@@ -204,8 +196,8 @@ def _image_file(folder, near, model, lenses, image):
 
 
 def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
-    """(cameras by id, or what is wrong with them, images) of the model in a folder; binary files go
-    before text. Raises UserError naming the file, and the line or the place in it.
+    """(cameras by id, or what is wrong with them, images) of the model in a folder. Raises UserError
+    naming the file, and the line or the place in it.
     """
     suffix = _suffix(folder)
     lenses: dict[int, Lens | Unusable] = {}
@@ -241,9 +233,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
 
 
 def read_points(folder: Path) -> Iterator[Sequence[float]]:
-    """Each (x, y, z, red, green, blue) of the points3D in a model's folder, which may have none.
-    Raises UserError naming the file, and the line or the place in it.
-    """
+    """Each (x, y, z, red, green, blue) of the points3D in a model's folder. Raises UserError."""
     for suffix in (".bin", ".txt"):
         if (file := folder / f"points3D{suffix}").is_file():
             yield from (point for _, point in _records(file, _binary_point, POINT, _text_point))
@@ -257,8 +247,7 @@ def _are_numbers(values):
 
 def _records(file, take, form, parse):
     """(place in words, record) of each record of a file, which take(opened) reads of a binary one,
-    and parse(line, next line) of a text file, whose lines are of a form. Files are not held whole:
-    points make them large. Raises UserError.
+    and parse(line) of a text file, whose lines are of a form.
     """
     is_binary = file.suffix == ".bin"
     try:

@@ -28,11 +28,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split: test is every eighth in the order of the images' names.
-
-    The world is that of world_mat, in its own units. scale_mat, where it is there, moves the unit
-    sphere around the object, which gives the depth range. Raises UserError naming the file and the
-    member.
+    """The images of a split: test is every eighth in the order of the images' names. scale_mat,
+    where it is there, gives the depth range. Raises UserError naming the file and the member.
     """
     file = _file(folder)
     matrices, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
@@ -58,8 +55,8 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def box(folder: Path) -> np.ndarray | None:
-    """(2, 3) box around the sphere that holds the object, of the first camera: scale_mat makes it
-    of the unit sphere. None where the file has none. Raises UserError as read_split does.
+    """(2, 3) box around the sphere that holds the object, by the first scale_mat, or None. Raises
+    UserError as read_split does.
     """
     file = _file(folder)
     scales = read_npz(file, "scale_mat_")
@@ -96,9 +93,7 @@ def _camera(matrix, size, fail):
 
 
 def _sphere(matrix, fail):
-    """((3,) middle, radius) of the sphere that a matrix makes of the unit sphere. Raises
-    fail(text).
-    """
+    """((3,) middle, radius) of the sphere that a matrix makes of the unit sphere."""
     if matrix.shape != (4, 4):
         raise fail(f"has shape {matrix.shape}; must be 4x4 numbers")
     left = matrix[:3, :3]
