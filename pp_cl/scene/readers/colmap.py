@@ -102,7 +102,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split: test is every eighth in the order of their names. Cameras are scaled to
+    """The images of a split: test is every eighth in the order of names. Cameras are scaled to
     images that were reduced since. Raises UserError naming the file, and the image.
     """
     model = model_folder(folder) or folder
@@ -127,7 +127,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Where a scene's model lies, of several that with images beside it and most of them, or None."""
+    """Where a scene's model lies, of several one with images beside it, and most, or None."""
     models = _models(folder)
     if len(models) < 2:
         return next(iter(models), None)
@@ -196,7 +196,7 @@ def _image_file(folder, near, model, lenses, image):
 
 
 def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
-    """(cameras by id, or what is wrong with them, images) of the model in a folder. Raises UserError
+    """(cameras by id, or what is wrong with them, images) of a folder's model. Raises UserError
     naming the file, and the line or the place in it.
     """
     suffix = _suffix(folder)

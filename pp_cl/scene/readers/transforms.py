@@ -15,8 +15,15 @@ from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.found import LeftOut, usable
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.readers.common import SPLITS, checked_box, fail_at, fitted, hold_out
-from pp_cl.scene.readers.common import progress, read_json
+from pp_cl.scene.readers.common import (
+    SPLITS,
+    checked_box,
+    fail_at,
+    fitted,
+    hold_out,
+    progress,
+    read_json,
+)
 from pp_cl.scene.readers.frame import Frame, frame_keys, lens_distortion, pinhole
 
 FILES = "transforms_train.json or transforms.json"
