@@ -103,37 +103,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         except BaseException as error:
             if caught:  # whatever came of it: an import, say, or the end of another process
                 return _fail(signals.INTERRUPTED, 128 + caught[0])
-            return _told(error)
-
-
-def _told(error):
-    """The exit status after an exception, which is told in a line; what is a bug is raised."""
-    try:
-        raise error
-    except _UsageError:
-        _show(str(error))
-        return 2
-    except UserError:
-        return _fail(str(error))
-    except BrokenPipeError:  # as in `pp-cl train ... | head`
-        return _fail("nobody reads the output any more", 128 + SIGPIPE)
-    except OSError:
-        what = f"{error.filename or 'file'}: {error.strerror or error}"
-        return _fail(f"{what}; {mend(error)}")
-    except BuildError:
-        print(error.log.rstrip(), file=sys.stderr)
-        return _fail(
-            f"{error}; update the driver, choose another device with --device, or report the lines"
-            " above"
-        )
-    except MemoryError:
-        return _fail("the host has no memory left; lower --points or raise --downscale")
-    except ImportError:
-        if "failed to map segment" not in str(error):  # as the loader says it
+            match error:
+                case _UsageError():
+                    _show(str(error))
+                    return 2
+                case UserError():
+                    return _fail(str(error))
+                case BrokenPipeError():  # as in `pp-cl train ... | head`
+                    return _fail("nobody reads the output any more", 128 + SIGPIPE)
+                case OSError():
+                    what = f"{error.filename or 'file'}: {error.strerror or error}"
+                    return _fail(f"{what}; {mend(error)}")
+                case BuildError():
+                    print(error.log.rstrip(), file=sys.stderr)
+                    return _fail(
+                        f"{error}; update the driver, choose another device with --device, or"
+                        " report the lines above"
+                    )
+                case MemoryError():
+                    return _fail("the host has no memory left; lower --points or raise --downscale")
+                case ImportError() if "failed to map segment" in str(error):  # as the loader says
+                    return _fail(f"no memory to load a library ({error}); raise `ulimit -v`")
+                case KeyboardInterrupt():
+                    return _fail(signals.INTERRUPTED, 128 + signal.SIGINT)
             raise
-        return _fail(f"no memory to load a library ({error}); raise its limit (ulimit -v)")
-    except KeyboardInterrupt:
-        return _fail(signals.INTERRUPTED, 128 + signal.SIGINT)
 
 
 def _show_warning(message, *_args, **_kwargs):

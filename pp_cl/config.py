@@ -92,16 +92,13 @@ def _word(value):
     return word
 
 
-def _truth(value):
-    return {"true": True, "1": True, "false": False, "0": False}[str(value).lower()]
-
-
+TRUTHS = {"true": True, "1": True, "false": False, "0": False}
 # type of a setting: (its name in errors, conversion of a value or its text)
 KINDS = {
     int: ("a whole number", whole),
     float: ("a finite number", finite),
     str: ("a word", _word),
-    bool: ("true or false", _truth),
+    bool: ("true or false", lambda value: TRUTHS[str(value).lower()]),
 }
 
 

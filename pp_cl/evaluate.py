@@ -81,34 +81,22 @@ def evaluate_run(
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
     if "exposed" in run.header:
         result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
-    result |= _about(run, costs) | _published(scene, split, views)
+    header, cameras = run.header, [view.file_camera for view in views]
+    points = {"initial": header["initial_points"], "final": run.model.cloud.count}
+    published = published_rows(scene.name, cameras)
+    differs = differences(scene.name, cameras, views[0].file_downscale, split) if published else ""
+    result |= {
+        "step": header["step"],
+        "finished": header["finished"],
+        "points": points | {"grid": header["grid"]["dims"]},
+        "seconds_per_frame": float(np.median([seconds for seconds, _ in costs])),
+        "computed_fraction": float(np.mean([computed for _, computed in costs])),
+        "published": published,
+        "published_differs": differs,
+    }
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
-
-
-def _published(scene, split, views):
-    """{"published": rows of the scene, "published_differs": how this measurement differs}."""
-    cameras = [view.file_camera for view in views]
-    rows = published_rows(scene.name, cameras)
-    differs = differences(scene.name, cameras, views[0].file_downscale, split) if rows else ""
-    return {"published": rows, "published_differs": differs}
-
-
-def _about(run, costs):
-    """What metrics.json says of the run. costs: [(seconds, fraction computed)] of each view."""
-    seconds, computed = zip(*costs, strict=True)
-    return {
-        "step": run.header["step"],
-        "finished": run.header["finished"],
-        "points": {
-            "initial": run.header["initial_points"],
-            "final": run.model.cloud.count,
-            "grid": run.header["grid"]["dims"],
-        },
-        "seconds_per_frame": float(np.median(seconds)),
-        "computed_fraction": float(np.mean(computed)),
-    }
 
 
 def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:

@@ -65,7 +65,13 @@ class Run:
         """
         check_scene(self.config.scene.path)
         scene = open_scene(self.dev, self.config, (split,))
-        self._compare(lambda: scene.splits.get("train") or self._some_views())
+
+        def trained():
+            if "train" in scene.splits or not self.header["pixels"]:
+                return scene.splits.get("train", [])
+            return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
+
+        self._compare(trained)
         views, gone = scene.splits[split], set(self.header.get("left_out", []))
         gone |= {v.name for v in misplaced(self.model.grid, self.model.cloud.ids.get(), views)}
         left = [view for view in views if view.name not in gone]
@@ -76,11 +82,6 @@ class Run:
         told += f" are beside the model ({names})"
         warnings.warn(f"{self.config.scene.path}: {told}", stacklevel=2)
         return replace(scene, splits={split: left}, notes=[*scene.notes, told])
-
-    def _some_views(self):
-        if not self.header["pixels"]:
-            return []
-        return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
 
     def _compare(self, read):
         """Raise UserError unless the training views, of read() also the pixels, are the run's."""

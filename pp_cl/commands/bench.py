@@ -137,6 +137,4 @@ def _prepared(name, options):
         return lambda dev: chain.from_iterable(bench_step(dev, config) for config in configs)
     sizes, bench = options.size or [256], bench_conv if name == "conv" else bench_unet
     blocks = options.blocks or "double"
-    return lambda dev: chain.from_iterable(
-        bench(dev, size, widths, blocks=blocks) for size in sizes
-    )
+    return lambda dev: chain.from_iterable(bench(dev, n, widths, blocks=blocks) for n in sizes)

@@ -43,7 +43,12 @@ def run(options: argparse.Namespace) -> None:
         ranked.sort(key=lambda row: -row[1]["psnr"])
     shared.write_json_option(options.json, result)
     print(_table(result, ranked, len(own)))
-    print(_summary(result))
+    points, computed = result["points"], result["computed_fraction"]
+    share = f"{computed:.0%} of the network's work, " if computed < 1 else ""
+    print(
+        f"{points['final']} points ({points['initial']} at the start), {share}"
+        f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
+    )
     written = Path(options.out or folder.evaluation(options.split))
     print(
         f"wrote {written / 'metrics.json'} and {written / 'comparison.png'} (prediction"
@@ -67,12 +72,3 @@ def _cell(values, name):
     if name == "lpips" and OTHER_LPIPS in values:
         return f"{values[OTHER_LPIPS]:9.4f}*"
     return f"{values[name]:9.4f} " if name in values else " " * 10
-
-
-def _summary(result):
-    points, computed = result["points"], result["computed_fraction"]
-    share = f"{computed:.0%} of the network's work, " if computed < 1 else ""
-    return (
-        f"{points['final']} points ({points['initial']} at the start), {share}"
-        f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
-    )

@@ -127,7 +127,10 @@ def describe_scene(
         problem = str(error)
     found = contradicting(views, hull, agreement) if hull else []
     ranges = np.array([view.depth_range for view in right if view.depth_range])
-    cameras, stored = ([getattr(v, name) for v in right] for name in ("camera", "stored_camera"))
+    cameras, stored, lenses = (
+        [getattr(view, name) for view in right]
+        for name in ("camera", "stored_camera", "file_camera")
+    )
     centre = looked_at(stored)
     facts = {
         "scene": path,
@@ -135,7 +138,11 @@ def describe_scene(
         "splits": {split: len(listed) for split, listed in frames.items()},
         "notes": list(opened.notes),
         "images": _image_sizes([frame for listed in frames.values() for frame in listed]),
-        **_lenses([view.file_camera for view in right]),
+        "focal_pixels": _range([focal for lens in lenses for focal in (lens.fx, lens.fy)]),
+        "field_of_view": {
+            "x": _angles((lens.width, lens.fx) for lens in lenses),
+            "y": _angles((lens.height, lens.fy) for lens in lenses),
+        },
         "masks": _masks(right)
         | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]}
         | ({"left_out": agreement.left_out, "forgiven": agreement.forgiven} if hull else {}),
@@ -167,19 +174,9 @@ def _range(values):
     return [float(min(values)), float(max(values))]
 
 
-def _lenses(cameras):
-    """Least and most of the cameras: focal length in pixels, angles of view in degrees."""
-
-    def angles(pairs):
-        return _range([math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in pairs])
-
-    return {
-        "focal_pixels": _range([focal for c in cameras for focal in (c.fx, c.fy)]),
-        "field_of_view": {
-            "x": angles((c.width, c.fx) for c in cameras),
-            "y": angles((c.height, c.fy) for c in cameras),
-        },
-    }
+def _angles(sides):
+    """Least and most degrees across (pixels, focal length)."""
+    return _range([math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in sides])
 
 
 def _masks(views):

@@ -70,11 +70,11 @@ def deferred() -> Iterator[None]:
 @contextmanager
 def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
     """Gives what makes signals do again what they did before; in other threads nothing changes."""
-    before = {number: signal.getsignal(number) for number in STOPPING}
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.getsignal(number) for number in STOPPING}
     # nohup, and & in a script, leave signals ignored; None is a handler that is not Python's
     before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
-    if threading.current_thread() is not threading.main_thread():
-        before = {}
 
     def restore() -> None:
         for number, handler in before.items():

@@ -48,6 +48,7 @@ def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.config import run_config
     from pp_cl.drivers import device_line, open_device
+    from pp_cl.engine.training.schedule import refine_steps
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
@@ -86,8 +87,12 @@ def run(options: argparse.Namespace) -> None:
             " start would differ, as all schedules end at the last step and the optimiser's"
             " moments start again"
         )
-    if training.hull and (told := _left_out_line(config.train)):
-        print(told)
+    wanted = sum(0 < share < 1 for share in config.train.refine_at)
+    if training.hull and (made := len(refine_steps(config.train))) < wanted:
+        print(
+            f"refinements: {made} of the {wanted} of train.refine_at, since in"
+            f" {config.train.iterations} iterations nothing is pruned between them"
+        )
     print(memory_line(training.memory_plan), flush=True)
     seconds = _run(training, options)
     print(
@@ -119,19 +124,6 @@ def _first_line(training):
         f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
         f" the object ({hull.seconds:.1f} s){capped if hull.capped else ''}"
     )
-
-
-def _left_out_line(train):
-    """A line of text if some refinements of train.refine_at are left out, else an empty one."""
-    from pp_cl.engine.training.schedule import refine_steps
-
-    wanted, made = sum(0 < share < 1 for share in train.refine_at), len(refine_steps(train))
-    if made < wanted:
-        return (
-            f"refinements: {made} of the {wanted} of train.refine_at, since in {train.iterations}"
-            " iterations nothing is pruned between them"
-        )
-    return ""
 
 
 def _images_line(training, chosen):

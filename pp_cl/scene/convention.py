@@ -12,15 +12,10 @@ from pp_cl.scene.gaze import looked_at
 from pp_cl.scene.readers.frame import GL_FROM_CV
 
 STATED = "stated"
-FLIPPED, INVERSE = "opencv", "world-to-camera"
 # {name: (whether the matrices are those from the world, whether their y and z axes point the other
 # way than the format has it)}
-AXES = {
-    STATED: (False, False),
-    FLIPPED: (False, True),
-    INVERSE: (True, False),
-    f"{FLIPPED} {INVERSE}": (True, True),
-}
+AXES = {STATED: (False, False), "opencv": (False, True)}
+AXES |= {"world-to-camera": (True, False), "opencv world-to-camera": (True, True)}
 LEAST_CAMERAS = 4
 MOST = 0.9  # of the cameras, that have before them what all look at
 ASIDE = 35.0  # degrees between a camera's axis and what all look at, in the median

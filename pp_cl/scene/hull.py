@@ -3,7 +3,7 @@
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -73,22 +73,21 @@ class Carver:
             table.append((camera.width, camera.height, words, start))
             start += words * camera.height
         self.masks = dev.empty((start,), np.uint32)
-        for view, (_, _, words, first) in zip(views, table, strict=True):
-            self._add_mask(view, words, first)
+        for view, (_, height, words, first) in zip(views, table, strict=True):
+            self._add_mask(view, height, words, first)
         self.view_masks = dev.upload(table, np.uint32)
         is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
         self.view_is_whole = dev.upload(is_whole, np.uint32)
         # else these bound the object, and close-ups must not take away what lies beside them
         self.doubts = int(sum(is_whole) < self.least)
 
-    def _add_mask(self, view, words, first):
+    def _add_mask(self, view, height, words, first):
         """Write the widened mask of a view from word `first` on."""
-        height, width = view.image.shape[:2]
         mask, other = (self.dev.empty((height * words,), np.uint32) for _ in range(2))
         self.program.launch(
             "pack_mask",
             (words, height),
-            width=width,
+            width=view.image.shape[1],
             height=height,
             words=words,
             threshold=MASK_THRESHOLD,
@@ -160,8 +159,32 @@ def build_grid(
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     limit = None if box is None else box - corner
-    hull = _search(dev, near, points, _box(near, limit, forgiven), forgiven, limit)
-    return replace(hull, grid=hull.grid.moved(corner))
+    box = _box(near, limit, forgiven)
+    carver = Carver(dev, _farthest_point_order(near, box.mean(0)))
+
+    def carve(voxel_size):
+        grid = Grid.centred_in(box, voxel_size).rounded()
+        return _tight(grid, carver.carve(grid, forgiven))
+
+    best = last = carve(smallest_voxel_size(box, min(COARSE_CELLS, CELL_CAP)))
+    capped, rounds, count = False, 0, last.total
+    if not count:
+        raise UserError(explain_empty_hull(near, box))
+    while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
+        if count:  # the next carving searches a voxel around
+            box = last.grid.box + last.grid.voxel_size * np.array([[-1], [1]])
+        if limit is not None:
+            box = np.stack([np.maximum(box[0], limit[0]), np.minimum(box[1], limit[1])])
+        wanted = last.grid.voxel_size * (max(count, 0.5) / (AIM * points)) ** (1 / 3)
+        voxel_size = max(wanted, smallest_voxel_size(box, CELL_CAP))
+        capped = voxel_size > wanted
+        if capped and voxel_size > 0.99 * last.grid.voxel_size:
+            break  # the box shrinks no more
+        last = carve(voxel_size)
+        count, rounds = last.total, rounds + 1
+        best = min(best, last, key=lambda c: (c.total < points, abs(c.total - points)))
+    ids = best.grid.ids_of(best.inside)
+    return Hull(best.grid.moved(corner), ids, capped and best.total < points)
 
 
 def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -> np.ndarray:
@@ -192,36 +215,8 @@ def _corner(views, reach):
     return unit * np.floor(eyes.min(0) / unit)
 
 
-def _search(dev, views, points, box, forgiven, limit):
-    """The Hull of build_grid() in a box. limit: (2, 3) that it may not leave, or None."""
-    carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
-
-    def carve(voxel_size):
-        grid = Grid.centred_in(box, voxel_size).rounded()
-        return _tight(grid, carver.carve(grid, forgiven))
-
-    best = last = carve(smallest_voxel_size(box, min(COARSE_CELLS, CELL_CAP)))
-    capped, rounds, count = False, 0, last.total
-    if not count:
-        raise UserError(explain_empty_hull(views, box))
-    while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
-        if count:  # the next carving searches a voxel around
-            box = last.grid.box + last.grid.voxel_size * np.array([[-1], [1]])
-        if limit is not None:
-            box = np.stack([np.maximum(box[0], limit[0]), np.minimum(box[1], limit[1])])
-        wanted = last.grid.voxel_size * (max(count, 0.5) / (AIM * points)) ** (1 / 3)
-        voxel_size = max(wanted, smallest_voxel_size(box, CELL_CAP))
-        capped = voxel_size > wanted
-        if capped and voxel_size > 0.99 * last.grid.voxel_size:
-            break  # the box shrinks no more
-        last = carve(voxel_size)
-        count, rounds = last.total, rounds + 1
-        best = min(best, last, key=lambda c: (c.total < points, abs(c.total - points)))
-    return Hull(best.grid, best.grid.ids_of(best.inside), capped and best.total < points)
-
-
 class _Carving(NamedTuple):
-    """The smallest grid that holds all `total` vertices inside, which are True in (nz, ny, nx)."""
+    """The smallest grid that holds all `total` vertices inside (nz, ny, nx)."""
 
     grid: Grid
     inside: np.ndarray

@@ -43,8 +43,8 @@ def unpacked_views(views: Any) -> list[ImageFile]:
 
 def _unpacked(name, stored):
     values = numbers(stored)
-    is_list = values is not None and values.ndim == 1
-    if type(name) is not str or not is_list or len(values) - (POSE + LENS) not in (0, RANGE):
+    shapes = (POSE + LENS,), (POSE + LENS + RANGE,)
+    if type(name) is not str or values is None or values.shape not in shapes:
         raise ValueError("a view without name or camera")
     fx, fy, cx, cy, width, height, *near_far = values[POSE:].tolist()
     pose = values[:POSE].reshape(3, 4)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -209,11 +210,8 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
         lacks = f"; {EDITS} drops some" if edited and edits.dropped else ""
         raise UserError(f"{folder}: split {split} has no images{lacks}; add some")
 
-    def checked(image_file):
-        check_lens(folder / image_file.name, image_file)
-        return image_file
-
-    image_files = list(usable(image_files, checked, lambda one: one.name, left_out))
+    check = partial(with_sound_lens, folder)
+    image_files = list(usable(image_files, check, lambda one: one.name, left_out))
     _check_left(image_files, left_out, LEAST_VIEWS if split == "train" else 1)
     image_files, done = _masked(folder, reader, image_files, split)
     image_files = _ignoring(folder, IGNORE_FOLDERS, image_files, split)
@@ -230,9 +228,11 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     return SplitFiles(image_files, left_out, done)
 
 
-def check_lens(file: Path, image_file: ImageFile) -> None:
-    """Raise Unusable naming the file where the camera shows nothing in float32, or a lens folds."""
-    camera = image_file.camera
+def with_sound_lens(folder: Path, image_file: ImageFile) -> ImageFile:
+    """The same image of a folder. Raises Unusable where its camera shows nothing in float32, or its
+    distortion folds.
+    """
+    file, camera = folder / image_file.name, image_file.camera
     for what, values, least in (
         ("focal lengths", (camera.fx, camera.fy), LEAST_FOCAL),
         ("a principal point", (camera.cx, camera.cy), -MOST_FOCAL),
@@ -249,6 +249,7 @@ def check_lens(file: Path, image_file: ImageFile) -> None:
             " the images with the program that found them",
             "distortion that folds",
         )
+    return image_file
 
 
 def _check_left(left, left_out, least):
@@ -272,21 +273,16 @@ def _masked(folder, reader, image_files, split):
             replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in image_files
         ]
     place = folder_named(folder, MASK_FOLDERS)
-    if place and reader is transforms and _are_cut_out(folder, image_files):
-        return image_files, done
+    for one in image_files if place and reader is transforms else ():
+        with suppress(Unusable):  # the first image that can be read tells of all
+            if is_transparent(folder / one.name):
+                return image_files, done
+            break
     masks = _masks_in(folder, image_files, split, MASK_FOLDERS)
     if masks and reader is transforms:
         what = f"masks are taken from {folder / place}, which no frame names"
         done += [(name, what) for name in masks]
     return [replace(one, mask=masks.get(one.name)) for one in image_files], done
-
-
-def _are_cut_out(folder, image_files):
-    """Whether the first image that can be read has transparent pixels."""
-    for one in image_files:
-        with suppress(Unusable):
-            return is_transparent(folder / one.name)
-    return False
 
 
 def _masks_in(folder, image_files, split, places):
@@ -324,20 +320,16 @@ def _ignoring(folder, places, image_files, split):
 
 def _lines(split, used, left_out, done):
     """One line for each kind of thing that was left out or done in a split."""
-    count = len(used) + len(left_out)
-    gone = _by_kind((name, getattr(error, "why", WRONG)) for name, error in left_out)
+    told: dict[str, list[str]] = {}
+    for name, error in left_out:
+        told.setdefault(f"views left out: {getattr(error, 'why', WRONG)}", []).append(name)
+    count, gone = len(used) + len(left_out), len(told)
+    for name, what in done:
+        told.setdefault(what, []).append(name)
     return [
-        f"{split}: {len(names)} of {count} views left out: {why} ({few_names(names)})"
-        for why, names in gone.items()
-    ] + [f"{split}: {what} ({few_names(names)})" for what, names in _by_kind(done).items()]
-
-
-def _by_kind(pairs):
-    """{kind: names} of pairs of a name and a kind."""
-    kinds: dict[str, list[str]] = {}
-    for name, kind in pairs:
-        kinds.setdefault(kind, []).append(name)
-    return kinds
+        f"{split}: {f'{len(names)} of {count} ' * (i < gone)}{what} ({few_names(names)})"
+        for i, (what, names) in enumerate(told.items())
+    ]
 
 
 def _tell(folder, lines):
@@ -362,10 +354,9 @@ def find_reader(path: str | Path) -> ModuleType:
     """The module of READERS for a folder. Raises UserError where it holds no scene."""
     folder = Path(path)
     check_folder(folder)
-    reader = _reader_of(folder)
-    if reader is None:
-        raise UserError(f"{folder}: no scene in it{_found_instead(folder)}")
-    return reader
+    if reader := _reader_of(folder):
+        return reader
+    raise UserError(f"{folder}: no scene in it{_found_instead(folder)}")
 
 
 def check_folder(folder: Path) -> None:
@@ -377,15 +368,14 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
-    if not _is_readable(folder):
+    if not os.access(folder, os.R_OK | os.X_OK):
         raise UserError(f"{folder}: cannot be read; check its permissions")
 
 
-def _is_readable(folder):
-    return os.access(folder, os.R_OK | os.X_OK)
-
-
 def _reader_of(folder):
+    """The reader of a folder, None where it holds no scene or cannot be read."""
+    if not os.access(folder, os.R_OK | os.X_OK):
+        return None
     return next((reader for reader in READERS if reader.recognises(folder)), None)
 
 
@@ -393,7 +383,7 @@ def _found_instead(folder):
     """What is in a folder without a scene, and where one is, in words."""
     inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     for near in (*folder.absolute().parents[:2], *filter(Path.is_dir, inside[:NEARBY])):
-        if _is_readable(near) and (reader := _reader_of(near)):
+        if reader := _reader_of(near):
             return f"; {near} is one ({reader.FILES}); give that"
     for file in (path for path in inside if path.suffix.lower() == ".json"):
         with suppress(UserError):
@@ -433,21 +423,20 @@ def load_scene(
     for option, given in (("--masks", masks.folder), ("--ignore", masks.ignore)):
         if given and not os.path.isdir(given):
             raise UserError(f"{given}: no such folder; {option} takes one of masks")
-    chosen, left_out = {}, {}
-
-    def reducible(image_file):
-        if downscale:
-            check_downscale(image_file.name, image_file.camera, downscale)
-        return image_file
-
+    chosen: dict[str, list[ImageFile]] = {}
+    left_out: dict[str, LeftOut] = {}
     for split in splits:
         found = (listed or {}).get(split) or list_split(folder, split)
         lines += _lines(split, *found)
-        some = _by_rule(masks, evenly(found.image_files, most), split)
-        gone: LeftOut = []
-        chosen[split] = list(usable(some, reducible, lambda one: one.name, gone))
-        _check_left(chosen[split], gone, 1)
-        left_out[split] = gone
+        chosen[split], left_out[split] = [], []
+        for one in _by_rule(masks, evenly(found.image_files, most), split):
+            try:
+                if downscale:
+                    check_downscale(one.name, one.camera, downscale)
+                chosen[split].append(one)
+            except UserError as error:
+                left_out[split].append((one.name, error))
+        _check_left(chosen[split], left_out[split], 1)
     image_files = [one for some in chosen.values() for one in some]
     if dev is None and any(one.lens for one in image_files):
         raise UserError(f"{folder}: its images have distortion, which only a device removes")

@@ -90,7 +90,13 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
             " background; give masks with --masks FOLDER, or a higher scene.mask_tolerance",
             "no uniform background",
         )
-    outside = _regions(distance < tolerance, with_holes)
+    places = distance < tolerance
+    regions = label(places, connectivity=1)
+    chosen = border(regions)
+    if with_holes:
+        large = np.flatnonzero(np.bincount(regions.ravel()) > HOLE * regions.size)
+        chosen = np.append(chosen, large)
+    outside = places & np.isin(regions, np.unique(chosen[chosen > 0]))
     within = distance_transform_edt(~outside) > EDGE
     alpha = np.where(outside, 0, np.clip(distance / tolerance - 1, 0, 1))
     alpha[within] = 1
@@ -110,13 +116,3 @@ def half_transparent(alpha: np.ndarray) -> float:
     """The share of what a mask (H, W) uint8 holds that is half transparent with all around it."""
     within = erosion((alpha > HALF[0]) & (alpha < HALF[1]), np.ones((3, 3)))
     return float(within.sum() / max((alpha > MASK_THRESHOLD).sum(), 1))
-
-
-def _regions(places, with_holes):
-    """(H, W) bool: the regions of `places` that reach the border, or are large enough for holes."""
-    regions = label(places, connectivity=1)
-    chosen = border(regions)
-    if with_holes:
-        large = np.flatnonzero(np.bincount(regions.ravel()) > HOLE * regions.size)
-        chosen = np.append(chosen, large)
-    return places & np.isin(regions, np.unique(chosen[chosen > 0]))

@@ -29,12 +29,7 @@ from pp_cl.presets import SHORT
 from pp_cl.progress import Progress
 from pp_cl.run import Run, load_run
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.load import (
-    SplitFiles,
-    list_split,
-    measured_split,
-    open_scene,
-)
+from pp_cl.scene.load import list_split, measured_split, open_scene
 from pp_cl.session.budget import NEVER, Budget
 from pp_cl.session.memory import MemoryPlan
 from pp_cl.session.start import automatic_radius, begin_network, fitting_hull, sheet_of_masks
@@ -187,11 +182,11 @@ class Training:
 
     def _measure(self):
         """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
-        found = [
-            psnr(to_8bit(image), to_8bit(view.ignoring(self.trainer.target(view), image)))
-            for view in self.measured
-            for image in [self._rendered(view)]
-        ]
+        found = []
+        for view in self.measured:
+            image = self._rendered(view)
+            truth = view.ignoring(self.trainer.target(view), image)
+            found.append(psnr(to_8bit(image), to_8bit(truth)))
         return {"test_psnr": float(np.mean(found))}
 
     def _expect_save(self):
@@ -229,57 +224,58 @@ class Training:
 def open_training(
     dev: Device, folder: RunFolder, config: Config, stored: Stored | None
 ) -> Training:
-    """The training in `folder`: resumed from its checkpoint `stored`, or begun without one."""
-    if stored is None:
-        return begin_training(dev, folder, config)
-    return resume_training(dev, folder, config, stored)
-
-
-def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
-    """A training in `folder` from its beginning; automatic settings in config are chosen. Raises
-    UserError for a broken scene, too little memory, and a folder that may not be written.
+    """The training in `folder` from its checkpoint `stored` on, a finished one extended with new
+    moments and without refinements; without one from its beginning, where the automatic settings in
+    config are chosen. Raises UserError for a broken scene or another one than the checkpoint's, too
+    little memory, and a folder that may not be written.
     """
-    began = time.monotonic()
+    began, (header, arrays) = time.monotonic(), stored or ({"step": 0}, {})
     check_target(folder.config)
-    folder.check_sheets(0)
-    net = begin_network(dev, config)
+    folder.check_sheets(header["step"])
+    begun = header["step"] if header.get("finished") else header.get("extended_from", 0)
+    followed = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
+
+    net = UNet.of_settings(dev, config.network) if stored else begin_network(dev, config)
     split_files = list_split(config.scene.path)
-    memory_plan = MemoryPlan(config, net, split_files.image_files)
-    memory_plan.check_unseen()
-    views, info = _read_views(dev, config, split_files)
-
-    start = time.perf_counter()
-    with Progress("carving the visual hull"):
-        agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
-        seconds = time.perf_counter() - start
-        sheet = sheet_of_masks(dev, views, hull, agreement)
-
-    cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
-    model = Model(dev, hull.grid, depth_range, cloud, net=net)
-    trainer = Trainer(dev, config, model, agreement.views)
-    info["initial_points"] = model.cloud.count
-    if agreement.left_out:
-        info["left_out"] = list(agreement.left_out)
-    facts, measured = HullFacts(hull.capped, seconds, sheet), _measured_views(dev, config)
+    memory_plan = MemoryPlan(followed, net, split_files.image_files)
+    if stored:
+        grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
+        memory_plan.check_points(grid, points, header["depth_range"], header["step"])
+    else:
+        memory_plan.check_unseen()
+    scene = open_scene(dev, config, ("train",), listed={"train": split_files})
+    views, facts = scene.splits["train"], None
+    info = identity(views) | ({"notes": scene.notes} if scene.notes else {})
+    if stored:
+        _check_scene(folder, config, header, views)
+        model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+        left_out = header.get("left_out", [])
+        views = [view for view in views if view.name not in left_out]
+        info["initial_points"] = header["initial_points"]
+    else:
+        start = time.perf_counter()
+        with Progress("carving the visual hull"):
+            agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
+            seconds = time.perf_counter() - start
+            facts = HullFacts(hull.capped, seconds, sheet_of_masks(dev, views, hull, agreement))
+        cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
+        model = Model(dev, hull.grid, depth_range, cloud, net=net)
+        views, left_out = agreement.views, list(agreement.left_out)
+        info["initial_points"] = model.cloud.count
+    trainer = Trainer(dev, followed, model, views)
+    if stored:
+        trainer.restore(header["step"], arrays, begun)
+    info |= {"extended_from": begun} if begun else {}
+    info |= {"left_out": left_out} if left_out else {}
+    measured = []
+    if config.train.eval_every:
+        split = measured_split(config.scene.path)
+        measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
     return Training(folder, config, trainer, info, memory_plan, facts, measured, began)
 
 
-def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
-    """The training in `folder` from its checkpoint on; a finished one is extended, with new moments
-    and without refinements. Raises UserError as begin_training(), and for another scene.
-    """
-    began, (header, arrays) = time.monotonic(), stored
-    check_target(folder.config)
-    folder.check_sheets(header["step"])
-    begun = header["step"] if header["finished"] else header.get("extended_from", 0)
-    extended = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
-
-    net = UNet.of_settings(dev, config.network)
-    split_files = list_split(config.scene.path)
-    memory_plan = MemoryPlan(extended, net, split_files.image_files)
-    grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
-    memory_plan.check_points(grid, points, header["depth_range"], header["step"])
-    views, info = _read_views(dev, config, split_files)
+def _check_scene(folder, config, header, views):
+    """Raise UserError where a checkpoint's training views are not those of the scene."""
     mismatch = difference(header, list_split(config.scene.path, edited=False).image_files, views)
     if not mismatch and {view.name for view in views} != {name for name, _ in header["views"]}:
         mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
@@ -288,31 +284,6 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
             f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
             " use another --out"
         )
-
-    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
-    left_out = header.get("left_out", [])
-    trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])
-    trainer.restore(header["step"], arrays, begun)
-    info["initial_points"] = header["initial_points"]
-    info |= {"extended_from": begun} if begun else {}
-    info |= {"left_out": left_out} if left_out else {}
-    measured = _measured_views(dev, config)
-    return Training(folder, config, trainer, info, memory_plan, None, measured, began)
-
-
-def _read_views(dev: Device, config: Config, split_files: SplitFiles):
-    """(the training views, what a checkpoint's header holds of them)."""
-    scene = open_scene(dev, config, ("train",), listed={"train": split_files})
-    views = scene.splits["train"]
-    return views, identity(views) | ({"notes": scene.notes} if scene.notes else {})
-
-
-def _measured_views(dev, config):
-    """The views on which train.eval_every measures PSNR: of the split val, else test."""
-    if not config.train.eval_every:
-        return []
-    split = measured_split(config.scene.path)
-    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
 
 
 def train_scene(

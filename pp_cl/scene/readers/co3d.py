@@ -58,7 +58,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
     ]
     if not frames:
         raise UserError(f"{file}: has no frame of the sequence {folder.name}; give another folder")
-    chosen = sorted((frame for frame in frames if _mass(frame) != 0), key=_number)
+    chosen = sorted((frame for frame in frames if not _is_empty(frame)), key=_number)
     if listed is None:
         chosen = hold_out(chosen, split)
     else:
@@ -124,12 +124,12 @@ def _number(frame):
     return number
 
 
-def _mass(frame):
-    """Pixels in the mask of a frame; None where that is not said."""
+def _is_empty(frame):
+    """Whether a frame's mask is said to have no pixel."""
     mask = frame.get("mask")
     if not isinstance(mask, dict):
-        return None
-    return Frame(frame.file, {}, mask, frame.index, "mask of frame ").number("mass", above=-1)
+        return False
+    return Frame(frame.file, {}, mask, frame.index, "mask of frame ").number("mass", above=-1) == 0
 
 
 def _path(frame, key):
