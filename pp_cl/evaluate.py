@@ -54,8 +54,8 @@ def evaluate_run(
     """
     run = run if isinstance(run, Run) else load(run, device, scene=scene)
     target = run.folder.evaluation(split) if out is None else Path(out)
-    scene = run.scene(split)
-    views = scene.splits[split]
+    here = run.scene(split)
+    views = here.splits[split]
     images = [target / "images" / file for file in image_paths([view.name for view in views])]
     measure = Metrics(run.dev, metrics)
     written = [target / "metrics.json", target / "comparison.png", *(images if save_images else [])]
@@ -78,13 +78,18 @@ def evaluate_run(
             images[i].parent.mkdir(parents=True, exist_ok=True)
             write_png(images[i], image)
     means = mean([{name: row[name] for name in metrics} for row in rows])
-    result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
+    result: dict[str, Any] = {
+        "split": split,
+        "device": run.dev.name,
+        "mean": means,
+        "per_image": rows,
+    }
     if "exposed" in run.header:
         result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
     header, cameras = run.header, [view.file_camera for view in views]
     points = {"initial": header["initial_points"], "final": run.model.cloud.count}
-    published = published_rows(scene.name, cameras)
-    differs = differences(scene.name, cameras, views[0].file_downscale, split) if published else ""
+    published = published_rows(here.name, cameras)
+    differs = differences(here.name, cameras, views[0].file_downscale, split) if published else ""
     result |= {
         "step": header["step"],
         "finished": header["finished"],

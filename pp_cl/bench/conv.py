@@ -167,7 +167,8 @@ def bench_conv(
     dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
     """Rows of every distinct convolution of the network at size x size, by direction, variant."""
-    rng, blocking, distinct = np.random.default_rng(0), blocking_of(dev), {}
+    rng, blocking = np.random.default_rng(0), blocking_of(dev)
+    distinct: dict[tuple, Any] = {}
     for layer in convolutions(unet_layers(widths, blocks=blocks)):
         distinct.setdefault((layer.kernel_size, layer.level, layer.sources, layer.channels), layer)
     for layer in distinct.values():

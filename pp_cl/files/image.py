@@ -95,9 +95,9 @@ def read_mask(path: Path | str) -> np.ndarray:
         image = in_srgb(path, opened).copy()
     if image.mode != "L":
         rgba = image.convert("RGBA")
-        alpha = rgba.getchannel("A")
-        if alpha.getextrema()[0] < 255:
-            return np.array(alpha)
+        alpha = np.array(rgba.getchannel("A"))
+        if alpha.min() < 255:
+            return alpha
         image = rgba.convert("RGB")
         sample = image.resize((COLOUR_SIDE, COLOUR_SIDE), Image.Resampling.NEAREST)
         cells = np.array(sample).reshape(128, 4, 128, 4, 3).mean((1, 3))
@@ -105,12 +105,13 @@ def read_mask(path: Path | str) -> np.ndarray:
         if len(shown) and (np.ptp(shown, axis=1) > COLOURLESS).mean() > COLOURED:
             raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
         image = image.convert("L")
-    if image.getextrema()[1] == 1:  # a JPEG may hold noise of that size
+    gray = np.array(image)
+    if gray.max() == 1:  # a JPEG may hold noise of that size
         if Path(path).suffix.lower() in LOSSY:
             raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
         _tell(path, "masks of 0 and 1 are read as 0 and 255")
-        return np.array(image) * np.uint8(255)
-    return np.array(image)
+        return gray * np.uint8(255)
+    return gray
 
 
 def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> tuple[int, int]:

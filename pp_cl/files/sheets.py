@@ -44,7 +44,7 @@ def write_comparison(
     """Write a PNG file of float (H, W, 3) images in [0, 1]: a row of prediction, truth and error
     for each view, the absolute difference, ERROR_SCALE times, dark on white.
     """
-    images = []
+    images: list[np.ndarray] = []
     for prediction, truth in zip(predictions, truths, strict=True):
         error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
         shown = np.repeat(1 - ERROR_SCALE * error, 3, axis=2)

@@ -11,14 +11,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import MASK_THRESHOLD, View
-from pp_cl.reference.scene import (
-    dilated_mask,
-    distance,
-    in_hull,
-    target_between,
-    target_forward,
-    undistorted,
-)
+from pp_cl.reference import scene as twin
 from pp_cl.scene.demo import distances
 from pp_cl.scene.hull import Carver
 from pp_cl.scene.lens import LensDistortion, undistort
@@ -61,7 +54,7 @@ def _masks(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         height, width = view.image.shape[:2]
         words = Carver(dev, [replace(view, downscale=downscale)]).masks.get().reshape(height, -1)
         bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")[:, :width]
-        yield exact(bits, dilated_mask(view.image[..., 3], MASK_THRESHOLD, 1 + downscale))
+        yield exact(bits, twin.dilated_mask(view.image[..., 3], MASK_THRESHOLD, 1 + downscale))
 
 
 def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -76,7 +69,7 @@ def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             (nx, ny, nz),
         )
         positions = grid.lattice()
-        expected, border = in_hull(
+        expected, border = twin.in_hull(
             views,
             positions,
             MASK_THRESHOLD,
@@ -98,11 +91,11 @@ def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for width, height in ((1, 5), (31, 5), (33, 5), (5, 31), (257, 5)):
         crop = {"width": width, "height": height}
         box = (1, 2, width, height)
-        expected = target_forward(image, 3, 3 + 2, 6 + 1, **crop)
+        expected = twin.target_forward(image, 3, 3 + 2, 6 + 1, **crop)
         colour, alpha = target.crop(view.reduced(3), box, (2, 1))
         yield absolute(colour.get(), expected, TARGET)
         # over white, the object's share is what a black object would hide
-        hidden = 1 - target_forward(black, 3, 3 + 2, 6 + 1, **crop)[..., 0]
+        hidden = 1 - twin.target_forward(black, 3, 3 + 2, 6 + 1, **crop)[..., 0]
         yield absolute(alpha.get(), hidden, TARGET)
 
 
@@ -116,7 +109,9 @@ def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     ):
         for x0, y0 in ((1, 2), (-3, 33)):
             found = target.crop(view, (x0, y0, width, height), (across, down))
-            expected = target_between(image, x0 + across, y0 + down, width=width, height=height)
+            expected = twin.target_between(
+                image, x0 + across, y0 + down, width=width, height=height
+            )
             yield absolute(found[0].get(), expected[..., :3], TARGET)
             yield absolute(found[1].get(), expected[..., 3], TARGET)
     nothing = replace(view, image=image * np.array([1, 1, 1, 0], np.uint8))
@@ -134,14 +129,14 @@ def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         image[..., 3] = rng.integers(128, 256, (height, width))
         for factor in range(1, 2 if width < 3 or height > 300 else 4):
             found = undistort(dev, image, camera, lens, factor)
-            yield absolute(found, undistorted(image, camera, lens, factor), ROUNDED)
+            yield absolute(found, twin.undistorted(image, camera, lens, factor), ROUNDED)
 
 
 def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
             grid = Grid(start, 1.6 / n, (n, 1, 1))
-            expected = distance(grid.lattice())
+            expected = twin.distance(grid.lattice())
             yield absolute(distances(dev, grid).ravel(), expected, DEMO)
 
 
