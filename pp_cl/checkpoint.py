@@ -30,10 +30,11 @@ FORMAT = 4  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
 # {key of the header: its types as JSON has them}, and those that it may lack
-KEYS: dict[str, tuple[type, ...]] = {"views": (list,), "step": (int,)}
-KEYS |= {"finished": (bool,), "initial_points": (int,), "grid": (dict,), "depth_range": (list,)}
-KEYS |= {"pixels": (dict, type(None)), "format": (int,), "extended_from": (int,)}
-KEYS |= {"exposed": (bool,), "left_out": (list,), "notes": (list,)}
+KEYS: dict[str, tuple] = dict.fromkeys(
+    ("step", "initial_points", "format", "extended_from"), (int,)
+)
+KEYS |= dict.fromkeys(("views", "depth_range", "left_out", "notes"), (list,))
+KEYS |= {"finished": (bool,), "exposed": (bool,), "grid": (dict,), "pixels": (dict, type(None))}
 OPTIONAL = {"extended_from", "exposed", "left_out", "notes"}
 MEND = "delete it to train again, or restore a copy"
 OTHER_RUN = "its config.json may belong to another run"
@@ -242,8 +243,7 @@ def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> di
     degrees = SH_DEGREES[: config.points.sh_degree + 1]
     sh_dtype = np.float16 if step is None else np.float32
     network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
-    table: dict[str, Any] = {"points.ids": ((n,), np.uint32)}
-    table["points.offset"] = (n, 4), np.float32
+    table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.offset": ((n, 4), np.float32)}
     table["points.opacity"] = (n, OPACITIES), np.float32
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}

@@ -93,13 +93,13 @@ class Progress:
 
     def _line(self, seconds):
         """What a file shows after so many seconds of the stage."""
-        done, passed = self._done - self._first, tqdm.format_interval(seconds)
+        done = self._done - self._first
         parts = [f"{self._done} of {self.total} {self._unit}s"] if self.total else []
         if self.total and done:
             left = tqdm.format_interval((self.total - self._done) * seconds / done)
             parts += [f"{done / seconds:.3g} a second", f"{left} left"]
         else:
-            parts.append(f"{passed} so far")
+            parts.append(f"{tqdm.format_interval(seconds)} so far")
         return f"{self._what}: {', '.join(parts + [self.note] * bool(self.note))}"
 
 

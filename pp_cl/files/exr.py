@@ -45,10 +45,10 @@ def read_exr_rgba(path: Path | str) -> np.ndarray:
     names = _wanted(path, header, columns * min(rows, CHUNK_ROWS))
     try:
         with closing(OpenEXR.InputFile(str(path))) as file:
-            read = [np.frombuffer(one, np.float32) for one in file.channels(names, FLOAT)]
+            found = file.channels(names, FLOAT)
+            planes = [np.frombuffer(one, np.float32).reshape(rows, columns) for one in found]
     except Exception as error:  # the library's exceptions have no common class
         raise refusal(path, error, "OpenEXR") from error
-    planes = [plane.reshape(rows, columns) for plane in read]
     broken = ~np.logical_and.reduce([np.isfinite(plane) for plane in planes])
     if broken.any():
         raise UserError(

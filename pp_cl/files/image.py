@@ -50,14 +50,14 @@ def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarr
 
 def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
     """The image, opened from a file, in one of EIGHT_BIT_MODES, in sRGB. Raises Unusable."""
-    if image.mode.startswith("I"):  # 16 bits of gray
+    is_deep_gray = image.mode.startswith("I")
+    if is_deep_gray or is_deep_png(path):
+        _tell(path, "images of 16 bits a channel are read as 8")
+    if is_deep_gray:
         levels = np.array(image)
         if levels.min() < 0 or levels.max() > 65535:
             raise Unusable(f"{path}: holds more than 16 bits; write 8", "numbers of another kind")
-        _tell(path, "images of 16 bits a channel are read as 8")
         return Image.fromarray(((levels.astype(np.uint32) + 128) // 257).astype(np.uint8))
-    if is_deep_png(path):
-        _tell(path, "images of 16 bits a channel are read as 8")
     if image.mode not in (*EIGHT_BIT_MODES, *CONVERTED):
         raise Unusable(
             f"{path}: not 8 or 16 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit"
@@ -118,8 +118,8 @@ def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> t
     """(width, height) from the header of an image file; as its EXIF turns it where only so it has
     the shape of the stated size. Raises UserError as read_rgba does.
     """
-    if _is_exr(path):
-        return _exr(exr_size, path)
+    if size := _exr(exr_size, path):
+        return size
     with _opened(path, checked=False) as image:
         size = image.size
         if stated and not same_shape(size, stated) and same_shape(size[::-1], stated):
@@ -133,12 +133,10 @@ def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return abs(one[0] * other[1] - one[1] * other[0]) <= max(other)
 
 
-def _is_exr(path):
-    return Path(path).suffix.lower() == ".exr"
-
-
 def _exr(read, path):
-    """What read() gives of an OpenEXR file. Raises Unusable where it refuses it."""
+    """What read() gives of an OpenEXR file, None of another. Raises Unusable."""
+    if Path(path).suffix.lower() != ".exr":
+        return None
     try:
         return read(path)
     except UserError as error:
@@ -150,8 +148,8 @@ def _opened(path, checked=True):
     """The image file, opened; what goes wrong with it in the block becomes Unusable. checked: by
     the checksums of a PNG, at which its decoder does not look.
     """
-    if _is_exr(path):
-        yield Image.fromarray(_exr(read_exr_rgba, path))
+    if (light := _exr(read_exr_rgba, path)) is not None:
+        yield Image.fromarray(light)
         return
     try:
         with opened_regular(path) as file:

@@ -130,7 +130,7 @@ class RunFolder:
         write_text(self.config, config_json + "\n")
 
     def rows(self) -> list[dict[str, Any]]:
-        """The rows of the log, up to the first that is broken."""
+        """The rows of the log, up to the first that is broken. Raises UserError for a long one."""
         return _rows(self.log)
 
     def open_log(self, step: int) -> "Log":

@@ -23,9 +23,18 @@ def compare(
     ssim, lpips, which needs dev. Raises UserError naming a file that is missing, unreadable,
     without partner or of another size than its partner.
     """
-    pairs = _pairs(Path(prediction), Path(truth))
-    measure = Metrics(dev, metrics)
-    rows = [{"name": a.name, **_measure(measure, a, b)} for a, b in pairs]
+    rows, measure = [], Metrics(dev, metrics)
+    for one, other in _pairs(Path(prediction), Path(truth)):
+        a, b = read_over_white(one), read_over_white(other)
+        if a.shape != b.shape:
+            raise UserError(
+                f"{one}: {a.shape[1]}x{a.shape[0]} pixels, {other} has"
+                f" {b.shape[1]}x{b.shape[0]}; sizes must agree"
+            )
+        try:
+            rows.append({"name": one.name, **measure(a, b)})
+        except UserError as error:
+            raise UserError(f"{one}: {error}") from None
     return {"mean": mean(rows), "per_image": rows}
 
 
@@ -57,19 +66,6 @@ def _image_names(folder):
                 f"{path}: not a format that is read; convert it to PNG, or move it away"
             )
     return {path.name for path in paths if path.suffix.lower() in ENDINGS}
-
-
-def _measure(measure, prediction, truth):
-    a, b = read_over_white(prediction), read_over_white(truth)
-    if a.shape != b.shape:
-        raise UserError(
-            f"{prediction}: {a.shape[1]}x{a.shape[0]} pixels, {truth} has"
-            f" {b.shape[1]}x{b.shape[0]}; sizes must agree"
-        )
-    try:
-        return measure(a, b)
-    except UserError as error:
-        raise UserError(f"{prediction}: {error}") from None
 
 
 def read_over_white(path: Path | str) -> np.ndarray:

@@ -29,17 +29,9 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
             f"{width}x{height} pixels, SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW}: "
             "take larger images or leave ssim out of --metrics"
         )
-    return float(
-        structural_similarity(
-            a / 255.0,
-            b / 255.0,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-            data_range=1.0,
-            channel_axis=-1,
-        )
-    )
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    both = (a / 255.0, b / 255.0)
+    return float(structural_similarity(*both, data_range=1.0, channel_axis=-1, **window))
 
 
 def exposed_alike(truth: np.ndarray, prediction: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -58,7 +50,7 @@ class Metrics:
 
     def __init__(self, dev: Any, names: tuple[str, ...]) -> None:
         self.names = names
-        self._lpips = Lpips(dev) if "lpips" in names else None
+self._lpips: Any = Lpips(dev) if "lpips" in names else None
 
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         """{name: number} of two float (H, W, 3) images in [0, 1], rounded to 8 bits. Raises
@@ -67,11 +59,10 @@ class Metrics:
         if prediction.shape != truth.shape:
             raise ValueError(f"prediction {prediction.shape}, truth {truth.shape}")
         a, b = to_8bit(prediction), to_8bit(truth)
-        functions = {"psnr": psnr, "ssim": ssim, "lpips": self._distance}
+        functions = {"psnr": psnr, "ssim": ssim}
+        if self._lpips:
+            functions["lpips"] = lambda a, b: self._lpips.distance(a / 255.0, b / 255.0)
         return {name: functions[name](a, b) for name in self.names}
-
-    def _distance(self, a, b):
-        return self._lpips.distance(a / 255.0, b / 255.0)
 
 
 def mean(rows: list[dict]) -> dict[str, float]:

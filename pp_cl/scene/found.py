@@ -109,14 +109,10 @@ def _inside(root, path):
 def _image_folders(root):
     """IMAGE_FOLDERS that there are, in any case, and images_N, the largest images first."""
     entries = sorted(os.listdir(root))
-    reduced = {
-        entry: int(number)
-        for entry in entries
-        if (number := entry.removeprefix("images_")).isdecimal() and number != entry
-    }
+    reduced = [entry for entry in entries if re.fullmatch(r"images_\d+", entry)]
     inside = {entry.lower(): entry for entry in reversed(entries)}
     usual = (inside.get(place, place) for place in IMAGE_FOLDERS)
-    places = (*usual, *sorted(reduced, key=reduced.__getitem__))
+    places = (*usual, *sorted(reduced, key=lambda entry: int(entry[len("images_") :])))
     return [place for place in places if os.path.isdir(os.path.join(root, place))]
 
 
@@ -129,12 +125,8 @@ def _alike(folder, name):
     bare = _bare(name)
     alike = _images(folder, os.stat(folder).st_mtime_ns).get(bare.lower(), [])
     exact = [one for one in alike if _bare(one) == bare]
-    if name in exact:
-        found = name
-    elif exact:
-        found = min(exact, key=lambda one: ENDINGS.index(os.path.splitext(one)[1].lower()))
-    else:
-        found = alike[0] if len(alike) == 1 else None
+    exact.sort(key=lambda one: (one != name, ENDINGS.index(os.path.splitext(one)[1].lower())))
+    found = next(iter(exact or alike * (len(alike) == 1)), None)
     return found if found and os.path.isfile(os.path.join(folder, found)) else None
 
 
@@ -178,10 +170,8 @@ def find_mask(folder: Path, image: str, *, by_number: bool = False) -> str | Non
 @lru_cache(maxsize=256)
 def _masks(folder, time):
     """{what an image may be called, or its number: its mask} in a folder last changed then."""
-    found = {}
     names = [name for names in _images(folder, time).values() for name in names]
-    for name in names:
-        found[os.path.splitext(name)[0]] = name
+    found = {os.path.splitext(name)[0]: name for name in names}
     for name in names:
         bare = _bare(name)
         for image in (bare, bare.removesuffix("_mask"), bare.removeprefix("mask_")):

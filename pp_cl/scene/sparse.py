@@ -41,11 +41,7 @@ def sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         if matrix is None:
             raise fail_at(file, "applied_transform")("must be 3 rows of 4 numbers; correct it")
         points = points @ matrix[:, :3].T + matrix[:, 3]
-    return points, _bytes(table[:, 3:])
-
-
-def _bytes(colours):
-    return np.clip(colours, 0, 255).astype(np.uint8)
+    return points, np.clip(table[:, 3:], 0, 255).astype(np.uint8)
 
 
 def _read_ply(file):
@@ -62,4 +58,4 @@ def _read_ply(file):
         raise refusal(file, error, "points of a .ply") from None
     if not (np.abs(points) < MOST).all():
         raise UserError(f"{file}: holds NaN, Inf or a huge number; write it again")
-    return points, _bytes(colours)
+    return points, np.clip(colours, 0, 255).astype(np.uint8)

@@ -2,15 +2,12 @@
 gradients, and where a naive formula overflows, divides by zero or hangs.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.project import FOOTPRINTS
 from pp_cl.engine.raster.weights import BLENDS
@@ -19,7 +16,6 @@ from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.case import (
     SIZES,
     Case,
-    Check,
     absolute,
     allowed,
     each,
@@ -51,7 +47,7 @@ STEP = 1e-6
 DIFFERENCES = 2e-3  # depths and falloff are steep at the rim, where that step is no small one
 
 
-def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _forward(rule, kind, dev, rng):
     for gamma in (0.1, 0.01):
         blended = Blended(dev, rng, kind=kind, gamma=gamma, rule=rule)
         weights = blended.scene.weights
@@ -62,15 +58,13 @@ def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Ite
         yield exact(blended.features[empty], np.ones((empty.sum(), 16)))
         yield exact(weights.visible.get(), blended.scene.seen)
         if rule == "alpha":
-            transmittance: Any = weights.transmittance
             background = blended.blend["background"]
-            yield absolute(transmittance.get(), background, WEIGHT[rule])
+            yield absolute(weights.transmittance.get(), background, WEIGHT[rule])
 
 
-def _backward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _backward(rule, kind, dev, rng):
     for gamma, tracked in ((0.1, 0), (0.01, 3)):
-        options: dict[str, Any] = {"max_tracked": tracked, "rule": rule}
-        blended = Blended(dev, rng, kind=kind, gamma=gamma, **options)
+        blended = Blended(dev, rng, kind=kind, gamma=gamma, max_tracked=tracked, rule=rule)
         gradients, expected = blended.gradients(), blended.reference_gradients(tracked)
         yield relative(gradients["features"], expected[0], GRADIENT)
         yield relative(gradients["opacity"], expected[1], OPACITY[rule])
@@ -86,28 +80,27 @@ def _check_blended(blended):
     yield relative(gradients["opacity"], references[1], GRADIENT)
 
 
-def _sizes(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    for n in SIZES:
-        for size in ((1, 1), (31, 33)):
-            yield from _check_blended(Blended(dev, rng, n, size=size, rule=rule))
+def _sizes(rule, dev, rng):
+    for n, size in product(SIZES, ((1, 1), (31, 33))):
+        yield from _check_blended(Blended(dev, rng, n, size=size, rule=rule))
 
 
-def _early_stop(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _early_stop(rule, dev, rng):
     """Nothing in front of the stop is dropped, all behind it is."""
     for stop in (0.001, 0.05, 0.5):
-        options: dict[str, Any] = {"gamma": 0.02, "radius": 0.4, "rule": rule, "early_stop": stop}
-        blended = Blended(dev, rng, 500, **options)
+        blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, early_stop=stop)
         fragment, used = blended.geometry["fragment"], blended.blend["fragment"]
         yield exact(blended.dropped, fragment & ~used)
         yield exact(blended.scene.weights.visible.get(), np.flatnonzero(used.any(axis=1)))
         yield from _check_blended(blended)
 
 
-def _zero_opacity(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _zero_opacity(rule, dev, rng):
     """The image is the background; every opacity has a gradient by which it can come back."""
     for gamma, stop in ((0.1, 0.0), (0.01, 0.0), (1e-5, 0.0), (0.1, 1e-3)):
-        options: dict[str, Any] = {"rule": rule, "early_stop": stop}
-        scene, weight = blend_on_axis(dev, [0.9, 0.5, 0.2], [0.0] * 3, gamma, **options)
+        scene, weight = blend_on_axis(
+            dev, [0.9, 0.5, 0.2], [0.0] * 3, gamma, rule=rule, early_stop=stop
+        )
         yield exact(weight, np.zeros(3))
         yield exact(scene.features.get(), np.ones((1, 1, 16)))
         gradients = scene.gradients(np.ones((1, 1, 16)))
@@ -119,7 +112,7 @@ def _zero_opacity(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[
         yield exact(gradients["features"], np.zeros((3, 16)))
 
 
-def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _spheres(dev, rng):
     """Gradients of positions and radii, against finite differences; one sphere is below a pixel."""
     camera, n, gamma = make_camera(), 30, 0.1
     positions, radius = make_points(rng, n), rng.uniform(0.05, 0.5, n).astype(np.float32)
@@ -143,7 +136,7 @@ def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(gradients["radius"], numeric, DIFFERENCES)
 
 
-def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _offsets(dev, rng):
     """Gradients of offsets, against finite differences of what the falloff changes."""
     camera, n, voxel_size = make_camera(), 40, 0.3
     positions, opacity = make_points(rng, n), rng.uniform(0, 1, n).astype(np.float32)
@@ -169,7 +162,7 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(gradients, np.array(numeric), DIFFERENCES)
 
 
-def _gaussians(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _gaussians(dev, rng):
     """Of all shapes: their images, and the gradients of places and shapes, against finite
     differences; features that were clamped to 0 have none. 1e-3: far below a pixel.
     """
@@ -210,7 +203,7 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
     yield exact(found["offset"][:, 9:], np.zeros((n, 7)))
 
 
-def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _smallest_gamma(dev, rng):
     """gamma = 1e-5 makes exponents of 1e5, which are off by 1e-2: so are the weights."""
     for opacity in (1.0, 0.3, 1e-3, 1e-38):
         scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
@@ -219,7 +212,7 @@ def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield each(weight, expected[:, 0], 1e-2, floor=1e-28)
 
 
-def _opacity_bound(blended: Blended) -> np.ndarray:
+def _opacity_bound(blended):
     """(N,) how far float32 may be from dL/do (docs/maths.md): a product G.f rounds by its terms'
     size, an exponent o z/gamma by 1/gamma, and a numerator below the least float is 0.
     """
@@ -235,16 +228,15 @@ def _opacity_bound(blended: Blended) -> np.ndarray:
     return np.where(blend["fragment"], factor * (rounded + underflow), 0).sum(axis=1)
 
 
-def _sharp(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _sharp(dev, rng):
     """Where one fragment has nearly all of the weight, dL/do is a rounding of 0 times 1/gamma."""
-    for kind in FOOTPRINTS:
-        for gamma in (1e-3, 1e-5):
-            blended = Blended(dev, rng, kind=kind, gamma=gamma)
-            expected = blended.reference_gradients()[1]
-            yield allowed(blended.gradients()["opacity"], expected, _opacity_bound(blended))
+    for kind, gamma in product(FOOTPRINTS, (1e-3, 1e-5)):
+        blended = Blended(dev, rng, kind=kind, gamma=gamma)
+        expected = blended.reference_gradients()[1]
+        yield allowed(blended.gradients()["opacity"], expected, _opacity_bound(blended))
 
 
-def _many_fragments(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _many_fragments(rule, dev, rng):
     """20000 in a pixel: a transmittance falls below the smallest number, and nothing is NaN."""
     z, opacity = rng.uniform(0.1, 0.99, 20_000), rng.uniform(0, 1, 20_000).astype(np.float32)
     for gamma, stop in ((0.1, 0.0), (0.01, 1e-3 if rule == "alpha" else 0.0)):
@@ -258,7 +250,7 @@ def _many_fragments(rule: str, dev: Device, rng: np.random.Generator) -> Iterato
         yield finite(*scene.gradients(rng.normal(size=(1, 1, 16))).values())
 
 
-def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _gradient_of_alpha(dev, rng):
     """One of alpha is one of a feature that is 0 in all points, since the background's is 1."""
     for stop in (0.0, 0.05):
         blended = Blended(dev, rng, rule="alpha", early_stop=stop)
@@ -274,11 +266,10 @@ def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]
         yield relative(gradients["features"][:, :15], expected[0][:, :15], GRADIENT)
 
 
-def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _distortion(dev, rng):
     """Of fragments of all weights, of those before an early stop, and of the tracked ones."""
     for n, tracked, stop in ((257, 0, 0), (257, 0, 0.05), (257, 3, 0), (33, 0, 0), (31, 0, 0)):
-        options: dict[str, Any] = {"max_tracked": tracked, "early_stop": stop}
-        blended = Blended(dev, rng, n, rule="alpha", **options)
+        blended = Blended(dev, rng, n, rule="alpha", max_tracked=tracked, early_stop=stop)
         blended.grad[:] = 0
         expected = blended.reference_gradients(tracked, distortion_weight=3.0)[1]
         gradients = blended.gradients(distortion_weight=3.0)

@@ -1,6 +1,5 @@
 """Cases of the layers: convolutions of every variant, pooling, upsampling, gate, tiles."""
 
-from collections.abc import Iterator
 from functools import cache, partial
 
 import numpy as np
@@ -109,7 +108,7 @@ def within(actual: np.ndarray, expected: np.ndarray) -> Check:
     return allowed(actual, expected, np.broadcast_to(most, expected.shape))
 
 
-def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _convolution(variant, dev, rng):
     """All directions; awkward sizes, two sources, a masked gradient."""
     bound = BOUNDS[variant]
     layers = _layers() if can_run(variant, 1) else _layers()[: len(SHAPES)]
@@ -120,14 +119,14 @@ def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterato
             yield relative(actual, expected, max(bound, WEIGHTS_BOUND) if of_weights else bound)
 
 
-def _hard_convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _hard_convolution(variant, dev, rng):
     """Large means, weights over six decades, values of 6e4 and 1e-7, 512 channels, zeros."""
     for layer in _hard_layers().values():
         results = layer.computed(dev, variant, blocking_of(dev))
         yield from map(within, results, layer.expected)
 
 
-def _pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _pool(dev, rng):
     """Means of 2x2 pixels; the gradient is added, and masked where a ReLU was pooled."""
     for h, w, c in PLANES:
         x, other = np.maximum(_normal(rng, 2 * h, 2 * w, c), 0), _normal(rng, 2 * h, 2 * w, c)
@@ -141,7 +140,7 @@ def _pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             yield relative(grad_x.get(), expected, FOUR)
 
 
-def _max_pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _max_pool(dev, rng):
     """Cells of zeros and of equal values; odd borders drop."""
     for shape in ((2, 2, 16), (3, 5, 3), (31, 33, 17), (257, 2, 32)):
         x = np.maximum(rng.integers(-3, 3, shape), 0).astype(np.float32)
@@ -150,7 +149,7 @@ def _max_pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(out.get(), lpips.maxpool2(x))
 
 
-def _upsample(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _upsample(dev, rng):
     for h, w, c in PLANES:
         x, grad_out = _normal(rng, h, w, c), _normal(rng, 2 * h, 2 * w, c)
         out, grad_x = dev.empty(grad_out.shape), dev.empty(x.shape)
@@ -162,7 +161,7 @@ def _upsample(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(grad_x.get(), expected, 8 * EPS)
 
 
-def _output(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _output(dev, rng):
     """Colours of the network's output, with features added and without, and the gradients."""
     for width in (1, 31, 33, 257):
         features, output = rng.standard_normal((3, width, 16)), rng.standard_normal((3, width, 3))
@@ -183,7 +182,7 @@ def _output(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(grad_features.get(), expected, 2 * EPS)
 
 
-def _first_features(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _first_features(dev, rng):
     """Colours that are features, and the gradient."""
     for height, width in ((1, 1), (31, 33), (3, 257)):
         features, grad = _normal(rng, height, width, 16), _normal(rng, height, width, 3)
@@ -196,7 +195,7 @@ def _first_features(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(grad_features.get(), expected, EPS)
 
 
-def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _gate(dev, rng):
     """Sizes; features and gates from 1e-12 to 60, where expm1 would cancel and exp overflow."""
     for h, w, c in PLANES:
         x, grad_out = 3 * _normal(rng, h, w, 2 * c), _normal(rng, h, w, c)
@@ -223,7 +222,7 @@ def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray,
     return out.get(), grad_x.get()
 
 
-def _tiles(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _tiles(dev, rng):
     """Which tiles hold something, which have fragments, copies of them, also at the border."""
     for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
         odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))

@@ -1,22 +1,18 @@
 """Cases of the losses: L1 and SSIM, masks, exposure, and their sum."""
 
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.training.exposure import DECAY, PRIOR, Exposure
 from pp_cl.engine.training.loss import Loss, ignore_gradient, ignore_target
 from pp_cl.reference import loss as reference_loss
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
 ONE = np.uint8(1)
 FLAT = 3e-6  # variances of nothing: rounding of Var[d] over C2 = 0.03^2
 
 
-def _loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _loss(dev, rng):
     """L1 and SSIM; at sizes below a window L1 alone."""
     for size in ((11, 11), (12, 33), (33, 31), (40, 257), (1, 1), (1, 257), (10, 40)):
         prediction, target = images(rng, *size)
@@ -48,7 +44,7 @@ def four_terms(loss: Loss) -> np.ndarray:
     return np.array([found["loss"], found["l1"], 1 - found["ssim"], mse])
 
 
-def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _hard_loss(dev, rng):
     """Flat images, equal ones, and variances far below the squares they are the difference of."""
     for levels in ((0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)):
         prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
@@ -65,7 +61,7 @@ def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(grad.get(), np.zeros_like(target))
 
 
-def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _mask_loss(dev, rng):
     """Of a part of the image, where alpha is too low times the shortfall's; nothing outside."""
     weight, shortfall, width, left, top = 0.7, 0.3, 29, 3, 1
     for side in SIZES:
@@ -74,7 +70,6 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         ignored = rng.random(mask.shape) < 0.2
         loss = Loss(dev, 0.0, mask_weight=weight)
         rendered = dev.upload(transmittance.ravel(), np.float32)
-        grad: Any
         _, grad = loss.forward_backward(
             dev.zeros((*size, 3)),
             dev.zeros((side, width, 3)),
@@ -92,7 +87,7 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(grad.get().reshape(size), expected, 8 * EPS)
 
 
-def _ignored(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _ignored(dev, rng):
     """What a part of an image is compared with where pixels are ignored, and no gradient there."""
     for side in SIZES:
         prediction, target = images(rng, side + 3, 36)[0], images(rng, side, 29)[1]
@@ -111,7 +106,7 @@ def _ignored(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(grad.get(), expected)
 
 
-def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _sum_of_terms(dev, rng):
     """The loss is that of the image and what is added."""
     for n in SIZES:
         prediction, target = images(rng, 12, n)
@@ -126,7 +121,7 @@ def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield each([found["loss"], found["distortion"]], expected, LOSS)
 
 
-def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _exposure(dev, rng):
     """The gains of three views, one seen twice and one never, and images divided by them."""
     known, left, top = np.zeros((3, 3, 3)), 3, 1
     exposure = Exposure(dev, 3, is_applied=True)

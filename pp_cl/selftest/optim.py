@@ -2,7 +2,6 @@
 opacities of split points.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,7 +19,7 @@ from pp_cl.engine.training.schedule import Rates
 from pp_cl.engine.training.smooth import Smoother
 from pp_cl.engine.training.state import PointState, split_opacity
 from pp_cl.reference import dense, optim
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import some_ids, some_opacities
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
@@ -126,7 +125,7 @@ def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int 
     return grads
 
 
-def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _adam(dev, rng):
     """Parameters and moments after twenty steps; the first step is the rate."""
     for n in SIZES:
         grads = 1e-3 * rng.standard_normal((20, n))
@@ -155,7 +154,7 @@ def adam_steps(
     return twin, parameter.get(), state
 
 
-def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _adam_extremes(dev, rng):
     """Gradients of 1e-20 to 1e10, of which float32 cannot square all; and of 0."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         for eps in (1e-8, 1e-15):
@@ -169,7 +168,7 @@ def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield exact(state["v"].get(), np.zeros(33))
 
 
-def _rmsprop(degree: int, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _rmsprop(degree, dev, rng):
     """Points without a gradient keep their values, and their second moments decay."""
     for n in SIZES:
         cloud = Cloud(dev, rng, n, degree)
@@ -193,7 +192,7 @@ def _rmsprop_checks(cloud):
         yield relative(moments[name], cloud.twin.v[name], 3e-6)  # a sum of squares
 
 
-def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _rmsprop_extremes(dev, rng):
     """Some squares leave float32; NaN stays; a gradient of one parameter alone moves it alone."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         cloud = Cloud(dev, rng, 31)
@@ -202,10 +201,8 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         for name, values in cloud.learned().items():
             yield relative(values, cloud.twin.values[name], 1e-6 if name == "sh" else 1e-5)
     cloud, grads = Cloud(dev, rng, 33), gradients(rng, 33, 0.0)
-    grads["sh"][1], grads["sh"][2, 5], grads["opacity"][4], grads["offset"][7, 1] = (
-        -0.0,
-        *[np.nan] * 3,
-    )
+    grads["sh"][1] = -0.0
+    grads["sh"][2, 5] = grads["opacity"][4] = grads["offset"][7, 1] = np.nan
     grads["opacity"][10], grads["offset"][13, 3] = 1e-4, -1e-4
     cloud.step(grads, np.arange(33))
     for name, values in cloud.learned().items():
@@ -214,7 +211,7 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield absolute(np.nan_to_num(values), np.nan_to_num(expected), 1e-6 * RATES.opacity)
 
 
-def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _bounded(dev, rng):
     """Huge gradients keep opacities, offsets and Gaussians' SH above degree 0 in their bounds."""
     for footprint in ("soft", "gaussian"):
         width = offset_width(footprint)
@@ -235,7 +232,7 @@ def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield absolute(sh, cloud.twin.values["sh"], 1e-5)
 
 
-def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _ema(dev, rng):
     for n in SIZES:
         old, new = rng.standard_normal((2, n)).astype(np.float32)
         ema = dev.upload(old)
@@ -244,7 +241,7 @@ def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(ema.get(), expected, 2 * EPS)
 
 
-def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _smooth(dev, rng):
     """Neighbours on the grid, and the step towards their mean."""
     grid = Grid((0, 0, 0), 1, (7, 17, 9))
     for n in SIZES:
@@ -261,7 +258,7 @@ def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             yield relative(sh.get(), expected, 4 * EPS)  # a mean of up to six
 
 
-def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _refine(dev, rng):
     """1 - sqrt(1 - o), which cancels for small opacities; what depends on the direction alike."""
     for n in SIZES:
         opacity = some_opacities(rng, n)

@@ -62,27 +62,22 @@ class PairedPoints:
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
     ):
         exact = partial(dense.geometry, camera, positions, radius, kind, depth_range=depth_range)
-        self._begin(dev, camera, len(positions), exact, depth_range)
-        self._pair(
-            project_spheres(
-                dev,
-                self.buffers,
-                kind,
-                dev.upload(camera.packed(depth_range)),
-                dev.upload(positions, np.float32),
-                point_radius=dev.upload(np.broadcast_to(radius, self.n), np.float32),
-            )
+        buffers, n = Buffers(dev), len(positions)
+        projected = project_spheres(
+            dev,
+            buffers,
+            kind,
+            dev.upload(camera.packed(depth_range)),
+            dev.upload(positions, np.float32),
+            point_radius=dev.upload(np.broadcast_to(radius, n), np.float32),
         )
+        self._pair(dev, camera, n, exact, depth_range, buffers, projected)
 
-    def _begin(self, dev, camera, n, exact, depth_range):
-        self.dev, self.camera, self.n = dev, camera, n
+    def _pair(self, dev, camera, n, exact, depth_range, buffers, projected):
+        self.dev, self.camera, self.n, self.buffers = dev, camera, n, buffers
         self._exact, self.depth_range = exact, depth_range
-        self.shape = (camera.height, camera.width)
-        self.buffers = Buffers(dev)
-
-    def _pair(self, projected):
-        self.projected = projected
-        self.pairs = find_all_pairs(self.dev, self.buffers, projected, self.shape)
+        self.shape, self.projected = (camera.height, camera.width), projected
+        self.pairs = find_all_pairs(dev, buffers, projected, self.shape)
 
     @property
     def seen(self) -> np.ndarray:
@@ -151,21 +146,16 @@ class PairedPoints:
 
     def weight(self) -> np.ndarray:
         """(N, HW) the blend weights, 0 where a fragment was dropped."""
+        return self.weight_and_dropped()[0]
+
+    def weight_and_dropped(self) -> tuple[np.ndarray, np.ndarray]:
+        """((N, HW) blend weights, (N, HW) bool: the fragments behind an early stop)."""
         is_listed, _, weights = listed_fragments(self.pairs, self.weights)
-        by_pair = np.zeros(self.pairs.total, np.float32)
-        by_pair[self._listed()[is_listed]] = weights
-        return self.dense(by_pair)
-
-    def dropped(self) -> np.ndarray:
-        """(N, HW) bool: the fragments behind an early stop."""
-        is_listed, _, _ = listed_fragments(self.pairs, self.weights)
-        by_pair = np.empty(self.pairs.total, bool)
-        by_pair[self._listed()] = ~is_listed
-        return self.dense(by_pair, False)
-
-    def _listed(self):
-        """(P,) the pairs in the order of the keys."""
-        return self.pairs.pair_key.get()[: self.pairs.total] & np.uint64(0xFFFFFFFF)
+        ordered = self.pairs.pair_key.get()[: self.pairs.total] & np.uint64(0xFFFFFFFF)
+        weight, dropped = np.zeros(len(ordered), np.float32), np.empty(len(ordered), bool)
+        weight[ordered[is_listed]] = weights
+        dropped[ordered] = ~is_listed
+        return self.dense(weight), self.dense(dropped, False)
 
     def gradients(
         self,
@@ -228,23 +218,20 @@ class PairedGaussians(PairedPoints):
         offset: np.ndarray,
         radius: float,
     ):
-        exact = partial(
-            dense.gaussians, camera, grid.positions(ids), grid.voxel_size, offset, radius
+        vertices, n, buffers = grid.positions(ids), len(ids), Buffers(dev)
+        exact = partial(dense.gaussians, camera, vertices, grid.voxel_size, offset, radius)
+        projected = project_grid(
+            dev,
+            buffers,
+            "gaussian",
+            dev.upload(camera.packed(dense.DEPTH_RANGE)),
+            dev.upload(grid.packed()),
+            point_id=dev.upload(ids, np.uint32),
+            cloud_offset=dev.upload(offset, np.float32),
+            opacity=dev.zeros((n, OPACITIES)),
+            radius=radius,
         )
-        self._begin(dev, camera, len(ids), exact, dense.DEPTH_RANGE)
-        self._pair(
-            project_grid(
-                dev,
-                self.buffers,
-                "gaussian",
-                dev.upload(camera.packed(self.depth_range)),
-                dev.upload(grid.packed()),
-                point_id=dev.upload(ids, np.uint32),
-                cloud_offset=dev.upload(offset, np.float32),
-                opacity=dev.zeros((len(ids), OPACITIES)),
-                radius=radius,
-            )
-        )
+        self._pair(dev, camera, n, exact, dense.DEPTH_RANGE, buffers, projected)
 
 
 NEAR, FAR = dense.DEPTH_RANGE
@@ -298,8 +285,7 @@ class Blended:
         self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
         self.blend = dense.blend_by_rule(rule, self.geometry, self.opacity, gamma, stop)
-        self.weight = self.scene.weight()
-        self.dropped = self.scene.dropped()
+        self.weight, self.dropped = self.scene.weight_and_dropped()
 
     def gradients(self, distortion_weight: float = 0.0) -> Gradients:
         """The kernels' gradients of sum(features * grad) and the weighted distortion loss."""

@@ -1,13 +1,11 @@
 """Cases of a scene's preparation: hull, targets, the demo."""
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import MASK_THRESHOLD, View
@@ -15,7 +13,7 @@ from pp_cl.reference import scene as twin
 from pp_cl.scene.demo import distances
 from pp_cl.scene.hull import Carver
 from pp_cl.scene.lens import LensDistortion, undistort
-from pp_cl.selftest.case import SIZES, Case, Check, absolute, exact
+from pp_cl.selftest.case import SIZES, Case, absolute, exact
 
 BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
 TARGET = 5e-7  # a few roundings of a float32 in [0, 1]
@@ -48,7 +46,7 @@ def _views(rng, share):
     return views
 
 
-def _masks(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _masks(dev, rng):
     """Widened by two pixels, of a reduced image by more, and packed to bits."""
     for view, downscale in itertools.product(_views(rng, 0.002), (1, 2, 35)):
         height, width = view.image.shape[:2]
@@ -57,7 +55,7 @@ def _masks(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(bits, twin.dilated_mask(view.image[..., 3], MASK_THRESHOLD, 1 + downscale))
 
 
-def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _hull(dev, rng):
     """Which vertices enough images see and few enough masks reject, and their numbers."""
     views = _views(rng, 0.05)
     carver = Carver(dev, views)
@@ -81,7 +79,7 @@ def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(found[border > BORDER], expected[border > BORDER])
 
 
-def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _target(dev, rng):
     """Means over white of blocks of pixels, some of which reach outside of the image."""
     image = rng.integers(0, 256, (83, 97, 4), np.uint8)
     image[..., 3] = rng.choice([0, 255, 7, 130], (83, 97), p=[0.33, 0.33, 0.17, 0.17])
@@ -99,7 +97,7 @@ def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield absolute(alpha.get(), hidden, TARGET)
 
 
-def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _target_between(dev, rng):
     """Shifted by parts of a pixel, also where the crop reaches outside of the image."""
     image = rng.integers(0, 256, (40, 97, 4), np.uint8)
     view = View("noise", Camera(np.eye(3, 4), 90.0, 95.0, 45.6, 20.2, 97, 40), image)
@@ -120,7 +118,7 @@ def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(found[0].get(), np.ones((33, 60, 3)))
 
 
-def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _distortion(dev, rng):
     """Noise, at its size and at a half and a third; a tall image takes several bands."""
     sizes = [(n, 31) for n in SIZES] + [(33, 257), (1030, 700)]
     for (width, height), lens in itertools.product(sizes, LENSES):
@@ -132,7 +130,7 @@ def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             yield absolute(found, twin.undistorted(image, camera, lens, factor), ROUNDED)
 
 
-def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _demo(dev, rng):
     for n in SIZES:
         for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
             grid = Grid(start, 1.6 / n, (n, 1, 1))

@@ -129,15 +129,10 @@ class MemoryPlan:
             halved = stretches[0].refinements - stretch.refinements
             width = radius / 2**halved if self._raster.footprint == "soft" else radius
             found.append(self._need_of_stretch(stretch, width / self._downscale))
-        peak = max(found, key=lambda need: need.device)
-        host = max(need.host for need in found)
-        host = 2 * PIECE_BYTES + host + self.dev.is_cpu * peak.device
-        return Need(
-            peak.device,
-            peak.points,
-            max(need.largest for need in found),
-            self._images + max(host, self._reading_bytes),
-        )
+        peak, largest = max(found), max(need.largest for need in found)
+        host = 2 * PIECE_BYTES + max(need.host for need in found) + self.dev.is_cpu * peak.device
+        host = self._images + max(host, self._reading_bytes)
+        return peak._replace(largest=largest, host=host)
 
     def _need_of_stretch(self, stretch, radius):
         """The Need of some steps; of the host what refining after them takes."""
@@ -147,14 +142,8 @@ class MemoryPlan:
         pairs = grown(0, round(n * min(footprint_pixels(radius), math.prod(image))))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
         share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(image))
-        of_step = view_table(
-            raster,
-            n,
-            math.prod(crop),
-            round(share * pairs),
-            round(share * visible),
-            training=True,
-        )
+        of_crop = math.prod(crop), round(share * pairs), round(share * visible)
+        of_step = view_table(raster, n, *of_crop, training=True)
         of_preview = view_table(raster, n, math.prod(image), pairs, visible)
         of_pruning = view_table(raster, n, math.prod(image), pairs, 0, until="weights")
 
@@ -168,10 +157,7 @@ class MemoryPlan:
             loss_table(self.dev, crop, crop, train.ssim_weight),
             {"image": ((self._image,), np.uint8)},
         ]
-        taking_turns = [
-            [of_step, target_table(crop)],
-            [of_preview, target_table(image)],
-        ]
+        taking_turns = [[of_step, target_table(crop)], [of_preview, target_table(image)]]
         if stretch.refinements == 0 and train.prune_weight > 0:
             taking_turns.append([of_pruning])
         device = _bytes(held) + max(map(_bytes, taking_turns))

@@ -58,7 +58,11 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
     ]
     if not frames:
         raise UserError(f"{file}: has no frame of the sequence {folder.name}; give another folder")
-    chosen = sorted((frame for frame in frames if not _is_empty(frame)), key=_number)
+    for frame in frames:
+        if frame.number("frame_number") is None:
+            raise frame.error("frame_number", "is missing; copy the annotations again")
+    chosen = [frame for frame in frames if not _is_empty(frame)]
+    chosen.sort(key=lambda frame: frame.get("frame_number"))
     if listed is None:
         chosen = hold_out(chosen, split)
     else:
@@ -115,13 +119,6 @@ def _objects(opened):
             at = end
         elif not piece:
             raise ValueError("ends too early")
-
-
-def _number(frame):
-    number = frame.number("frame_number")
-    if number is None:
-        raise frame.error("frame_number", "is missing; copy the annotations again")
-    return number
 
 
 def _is_empty(frame):

@@ -77,7 +77,7 @@ TRACK_BYTES = 8  # the ids of an image and of a point in it
 
 
 class Lens(NamedTuple):
-    """A camera of the model. parameters: as COLMAP orders them for this model."""
+    """A camera of the model, its parameters as COLMAP orders them."""
 
     model: str
     width: int
@@ -234,10 +234,9 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
 
 def read_points(folder: Path) -> Iterator[Sequence[float]]:
     """Each (x, y, z, red, green, blue) of the points3D in a model's folder. Raises UserError."""
-    for suffix in (".bin", ".txt"):
-        if (file := folder / f"points3D{suffix}").is_file():
-            yield from (point for _, point in _records(file, _binary_point, POINT, _text_point))
-            return
+    files = (folder / f"points3D{suffix}" for suffix in (".bin", ".txt"))
+    for file in [file for file in files if file.is_file()][:1]:
+        yield from (point for _, point in _records(file, _binary_point, POINT, _text_point))
 
 
 def _are_numbers(values):
@@ -251,10 +250,7 @@ def _records(file, take, form, parse):
     """
     is_binary = file.suffix == ".bin"
     try:
-        if is_binary:
-            yield from _binary_entries(file, take)
-        else:
-            yield from _text_entries(file, form, parse)
+        yield from _binary_entries(file, take) if is_binary else _text_entries(file, form, parse)
     except (OSError, OverflowError, ValueError) as error:
         raise refusal(file, error, "COLMAP's" if is_binary else "text") from None
 
@@ -304,8 +300,8 @@ def _text_image(line):
 
 
 def _text_point(line):
-    _, x, y, z, red, green, blue = map(float, line.split(maxsplit=7)[:7])
-    return x, y, z, red, green, blue
+    _, *point = map(float, line.split(maxsplit=7)[:7])
+    return point
 
 
 # Binary -------------------------------------------------------------------------------------------
