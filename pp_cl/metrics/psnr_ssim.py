@@ -50,7 +50,7 @@ class Metrics:
 
     def __init__(self, dev: Any, names: tuple[str, ...]) -> None:
         self.names = names
-self._lpips: Any = Lpips(dev) if "lpips" in names else None
+        self._lpips: Any = Lpips(dev) if "lpips" in names else None
 
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         """{name: number} of two float (H, W, 3) images in [0, 1], rounded to 8 bits. Raises

@@ -13,7 +13,8 @@ from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.errors import Unusable
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.lens import LensDistortion, undistort
-from pp_cl.scene.masks import OPAQUE, MaskRule, cut_out, read_mask_of_size
+from pp_cl.scene.masks import OPAQUE, cut_out, is_by_colour, read_mask_of_size
+from pp_cl.settings import SceneConfig
 
 # Of a scene's images in memory, as RGBA; more than this is reduced while it is read. A fixed
 # number, not what happens to be free: the same command gives the same bits on every machine.
@@ -74,7 +75,7 @@ def shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def read_view(
-    folder: Path, image_file: ImageFile, rule: MaskRule, dev: Device | None, factor: int = 1
+    folder: Path, image_file: ImageFile, masks: SceneConfig, dev: Device | None, factor: int = 1
 ) -> View:
     """The View of an image of the scene in a folder, with its mask, reduced `factor` times. dev:
     removes distortion. Raises Unusable where the image or a mask cannot be used.
@@ -94,12 +95,12 @@ def read_view(
     image = read_rgba(folder / image_file.name, size)
     if image_file.mask:
         image[..., 3] = read_mask_of_size(folder / image_file.mask, image.shape[1::-1])
-    elif rule.source in ("box", "none"):
+    elif masks.mask_from in ("box", "none"):
         image[..., 3] = OPAQUE
     digest = pixel_digest(image, image_file.lens, ignored)
     image = used(image)
-    if rule.is_by_colour:
-        image = cut_out(image, image_file.name, rule.tolerance)
+    if is_by_colour(masks):
+        image = cut_out(image, image_file.name, masks.mask_tolerance)
     if ignored is not None:
         image = np.where(ignored[..., None], np.uint8(0), image)
     if image[..., 3].max() <= MASK_THRESHOLD:

@@ -36,11 +36,11 @@ from pp_cl.scene.found import (
 )
 from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
-from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, half_transparent, read_mask_of_size
+from pp_cl.scene.masks import AS_GIVEN, OPAQUE, half_transparent, is_by_colour, read_mask_of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import SPLITS, read_json
 from pp_cl.scene.silhouette import within_silhouettes
-from pp_cl.settings import Config
+from pp_cl.settings import Config, SceneConfig
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
@@ -110,11 +110,13 @@ def open_scene(
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
     `demo` is rendered on the device. most, listed: as load_scene() takes them.
     """
-    path, downscale, masks = config.scene.path, config.scene.downscale, mask_rule(config)
+    path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
         rendered = {split: demo.demo_views(dev, split, most) for split in splits}
         return Scene(DEMO, None, _reduced(rendered, downscale))
-    scene = load_scene(path, splits, most, masks, downscale=downscale, listed=listed, dev=dev)
+    scene = load_scene(
+        path, splits, most, config.scene, downscale=downscale, listed=listed, dev=dev
+    )
     views = scene.splits.get("train", [])
     masked = [view for view in views if view.has_mask]
     shares = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked]
@@ -139,12 +141,6 @@ def open_scene(
             stacklevel=2,
         )
     return scene
-
-
-def mask_rule(config: Config) -> MaskRule:
-    """How the masks of the run's scene are made."""
-    scene = config.scene
-    return MaskRule(scene.mask_from, scene.masks, scene.mask_tolerance, scene.ignore)
 
 
 def scene_box(config: Config) -> np.ndarray | None:
@@ -406,7 +402,7 @@ def load_scene(
     path: str | Path,
     splits: Iterable[str] = ("train",),
     most: int | None = None,
-    masks: MaskRule = AS_GIVEN,
+    masks: SceneConfig = AS_GIVEN,
     *,
     dev: Device | None = None,
     downscale: int | None = None,
@@ -420,7 +416,7 @@ def load_scene(
     for distortion without a device.
     """
     folder, lines = Path(path), []
-    for option, given in (("--masks", masks.folder), ("--ignore", masks.ignore)):
+    for option, given in (("--masks", masks.masks), ("--ignore", masks.ignore)):
         if given and not os.path.isdir(given):
             raise UserError(f"{given}: no such folder; {option} takes one of masks")
     chosen: dict[str, list[ImageFile]] = {}
@@ -464,12 +460,12 @@ def _reduced(splits, downscale):
 
 def _by_rule(rule, image_files, split):
     """The images, with the masks of the rule's folders, and none where its masks are no files."""
-    if rule.folder:
-        own = Path(rule.folder).absolute()
+    if rule.masks:
+        own = Path(rule.masks).absolute()
         masks = _masks_in(own, image_files, split, ["."])
         files = {name: str(own / mask) for name, mask in masks.items()}
         image_files = [replace(one, mask=files.get(one.name)) for one in image_files]
-    elif rule.source != "given":
+    elif rule.mask_from != "given":
         image_files = [replace(one, mask=None) for one in image_files]
     if rule.ignore:
         image_files = _ignoring(Path(rule.ignore), ["."], image_files, split)
@@ -512,12 +508,12 @@ def _all_masked(folder, views, dev, left_out):
 
 
 def reading_cost(
-    image_files: Sequence[ImageFile], masks: MaskRule = AS_GIVEN, factor: int = 1
+    image_files: Sequence[ImageFile], masks: SceneConfig = AS_GIVEN, factor: int = 1
 ) -> tuple[int, int]:
     """(how many images are read side by side, bytes that this takes beside the images that stay):
     as many as there are cores and READING_BYTES hold.
     """
-    per_pixel = DECODED + (CUT_OUT / factor**2 if masks.is_by_colour else 0)
+    per_pixel = DECODED + (CUT_OUT / factor**2 if is_by_colour(masks) else 0)
     pixels = max(one.camera.width * one.camera.height for one in image_files)
     most = math.ceil(per_pixel * pixels)
     workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(image_files)))

@@ -1,7 +1,6 @@
 """The mask of an image: from a file, from its alpha, from a uniform background, or none."""
 
 import warnings
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -15,6 +14,7 @@ from pp_cl.engine.views import MASK_THRESHOLD, border
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import read_mask, same_shape
 from pp_cl.scene.found import find_mask
+from pp_cl.settings import SceneConfig
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = 255
@@ -24,24 +24,12 @@ HALF = 16, 239  # alphas between which a pixel is half transparent
 EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
 
-@dataclass(frozen=True)
-class MaskRule:
-    """How a scene's masks are made: the settings scene.mask_from, scene.masks, scene.mask_tolerance
-    and scene.ignore.
-    """
-
-    source: str = "given"
-    folder: str = ""
-    tolerance: float = 10.0
-    ignore: str = ""
-
-    @property
-    def is_by_colour(self) -> bool:
-        """Whether cut_out() makes the masks, of images as they are used, since it takes long."""
-        return self.source == "color" and not self.folder
+AS_GIVEN = SceneConfig()  # the masks of the scene's format, else alpha
 
 
-AS_GIVEN = MaskRule()
+def is_by_colour(masks: SceneConfig) -> bool:
+    """Whether cut_out() makes the masks, of images as they are used, since it takes long."""
+    return masks.mask_from == "color" and not masks.masks
 
 
 def named_mask(folder: Path, *names: str) -> Path:

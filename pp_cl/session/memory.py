@@ -27,7 +27,7 @@ from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import target_table
 from pp_cl.errors import UserError
 from pp_cl.scene.image_file import ImageFile, image_bytes, shrink_factor
-from pp_cl.scene.load import DEMO, mask_rule, reading_cost
+from pp_cl.scene.load import DEMO, reading_cost
 from pp_cl.settings import Config
 
 MIB, GIB = 2**20, 2**30
@@ -66,9 +66,7 @@ class MemoryPlan:
         factor = 1 if is_demo else shrink_factor(sizes, self._downscale)
         self._images = image_bytes(sizes, factor)
         self._image = image_bytes([(self._largest.width, self._largest.height)], factor)
-        self._reading_bytes = (
-            0 if is_demo else reading_cost(image_files, mask_rule(config), factor)[1]
-        )
+        self._reading_bytes = 0 if is_demo else reading_cost(image_files, config.scene, factor)[1]
         held = self.dev.bytes if self.dev.is_cpu else 0  # which `need` counts
         self._program = resident_bytes() - held + compiler_bytes(self.dev.info)
 

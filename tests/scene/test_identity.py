@@ -12,7 +12,7 @@ from support.scenes import move_scene, write_ball_scene
 from pp_cl.scene.identity import difference, identity, unpacked_views
 from pp_cl.scene.image_file import pixel_digest
 from pp_cl.scene.load import load_scene, scene_frames
-from pp_cl.scene.masks import MaskRule
+from pp_cl.settings import SceneConfig
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_masks_of_their_own_belong_to_the_pixels(folder, tmp_path):
         mask = np.full((48, 48), 255, np.uint8)
         mask[:, : 4 + i] = 0
         Image.fromarray(mask).save(tmp_path / "masks" / f"r_{i}.png")
-    rule = MaskRule(folder=str(tmp_path / "masks"))
+    rule = SceneConfig(masks=str(tmp_path / "masks"))
     header = identity(views_of(folder, masks=rule))
     pixels = np.array(Image.open(tmp_path / "masks/r_2.png"))
     Image.fromarray(255 - pixels).save(tmp_path / "masks/r_2.png")
