@@ -1,14 +1,12 @@
 """Measures a run on the views of a split."""
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pp_cl.engine.training.target import Target
-from pp_cl.engine.views import View
 from pp_cl.files.atomic import own, remove_ours, write_json
 from pp_cl.files.image import image_paths, write_png
 from pp_cl.files.sheets import write_comparison
@@ -18,19 +16,6 @@ from pp_cl.progress import Progress, track
 from pp_cl.run import Run, load
 
 SHOWN_VIEWS = 4  # rows of the comparison image
-
-
-class Rendered(NamedTuple):
-    """A view as the run renders it. image, truth: (H, W, 3) float32 in [0, 1]. alpha: (H, W) of the
-    truth. computed: fraction of the network's multiplications; the others saw background alone.
-    """
-
-    name: str
-    image: np.ndarray
-    truth: np.ndarray
-    alpha: np.ndarray
-    seconds: float
-    computed: float
 
 
 def evaluate_run(
@@ -64,26 +49,30 @@ def evaluate_run(
         remove_ours((target / "images").rglob("*"))
     rows: list[dict[str, Any]] = []
     costs, shown = [], []
-    every = render_views(run, views)
-    for i, rendered in enumerate(track(every, "measuring", "view", len(views))):
-        image, truth = rendered.image, rendered.truth
-        rows.append({"name": rendered.name} | measure(image, truth))
+    result: dict[str, Any]
+    targets = Target(run.dev)
+    with Progress("building kernels"):
+        run.render(views[0].camera)
+    for i, view in enumerate(track(views, "measuring", "view")):
+        start = time.perf_counter()
+        rendered = run.renderer.forward(view.camera, run.gamma)
+        image, computed = run.checked(rendered.clamped()), rendered.computed_fraction
+        costs.append((time.perf_counter() - start, computed))
+        del rendered  # else its arrays would stay beside the larger ones of the next view
+        whole = targets.crop(view, (0, 0, view.camera.width, view.camera.height))
+        truth, alpha = (array.get() for array in whole)
+        truth = view.ignoring(truth, image)
+        rows.append({"name": view.name} | measure(image, truth))
         if "exposed" in run.header:
-            matched = exposed_alike(truth, image, rendered.alpha)
+            matched = exposed_alike(truth, image, alpha)
             rows[-1]["after_gains"] = measure(image, matched)
-        costs.append((rendered.seconds, rendered.computed))
         if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
             shown.append((image, truth))
         if save_images:
             images[i].parent.mkdir(parents=True, exist_ok=True)
             write_png(images[i], image)
     means = mean([{name: row[name] for name in metrics} for row in rows])
-    result: dict[str, Any] = {
-        "split": split,
-        "device": run.dev.name,
-        "mean": means,
-        "per_image": rows,
-    }
+    result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
     if "exposed" in run.header:
         result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
     header, cameras = run.header, [view.file_camera for view in views]
@@ -102,20 +91,3 @@ def evaluate_run(
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
-
-
-def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
-    """Each view as the run renders it, in turn."""
-    target = Target(run.dev)
-    with Progress("building kernels"):
-        run.render(views[0].camera)
-    for view in views:
-        start = time.perf_counter()
-        result = run.renderer.forward(view.camera, run.gamma)
-        image, computed = run.checked(result.clamped()), result.computed_fraction
-        seconds = time.perf_counter() - start
-        del result  # else its arrays would stay beside the larger ones of the next view
-        whole = target.crop(view, (0, 0, view.camera.width, view.camera.height))
-        truth, alpha = (array.get() for array in whole)
-        truth = view.ignoring(truth, image)
-        yield Rendered(view.name, image, truth, alpha, seconds, computed)
