@@ -216,8 +216,7 @@ def load_config(path: Path | str) -> Config:
         if not isinstance(values, dict):
             raise broken(f"{shown(section, 40)} is no section of settings")
         found |= {f"{section}.{key}": value for key, value in values.items()}
-    config = preset(name)
-    config.automatic = automatic
+    config = Config(name, automatic)
     for key, section, item in every_setting(config):
         if key not in found:
             raise broken(f"{key} is missing")
@@ -225,8 +224,8 @@ def load_config(path: Path | str) -> Config:
         if not _is_alike(value, item.default):
             raise broken(f"{key} is {quoted(value, 40)}, not like {text_of(item.default)}")
         setattr(section, item.name, _convert(value, item.default, f"{path}: {key}"))
-    for key in found:
-        raise broken(f"unknown key {shown(key, 100)}")
+    if found:
+        raise broken(f"unknown key {shown(min(found), 100)}")
     validate(config, str(path))
     if not config.scene.path:
         raise broken("scene.path is empty")
@@ -260,15 +259,12 @@ def field_of(key: str) -> dataclasses.Field:
 
 def help_lines() -> list[str]:
     """Lines `section.key = default  (help)` of all settings, with presets' values that differ."""
-    return [
-        f"  {key} = {text_of(item.default)}  ({item.metadata['help']})"
-        + "".join(
-            f"  {name}: {text_of(changes[key])}"
-            for name, changes in PRESETS.items()
-            if key in changes
-        )
-        for key, _, item in every_setting(Config())
-    ]
+    lines = []
+    for key, _, item in every_setting(Config()):
+        changed = [(name, own[key]) for name, own in PRESETS.items() if key in own]
+        others = "".join(f"  {name}: {text_of(value)}" for name, value in changed)
+        lines.append(f"  {key} = {text_of(item.default)}  ({item.metadata['help']}){others}")
+    return lines
 
 
 # ---- the settings of a training in a folder: of a new one, or of one that goes on

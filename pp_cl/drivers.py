@@ -75,13 +75,12 @@ def open_device(choice: str | None = None) -> Device:
         best = min(working)
         alike = [one for m, one in zip(matches, found, strict=True) if m == best]
         return Device(by_speed(alike)[0][1])
-    listed = "; ".join(
-        [
-            f"{i} {d.name.strip()} ({d.platform.name.strip()}) {problem or 'works'}"
-            for i, d, problem in found
-        ]
-        + [f"{driver} {problem}" for driver, problem in list_left_out()]
-    )
+    told = [
+        f"{i} {device.name.strip()} ({device.platform.name.strip()}) {problem or 'works'}"
+        for i, device, problem in found
+    ]
+    told += [f"{driver} {problem}" for driver, problem in list_left_out()]
+    listed = "; ".join(told)
     if choice and found and min(matches) == NONE:
         raise UserError(f"device {choice!r}: no such OpenCL device; found {listed}")
     asked = f"device {choice!r}: " if choice else ""
@@ -352,17 +351,17 @@ def load_drivers(
 def _listed_by_loader(drivers):
     """The platforms that the system's loader lists, at its first use of these drivers alone."""
     libraries = [library for name, library in drivers.items() if library != name]
-    names = ("OCL_ICD_VENDORS", "PYOPENCL_HOME") if any(libraries) else ()
-    before, found = {name: os.environ[name] for name in names if name in os.environ}, []
+    before, found = dict(os.environ), []
     with tempfile.TemporaryDirectory(prefix="pp-cl-drivers-") as folder:
         for i, library in enumerate(libraries):
             Path(folder, f"{i}.icd").write_text(f"{library}\n", "utf-8")
-        os.environ.update(dict.fromkeys(names, folder))
+        if any(libraries):
+            os.environ |= {"OCL_ICD_VENDORS": folder, "PYOPENCL_HOME": folder}
         with suppress(cl.Error):  # of a loader that finds none
             found = cl.get_platforms()
-    for name in names:
-        del os.environ[name]
-    os.environ.update(before)
+    for name in ("OCL_ICD_VENDORS", "PYOPENCL_HOME"):
+        os.environ.pop(name, None)
+    os.environ |= before
     return found
 
 

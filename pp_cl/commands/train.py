@@ -112,27 +112,25 @@ def _first_line(training):
     if hull is None:
         return f"resuming at step {trainer.step} with {points} points"
     spacing = spacing_pixels(trainer.model.grid, [view.camera for view in trainer.views])
-    asked = training.config.points.count
-    capped = (
-        f"\npoints: only {points} of the {asked} asked for, since a finer grid would have more than"
-        f" {CELL_CAP} cells"
-    )
-    finer = "".join(
-        f", later {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
-    )
-    return (
+    times = range(1, trainer.refinements_to_come + 1)
+    finer = "".join(f", later {spacing / 2**n:.2f}" for n in times)
+    line = (
         f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
-        f" the object ({hull.seconds:.1f} s){capped if hull.capped else ''}"
+        f" the object ({hull.seconds:.1f} s)"
     )
+    if hull.capped:
+        line += (
+            f"\npoints: only {points} of the {training.config.points.count} asked for, since a"
+            f" finer grid would have more than {CELL_CAP} cells"
+        )
+    return line
 
 
 def _images_line(training, chosen):
     """A line of text: the size of the images. chosen: whether the preset chose the downscale."""
     views = training.trainer.views
-    view = views[0]
-    stored, used = (
-        _sizes(cameras) for cameras in ([v.file_camera for v in views], [v.camera for v in views])
-    )
+    view, stored = views[0], _sizes([view.file_camera for view in views])
+    used = _sizes([view.camera for view in views])
     if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""

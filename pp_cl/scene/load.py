@@ -291,6 +291,10 @@ def _masks_in(folder, image_files, split, places):
         return {}
 
 
+def _absolute(folder, masks):
+    return {name: str(folder.absolute() / mask) for name, mask in masks.items()}
+
+
 def _are_besides(folder, image_file):
     """Whether the mask that a frame names is none of the object, by alpha or a folder of masks."""
     place, image = folder_named(folder, MASK_FOLDERS), folder / image_file.name
@@ -306,8 +310,7 @@ def _are_besides(folder, image_file):
 
 def _ignoring(folder, places, image_files, split):
     """The images, with the masks of what says nothing in one of the places in a folder."""
-    masks = _masks_in(folder, image_files, split, places)
-    files = {name: str(folder.absolute() / mask) for name, mask in masks.items()}
+    files = _absolute(folder, _masks_in(folder, image_files, split, places))
     return [
         replace(one, ignore=files[one.name], ignores_black=False) if one.name in files else one
         for one in image_files
@@ -340,9 +343,8 @@ def _tell(folder, lines):
 def measured_split(path: str) -> str:
     """The split that tells how a training goes: val, else test. Raises UserError without either."""
     present = scene_splits(path)
-    for split in ("val", "test"):
-        if split in present:
-            return split
+    if split := next((split for split in ("val", "test") if split in present), ""):
+        return split
     raise UserError(f"--eval-every: {path} has no split val or test; leave it out")
 
 
@@ -442,13 +444,12 @@ def load_scene(
         for split, some in chosen.items()
     }
     has_masks = any(v.is_masked or v.has_mask for some in views.values() for v in some)
-    for split, some in views.items():
+    for split, gone in left_out.items():
         is_whole, done = split == "train" and most is None, []
         if has_masks:
-            dev_or_none = dev if is_whole else None
-            views[split], done = _all_masked(folder, some, dev_or_none, left_out[split])
-        _check_left(views[split], left_out[split], LEAST_VIEWS if is_whole else 1)
-        lines += _lines(split, views[split], left_out[split], done)
+            views[split], done = _all_masked(folder, views[split], dev if is_whole else None, gone)
+        _check_left(views[split], gone, LEAST_VIEWS if is_whole else 1)
+        lines += _lines(split, views[split], gone, done)
     _tell(folder, lines)
     views = _reduced(views, downscale // factor) if downscale else views
     return Scene(folder.resolve().name, folder, views, lines)
@@ -461,9 +462,7 @@ def _reduced(splits, downscale):
 def _by_rule(rule, image_files, split):
     """The images, with the masks of the rule's folders, and none where its masks are no files."""
     if rule.masks:
-        own = Path(rule.masks).absolute()
-        masks = _masks_in(own, image_files, split, ["."])
-        files = {name: str(own / mask) for name, mask in masks.items()}
+        files = _absolute(Path(rule.masks), _masks_in(Path(rule.masks), image_files, split, ["."]))
         image_files = [replace(one, mask=files.get(one.name)) for one in image_files]
     elif rule.mask_from != "given":
         image_files = [replace(one, mask=None) for one in image_files]
@@ -481,13 +480,15 @@ def _read_views(folder, image_files, masks, dev, factor, left_out):
         except UserError as error:
             return error
 
+    views = []
     with ThreadPoolExecutor(reading_cost(image_files, masks, factor)[0]) as pool:
-        reads, count = pool.map(read, image_files), len(image_files)
-        found = list(track(reads, "reading images", "image", count))
-    for image_file, error in zip(image_files, found, strict=True):
-        if isinstance(error, UserError):
-            left_out.append((image_file.name, error))
-    return [view for view in found if isinstance(view, View)]
+        reads = track(pool.map(read, image_files), "reading images", "image", len(image_files))
+        for image_file, found in zip(image_files, reads, strict=True):
+            if isinstance(found, UserError):
+                left_out.append((image_file.name, found))
+            else:
+                views.append(found)
+    return views
 
 
 def _all_masked(folder, views, dev, left_out):
