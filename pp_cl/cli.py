@@ -1,7 +1,4 @@
-"""The command line: builds the parser from the commands, turns exceptions into exit statuses.
-
-Bad input is one line on stderr and exit status 2.
-"""
+"""The command line: builds the parser from the commands, turns exceptions into exit statuses."""
 
 import argparse
 import importlib

@@ -1,6 +1,4 @@
-"""Reads the settings of a run from presets, command-line texts and config.json, and checks them;
-errors name the setting.
-"""
+"""Reads and checks the settings of a run from presets, command-line texts and config.json."""
 
 import dataclasses
 import json

@@ -1,6 +1,4 @@
-"""How fast OpenCL devices are, and which one is taken: measured once, for all commands and
-environments that share the user's cache.
-"""
+"""How fast OpenCL devices are, measured once, and which one is taken."""
 
 import json
 import math

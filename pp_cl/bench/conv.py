@@ -1,7 +1,4 @@
-"""`pp-cl bench conv`: time against error of the variants of every convolution of the network.
-
-Errors are against float64 (reference/network.py), of an image of at most CHECK_SIDE pixels a side.
-"""
+"""`pp-cl bench conv`: time against error of every convolution of the network, by variant."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence

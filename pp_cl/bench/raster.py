@@ -1,9 +1,4 @@
-"""`pp-cl bench raster`: time, bytes and error of the rasteriser's stages, by number of points,
-image side and blend, on two made scenes.
-
-Times are wall clock until the stage's work is done, with both blends in turn. Errors are against
-float64, of CHECKED_POINTS points in CHECKED_SIDE x CHECKED_SIDE pixels, some hundred in a pixel.
-"""
+"""`pp-cl bench raster`: times and errors of the rasteriser's stages, with both blends in turn."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Spheres anywhere, as Pulsar has them, beside the engine's points on a grid: their projection, and
-the gradients of their positions and radii, which no training needs.
-"""
+"""Spheres anywhere, as Pulsar has them, beside the engine's points on a grid."""
 
 import math
 

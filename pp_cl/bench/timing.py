@@ -1,8 +1,4 @@
-"""Times of runs in turn, errors against float64, and the rows of what was timed as a table.
-
-Times are wall clock, launches included: every run once a round, so that a machine that slows down
-slows all of them.
-"""
+"""Wall-clock times of runs in turn, errors against float64, and rows of a table."""
 
 import time
 from collections.abc import Callable

@@ -1,8 +1,4 @@
-"""`pp-cl bench unet`: time against error of the variants of the convolutions, as a network.
-
-Errors are against float64 (reference/network.py), over the whole image, at most CHECK_SIZE wide and
-high: of a larger image its upper left part, taken as an image of its own.
-"""
+"""`pp-cl bench unet`: time against error of the variants of the convolutions, as a network."""
 
 from collections.abc import Callable, Iterator
 

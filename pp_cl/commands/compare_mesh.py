@@ -1,6 +1,4 @@
-"""How well a run's points fill the surface of a mesh, before and after training: a row of Table 4
-of the PlenopticPoints supplemental.
-"""
+"""How well a run's points fill the surface of a mesh: a row of the supplemental's Table 4."""
 
 from typing import Any
 

@@ -1,6 +1,4 @@
-"""LPIPS v0.1 with VGG16 (Zhang et al. 2018): a perceptual distance, run on the convolutions of the
-renderer.
-"""
+"""LPIPS v0.1 with VGG16 (Zhang et al. 2018), run on the convolutions of the renderer."""
 
 import math
 from collections.abc import Iterator

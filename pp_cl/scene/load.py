@@ -1,6 +1,4 @@
-"""Scenes: images of one object with cameras and masks, from a folder in any format that READERS
-knows, or made by the program.
-"""
+"""Scenes: images of one object with cameras and masks, from a folder or made by the program."""
 
 import math
 import mimetypes

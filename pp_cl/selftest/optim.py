@@ -1,6 +1,4 @@
-"""Cases of what changes parameters: Adam, RMSprop of the points, moving averages, smoothing, the
-opacities of split points.
-"""
+"""Cases of what changes parameters: Adam, RMSprop, moving averages, smoothing, splits."""
 
 from dataclasses import replace
 from functools import partial

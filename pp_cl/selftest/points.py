@@ -1,6 +1,4 @@
-"""Runs the rasteriser's stages on explicit points: what render.py does, with every intermediate at
-hand. The tests use it too.
-"""
+"""Runs the rasteriser's stages on explicit points, with every intermediate at hand."""
 
 from collections.abc import Sequence
 from dataclasses import replace

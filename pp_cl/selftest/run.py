@@ -1,6 +1,4 @@
-"""Runs the cases of the selftest one by one; their results as a table and as JSON, with what a
-report of a fault needs: device, driver and versions.
-"""
+"""Runs the cases of the selftest one by one; their results as a table and as JSON."""
 
 import os
 import platform

@@ -1,6 +1,4 @@
-"""What a new training starts from: its network, its visual hull, and the size that its points are
-to be refined to.
-"""
+"""What a new training starts from: its network, its visual hull, its refinements."""
 
 import warnings
 from pathlib import Path
