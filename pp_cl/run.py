@@ -229,9 +229,7 @@ def find_run(path: Path | str) -> RunFolder:
 
 
 def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Run:
-    """The run in a folder, finished or not. scene: the folder of its scene, if that has moved.
-    Raises UserError naming the file that is missing or broken.
-    """
+    """load() on an opened device."""
     place = find_run(folder)
     config = stored_config(place, scene)
     header, arrays = load_run_state(place, config)
@@ -243,6 +241,10 @@ def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Ru
 def load(
     folder: Path | str, device: str | Device | None = None, *, scene: str | None = None
 ) -> Run:
-    """load_run() on a device: an opened one, or as `pp-cl devices` lists them, else the default."""
-    dev = device if isinstance(device, Device) else open_device(device)
-    return load_run(dev, folder, scene=scene)
+    """The run in a folder, finished or not. device: an opened one, or as `pp-cl devices` lists
+    them, else the default. scene: the folder of its scene, if that has moved. Raises UserError
+    naming the file that is missing or broken.
+    """
+    return load_run(
+        device if isinstance(device, Device) else open_device(device), folder, scene=scene
+    )
