@@ -297,7 +297,7 @@ def run_config(
         return _resumed(folder, stored, scene, given)
     if not stored or other_preset:
         return scene_config(scene, preset_name or "tiny", given)
-    # a training that was stopped before its first checkpoint: what its images automatic is open
+    # a training that was stopped before its first checkpoint: what was automatic is open
     # again
     for key in stored.automatic:
         assign(stored, key, field_of(key).default, "preset")

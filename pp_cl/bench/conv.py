@@ -11,15 +11,7 @@ import numpy as np
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.engine.device.buffers import PackedArrays
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.choice import (
-    OFFERED,
-    VARIANTS,
-    blocking_of,
-    can_run,
-    device_class,
-    lay_out,
-    work_shape,
-)
+from pp_cl.engine.layers import choice
 from pp_cl.engine.layers.conv import (
     DIRECTIONS,
     Blocking,
@@ -108,7 +100,11 @@ class UploadedLayer:
         co, k = layer.weight.shape[0], layer.weight.shape[2]
         sources = [part.shape[2] for part in layer.parts]
         self.table = PackedArrays(dev)
-        self.variants = [v for v in OFFERED[device_class(dev)] if can_run(v, k, *sources, co)]
+        self.variants = [
+            v
+            for v in choice.OFFERED[choice.device_class(dev)]
+            if choice.can_run(v, k, *sources, co)
+        ]
 
     def runner(self, variant: str, direction: str, blocking: Blocking) -> Callable:
         """A function that computes a direction by a variant and waits for it."""
@@ -124,7 +120,12 @@ class UploadedLayer:
         self, variant: str, blocking: Blocking, direction: str, tiles: Tiles | None
     ) -> None:
         """Compute a direction by a variant, as each step of a training does."""
-        dev, parts, grad_out, kernels = self.dev, self.parts, self.grad_out, VARIANTS[variant]
+        dev, parts, grad_out, kernels = (
+            self.dev,
+            self.parts,
+            self.grad_out,
+            choice.VARIANTS[variant],
+        )
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
         tiles = tiles or all_tiles(dev, height, width)
@@ -133,11 +134,11 @@ class UploadedLayer:
             k = self.weight.shape[1]
             shape = ConvShape(direction, k, channels, co, (height, width), source)
             conv = Conv(dev, blocking, variant, shape, self.weight, self.bias)
-            if needed := work_shape(variant, shape):
+            if needed := choice.work_shape(variant, shape):
                 n = math.prod(needed)
                 shared = dev.scratch("bench: weights and parts of their gradients", n)
                 conv.work = shared[:n].reshape(needed)
-                lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
+                choice.lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
             if direction == "forward":
                 kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
             elif direction == "weights":
@@ -164,7 +165,7 @@ def bench_conv(
     dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
     """Rows of every distinct convolution of the network at size x size, by direction, variant."""
-    rng, blocking = np.random.default_rng(0), blocking_of(dev)
+    rng, blocking = np.random.default_rng(0), choice.blocking_of(dev)
     distinct: dict[tuple, Any] = {}
     for layer in convolutions(unet_layers(widths, blocks=blocks)):
         distinct.setdefault((layer.kernel_size, layer.level, layer.sources, layer.channels), layer)
