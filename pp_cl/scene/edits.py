@@ -9,7 +9,7 @@ import numpy as np
 
 from pp_cl.errors import quoted
 from pp_cl.files.atomic import told, write_json
-from pp_cl.scene.convention import AXES
+from pp_cl.scene.gaze import AXES
 from pp_cl.scene.readers.common import checked_box, fail_at, read_json
 
 EDITS = "pp_cl.json"

@@ -37,9 +37,6 @@ def usable(
             left_out.append((name(item), error))
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def find_image(folder: Path, given: str, fail: Fail, kind: str = "image") -> str:
     """Path relative to the scene's folder of the image that a file there calls `given`: as it is
     written, or what is _alike() for the tails of the path, the longest first, beside the file and

@@ -21,7 +21,6 @@ from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, quoted
 from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.progress import track
 from pp_cl.scene import demo
-from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.found import (
     IGNORE_FOLDERS,
@@ -32,6 +31,7 @@ from pp_cl.scene.found import (
     pictures_of,
     usable,
 )
+from pp_cl.scene.gaze import STATED, other_axes, read_as
 from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
 from pp_cl.scene.masks import AS_GIVEN, OPAQUE, half_transparent, is_by_colour, read_mask_of_size

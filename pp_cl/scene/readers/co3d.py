@@ -178,9 +178,6 @@ def _camera(frame, size):
     return Camera(pose, *(float(v) for v in (*focal, *centre)), *size)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def _set_list(folder):
     """{split: paths of images} of the sequence, each in one split only; None without a list.
     Version 1 calls them known and unseen; in version 2 lists of many views go before others.
