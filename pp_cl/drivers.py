@@ -18,7 +18,6 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
@@ -114,7 +113,7 @@ def list_devices(*, again: bool = False) -> list[Listed]:
         known.setdefault(tuple(name), []).append(problem)
     usable = {n: lib for n, lib in find_drivers().items() if n not in tried["left_out"]}
     found: list[Listed] = []
-    for p, (_, owner) in enumerate(load_drivers(usable)):
+    for p, owner in enumerate(load_drivers(usable)):
         for d, device in enumerate(devices_of(owner)):
             problems = known.get(identity(device))
             if not problems and not again:  # another version, or a device more
@@ -321,36 +320,30 @@ def report() -> None:
         print(f"\n{BEGINS}{json.dumps(name)}", flush=True)  # noqa: T201 - read by _probe()
         faulthandler.dump_traceback_later(SECONDS, exit=True)
 
-    rows: list[list[str | None]] = []
-    for name, owner in load_drivers(json.loads(sys.argv[1]), begin):
+    drivers: dict[str, str] = json.loads(sys.argv[1])
+    owners: dict[int, str] = {}  # {address of a platform: its driver}
+    for name, library in drivers.items():
         begin(name)
+        owners |= dict.fromkeys(_addresses(library) if library else (), name)
+    unnamed = next((name for name, library in drivers.items() if not library), "")
+    rows: list[list[str | None]] = []
+    for owner in load_drivers(drivers):
+        begin(owners.get(owner.int_ptr, unnamed))
         rows += [[*identity(device), find_problem(device)] for device in devices_of(owner)]
     print(f"\n{json.dumps(rows)}", flush=True)  # noqa: T201 - read by _probe()
     os._exit(0)  # some drivers crash when a process ends
 
 
-def load_drivers(
-    drivers: dict[str, str], begin: Callable[[str], object] = lambda name: None
-) -> list[tuple[str, cl.Platform]]:
-    """[(name of its driver, platform)] of some drivers; the system's loader is shown no others.
-    begin: called with the name of a driver before it is loaded.
-    """
-    owners: dict[int, str] = {}  # {address of a platform: its driver}
-    for name, library in drivers.items():
-        begin(name)
-        if library:  # else the loader finds it
-            owners |= dict.fromkeys(_addresses(library), name)
-    found = [] if [*drivers] == [*drivers.values()] else _listed_by_loader(drivers)
-    # Intel's runtime works without a loader: it dispatches calls, too
-    runtime = [address for address, name in owners.items() if drivers[name] == name]
-    found += [cl.Platform.from_int_ptr(address) for address in runtime]
-    unnamed = next((name for name, library in drivers.items() if not library), "")
-    return [(owners.get(platform.int_ptr, unnamed), platform) for platform in found]
-
-
-def _listed_by_loader(drivers):
-    """The platforms that the system's loader lists, at its first use of these drivers alone."""
+def load_drivers(drivers: dict[str, str]) -> list[cl.Platform]:
+    """The platforms of some drivers; the system's loader is shown no others at its first use."""
     libraries = [library for name, library in drivers.items() if library != name]
+    # Intel's runtime works without a loader: it dispatches calls, too
+    runtime = [address for name in drivers if drivers[name] == name for address in _addresses(name)]
+    found = _listed_by_loader(libraries) if libraries else []
+    return found + [cl.Platform.from_int_ptr(address) for address in runtime]
+
+
+def _listed_by_loader(libraries):
     before, found = dict(os.environ), []
     with tempfile.TemporaryDirectory(prefix="pp-cl-drivers-") as folder:
         for i, library in enumerate(libraries):
