@@ -228,16 +228,6 @@ def find_run(path: Path | str) -> RunFolder:
     return folder
 
 
-def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Run:
-    """load() on an opened device."""
-    place = find_run(folder)
-    config = stored_config(place, scene)
-    header, arrays = load_run_state(place, config)
-    net = UNet.of_settings(dev, config.network)
-    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
-    return Run(dev, place, config, header, model)
-
-
 def load(
     folder: Path | str, device: str | Device | None = None, *, scene: str | None = None
 ) -> Run:
@@ -245,6 +235,10 @@ def load(
     them, else the default. scene: the folder of its scene, if that has moved. Raises UserError
     naming the file that is missing or broken.
     """
-    return load_run(
-        device if isinstance(device, Device) else open_device(device), folder, scene=scene
-    )
+    dev = device if isinstance(device, Device) else open_device(device)
+    place = find_run(folder)
+    config = stored_config(place, scene)
+    header, arrays = load_run_state(place, config)
+    net = UNet.of_settings(dev, config.network)
+    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+    return Run(dev, place, config, header, model)

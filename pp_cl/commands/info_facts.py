@@ -16,7 +16,7 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import load_run, scene_is_there, stored_config
+from pp_cl.run import load, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.gaze import looked_at, up_of
@@ -77,7 +77,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
 
 def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
     """outline_sheet() of the points that a run has left, over renderings without its scene."""
-    run = load_run(dev, folder.path, scene=scene)
+    run = load(folder.path, dev, scene=scene)
     path = run.config.scene.path
     points = Hull(run.model.grid, run.model.cloud.ids.get(), capped=False)
     if scene_is_there(path):

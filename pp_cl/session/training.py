@@ -27,7 +27,7 @@ from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.progress import Progress
-from pp_cl.run import Run, load_run
+from pp_cl.run import Run, load
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import list_split, measured_split, open_scene
 from pp_cl.session.budget import NEVER, Budget
@@ -313,7 +313,7 @@ def train_scene(
     stored, dev = stored_state(folder, config), open_device(device)
     if not is_finished(stored, config):
         open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
-    return load_run(dev, out)
+    return load(out, dev)
 
 
 # ---- what is asked for, and what there is

@@ -14,11 +14,10 @@ from support.transforms_scenes import SIZE, write_scene
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
-from pp_cl.drivers import open_device
 from pp_cl.engine.views import MASK_THRESHOLD
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import agreeing, build_grid
 from pp_cl.scene.load import load_scene, open_scene, scene_box
@@ -282,4 +281,4 @@ def test_the_choice_is_kept_with_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir("/")
     stored = json.loads((tmp_path / "run" / "config.json").read_text())["scene"]
     assert stored["masks"] == str(tmp_path / "masks")
-    assert load_run(open_device(), tmp_path / "run").scene("train").splits["train"][3].has_mask
+    assert load(tmp_path / "run").scene("train").splits["train"][3].has_mask

@@ -20,7 +20,7 @@ from pp_cl.config import run_config
 from pp_cl.drivers import open_device
 from pp_cl.evaluate import evaluate_run
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_cl.session.training import open_training
 
 ROOT = Path(__file__).parents[3]
@@ -101,7 +101,7 @@ def undisturbed(dev, job):
     """Evaluation of the job, trained in this process."""
     folder = RunFolder(job.folder)
     open_training(dev, folder, run_config(folder, job.scene, None, job.given), None).run()
-    return evaluate_run(load_run(dev, folder.path), "test", job.metrics)
+    return evaluate_run(load(folder.path, dev), "test", job.metrics)
 
 
 @pytest.mark.unix

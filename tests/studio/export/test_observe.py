@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.models import blend_matrix
 
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_studio.export.observe import observe
 
 
@@ -32,9 +32,9 @@ def test_dropped_fragments_are_no_part_of_it(run_folder, session_device, tmp_pat
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     config["raster"]["early_stop"] = 0.3
     (tmp_path / "run" / "config.json").write_text(json.dumps(config))
-    run = load_run(session_device, tmp_path / "run")
+    run = load(tmp_path / "run", session_device)
     camera = run.cameras("test")[0]
-    whole = load_run(session_device, run_folder)
+    whole = load(run_folder, session_device)
     (seen,), (all_seen,) = (list(observe(r, [camera], "")) for r in (run, whole))
     assert 0 < blend_matrix(seen).nnz < blend_matrix(all_seen).nnz
     check(run)
