@@ -44,7 +44,10 @@ class _Parser(argparse.ArgumentParser):
     def _get_value(self, action, text):
         if text == "" and action.nargs != argparse.PARSER:
             raise argparse.ArgumentError(action, "is empty; write it, or leave it out")
-        return super()._get_value(action, text)
+        try:
+            return super()._get_value(action, text)
+        except UserError as error:  # of a type
+            raise argparse.ArgumentError(action, str(error)) from None
 
     def _check_value(self, action, value):
         if action.choices is not None and value not in action.choices:

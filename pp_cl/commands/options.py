@@ -44,7 +44,7 @@ def _read(convert, accepts, what):
                 return value
         except (ValueError, OverflowError):
             pass
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+        raise UserError(f"{quoted(text)}: write {what}")
 
     return read
 
@@ -59,12 +59,9 @@ def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
 
     def read(text):
         given = tuple(dict.fromkeys(word.strip() for word in text.split(",")))
-        for word in given:
-            if word not in known:
-                near = suggestion(word, known)
-                raise argparse.ArgumentTypeError(
-                    f"{quoted(word)}: {near}choose from {', '.join(known)}"
-                )
+        for word in (word for word in given if word not in known):
+            near = suggestion(word, known)
+            raise UserError(f"{quoted(word)}: {near}choose from {', '.join(known)}")
         return given
 
     return read
@@ -74,7 +71,7 @@ def _parts(text, separator, one, count, what):
     """So many values of another type, written as `what`."""
     parts = text.split(separator)
     if len(parts) != count:
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+        raise UserError(f"{quoted(text)}: write {what}")
     return [one(part) for part in parts]
 
 
@@ -89,7 +86,7 @@ def box(text: str) -> list[float]:
     what = "two corners, as -1,-1,-1,1,1,1"
     corners = _parts(text, ",", number(-1e6, 1e6), 6, what)
     if any(a == b for a, b in zip(corners[:3], corners[3:], strict=True)):
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+        raise UserError(f"{quoted(text)}: write {what}")
     return corners
 
 
@@ -106,19 +103,12 @@ def output_file(*suffixes: str) -> Callable[[str], str]:
     def read(text):
         path, folder = Path(text), os.path.dirname(os.path.abspath(text))
         if suffixes and path.suffix.lower() not in suffixes:
-            raise argparse.ArgumentTypeError(
-                f"{quoted(text)}: name a file that ends in {' or '.join(suffixes)}"
-            )
+            raise UserError(f"{quoted(text)}: name a file that ends in {' or '.join(suffixes)}")
         if os.path.exists(path) and not os.path.isfile(path):
-            raise argparse.ArgumentTypeError(f"{quoted(text)}: is no file; name one")
+            raise UserError(f"{quoted(text)}: is no file; name one")
         if not os.path.isdir(folder):
-            raise argparse.ArgumentTypeError(
-                f"{quoted(text)}: there is no folder {folder}; make it first"
-            )
-        try:
-            check_target(path)
-        except UserError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
+            raise UserError(f"{quoted(text)}: there is no folder {folder}; make it first")
+        check_target(path)
         return text
 
     return read
@@ -149,7 +139,7 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
             with suppress(OSError), open(text, "rb") as file:
                 is_of_command = file.read(1) not in (b"", b"{", b"[")  # it would be lost
         if is_of_command:
-            raise argparse.ArgumentTypeError(
+            raise UserError(
                 f"{quoted(text)}: no JSON may be written there; name another FILE, or write what"
                 " the command works on before --json"
             )
@@ -199,7 +189,7 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
 
     def names(text):
         if os.path.exists(text):
-            raise argparse.ArgumentTypeError(f"{quoted(text)}: write it before --metrics")
+            raise UserError(f"{quoted(text)}: write it before --metrics")
         return words(METRICS)(text)
 
     parser.add_argument(
@@ -244,5 +234,5 @@ def add_set(parser: argparse.ArgumentParser, text: str) -> None:
 def _setting(text):
     key, equals, value = text.partition("=")
     if not equals:
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write section.key=value")
+        raise UserError(f"{quoted(text)}: write section.key=value")
     return key.strip(), value.strip(), "--set"
