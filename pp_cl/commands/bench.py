@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> None:
     foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
     shared.refuse(options, foreign, f"bench {options.what} has no such option")
     if options.plot:
-        require(f"--plot {options.plot}", "matplotlib")
+        require("--plot", "matplotlib")
     given = {options.what: vars(options)}
     if options.what == "all":
         given = {name: vars(options) | changes for name, changes in SMALL.items()}
