@@ -103,8 +103,11 @@ def _sync_folder(folder):
     if not hasattr(os, "O_DIRECTORY"):
         return
     try:
-        with open(os.open(folder, os.O_DIRECTORY)) as opened:
-            os.fsync(opened.fileno())
+        descriptor = os.open(folder, os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     except OSError as error:
         if error.errno in DISK:
             raise
