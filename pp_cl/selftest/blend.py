@@ -65,7 +65,7 @@ def _forward(rule, kind, dev, rng):
 def _backward(rule, kind, dev, rng):
     for gamma, tracked in ((0.1, 0), (0.01, 3)):
         blended = Blended(dev, rng, kind=kind, gamma=gamma, max_tracked=tracked, rule=rule)
-        gradients, expected = blended.gradients(), blended.reference_gradients(tracked)
+        gradients, expected = blended.gradients(), blended.reference_gradients(max_tracked=tracked)
         yield relative(gradients["features"], expected[0], GRADIENT)
         yield relative(gradients["opacity"], expected[1], OPACITY[rule])
         unseen = ~blended.geometry["fragment"].any(axis=1)
@@ -271,7 +271,7 @@ def _distortion(dev, rng):
     for n, tracked, stop in ((257, 0, 0), (257, 0, 0.05), (257, 3, 0), (33, 0, 0), (31, 0, 0)):
         blended = Blended(dev, rng, n, rule="alpha", max_tracked=tracked, early_stop=stop)
         blended.grad[:] = 0
-        expected = blended.reference_gradients(tracked, distortion_weight=3.0)[1]
+        expected = blended.reference_gradients(max_tracked=tracked, distortion_weight=3.0)[1]
         gradients = blended.gradients(distortion_weight=3.0)
         yield relative(gradients["opacity"], expected, GRADIENT)
         yield exact(gradients["features"], np.zeros((n, 16)))

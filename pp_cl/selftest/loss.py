@@ -70,14 +70,9 @@ def _mask_loss(dev, rng):
         ignored = rng.random(mask.shape) < 0.2
         loss = Loss(dev, 0.0, mask_weight=weight)
         rendered = dev.upload(transmittance.ravel(), np.float32)
-        _, grad = loss.forward_backward(
-            dev.zeros((*size, 3)),
-            dev.zeros((side, width, 3)),
-            left,
-            top,
-            alphas=(rendered, dev.upload(np.where(ignored, -1, mask), np.float32)),
-            shortfall=shortfall,
-        )
+        images = dev.zeros((*size, 3)), dev.zeros((side, width, 3))
+        alphas = rendered, dev.upload(np.where(ignored, -1, mask), np.float32)
+        _, grad = loss.forward_backward(*images, left, top, alphas=alphas, shortfall=shortfall)
         difference = np.where(ignored, 0, 1 - transmittance[inside] - mask)
         weighted = np.where(difference < 0, shortfall, 1) * difference
         found, mean = loss.read(1).get(), (weighted * difference).mean()

@@ -90,9 +90,8 @@ class Cloud:
         seen = np.isin(np.arange(self.n), visible)
         grads = {name: np.where(seen, g.T, 0).T for name, g in grads.items()}
         grads["offset"] = grads["offset"] * (rates.offset > 0)
-        self.twin.step(
-            self.steps, grads, vars(rates) | {"sh": np.repeat(rates.sh, (1, 3, 5))}, EPSILONS
-        )
+        by_basis = vars(rates) | {"sh": np.repeat(rates.sh, (1, 3, 5))}
+        self.twin.step(self.steps, grads, by_basis, EPSILONS)
 
     def learned(self) -> dict[str, np.ndarray]:
         """float32 on the host."""
@@ -128,9 +127,8 @@ def _adam(dev, rng):
     for n in SIZES:
         grads = 1e-3 * rng.standard_normal((20, n))
         for eps in (1e-8, 1e-15):
-            twin, parameter, state = adam_steps(
-                dev, rng.standard_normal(n), grads, rate=0.01, eps=eps
-            )
+            start = rng.standard_normal(n)
+            twin, parameter, state = adam_steps(dev, start, grads, rate=0.01, eps=eps)
             # the parameter is rounded in each step, by half EPS of its size; rarely the same way
             yield relative(parameter, twin.parameter, 3e-7)
             yield each(state["m"].get(), twin.m, 8 * EPS, floor=1e-3)

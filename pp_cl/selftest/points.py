@@ -124,15 +124,9 @@ class PairedPoints:
     ) -> np.ndarray:
         """(H, W, 16) blended features. rule: of BLENDS. drops: max_tracked and early_stop."""
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
+        view = self.buffers, self.pairs, self.projected.camera_buffer
         self.weights = blend_weights(
-            self.dev,
-            self.buffers,
-            self.pairs,
-            self.projected.camera_buffer,
-            self.opacity,
-            blend=rule,
-            gamma=gamma,
-            **drops,
+            self.dev, *view, self.opacity, blend=rule, gamma=gamma, **drops
         )
         visible = self.weights.visible.get()
         rows = np.full((len(visible) + 1, 16), np.nan)  # as if there was room for one more
@@ -166,12 +160,11 @@ class PairedPoints:
         sum(features * grad_features), sum(alpha * grad_alpha) and the weighted distortion loss.
         """
         grad_features = np.reshape(grad_features, (*self.shape, 16))
+        view = self.projected, self.pairs, self.weights
         found = self.backward = blend_backward(
             self.dev,
             self.buffers,
-            self.projected,
-            self.pairs,
-            self.weights,
+            *view,
             opacity=self.opacity,
             visible_features=self.visible_features,
             features=self.features,
@@ -191,15 +184,10 @@ class PairedPoints:
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
-        gradients = self.gradients(grad_features)
+        gradients, view = self.gradients(grad_features), (self.projected, self.pairs, self.weights)
+        pair_gradient = self.backward.pair_gradient
         positions, radius = spheres_backward(
-            self.dev,
-            self.projected,
-            self.pairs,
-            self.weights,
-            self.backward.pair_gradient,
-            opacity=self.opacity,
-            gamma=self.gamma,
+            self.dev, *view, pair_gradient, opacity=self.opacity, gamma=self.gamma
         )
         return gradients | {"positions": positions.get(), "radius": radius.get()}
 
@@ -289,15 +277,6 @@ class Blended:
         """The kernels' gradients of sum(features * grad) and the weighted distortion loss."""
         return self.scene.gradients(self.grad, distortion_weight=distortion_weight)
 
-    def reference_gradients(
-        self, max_tracked: int = 0, distortion_weight: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The same in float64: (features, opacity)."""
-        return dense.gradients(
-            self.geometry,
-            self.blend,
-            self.point_features,
-            self.grad,
-            max_tracked=max_tracked,
-            distortion_weight=distortion_weight,
-        )
+    def reference_gradients(self, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The same in float64: (features, opacity). options: of dense.gradients()."""
+        return dense.gradients(self.geometry, self.blend, self.point_features, self.grad, **options)

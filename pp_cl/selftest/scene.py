@@ -35,9 +35,8 @@ def _views(rng, share):
         ((-2.0, 2, 1), (31, 33)),
         ((0.3, -0.4, 0.2), (40, 257)),
     ):
-        camera = Camera.look_at(
-            eye, (0, 0, 0), (0.3, 0.2, 1), fx=1.5 * width, width=width, height=height
-        )
+        size = {"fx": 1.5 * width, "width": width, "height": height}
+        camera = Camera.look_at(eye, (0, 0, 0), (0.3, 0.2, 1), **size)
         inside = rng.random((height, width, 1)) < share
         if width == height - 2:
             inside[[0, -1]] = inside[:, [0, -1]] = False  # the object ends within the image
@@ -61,20 +60,11 @@ def _hull(dev, rng):
     carver = Carver(dev, views)
     for nx, forgiven, carver.doubts in itertools.product(SIZES, (0, 1, 2), (0, 1)):
         voxel_size, ny, nz = 2 / nx, 7, 5
-        grid = Grid(
-            (-voxel_size * nx / 2, -voxel_size * ny / 2, -voxel_size * nz / 2 + 0.1),
-            voxel_size,
-            (nx, ny, nz),
-        )
+        origin = -voxel_size * np.array([nx, ny, nz]) / 2 + [0, 0, 0.1]
+        grid = Grid(tuple(origin), voxel_size, (nx, ny, nz))
         positions = grid.lattice()
-        expected, border = twin.in_hull(
-            views,
-            positions,
-            MASK_THRESHOLD,
-            least=carver.least,
-            forgiven=forgiven,
-            doubts=bool(carver.doubts),
-        )
+        rule = {"least": carver.least, "forgiven": forgiven, "doubts": bool(carver.doubts)}
+        expected, border = twin.in_hull(views, positions, MASK_THRESHOLD, **rule)
         found = carver.carve(grid, forgiven).ravel()
         yield exact(found[border > BORDER], expected[border > BORDER])
 
