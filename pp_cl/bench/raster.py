@@ -126,14 +126,14 @@ class PulsarScene:
         dev, opacity = self.dev, self.point_opacity
         view = result.points, result.pairs, result.weights
         with dev.stage("backward"):
-            features = {"visible_features": result.visible_features, "features": result.features}
             gradients = blend_backward(
                 dev,
                 self.buffers[blend],
                 *view,
                 opacity=opacity,
+                visible_features=result.visible_features,
+                features=result.features,
                 grad_features=self.grad,
-                **features,
             )
         with dev.stage("spheres"):
             spheres_backward(dev, *view, gradients.pair_gradient, opacity=opacity, gamma=GAMMA)
