@@ -120,12 +120,8 @@ class UploadedLayer:
         self, variant: str, blocking: Blocking, direction: str, tiles: Tiles | None
     ) -> None:
         """Compute a direction by a variant, as each step of a training does."""
-        dev, parts, grad_out, kernels = (
-            self.dev,
-            self.parts,
-            self.grad_out,
-            choice.VARIANTS[variant],
-        )
+        dev, kernels = self.dev, choice.VARIANTS[variant]
+        parts, grad_out = self.parts, self.grad_out
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
         tiles = tiles or all_tiles(dev, height, width)

@@ -117,27 +117,25 @@ def open_scene(
     )
     views = scene.splits.get("train", [])
     masked = [view for view in views if view.has_mask]
-    shares = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked]
+    shares, told = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked], []
     if masked and np.median(shares) > INVERTED:
-        warnings.warn(
-            f"{path}: most masks hold the border of their image, as if they were inverted: they"
-            " must be white on the object and black around it",
-            stacklevel=2,
+        told.append(
+            "most masks hold the border of their image, as if they were inverted: they must be"
+            " white on the object and black around it"
         )
     alphas = [shrink(view.image, view.downscale)[..., 3] for view in evenly(masked, MEASURED)]
     if masked and (soft := np.mean([half_transparent(alpha) for alpha in alphas])) > SOFT:
-        warnings.warn(
-            f"{path}: {soft:.0%} of what the masks hold is half transparent, edges not counted:"
-            " where the object is opaque, sharp masks give a sharper model",
-            stacklevel=2,
+        told.append(
+            f"{soft:.0%} of what the masks hold is half transparent, edges not counted: where the"
+            " object is opaque, sharp masks give a sharper model"
         )
     if views and not masked and most is None and config.scene.mask_from != "box":
-        warnings.warn(
-            f"{path}: no image has a mask: points fill the box that all cameras see;"
-            " --mask-from color cuts out a uniform background, --masks FOLDER takes masks,"
-            " --mask-from box says that it is meant",
-            stacklevel=2,
+        told.append(
+            "no image has a mask: points fill the box that all cameras see; --mask-from color cuts"
+            " out a uniform background, --masks FOLDER takes masks, --mask-from box says that it is"
+            " meant"
         )
+    _tell(path, told)
     return scene
 
 
