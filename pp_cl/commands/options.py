@@ -133,12 +133,12 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
     def target(text):
         if text == "-":
             return sys.stdout
-        is_of_command = text in known or os.path.isdir(text)
-        if not is_of_command:
+        is_taken = text in known or os.path.isdir(text)
+        if not is_taken:
             output_file()(text)  # it refuses pipes, that reading would wait for
             with suppress(OSError), open(text, "rb") as file:
-                is_of_command = file.read(1) not in (b"", b"{", b"[")  # it would be lost
-        if is_of_command:
+                is_taken = file.read(1) not in (b"", b"{", b"[")  # it would be lost
+        if is_taken:
             raise UserError(
                 f"{quoted(text)}: no JSON may be written there; name another FILE, or write what"
                 " the command works on before --json"
