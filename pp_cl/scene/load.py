@@ -43,9 +43,9 @@ from pp_cl.settings import Config, SceneConfig
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, splits(folder) names its splits, read_split(folder, split, left_out) gives a
-# list of ImageFile of one of them without reading pixels and adds the views that cannot be used to
-# left_out, and box(folder), which only some have, gives the box that the files state around the
+# holds such files, read_split(folder, split, left_out) gives a list of ImageFile of one of them
+# without reading pixels and adds the views that cannot be used to left_out. Only some have
+# splits(folder), the names of its splits, and box(folder), the box that the files state around the
 # object. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
@@ -162,7 +162,10 @@ def scene_format(path: str) -> str:
 
 def scene_splits(path: Path | str) -> list[str]:
     """The names of a scene's splits. Raises UserError where there is no scene."""
-    return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
+    if path == DEMO:
+        return list(demo.SPLITS)
+    reader = find_reader(path)
+    return reader.splits(Path(path)) if hasattr(reader, "splits") else SPLITS
 
 
 # Listing a split ----------------------------------------------------------------------------------
@@ -182,7 +185,7 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     if path == DEMO:
         return SplitFiles(demo.demo_frames(split), [], [])
     folder, reader = Path(path), find_reader(path)
-    present = reader.splits(folder)
+    present = scene_splits(path)
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
     left_out: LeftOut = []

@@ -32,7 +32,6 @@ from pp_cl.scene.readers.common import (
     fitted,
     hold_out,
     progress,
-    two_splits,
 )
 
 FILES = "a sparse model of COLMAP beside images"
@@ -91,9 +90,6 @@ class Image(NamedTuple):
     name: str
     camera: int
     pose: Sequence[float]
-
-
-splits = two_splits
 
 
 def recognises(folder: Path) -> bool:

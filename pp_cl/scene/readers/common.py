@@ -39,11 +39,6 @@ Item = TypeVar("Item")
 # Splits -------------------------------------------------------------------------------------------
 
 
-def two_splits(folder: Path) -> list[str]:
-    """splits() of the readers of formats that know none: test is what hold_out() takes."""
-    return SPLITS
-
-
 def hold_out(items: Sequence[Item], split: str, files: Sequence[Path] = ()) -> list[Item]:
     """The items of split train or test, which is every eighth picture. files: of the items' images,
     which are one picture where they are copies.

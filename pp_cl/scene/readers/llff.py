@@ -10,7 +10,6 @@ from pp_cl.files.image import image_size
 from pp_cl.scene.found import LeftOut, image_folder
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import fail_at, fitted, folder_images, in_order, read_npy
-from pp_cl.scene.readers.common import two_splits as splits
 from pp_cl.scene.readers.frame import rigid
 
 FILES = "poses_bounds.npy (LLFF)"
@@ -18,7 +17,6 @@ POSES = "poses_bounds.npy"
 NUMBERS = 17  # 3x4 pose, (height, width, focal length) as its fifth column; near, far
 # LLFF: down, right, backwards; OpenCV: right, down, forwards
 LLFF_FROM_CV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
-__all__ = ["FILES", "read_split", "recognises", "splits"]
 
 
 def recognises(folder: Path) -> bool:

@@ -12,14 +12,12 @@ from pp_cl.engine.camera import Camera
 from pp_cl.files.image import image_size
 from pp_cl.scene.found import LeftOut, image_folder
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz, two_splits
+from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 IMAGES = ("image", "images", "rgb")
 MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours
-
-splits = two_splits
 
 
 def recognises(folder: Path) -> bool:
