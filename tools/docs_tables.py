@@ -4,7 +4,7 @@
 
 A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end table -->` of a
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
-parsers of pp_cl/commands/), `api` (from pp_cl's docstrings), `trained` and `evaluated` (what the
+parsers of pp_cl/commands/), `api` (of the public names), `trained` and `evaluated` (what the
 commands of README.md print, of docs/results/readme.json), or that of another file
 docs/results/NAME.json (NAME may be KIND/TABLE), which holds
 
@@ -24,7 +24,7 @@ import re
 import string
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
@@ -32,9 +32,9 @@ from typing import Any, get_origin
 
 from pp_cl.commands import COMMANDS
 from pp_cl.config import text_of
-from pp_cl.presets import PRESETS
+from pp_cl.presets import PRESETS, SHORT
 from pp_cl.settings import Config, every_setting
-from tools.provenance import ROOT, digest, sentence
+from tools.provenance import ROOT, sentence
 
 # the modules whose names other packages may import: pp_studio imports no others
 PUBLIC = (
@@ -43,6 +43,7 @@ PUBLIC = (
     *(f"pp_cl.{name}" for name in ("commands", "commands.options", "commands.signals")),
     "pp_studio",
 )
+TOLD = ("pp_cl", "pp_studio")
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
 MARKER = re.compile(r"^<!-- (?:end )?table", re.MULTILINE)
 
@@ -66,18 +67,16 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
 
 
-def table(results: dict, now: str) -> str:
-    """Markdown of a file of results: what was measured, the table, and of which code it is. now:
-    the digest of the present code.
-    """
+def table(results: dict) -> str:
+    """Markdown of a file of results: what was measured, of which code, and the table."""
     what = results["measured"]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
-    lines = [f"{what[0].upper()}{what[1:]}.", "", *markdown(heads, rows)]
-    return "\n".join([*lines, "", f"*{sentence(results, now)}*"])
+    caption = f"{what[0].upper()}{what[1:]}. *{sentence(results)}*"
+    return "\n".join([caption, "", *markdown(heads, rows)])
 
 
-def readme(results: dict, now: str) -> dict[str, str]:
+def readme(results: dict) -> dict[str, str]:
     """The lines that README's commands print: {trained, evaluated}, on the first driver; the others
     beside it.
     """
@@ -91,33 +90,37 @@ def readme(results: dict, now: str) -> dict[str, str]:
     lines = ["    " + line for line in first["table"]]
     return {
         "trained": f"    {first['trained']}",
-        "evaluated": "\n".join([*lines, "", f"{about} {sentence(results, now)}"]),
+        "evaluated": "\n".join([*lines, "", f"{about} {sentence(results)}"]),
     }
 
 
 def settings() -> str:
-    """Every setting: its value in the preset tiny and in those that differ, and its help."""
-    rows = []
+    """Every setting: its value in the preset tiny and in those that differ, and its help, unless
+    an option of its own has the same.
+    """
+    lines = []
+    options = {key: f"`--{name.replace('_', '-')}`" for name, key in SHORT.items()}
     for key, _, item in every_setting(Config()):
         others = [f"{n}: {text_of(c[key])}" for n, c in PRESETS.items() if key in c]
-        value = "; ".join([text_of(item.default), *others])
-        rows.append([f"`{key}`", value, item.metadata["help"].replace("|", "\\|")])
-    return "\n".join(markdown(["setting", "value", "meaning"], rows))
+        value = "; ".join(filter(None, [text_of(item.default), *others]))
+        meaning = options.get(key, item.metadata["help"])
+        lines += [f"- `{key}`{f' ({value})' if value else ''}: {meaning}"]
+    return "\n".join(lines)
 
 
 def commands() -> str:
-    """Every command with its arguments; options of three commands or more come last."""
+    """Every command with its arguments; options of several commands come last."""
     found = {name: _command(name) for name in COMMANDS}
     users = {}
     for name, (_, arguments) in found.items():
         for argument in arguments:
             users.setdefault(argument, []).append(name)
-    common = [
-        option for option, names in users.items() if len(names) >= 3 and option[0].startswith("-")
-    ]
+    common = [one for one, names in users.items() if len(names) > 1 and one[0].startswith("-")]
     lines = []
     for name, (what, arguments) in found.items():
-        others = ", ".join(f"`{a.split()[0]}`" for a, text in arguments if (a, text) in common)
+        others = ", ".join(
+            f"`{a.split()[0].rstrip(',')}`" for a, text in arguments if (a, text) in common
+        )
         lines += [f"## pp-cl {name}", "", f"{what[0].upper()}{what[1:]}. Also: {others}.", ""]
         lines += [f"- `{a}`: {text}" for a, text in arguments if (a, text) not in common]
         lines += [""] * bool(lines[-1])
@@ -135,22 +138,24 @@ def _command(name: str) -> tuple[str, list[tuple[str, str]]]:
 
 
 def api() -> str:
-    """Every public name by module: its signature with types, and its docstring, of modules below
-    pp_cl the first sentence of it.
+    """The public names of each module: of those in TOLD with their signatures and the first
+    sentence of their docstrings, unless another module has named them before.
     """
     lines: list[str] = []
-    seen: dict[int, str] = {}  # {a class or function: the module that has named it before}
+    seen: set[int] = set()
     for name in PUBLIC:
         module = importlib.import_module(name)
+        names = public_names(module)
         lines += [f"## {name}", "", _first_sentence(module.__doc__), ""]
-        told = _first_sentence if "." in name else inspect.cleandoc
-        for one in public_names(module):
-            thing = getattr(module, one)
-            first = seen.setdefault(id(thing), name)
-            known = [f"- `{one}`: see {first}"]
-            lines += _described(one, thing, told) if first == name else known
+        if name in TOLD:
+            for one in names:
+                thing = getattr(module, one)
+                lines += _described(one, thing) if id(thing) not in seen else [f"- `{one}`: above"]
+                seen.add(id(thing))
+        else:
+            lines += [", ".join(f"`{one}`" for one in names)]
         lines += [""]
-    return "\n".join(line.rstrip() for line in lines).rstrip()
+    return "\n".join(lines).rstrip()
 
 
 def public_names(module: ModuleType) -> list[str]:
@@ -167,9 +172,7 @@ def _first_sentence(text: str | None) -> str:
     return re.split(r"(?<=\.)\s", paragraph)[0]
 
 
-def _described(
-    name: str, thing: Any, told: Callable[[str | None], str], indent: str = ""
-) -> list[str]:
+def _described(name: str, thing: Any) -> list[str]:
     """The lines of a name: a constant, a type, a function, or a class with its public methods."""
     if not (inspect.isroutine(thing) or inspect.isclass(thing)):
         if isinstance(thing, (int, str)):
@@ -177,22 +180,23 @@ def _described(
         is_type = get_origin(thing) is not None
         value = re.sub(r"(collections\.abc|typing)\.", "", str(thing)) if is_type else ""
         return [f"- `{name} = {value}`" if is_type else f"- `{name}: {type(thing).__name__}`"]
-    text = textwrap.indent(told(thing.__doc__), f"{indent}  ").strip()
-    lines = [f"{indent}- `{name}{_signature(thing)}`: {text}"]
-    if inspect.isclass(thing) and not issubclass(thing, Exception):
-        for own, member in vars(thing).items():
-            if own[0] == "_" or own in getattr(thing, "_fields", ()):
-                continue
-            if isinstance(member, (property, cached_property)):
-                function = member.fget if isinstance(member, property) else member.func
-                returned = _signature(function).partition(" -> ")[2]
-                text = textwrap.indent(told(function.__doc__), f"{indent}    ").strip()
-                lines.append(f"{indent}  - `.{own}: {returned}`: {text}")
-            elif isinstance(member, (classmethod, staticmethod)) or inspect.isfunction(member):
-                lines += _described(
-                    f".{own}", getattr(member, "__func__", member), told, f"{indent}  "
-                )
-    return lines
+    lines = [f"- `{name}{_signature(thing)}`: {_first_sentence(thing.__doc__)}"]
+    members = _members(thing) if inspect.isclass(thing) else []
+    return [*lines, "", *(f"        {one}" for one in members), ""] if members else lines
+
+
+def _members(thing: type) -> list[str]:
+    """The signatures of a class's public methods and properties, but for an error's."""
+    found = []
+    for name, member in vars(thing).items():
+        if name[0] == "_" or name in getattr(thing, "_fields", ()) or issubclass(thing, Exception):
+            continue
+        if isinstance(member, (property, cached_property)):
+            function = member.fget if isinstance(member, property) else member.func
+            found.append(f".{name}: {_signature(function).partition(' -> ')[2]}")
+        elif isinstance(member, (classmethod, staticmethod)) or inspect.isfunction(member):
+            found.append(f".{name}{_signature(getattr(member, '__func__', member))}")
+    return found
 
 
 def _signature(thing: Any) -> str:
@@ -207,7 +211,8 @@ def _signature(thing: Any) -> str:
         (node,) = inits
     node.args.args = [one for one in node.args.args if one.arg not in ("self", "cls")]
     returned = f" -> {ast.unparse(node.returns)}" if node.returns else ""
-    return re.sub(r"'([A-Z]\w+)'", r"\1", f"({ast.unparse(node.args)}){returned}")
+    text = f"({ast.unparse(node.args)}){returned}".removesuffix(" -> None")
+    return re.sub(r"'([A-Z]\w+)'", r"\1", text)
 
 
 def _written(action: argparse.Action) -> str:
@@ -232,9 +237,8 @@ def read_results(folder: Path) -> dict[str, dict]:
 def read_tables(folder: Path) -> dict[str, str]:
     """{name: Markdown} of all that can be generated; folder: of the results. Raises TableError."""
     results = read_results(folder)
-    now = digest()
-    measured = readme(results.pop("readme"), now) if "readme" in results else {}
-    measured |= {name: table(contents, now) for name, contents in results.items()}
+    measured = readme(results.pop("readme")) if "readme" in results else {}
+    measured |= {name: table(contents) for name, contents in results.items()}
     return measured | {"settings": settings(), "commands": commands(), "api": api()}
 
 

@@ -96,7 +96,6 @@ QUALITY = [
     {"head": "scene", "cell": "{name}"},
     {"head": "size", "cell": "{size}"},
     {"head": "preset, steps", "cell": "`{preset}`, {steps:,}"},
-    {"head": "test views", "cell": "{views}"},
     {"head": "minutes", "cell": "{minutes:.1f}"},
     {"head": "PSNR", "cell": "{psnr:.2f}"},
     {"head": "SSIM", "cell": "{ssim:.4f}"},
@@ -104,27 +103,16 @@ QUALITY = [
     {"head": "points", "cell": "{points:,}"},
     {"head": "ms a frame", "cell": "{frame_ms:.0f}"},
 ]
-FORWARD = ("project", "pairs", "weights", "shade", "blend")
-# by preset, the training whose last steps are timed; a paper's begins
-STEPS = {"tiny": "lego_8000", "full": "lego_15000", "paper": "lego_paper"}
+# by preset, the training whose last steps are timed
+STEPS = {"tiny": "lego_8000", "full": "lego_15000"}
 RASTERISER = [
     {"head": "scene", "cell": "{scene}"},
     {"head": "points", "cell": "{points:,}"},
     {"head": "side", "cell": "{size}"},
     {"head": "blend", "cell": "{blend}"},
-    *({"head": f"{stage}, ms", "cell": f"{{{stage}_ms:.1f}}"} for stage in FORWARD),
-    {"head": "forward", "cell": "{forward_ms:.1f}"},
-    {"head": "backward", "cell": "{backward_ms:.1f}"},
+    {"head": "forward, ms", "cell": "{forward_ms:.1f}"},
+    {"head": "backward, ms", "cell": "{backward_ms:.1f}"},
     {"head": "error", "cell": "{max_err:.1e}"},
-]
-NETWORK = [
-    {"head": "widths", "cell": "{widths}"},
-    {"head": "side", "cell": "{side}"},
-    {"head": "variant", "cell": "`{variant}`"},
-    {"head": "pass", "cell": "{direction}"},
-    {"head": "ms", "cell": "{ms:.1f}"},
-    {"head": "GFLOP/s", "cell": "{gflops:.0f}"},
-    {"head": "relative L2 error", "cell": "{rel_l2:.1e}"},
 ]
 PYTORCH = [
     {"head": "widths", "cell": "{widths}"},
@@ -138,11 +126,7 @@ PYTORCH = [
 ]
 STAGES = [
     {"head": "stage", "cell": "{stage}"},
-    *(
-        {"head": head.format(preset), "cell": f"{{{key}_{preset}:.1f}}"}
-        for preset in STEPS
-        for head, key in (("{}, ms", "ms"), ("at least", "least"))
-    ),
+    *({"head": f"{preset}, ms", "cell": f"{{ms_{preset}:.1f}}"} for preset in STEPS),
 ]
 MEMORY = [
     {"head": "training", "cell": "{name}"},
@@ -215,29 +199,13 @@ def train(training: Training, store: Path) -> dict:
 def rasteriser(store: Path) -> list[dict]:
     """Rows of RASTERISER."""
     rows = []
-    for scene, points, sizes in (
-        ("grid", "250000,4000000", "200,800"),
-        ("pulsar", "100000", "400,800"),
+    for scene, points, size in (
+        ("grid", 250000, 200),
+        ("grid", 4000000, 800),
+        ("pulsar", 100000, 800),
     ):
-        words = ["--scene", scene, "--points", points, "--size", sizes]
+        words = ["--scene", scene, "--points", points, "--size", size]
         rows += read_found(store, *PP_CL, "bench", "raster", *words)["rows"]
-    return [by_stage(row) for row in rows]
-
-
-def by_stage(row: dict) -> dict:
-    """A row of the bench with the time of each stage; `blend` alone is the rule."""
-    return row | {f"{stage}_ms": row["stages_ms"].get(stage, 0) for stage in FORWARD}
-
-
-def network(store: Path) -> list[dict]:
-    """Rows of NETWORK: the paper's network, and that of the other presets."""
-    rows = []
-    for (widths, side), blocks in zip(NETWORKS, ("double", "single"), strict=True):
-        words = ["--widths", widths, "--size", side, "--blocks", blocks]
-        found = read_found(store, *PP_CL, "bench", "unet", *words)["rows"]
-        # auto is one of the others, and which are fast depends on the device
-        found = [row for row in found if row["variant"] in ("direct", "auto")]
-        rows += [row | {"widths": widths, "side": side} for row in found]
     return rows
 
 
@@ -256,7 +224,6 @@ def pytorch(store: Path) -> list[dict]:
 def stages(store: Path) -> dict[str, dict]:
     """{preset: what tools/stages.py says}."""
     words = {name: (scene_of(LEGO), "--out", store / run) for name, run in STEPS.items()}
-    words["paper"] += ("--preset", "paper")
     return {name: read_found(store, *TOOL, "tools.stages", *w) for name, w in words.items()}
 
 
@@ -265,9 +232,7 @@ def by_preset(found: dict) -> list[dict]:
     rows = {}
     for preset, steps in found.items():
         for row in steps["stages"]:
-            cells = {f"ms_{preset}": row["ms"]}
-            cells |= {f"least_{preset}": row["least_ms"]} if "least_ms" in row else {}
-            rows[row["stage"]] = rows.get(row["stage"], {"stage": row["stage"]}) | cells
+            rows.setdefault(row["stage"], {"stage": row["stage"]})[f"ms_{preset}"] = row["ms"]
     return list(rows.values())
 
 
@@ -296,7 +261,6 @@ PARTS: dict[str, Callable[[Path], Found]] = {
     **{key_of(training): partial(train, training) for training in TRAININGS},
     "demo": demo,
     "rasteriser": rasteriser,
-    "network": network,
     "pytorch": pytorch,
     "stages": stages,
     "memory": memory,
@@ -395,27 +359,20 @@ def timed(found: dict[str, Found]) -> list[dict]:
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
     """{name: contents} of the tables of which all was found, but for origin()."""
-    quality = (
-        "means over the held-out views, 8-bit images composited on white; minutes of training alone"
-    )
+    quality = "means over the held-out views; minutes of training alone"
     blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
-    passes = (
-        "medians of interleaved runs; GFLOP/s count the multiplications of the direct convolution"
-    )
     rows = found | {"trainings": trained(found)}
     steps = ""
     if "stages" in found:
         rows["stages"] = by_preset(found["stages"])
         steps = "; ".join(
-            f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['copy_gbs']:.1f} GB/s,"
-            f" {run['gflops']:.0f} GFLOP/s"
+            f"{preset}: {run['points']:,} points, {run['size']} pixels"
             for preset, run in found["stages"].items()
         )
     parts = {
         "trainings": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
-        "network": (passes, NETWORK),
-        "pytorch": ("ours and PyTorch's, medians of interleaved runs", PYTORCH),
+        "pytorch": ("ours, PyTorch's, theirs over ours; medians of interleaved runs", PYTORCH),
         "stages": (f"medians of a step on lego ({steps})", STAGES),
         "memory": ("the most memory that a few steps take", MEMORY),
         "demo": ("runs of the demo", DEMO),
@@ -476,13 +433,6 @@ def plot_speed(axes: "Axes", timed: list[dict]) -> None:
     axes.minorticks_off()
 
 
-def videos(store: Path, folder: Path) -> None:
-    """Videos around the demo and around a real object, for README.md."""
-    for name, run in (("demo", "demo_1500"), ("video", "ethiopian_head_6000")):
-        look = ("--size", "320x320", "--seconds", 5, "--fps", 12, "--out", folder / f"{name}.webp")
-        run_program(*PP_CL, "render", store / run, *look)
-
-
 def main() -> int:
     """Measure what is missing, write the documents; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
@@ -507,7 +457,6 @@ def main() -> int:
             write_json(folder / f"{name}.json", about | contents)
     if is_whole and not options.kind:
         draw(trained(found), timed(found), ROOT / "docs")
-        videos(store, ROOT / "docs")
     return 0
 
 

@@ -7,16 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from tools import docs_tables
+
 ROOT = Path(__file__).parents[2]
 # underscores that are public all the same
 OF_TUPLES, OTHERS = ("_replace", "_asdict", "_fields"), ("self", "cls", "os")
-
-
-def listed(page):
-    """{module: names} of the sections and entries of docs/api.md."""
-    sections = re.split(r"(?m)^## (pp_\S+)$", page)[1:]
-    pairs = zip(sections[::2], sections[1::2], strict=True)
-    return {module: set(re.findall(r"(?m)^- `(\w+)", text)) for module, text in pairs}
 
 
 def faults(source, public):
@@ -38,7 +33,10 @@ def faults(source, public):
     return found
 
 
-PUBLIC = listed((ROOT / "docs" / "api.md").read_text("utf-8"))
+PUBLIC = {
+    name: set(docs_tables.public_names(importlib.import_module(name)))
+    for name in docs_tables.PUBLIC
+}
 
 
 @pytest.mark.parametrize(

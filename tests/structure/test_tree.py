@@ -109,8 +109,8 @@ def packed(folder, tmp_path):
 def test_the_source_archive_lacks_what_is_not_free(tmp_path):
     """Images of others' scenes under CC BY-NC-SA; their pages say so."""
     found = packed(ROOT, tmp_path)
-    assert {"docs/demo.png", "cl/common.h", "pp_cl/engine/step.py"} <= found
-    assert not {"docs/video.webp", "docs/orbits.png", "docs/make.png"} & found
+    assert {"docs/capture.png", "cl/common.h", "pp_cl/engine/step.py"} <= found
+    assert not {"docs/orbits.png", "docs/make.png"} & found
 
 
 def test_docker_gets_all_that_is_installed(tmp_path):
