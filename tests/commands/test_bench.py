@@ -72,5 +72,5 @@ def test_a_step_on_a_small_scene(tmp_path, capsys):
 
 
 def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert "pip install matplotlib" in failure("bench", "--plot", tmp_path / "b.png")

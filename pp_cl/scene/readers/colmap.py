@@ -296,8 +296,8 @@ def _text_image(line):
 
 
 def _text_point(line):
-    _, *point = map(float, line.split(maxsplit=7)[:7])
-    return point
+    _, x, y, z, red, green, blue = map(float, line.split(maxsplit=7)[:7])
+    return x, y, z, red, green, blue
 
 
 # Binary -------------------------------------------------------------------------------------------
