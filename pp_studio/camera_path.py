@@ -1,6 +1,4 @@
-"""Camera paths: around an object (orbit, spiral), made from the cameras of its images, and
-through given cameras.
-"""
+"""Camera paths: around an object, by the cameras of its images, and through given cameras."""
 
 import math
 from collections.abc import Sequence
@@ -20,61 +18,44 @@ NEIGHBOURS = 4  # of a camera, in whose directions another lies between()
 SAMPLED_POINTS = 20_000
 
 
-class Surroundings:
-    """Where cameras were around an object.
+def around(
+    path: str, cameras: Sequence[Camera], points: np.ndarray, camera: Camera, frames: int
+) -> list[Camera]:
+    """So many cameras with the size and angle of view of `camera` that look at the middle of an
+    object from one distance: that of its images, or farther where it would be cut off.
 
-    cameras: those of the images. points: (N, 3), world positions of the object's points.
+    path: orbit, a circle at the images' median elevation that begins where the first was taken, the
+    last frame one step before the first; spiral, two turns from the lowest tenth of the elevations
+    to the highest. cameras: those of the images. points: (N, 3), the object's, in the world.
     """
-
-    def __init__(self, cameras: Sequence[Camera], points: np.ndarray):
-        self.up = up_of(cameras)
-        self.centre = (points.min(axis=0) + points.max(axis=0)) / 2
-        step = max(1, len(points) // SAMPLED_POINTS)
-        self._points = points[::step] - self.centre
-        offsets = np.array([camera.eye - self.centre for camera in cameras])
-        self.distance = float(np.median(np.linalg.norm(offsets, axis=1)))
-        heights = offsets @ self.up / np.linalg.norm(offsets, axis=1)
-        self.elevations = np.clip(np.arcsin(np.clip(heights, -1, 1)), -HIGHEST, HIGHEST)
-        self._ahead = level(offsets[0], self.up)
-        self._aside = np.cross(self.up, self._ahead)
-
-    def orbit(self, camera: Camera, frames: int) -> list[Camera]:
-        """A circle at the images' median elevation that begins where the first of them was
-        taken; the last frame is one step before the first. camera: size and angle of view.
-        """
-        angles = 2 * math.pi * np.arange(frames) / frames
-        return self._around(camera, angles, np.full(frames, np.median(self.elevations)))
-
-    def spiral(self, camera: Camera, frames: int) -> list[Camera]:
-        """Two turns from the lowest tenth of the images' elevations to the highest."""
-        low, high = np.quantile(self.elevations, [0.1, 0.9])
-        angles = TURNS * 2 * math.pi * np.arange(frames) / frames
-        return self._around(camera, angles, np.linspace(low, high, frames))
-
-    def _around(self, camera, angles, elevations):
-        """Cameras at these angles that look at the centre, from one distance: that of the
-        images, or farther where the object would be cut off.
-        """
-        offsets = [
-            math.cos(e) * (math.cos(a) * self._ahead + math.sin(a) * self._aside)
-            + math.sin(e) * self.up
-            for a, e in zip(angles, elevations, strict=True)
-        ]
-        size = {"fx": camera.fx, "width": camera.width, "height": camera.height}
-        poses = [Camera.look_at(offset, (0, 0, 0), self.up, **size).pose for offset in offsets]
-        distance = max(self.distance, *(self._least_distance(camera, pose) for pose in poses))
-        centred = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
-        return [
-            replace(centred, pose=np.column_stack([pose[:, :3], self.centre + distance * offset]))
-            for pose, offset in zip(poses, offsets, strict=True)
-        ]
-
-    def _least_distance(self, camera, pose):
-        """From which all points are in the image of a camera of this direction."""
-        x, y, z = (self._points @ pose[:, :3]).T
+    up, centre = up_of(cameras), (points.min(axis=0) + points.max(axis=0)) / 2
+    points = points[:: max(1, len(points) // SAMPLED_POINTS)] - centre
+    offsets = np.array([one.eye - centre for one in cameras])
+    distances = np.linalg.norm(offsets, axis=1)
+    elevations = np.arcsin(np.clip(offsets @ up / distances, -1, 1)).clip(-HIGHEST, HIGHEST)
+    ahead = level(offsets[0], up)
+    aside = np.cross(up, ahead)
+    angles, low = 2 * math.pi * np.arange(frames) / frames, np.median(elevations)
+    high = low
+    if path == "spiral":
+        angles, (low, high) = TURNS * angles, np.quantile(elevations, [0.1, 0.9])
+    towards = [
+        math.cos(e) * (math.cos(a) * ahead + math.sin(a) * aside) + math.sin(e) * up
+        for a, e in zip(angles, np.linspace(low, high, frames), strict=True)
+    ]
+    centred = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
+    size = {"width": camera.width, "height": camera.height}
+    poses = [Camera.look_at(offset, (0, 0, 0), up, fx=camera.fx, **size).pose for offset in towards]
+    distance = float(np.median(distances))
+    for pose in poses:  # from which all points are in the image
+        x, y, z = (points @ pose[:, :3]).T
         across = np.abs(x) * 2 * camera.fx / (MARGIN * camera.width) - z
         down = np.abs(y) * 2 * camera.fy / (MARGIN * camera.height) - z
-        return float(max(across.max(), down.max()))
+        distance = max(distance, float(across.max()), float(down.max()))
+    return [
+        replace(centred, pose=np.column_stack([pose[:, :3], centre + distance * offset]))
+        for pose, offset in zip(poses, towards, strict=True)
+    ]
 
 
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,13 +47,8 @@ def render_large(
         on_part()
         shift = [(place + 0.5) / n - 0.5 for place in (column, row)]
         part = run.render(small.shifted(*shift), **options)
-        for field in fields(part):
-            values = getattr(part, field.name)
+        for name, values in vars(part).items():
             if values is not None:
-                whole = (n * height, n * width, *values.shape[2:])
-                woven.setdefault(field.name, np.empty(whole, values.dtype))[row::n, column::n] = (
-                    values
-                )
-    return RenderedView(
-        **{name: array[: camera.height, : camera.width] for name, array in woven.items()}
-    )
+                whole = np.empty((n * height, n * width, *values.shape[2:]), values.dtype)
+                woven.setdefault(name, whole)[row::n, column::n] = values
+    return RenderedView(**{k: v[: camera.height, : camera.width] for k, v in woven.items()})

@@ -1,6 +1,4 @@
-"""Videos from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF and WebP with
-Pillow.
-"""
+"""Videos from frames: MP4 and WebM with the ffmpeg of imageio's wheel, GIF and WebP with Pillow."""
 
 from collections.abc import Iterable
 from itertools import chain, pairwise
@@ -9,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, require
 from pp_cl.files import atomic_path
 
 LOOPED = ("gif", "webp")  # as pages show without a player
@@ -20,35 +18,27 @@ CONVERTED = "scale=out_color_matrix=bt709:out_range=tv"
 TAGGED = "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 COLOURS = ["-vf", f"{CONVERTED},{TAGGED}"]
 AT_ONCE = ["-movflags", "+faststart"]  # the index comes first: browsers play it as it arrives
-MISSING = (
-    "videos need imageio and imageio-ffmpeg; install them with `pip install imageio imageio-ffmpeg`"
-)
 
 
 def check_video(suffix: str) -> None:
-    """Raise UserError with the command that mends it where a video of this format cannot be
-    made.
-    """
+    """Raise UserError with what mends it where a video of this format cannot be made."""
     if suffix in LOOPED:
         return
-    try:
-        import imageio.v2  # noqa: F401
-        import imageio_ffmpeg
+    require("a video, unlike --format webp or frames,", "imageio", "imageio-ffmpeg")
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-        imageio_ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError):
-        raise UserError(f"{MISSING}, or write --format webp, or png for frames") from None
+    try:
+        get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise UserError(f"imageio-ffmpeg: {error}; write --format webp or png") from None
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Write a video of uint8 frames of one size, (H, W, 3), or (H, W, 4) with straight alpha, which
-    WebM keeps; atomically. An odd side is extended by a copy of its last row or column, as video
-    needs even ones.
-
-    path: its suffix, one of FORMATS, chooses the format. Raises UserError naming the file when it
-    cannot be written.
+    WebM keeps, in the format of the path's suffix, one of FORMATS. An odd side is extended by its
+    last row or column. Raises UserError naming the file when it cannot be written.
     """
-    frames = (_even(frame) for frame in frames)
+    frames = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), "edge") for f in frames)
     looped = path.suffix.lower()[1:] in LOOPED
     with atomic_path(path) as temporary:
         (_write_looped if looped else _write)(temporary, frames, fps)
@@ -70,7 +60,18 @@ def _write(path, frames, fps):
     from imageio_ffmpeg import count_frames_and_secs
 
     first, written = next(frames), 0
-    with imageio.get_writer(str(path), **_options(path.suffix.lower()[1:], first, fps)) as writer:
+    if path.suffix.lower() == ".mp4":
+        options = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
+        options["output_params"] = [*COLOURS, *AT_ONCE]
+    else:
+        pixels = "yuva420p" if first.shape[2] == 4 else "yuv420p"
+        options = {"codec": "libvpx-vp9", "quality": None, "pixelformat": pixels}
+        quality = ["-crf", "24", "-b:v", "0", "-auto-alt-ref", "0"]
+        options["output_params"] = [*quality, *COLOURS]
+    # of a full disk ffmpeg says four lines
+    options |= {"fps": fps, "macro_block_size": 1, "ffmpeg_log_level": "quiet"}
+    options["input_params"] = ["-threads", "2"]
+    with imageio.get_writer(str(path), **options) as writer:
         for frame in chain([first], frames):
             writer.append_data(frame)
             written += 1
@@ -80,31 +81,3 @@ def _write(path, frames, fps):
         there = 0
     if there != written:
         raise OSError(f"{there} of its {written} frames were kept")
-
-
-def _options(suffix, frame, fps):
-    """Of imageio's writer."""
-    alpha = frame.shape[2] == 4
-    options = {
-        "fps": fps,
-        "macro_block_size": 1,
-        "ffmpeg_log_level": "quiet",  # of a full disk it says four lines
-        "input_params": ["-threads", "2"],
-    }
-    if suffix == "mp4":
-        coded = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
-        return options | coded | {"output_params": [*COLOURS, *AT_ONCE]}
-    pixels = "yuva420p" if alpha else "yuv420p"
-    quality = ["-crf", "24", "-b:v", "0", "-auto-alt-ref", "0", *COLOURS]
-    return options | {
-        "codec": "libvpx-vp9",
-        "quality": None,
-        "pixelformat": pixels,
-        "output_params": quality,
-    }
-
-
-def _even(frame):
-    """The frame with even sides."""
-    height, width = frame.shape[:2]
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")

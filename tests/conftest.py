@@ -44,7 +44,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_collection_modifyitems(items):
-    """Leave out what needs Unix where this is none."""
     for item in items if not hasattr(os, "fork") else ():
         if item.get_closest_marker("unix"):
             item.add_marker(pytest.mark.skip(reason="needs Unix"))
@@ -125,7 +124,6 @@ def no_stray_writes(session_device):
 
 @pytest.fixture
 def dev(session_device):
-    """The guarded device."""
     return session_device
 
 
@@ -144,7 +142,6 @@ def cpu_form(dev, monkeypatch):
 
 @pytest.fixture
 def rng():
-    """A seeded numpy generator."""
     return np.random.default_rng(7)
 
 

@@ -1,5 +1,3 @@
-"""Checkpoints by the clock: when they are written, and that nothing else changes."""
-
 import time
 from types import SimpleNamespace
 

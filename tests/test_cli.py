@@ -1,7 +1,3 @@
-"""The command line as a user meets it: what it prints, its exit status, and one line for whatever
-is wrong.
-"""
-
 import json
 import signal
 import subprocess
@@ -59,11 +55,6 @@ def test_a_kernel_that_does_not_build_is_one_line_below_the_log(scene, tmp_path,
     assert line.startswith(
         "pp-cl: cl/a.cl does not build on a device with -DA=1; update the driver"
     )
-
-
-def test_what_was_typed_breaks_no_line(tmp_path):
-    line = failure("eval", f"{tmp_path}/a\nb\x1b[31m")
-    assert f"{tmp_path}/a b?[31m/config.json" in line
 
 
 SIGINT = "signal.raise_signal(signal.SIGINT)"

@@ -1,5 +1,3 @@
-"""Settings: presets, text conversion, JSON round trip, and one-line errors that name the key."""
-
 import json
 
 import pytest
@@ -62,13 +60,9 @@ def test_assign_converts_text(key, text, value):
     "key, text, message",
     [
         ("train.iteration", "5", "unknown key"),
-        ("trains.iterations", "5", "unknown key"),
-        ("preset", "x", "unknown key"),
         ("train.iterations", "many", "whole number"),
         ("train.iterations", "1.5", "whole number"),
-        ("train.iterations", "inf", "whole number"),
         ("network.widths", "8,16", "3 values"),
-        ("network.widths", 8, "3 values"),
         ("train.pixel_jitter", "perhaps", "true or false"),
         ("raster.radius", "nan", "finite number"),
         ("network.rate", "0.1,x", "finite number"),
@@ -82,7 +76,6 @@ def test_assign_refuses(key, text, message):
 
 
 def refusal(path):
-    """The one line by which the settings are refused."""
     with pytest.raises(UserError) as caught:
         load_config(path)
     line = str(caught.value)
@@ -98,7 +91,6 @@ TEXTS = {
     "nothing in it": b"{}",
     "a list for the preset": b'{"format": 1, "preset": ["tiny"]}',
     "an unknown preset": b'{"format": 1, "preset": "huge"}',
-    "no more than a preset": b'{"format": 1, "preset": "tiny"}',
     "a number for a section": b'{"format": 1, "preset": "tiny", "train": 3}',
     "out of line": b'{"format": 1, "preset": "tiny", "a\\nb\\u001b[31m": {}}',
 }
@@ -111,7 +103,6 @@ def test_a_broken_config_file_is_one_line(tmp_path, text):
 
 
 def stored_settings():
-    """What a run of the demo stores."""
     config = preset("tiny")
     config.scene.path = "demo"
     return json.loads(config.to_json())
@@ -120,7 +111,6 @@ def stored_settings():
 VALUES = {
     "format": [5, 0, True, "1", None],
     "train.iterations": [True, "60", 60.5, 10**400, None, 0],
-    "train.crop": [130],
     "train.ema": [1, "true"],
     "train.smooth_l1": [float("nan"), float("inf")],
     "raster.radius": [False, [1.0]],
@@ -162,16 +152,7 @@ def test_a_section_and_each_of_its_keys_must_be_there(tmp_path, section):
     assert f"{section}." in refusal(path)
 
 
-def test_names_of_files_that_are_no_text_survive(tmp_path):
-    """A system may give bytes that are no UTF-8."""
-    stored, path = stored_settings(), tmp_path / "config.json"
-    stored["scene"]["path"] = "/data/\udce4\udcff"
-    path.write_text(json.dumps(stored))
-    assert load_config(path).scene.path == "/data/\udce4\udcff"
-
-
 def test_help_covers_every_setting():
-    """With its default as --set takes it."""
     text, count = "\n".join(help_lines()), 0
     for section, values in json.loads(Config().to_json()).items():
         if isinstance(values, dict):

@@ -1,7 +1,3 @@
-"""A training whose numbers are no longer finite: one line, the last good checkpoint, and NaN
-nowhere.
-"""
-
 import json
 
 import numpy as np
@@ -41,7 +37,6 @@ def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
 
 
 def _poison(monkeypatch, after, what):
-    """NaN in an array after so many steps."""
     update, steps = Optimiser.update, []
 
     def poisoned(self, *args, **named):

@@ -1,5 +1,3 @@
-"""Scenes far from the world's origin train, render and are exported as those at the origin."""
-
 import json
 
 import numpy as np
@@ -53,7 +51,6 @@ def far(tmp_path_factory):
 
 
 def test_exact_moves_give_the_same_bits(at_origin, far):
-    """Of a grid that is refined, too."""
     header, arrays, psnr, _ = far
     expected, expected_arrays, expected_psnr, _ = at_origin
     assert psnr == expected_psnr

@@ -82,7 +82,6 @@ class Bench:
         self._seen = set()  # states from which the next start came to the right end
 
     def calls(self, begin, words):
-        """The calls of a command that nothing disturbs."""
         restore(self.run, begin)
         with Faults(self.run) as faults:
             assert run_command(words) == (0, [])
@@ -90,7 +89,6 @@ class Bench:
         return faults.calls
 
     def left(self, name, *, may_leave=False):
-        """What is wrong with what a disturbed command has left, and with the next start."""
         _, words, expected = self.commands[name]
         left = leftovers(self.run)
         wrong = half_written(self.run) + ([] if may_leave else left)
@@ -104,14 +102,12 @@ class Bench:
 
 
 def restore(run, begin):
-    """Make the run a copy of a template, or nothing at all."""
     shutil.rmtree(run, ignore_errors=True)
     if begin:
         shutil.copytree(begin, run)
 
 
 def numbers(calls, beginning):
-    """The numbers, from 1 on, of calls that begin so."""
     return [n for n, call in enumerate(calls, 1) if call.startswith(beginning)]
 
 
@@ -171,35 +167,3 @@ def test_a_process_that_is_killed(bench, name, part):
         restore(bench.run, begin)
     wrong += bench.left(name, may_leave=True)
     assert wrong == [] and killed
-
-
-@pytest.mark.parametrize("name", ["training that goes on", "evaluation"])
-def test_images_that_are_gone(bench, name):
-    begin, words, _ = bench.commands[name]
-    restore(bench.run, begin)
-    before, scene = content(bench.run), bench.run.parent / "scene"
-    scene.rename(scene.with_name("gone"))
-    try:
-        assert run_command(words, scene) == (2, [])
-    finally:
-        scene.with_name("gone").rename(scene)
-    assert differences(bench.run, before) == [] and bench.left(name) == []
-
-
-def test_what_is_wrong_is_found(bench, tmp_path):
-    """Half a file, another one, one too many."""
-    run, (begin, _, expected) = tmp_path / "run", bench.commands["evaluation"]
-    restore(run, begin)
-    assert half_written(run) == [] and "eval/metrics.json is missing" in differences(run, expected)
-    log = (run / "log.jsonl").read_bytes()
-    (run / "log.jsonl").write_bytes(log[:-9])  # its last row may be half there
-    assert half_written(run) == [] and "log.jsonl differs" in differences(run, expected)
-    (run / "log.jsonl").write_bytes(log[9:])
-    cut = ["checkpoint.npz", "config.json", "previews/step_000030.png"]
-    for name in cut:
-        (run / name).write_bytes((run / name).read_bytes()[:60])
-    (run / "odd").touch()
-    (run / ".a.7.tmp").touch()
-    found = sorted(line.partition(":")[0] for line in half_written(run))
-    assert found == sorted([*cut, "log.jsonl", "odd"]) and leftovers(run) == ["left .a.7.tmp"]
-    assert "odd is new" in differences(run, expected)

@@ -1,5 +1,3 @@
-"""`pp-cl info`: what a run or a scene is, and the image of its points."""
-
 import json
 import math
 import shutil
@@ -15,7 +13,6 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.files.image import read_rgba
-from pp_cl.files.sheets import GAP, HEADER
 from pp_cl.scene.outline import OUTLINE
 
 BALL = 0.8  # its radius, support.scenes
@@ -23,15 +20,12 @@ BALL = 0.8  # its radius, support.scenes
 
 @pytest.fixture(scope="module")
 def finished(finished):
-    """Folder of a finished and evaluated run."""
     assert main(["eval", str(finished), "--metrics", "psnr"]) == 0
     return finished
 
 
 @pytest.fixture
 def facts(capsys):
-    """Reads the facts that `pp-cl info ... --json` prints."""
-
     def read(*words):
         capsys.readouterr()
         assert main(["info", *map(str, words), "--json"]) == 0
@@ -77,7 +71,6 @@ def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, 
 
 
 def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts):
-    """info tells what it knows; eval asks for --scene."""
     run, old, new = tmp_path / "run", tmp_path / "ball", tmp_path / "sphere"
     shutil.copytree(scene, old)
     assert main(arguments(str(old), run, train__iterations=6)) == 0
@@ -140,41 +133,6 @@ def test_a_scene_without_hull_has_an_image(tmp_path, facts, capsys):
     assert found["masks"]["with_alpha"] == 0 and found["masks"]["object"] is None
     assert found["hull"]["points"] > 0, "they fill a box"
     assert read_rgba(tmp_path / "sheet.png").shape[1] >= 4 * 48
-
-
-def outlined(path, tile):
-    """(48, 48) bool: where a cell of a sheet has the outline's colour."""
-    row, column = divmod(tile, 4)
-    y, x = HEADER + row * (48 + HEADER + GAP), column * (48 + GAP)
-    return (read_rgba(path)[y : y + 48, x : x + 48, :3] == OUTLINE).all(-1)
-
-
-def test_the_image_draws_the_points_around_the_object(scene, tmp_path, capsys):
-    path, subject = tmp_path / "points.png", tmp_path / "run"
-    assert main(arguments(scene, subject, train__iterations=2, train__prune_weight=0)) == 0
-    assert main(["info", str(subject), "--picture", str(path)]) == 0
-    assert f"wrote {path}" in capsys.readouterr().out
-    radius = BALL / math.sqrt(16 - BALL**2) * 24 / math.tan(0.35)  # of the ball, in pixels
-    for tile in range(8):
-        y, x = np.nonzero(outlined(path, tile)) - np.array([[23.5], [23.5]])
-        off = np.hypot(x, y) - radius
-        assert off.max() < 5  # the masks' margins, and a point's width
-        directions = np.arctan2(y, x)[np.abs(off) < 5] / (2 * np.pi) * 24
-        assert set(np.floor(directions)) == set(range(-12, 12))
-
-
-def test_a_broken_evaluation_is_one_line(finished, tmp_path):
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
-    file = run / "eval" / "metrics.json"
-    whole = json.loads(file.read_text())
-    means = 3, {"psnr": "high"}, {"psnr": float("nan")}, {"psnr": 10**400}
-    for text in ("[]", "{", "[" * 100_000, *(json.dumps(whole | {"mean": m}) for m in means)):
-        file.write_text(text)
-        assert "metrics.json: " in failure("info", run)
-    file.unlink()
-    file.mkdir()
-    assert "metrics.json: " in failure("info", run)
 
 
 def test_small_units_have_their_digits(tmp_path, capsys):

@@ -1,5 +1,3 @@
-"""The notebook in docs/ runs from its first cell to its last."""
-
 import ast
 import json
 from pathlib import Path

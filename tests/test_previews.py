@@ -1,5 +1,3 @@
-"""Previews and measured views: what a run shows of itself on the way does not change it."""
-
 from pathlib import Path
 
 from support.refused import failure
@@ -20,7 +18,6 @@ def test_the_split_val_is_measured_where_there_is_one(tmp_path):
 
 
 def test_previews_and_measured_views_leave_the_run_as_it_is(tmp_path, monkeypatch):
-    """Many in places of their own, one of them by the clock, against none but the last."""
     scene = write_ball_scene(tmp_path / "ball")
     none, many = tmp_path / "none", tmp_path / "many"
     for out, previews, first, more in ((none, 1, 1e9, []), (many, 7, 0, ["--eval-every", "12"])):

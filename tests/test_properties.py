@@ -1,5 +1,3 @@
-"""Properties of what reads and writes texts, for whatever texts and numbers there are."""
-
 import json
 import math
 
@@ -10,11 +8,10 @@ from hypothesis.extra import numpy as arrays
 from support.checkpoints import load_checkpoint
 
 from pp_cl.checkpoint import FORMAT, save_checkpoint
-from pp_cl.config import assign, load_config, preset, text_of
+from pp_cl.config import assign, load_config, preset
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
-from pp_cl.scene.readers.frame import rigid
 from pp_cl.settings import Config, every_setting
 
 json_values = st.recursive(
@@ -59,15 +56,6 @@ def given_settings(draw):
 
 
 @given(given_settings())
-def test_a_setting_is_itself_again_from_its_text(pair):
-    key, value = pair
-    section, _, name = key.partition(".")
-    config = preset("tiny")
-    assign(config, key, text_of(value), "a test")
-    assert getattr(getattr(config, section), name) == value
-
-
-@given(given_settings())
 def test_settings_are_themselves_again_from_their_file(tmp_path, pair):
     config = preset("tiny")
     config.scene.path = "demo"
@@ -109,20 +97,3 @@ def test_a_checkpoint_comes_back(tmp_path, stored):
     assert header == {"format": FORMAT, "step": 1} and found.keys() == stored.keys()
     for name, array in stored.items():
         assert found[name].dtype == array.dtype and np.array_equal(found[name], array)
-
-
-@given(arrays.arrays(np.float64, (3, 4), elements=st.floats(-2, 2)))
-def test_what_is_taken_for_a_pose_is_rigid(matrix):
-    """Near to what was given, for random matrices and for rotations that are off by little."""
-    u, _, vt = np.linalg.svd(matrix[:, :3])
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    near = np.column_stack([turn + 1e-5 * matrix[:, :3], matrix[:, 3]])
-    for given_matrix in (matrix, near):
-        try:
-            pose = rigid(given_matrix, UserError)
-        except UserError:
-            assert given_matrix is matrix
-            continue
-        assert np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(pose[:, :3]) > 0
-        assert np.abs(pose - given_matrix).max() < 1e-3

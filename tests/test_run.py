@@ -1,11 +1,8 @@
-"""pp-cl from Python: the same runs, without text."""
-
 import json
 import os
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +78,6 @@ def test_the_package_and_its_help_need_no_opencl():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=root, stdout=subprocess.DEVNULL)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def test_a_folder_has_one_training_at_a_time(scene, tmp_path):
     out = tmp_path / "run"
     with RunFolder(out).owned():
@@ -94,22 +88,7 @@ def test_a_folder_has_one_training_at_a_time(scene, tmp_path):
     assert not (out / ".pp-cl.owner").exists()
 
 
-def test_a_killed_owner_owns_nothing_any_more(scene, tmp_path):
-    out = tmp_path / "run"
-    words = [sys.executable, "-m", "pp_cl", *arguments(scene, out, train__iterations=5000)]
-    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
-        while process.poll() is None and not (out / "log.jsonl").exists():
-            time.sleep(0.05)
-        second = subprocess.run(words, capture_output=True, text=True, check=False)
-        assert second.returncode == 2 and f"process {process.pid} on " in second.stderr
-        assert process.poll() is None, "the second start ended the first"
-        process.kill()
-    with RunFolder(out).owned():
-        assert (out / ".pp-cl.owner").read_text().startswith(f"process {os.getpid()} ")
-
-
 def test_a_folder_that_went_on_since_it_was_looked_at(scene, tmp_path, monkeypatch):
-    """Two trainings look at an empty folder; the slower one finds what the other has left."""
     out, folder = tmp_path / "run", RunFolder(tmp_path / "run")
     config = run_config(folder, scene, None, [("scene.downscale", 2, "test")])
     for key, value in (SETTINGS | {"train.iterations": 3}).items():

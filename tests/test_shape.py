@@ -1,5 +1,3 @@
-"""A run's points against the surface of its object: a row of Table 4."""
-
 import json
 
 import numpy as np
@@ -35,13 +33,11 @@ def trained(runs, scene, tmp_path_factory):
 
 
 def train(scene, out, **changes):
-    """A run of 20 steps."""
     assert main(arguments(scene, out, 1, train__iterations=20, **changes)) == 0
     return out
 
 
 def test_a_run_before_and_after(dev, scene, mesh, trained):
-    """Before training the points fill the hull, which holds the ball; training drops some."""
     facts = run_shape(dev, RunFolder(trained), mesh, 40_000)
     hull = build_grid(dev, load_scene(scene).splits["train"], 1000)
     surface = sample_surface(dev, mesh, hull.grid, 40_000)
@@ -70,9 +66,6 @@ def test_another_scene_is_noticed(dev, mesh, trained, tmp_path):
     other = write_ball_scene(tmp_path / "other", views=5, size=40)
     with pytest.raises(UserError, match="not the one that the run began with"):
         run_shape(dev, RunFolder(trained), mesh, 100, scene=str(other))
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_the_command_prints_and_writes_the_row(mesh, trained, tmp_path, capsys):

@@ -14,7 +14,7 @@ from pp_cl.engine.grid import Grid
 from pp_cl.errors import UserError
 from pp_cl.run import Run, load
 from pp_cl.scene.demo import demo_mesh, distances
-from pp_studio.export.fusion import HIDDEN, box_around, fuse
+from pp_studio.export.mesh import HIDDEN, box_around, fuse
 
 SAMPLES = 60_000  # of a surface
 EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances are asked for

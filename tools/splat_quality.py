@@ -28,7 +28,7 @@ VIEWS = 5
 def row(run: Run, steps: int, cell: float) -> dict:
     """The measurements of a splat."""
     before = sum(os.times()[:2])
-    cloud, _ = fit_gaussians(run, steps, cell)
+    cloud = fit_gaussians(run, steps, cell)
     seconds = (sum(os.times()[:2]) - before) / (os.cpu_count() or 1)
     model = Model(run.dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(run.dev))
     renderer, target = Renderer(run.dev, model, config_of(run, steps).raster), Target(run.dev)

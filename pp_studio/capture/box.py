@@ -47,8 +47,12 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     ahead = level(eyes[0] - centre, up)
     rotation = np.stack([ahead, np.cross(up, ahead), up])  # the first camera to the side of x
     upright = (points - centre) @ rotation.T / reach
-    on_object = _on_object(upright, _seen_share(cameras, points))
-    ball = min(_seen_radius(camera, centre) for camera in cameras) / reach
+    seen = np.mean([camera.pixels(points)[2] for camera in cameras], axis=0)
+    on_object = _on_object(upright, seen)
+    angles = [np.arctan(min(one.width / one.fx, one.height / one.fy) / 2) for one in cameras]
+    away = [np.linalg.norm(eye - centre) for eye in eyes]
+    # of the ball around the centre that all cameras see as a whole
+    ball = min(far * np.sin(angle) for far, angle in zip(away, angles, strict=True)) / reach
     low, high = np.outer([-ball, ball], np.ones(3))
     if len(on_object) >= LEAST_POINTS:
         ends = np.quantile(on_object, [CUT, 1 - CUT], axis=0)
@@ -64,21 +68,8 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     return World(scale, rotation, shift, np.stack([low - middle, high - middle]) / size)
 
 
-def _seen_radius(camera, centre):
-    """Radius of the ball around the centre that the camera sees as a whole."""
-    angle = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
-    return np.linalg.norm(camera.eye - centre) * np.sin(angle)
-
-
-def _seen_share(cameras, points):
-    """(N,) share of the cameras whose image has room for each point."""
-    return np.mean([camera.pixels(points)[2] for camera in cameras], axis=0)
-
-
 def _on_object(points, seen):
-    """(M, 3) of the points: those that nearly all cameras see and that are not alone, without the
-    table that they stand on. points: (N, 3), z up, the cameras at a distance of 1 from the origin.
-    """
+    """(M, 3) of the points that nearly all cameras see and that are not alone, without a table."""
     near = np.linalg.norm(points, axis=1) < 1
     if not near.any():
         return points[near]
@@ -104,14 +95,13 @@ def _table(points):
             continue
         middle = first[inside.argmax()] + THICK
         on, above = np.abs(height - middle) <= THICK, height > middle + THICK
-        if above.any() and (_spread(points[on]) > LEAST_SPREAD * _spread(points[above])).all():
+        if not above.any():
+            continue
+        # widths in x and y, but for some at the ends
+        ends = [np.quantile(points[some, :2], [0.05, 0.95], axis=0) for some in (on, above)]
+        if (np.ptp(ends[0], axis=0) > LEAST_SPREAD * np.ptp(ends[1], axis=0)).all():
             best, found = inside.max(), np.append(normal, middle)
     return found
-
-
-def _spread(points):
-    """(2,) width of points in x and y, but for some at the ends."""
-    return np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0)
 
 
 def corners_of(box: np.ndarray) -> np.ndarray:

@@ -1,22 +1,32 @@
 """Cuts an object out of photographs with known cameras: GrabCut by view, with colours that all
 views share, from the sparse points, then by what stands out from the background, then by a vote of
 the views with a forgiving hull.
+
+What stands out: a photograph against what others show of the wall behind the object, which they see
+beside it; or at the same pixels, where the object turns before a wall that stands still. Parts and
+gaps too thin for a cut by colour are found in this way.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 
-from pp_cl import track
-from pp_cl.engine import Grid, smallest_voxel_size
+from pp_cl import Camera, track
+from pp_cl.engine import Grid, evenly, smallest_voxel_size
 from pp_cl.errors import UserError
-from pp_studio.capture import backdrop
+from pp_cl.scene import ImageFile
 from pp_studio.capture.box import corners_of
 from pp_studio.capture.packages import needed
-from pp_studio.capture.window import CUT_SIDE, Window, dilated, disc
 
 cv2 = needed("cv2")
 
+CUT_SIDE = 400  # pixels of what is cut: the projected box and what is around it
+AROUND = 0.2  # of the projected box, on each side: shows what the background looks like
 # Of the box's diagonal: points lower in it may be on what the object stands on, or on what lies
 # around it. The object's own lowest are at 0.05, as box.MARGIN is below them.
 FOOT = 0.08
@@ -38,6 +48,106 @@ TOUCHING, GROWTH, GROWTHS = 0.03, 0.05, 4
 MOSTLY_SEEN = 0.5  # of the windows
 SOFT = 1.0  # pixels of the cut image over which a border is refined
 FLAT = 1e-3  # variance of colours, of 1, below which a border follows no edge
+# Of what stands out
+NEAREST = 10  # photographs that one is compared with
+STEP = 8  # pixels between places whose depth is interpolated
+MARGIN = 0.1  # of a window's size: sparse points so far outside it still tell depths in it
+LEAST, MOST = 50, 800  # sparse points behind a window: needed, and looked at
+AMONG = 6  # points whose median depth each has, since some are wrong
+HIDING = 2  # pixels around a mask that may show the object
+UNSEEN = 255  # as a difference: no other photograph shows the background
+# Of an object that turns
+COMPARED = 64  # photographs that one is compared with
+ALIKE, SLIGHT = 2.0, 3.0  # times what is usual, and levels: differences of the same still wall
+LEAST_ALIKE = 5  # photographs that show the same
+SHOWN = 0.15, 0.4, 0.9  # few, some and nearly all of them
+BLUR = 2.0  # levels over which differences are counted
+RARE = 1e-3  # share of the pixels that are spread over all levels
+
+
+@dataclass(eq=False)
+class Window:
+    """The part of a photograph around the projected box, reduced for cutting.
+
+    image: (H, W, 3) uint8. camera: of it. place: (x0, y0, x1, y1) in the photograph. mask: (H, W)
+    bool, None until it is known.
+    """
+
+    name: str
+    image: np.ndarray
+    camera: Camera
+    place: tuple[int, int, int, int]
+    mask: Any = None
+
+    def pixels(self, positions: np.ndarray) -> np.ndarray:
+        """(N, 2) x and y of world positions (N, 3); NaN behind the camera."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y, depth = self.camera.project(positions)
+        return np.where(depth > 0, [x, y], np.nan).T
+
+    def reduced(self, image: np.ndarray) -> np.ndarray:
+        """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
+        x0, y0, x1, y1 = self.place
+        size = self.camera.width, self.camera.height
+        return cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
+
+    def inside(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """((M,) indices of the positions that lie in the image, their rows, their columns)."""
+        column, row, is_shown = self.camera.pixels(positions)
+        return np.flatnonzero(is_shown), row[is_shown], column[is_shown]
+
+    def marked(self, positions: np.ndarray) -> np.ndarray:
+        """(H, W) bool: the pixels that show world positions (N, 3)."""
+        _, rows, columns = self.inside(positions)
+        shown = np.zeros(self.image.shape[:2], bool)
+        shown[rows, columns] = True
+        return shown
+
+
+def place_of(image_file: ImageFile, box: np.ndarray) -> tuple[int, int, int, int] | None:
+    """(x0, y0, x1, y1) around the box (2, 3) in a photograph; None where it is outside."""
+    camera = image_file.camera
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y, depth = camera.project(corners_of(box))
+    if depth.min() <= 0:  # the box is around the camera
+        x, y = np.array([0, camera.width]), np.array([0, camera.height])
+    if x.max() < 1 or y.max() < 1 or x.min() > camera.width - 1 or y.min() > camera.height - 1:
+        return None
+    (x0, x1), (y0, y1) = _grown(x, camera.width), _grown(y, camera.height)
+    return x0, y0, x1, y1
+
+
+def window(image: np.ndarray, image_file: ImageFile, box: np.ndarray) -> Window:
+    """The Window of a photograph, (H, W, 3) uint8. Raises UserError where the box is outside."""
+    place = place_of(image_file, box)
+    if place is None:
+        raise UserError(f"{image_file.name}: the object's box is outside; give another with --box")
+    x0, y0, x1, y1 = place
+    scale = min(1, CUT_SIDE / max(x1 - x0, y1 - y0))
+    width, height = (max(2, round(scale * n)) for n in (x1 - x0, y1 - y0))
+    sx, sy = width / (x1 - x0), height / (y1 - y0)
+    camera = image_file.camera.crop(x0, y0, width, height)
+    camera = replace(
+        camera, fx=sx * camera.fx, fy=sy * camera.fy, cx=sx * camera.cx, cy=sy * camera.cy
+    )
+    found = Window(image_file.name, image, camera, place)
+    return replace(found, image=found.reduced(image))
+
+
+def _grown(places, size):
+    """(first, last + 1) pixel of the places, grown by AROUND, within an image's side."""
+    margin = AROUND * np.ptp(places)
+    return max(0, int(places.min() - margin)), min(size, int(places.max() + margin) + 1)
+
+
+def dilated(marked: np.ndarray, radius: int) -> np.ndarray:
+    """(H, W) bool: the marked pixels and those no further than a radius from one."""
+    return cv2.dilate(marked.astype(np.uint8), disc(radius)) > 0
+
+
+def disc(radius: int) -> np.ndarray:
+    """A filled circle for OpenCV's morphology."""
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
 def cut_out_all(
@@ -48,18 +158,16 @@ def cut_out_all(
     seen: Sequence[np.ndarray],
     turns: bool,
 ) -> None:
-    """Set the masks of the windows that have none. Raises UserError for a box in which nothing
-    stands.
-
-    box, points, seen, turns: as write_masks() takes them. inside: (N,) bool, the object's points.
+    """Set the masks of the windows that have none. box, points, seen, turns: of write_masks().
+    inside: (N,) bool, the object's points. Raises UserError for a box in which nothing stands.
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    seeds = {i: _seeds(windows[i], box, points, inside, seen[i]) for i in left}
     labels = [
-        seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
+        _seeds(one, box, points, inside, some) if one.mask is None else one.mask.astype(np.uint8)
+        for one, some in zip(windows, seen, strict=True)
     ]
-
+    seeds = list(labels)
     if not any((label & 1).any() for label in labels):  # the lowest bit: it is the object's
         raise UserError(
             "no point lies in the object's box above what it stands on; give another with --box"
@@ -68,7 +176,10 @@ def cut_out_all(
     def cut(number):
         colours, text = _colours(windows, labels), f"cutting out, {number} of {2 + ROUNDS}"
         for i in track(left, text, "image"):
-            windows[i].mask = _grab_cut(windows[i], labels[i], colours)
+            label, (background, front) = labels[i].copy(), (some.copy() for some in colours)
+            how = cv2.GC_EVAL_FREEZE_MODEL  # the colours are not changed
+            cv2.grabCut(windows[i].image, label, None, background, front, 1, how)
+            windows[i].mask = label & 1 == 1
 
     cut(1)
     around = [some == cv2.GC_BGD for some in labels]
@@ -76,16 +187,20 @@ def cut_out_all(
     def beside():
         return [some & ~one.mask for some, one in zip(around, windows, strict=True)]
 
-    differences = backdrop.differences(windows, points[~inside], beside() if turns else None)
+    found = differences(windows, points[~inside], beside() if turns else None)
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
             for i in left:
                 labels[i] = _relabelled(windows[i], seeds[i], *hull)
         surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
-        standing_out = backdrop.evidence(differences, beside(), surely)
-        for i in left:
-            labels[i] = _marked(labels[i], standing_out[i])
+        standing_out = evidence(found, beside(), surely)
+        for i in left:  # what stands out, or does not, is no longer open
+            label, wall = labels[i].copy(), standing_out[i] < IS_WALL
+            crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
+            label[(standing_out[i] > STANDS_OUT) & (label != cv2.GC_BGD)] = cv2.GC_FGD
+            label[wall & crowded & (label != cv2.GC_FGD)] = cv2.GC_BGD
+            labels[i] = label
         cut(2 + number)
     for i in left:
         windows[i].mask = without_islands(windows[i].mask)
@@ -123,9 +238,7 @@ def without_islands(mask: np.ndarray) -> np.ndarray:
 
 
 def _seeds(one, box, points, inside, seen):
-    """(H, W) uint8 of GrabCut's labels: points of the object that the photograph shows, those of
-    the background, what is outside the box; what is close to the object's points is probable.
-    """
+    """(H, W) uint8 of GrabCut's labels, by the box and the sparse points in a photograph."""
     labels = np.full(one.image.shape[:2], cv2.GC_BGD, np.uint8)
     outline = one.pixels(corners_of(box))
     if np.isnan(outline).any():
@@ -135,19 +248,13 @@ def _seeds(one, box, points, inside, seen):
         cv2.fillConvexPoly(labels, outline, cv2.GC_PR_BGD)
     radius = max(1, round(SEED * CUT_SIDE))
     foot = box[0, 2] + FOOT * np.linalg.norm(box[1] - box[0])
-    near = _dots(one, points[inside & (points[:, 2] > foot)], radius)
+    near = dilated(one.marked(points[inside & (points[:, 2] > foot)]), radius)
     near = _closed(near, round(NEAR * CUT_SIDE))
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
-    shown_inside = inside[seen]
-    sure = seen[shown_inside & (points[seen, 2] > foot)]
-    labels[_dots(one, points[seen[~shown_inside]], radius)] = cv2.GC_BGD
-    labels[_dots(one, points[sure], radius)] = cv2.GC_FGD
+    sure = seen[inside[seen] & (points[seen, 2] > foot)]
+    labels[dilated(one.marked(points[seen[~inside[seen]]]), radius)] = cv2.GC_BGD
+    labels[dilated(one.marked(points[sure]), radius)] = cv2.GC_FGD
     return labels
-
-
-def _dots(one, positions, radius):
-    """(H, W) bool: discs around the pixels that show world positions (N, 3)."""
-    return dilated(one.marked(positions), radius)
 
 
 def _eroded(marked, radius):
@@ -161,12 +268,8 @@ def _closed(marked, radius):
     return closed[radius:-radius, radius:-radius] > 0
 
 
-def _colours(
-    windows: Sequence[Window], labels: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """(the background's, the object's) colours, (1, 65) float64 each: GrabCut's mixture of five
-    normal distributions, fitted to SAMPLES^2 pixels of all windows.
-    """
+def _colours(windows, labels):
+    """(the background's, the object's) mixture of GrabCut, (1, 65) each, of all windows' pixels."""
     rng, drawn = np.random.default_rng(0), []
     each = -(-(SAMPLES**2) // len(windows))
     for wanted in (0, 1):  # the lowest bit of a label
@@ -180,14 +283,6 @@ def _colours(
     cv2.setRNGSeed(0)
     cv2.grabCut(image, sure, None, background, front, FITTED, cv2.GC_INIT_WITH_MASK)
     return background, front
-
-
-def _grab_cut(one, labels, colours):
-    """(H, W) bool: the object, by colours that are not changed."""
-    labels, (background, front) = labels.copy(), (some.copy() for some in colours)
-    how = cv2.GC_EVAL_FREEZE_MODEL
-    cv2.grabCut(one.image, labels, None, background, front, 1, how)
-    return labels & 1 == 1
 
 
 def forgiving_hull(
@@ -216,9 +311,7 @@ def forgiving_hull(
 
 
 def _relabelled(one, seeds, hull, rejections, voxel_size):
-    """(H, W) uint8 of GrabCut's labels of a window from what all views agree on: what is well
-    outside the hull is background, what is well within what no other view rejects is the object.
-    """
+    """(H, W) uint8 of GrabCut's labels, by the hull, and by what no other view of it rejects."""
     gap = gap_of(one, hull, voxel_size)
     found, rows, columns = one.inside(hull)
     agreed = found[rejections[found] == ~one.mask[rows, columns]]
@@ -240,16 +333,6 @@ def gap_of(one: Window, hull: np.ndarray, voxel_size: float) -> int:
 def silhouette(one: Window, hull: np.ndarray, gap: int) -> np.ndarray:
     """(H, W) bool: where a window shows vertices of a hull (N, 3), so many pixels apart."""
     return _closed(one.marked(hull), gap)
-
-
-def _marked(labels, standing_out):
-    """The labels, where what stands out from the background, or does not, is no longer open."""
-    labels = labels.copy()
-    labels[(standing_out > STANDS_OUT) & (labels != cv2.GC_BGD)] = cv2.GC_FGD
-    wall = standing_out < IS_WALL
-    crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
-    labels[wall & crowded & (labels != cv2.GC_FGD)] = cv2.GC_BGD
-    return labels
 
 
 def whole_mask(one: Window, image: np.ndarray) -> np.ndarray:
@@ -275,3 +358,130 @@ def whole_mask(one: Window, image: np.ndarray) -> np.ndarray:
     mask = np.zeros(image.shape[:2], np.uint8)
     mask[y0:y1, x0:x1] = np.clip(255 * refined + 0.5, 0, 255)
     return mask
+
+
+def differences(
+    windows: Sequence[Window],
+    background: np.ndarray,
+    beside: Sequence[np.ndarray] | None = None,
+) -> list[np.ndarray]:
+    """For each window (H, W) uint8, by how many levels its most different channel differs from what
+    others show of the background there; or UNSEEN.
+
+    background: (N, 3) sparse points around the object. beside: where the object turns before a
+    background that stands still, and that others show at the same pixels: (H, W) bool each, what
+    surely shows it.
+    """
+    eyes = np.stack([one.camera.eye for one in windows])
+    found = []
+    for i, one in enumerate(track(windows, "backgrounds", "image")):
+        order = np.argsort(np.linalg.norm(eyes - one.camera.eye, axis=1), kind="stable")
+        others = [windows[k] for k in order[1:]]
+        if beside is not None:
+            found.append(_difference_of_still(one, evenly(others, COMPARED), beside[i]))
+        else:
+            found.append(_difference(one, others[:NEAREST], background))
+    return found
+
+
+def _difference(one, others, background):
+    """From what the others show at the same places, beside their masks: the median."""
+    places = _places_behind(one, background)
+    if places is None:
+        return np.full(one.mask.shape, UNSEEN, np.uint8)
+    found = []
+    for other in others:
+        at = other.pixels(places.reshape(-1, 3)).reshape(*places.shape[:2], 2)
+        at = np.nan_to_num(at.astype(np.float32) - 0.5, nan=-1e6)
+        at = cv2.resize(at, one.mask.shape[::-1])
+        found.append(_levels(one, other, at, ~dilated(other.mask, HIDING)))
+    return _smallest(found, [0.5])[0]
+
+
+def _difference_of_still(one, others, beside):
+    """From those that show the same wall: what some do not exceed, whatever their masks say."""
+    found, off = [], []
+    for other in others:
+        at = []  # x and y of this one's pixels at the same places of the other's photograph
+        for axis in (0, 1):
+            (begin, end), (first, last) = one.place[axis::2], other.place[axis::2]
+            size, there = one.image.shape[1 - axis], other.image.shape[1 - axis]
+            places = begin + (np.arange(size) + 0.5) * (end - begin) / size
+            at.append((places - first) * there / (last - first) - 0.5)
+        same = np.stack(np.meshgrid(*at), axis=-1).astype(np.float32)
+        levels = _levels(one, other, same, np.ones(other.mask.shape, bool))
+        seen = beside & (levels < UNSEEN)
+        found.append(levels)
+        off.append(np.median(levels[seen]) if seen.any() else UNSEEN)
+    least = np.sort(off)[:LEAST_ALIKE].mean()
+    alike = min(max(SLIGHT, ALIKE * least), UNSEEN - 1)
+    found = [levels for levels, by in zip(found, off, strict=True) if by <= alike]
+    if len(found) < LEAST_ALIKE:
+        return np.full(beside.shape, UNSEEN, np.uint8)
+    few, some, nearly_all = _smallest(found, SHOWN)
+    usual, most = (ALIKE * np.median(one[beside]) + SLIGHT for one in (some, nearly_all))
+    # few show the wall that is mostly hidden; nearly all, a part of the object without a pattern
+    rarely, always = (few <= usual) & (some > usual), nearly_all <= most
+    some[rarely | (always & ~beside)] = UNSEEN
+    return some
+
+
+def _levels(one, other, at, usable):
+    """(H, W) uint8 differences from usable pixels of another window at (H, W, 2), else UNSEEN."""
+    usable = cv2.remap(255 * usable.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=0)
+    behind = cv2.remap(other.image, at, None, cv2.INTER_LINEAR)
+    levels = np.maximum.reduce(cv2.split(cv2.absdiff(one.image, behind)))
+    return np.where(usable == 255, np.minimum(levels, UNSEEN - 1), np.uint8(UNSEEN))
+
+
+def _smallest(found, shares):
+    """(H, W) uint8 each: the difference that a share of those that are seen do not exceed."""
+    found = np.sort(np.stack(found, axis=-1), axis=-1)
+    seen = (found < UNSEEN).sum(-1, keepdims=True)
+    places = (np.maximum(np.ceil(share * seen).astype(int) - 1, 0) for share in shares)
+    return [np.take_along_axis(found, at, axis=-1)[..., 0] for at in places]
+
+
+def _places_behind(one, background):
+    """(rows, columns, 3) positions between the background's points, None where these are few."""
+    camera = one.camera
+    size = np.array([camera.width, camera.height])
+    depth = (background - camera.eye) @ camera.pose[:, 2]
+    pixels = one.pixels(background)
+    near = (depth > 0) & (abs(pixels / size - 0.5) < 0.5 + MARGIN).all(1)
+    if near.sum() < LEAST:
+        return None
+    pixels, inverse = pixels[near], 1 / depth[near]
+    corners = size * (np.indices((2, 2)).reshape(2, 4).T * (1 + 2 * MARGIN) - MARGIN)
+    known = np.random.default_rng(0).permutation(pixels)[:MOST]
+    known = np.concatenate([known, corners])
+    nearest = cKDTree(pixels).query(known, AMONG)[1]
+    between = LinearNDInterpolator(known, np.median(inverse[nearest], axis=1))
+    columns, rows = -(-size // STEP)
+    x, y = np.meshgrid(
+        (np.arange(columns) + 0.5) * camera.width / columns,
+        (np.arange(rows) + 0.5) * camera.height / rows,
+    )
+    ahead = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)
+    along = np.stack(ahead, axis=-1) @ camera.pose[:, :3].T
+    return camera.eye + along / between(x, y)[..., None]
+
+
+def evidence(
+    found: Sequence[np.ndarray], beside: Sequence[np.ndarray], surely: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """For each window (H, W) float32: how much likelier its differences are on the object than
+    beside it, as a logarithm; 0 where they are UNSEEN.
+
+    beside, surely: (H, W) bool each, what shows the background and the object for sure.
+    What cannot be predicted says nothing: its differences are the same on both.
+    """
+    counts = np.zeros((2, UNSEEN + 1))
+    for difference, *sides in zip(found, beside, surely, strict=True):
+        for count, side in zip(counts, sides, strict=True):
+            count += np.bincount(difference[side], minlength=UNSEEN + 1)
+    shares = gaussian_filter1d(counts[:, :UNSEEN], BLUR, axis=1) + 1
+    shares /= shares.sum(1, keepdims=True)
+    off, on = np.log((1 - RARE) * shares + RARE / UNSEEN)
+    odds = np.append(on - off, 0.0).astype(np.float32)
+    return [odds[difference] for difference in found]

@@ -1,5 +1,6 @@
 """Features of the images by OpenCV and their matches by NumPy, both many times faster than those of
-pycolmap on a CPU; it checks them, and keeps them in its database.
+pycolmap on a CPU, which checks and keeps them; without those of what is behind an object that turns
+before a camera that stays, which would hide how the object moves.
 """
 
 import os
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.sparse import coo_matrix
 
 from pp_cl import Progress, track
 from pp_cl.errors import UserError, shown
@@ -32,6 +34,13 @@ BEST = 10  # others that one is compared with, whose large features are most ali
 LARGE = 256  # features that tell these: the largest, as they are found in most images
 MOVED = 0.01  # of the longer side: what stands still, as behind a turntable, tells nothing
 LEAST_ALIKE = 4  # large features
+# Of what stands still
+SAMPLED = 30  # matches of a pair
+LEAST_MATCHES = 15  # of a pair, of which at least a half stand still
+LEAST_PAIRS = 0.4  # of all pairs with so many matches, of photographs of an object that turns
+STILL = 0.006  # of the longer side: what stands still moves no further, once images are aligned
+ROUNDS, WIDEST, NARROWER = 30, 0.05, 0.7  # of the alignment: matches that it believes
+HELD = 0.001  # how strongly images without such matches are kept in place
 
 
 @contextmanager
@@ -53,8 +62,7 @@ def quiet(work: Path) -> Iterator[Any]:
 def find_features(
     database: Path, images: Path, taken: Sequence[dict[str, Any]], masks: Path | None = None
 ) -> dict[str, int]:
-    """Add the features of each image to the database, where they are not there yet, the largest
-    first.
+    """Add the features of each image to the database, the largest first, where they are not there.
 
     taken: what take_images() says of the images; those of equal lens and size have one camera.
     masks: NAME.png of each image, black where no features are wanted. Returns {name: features}.
@@ -92,9 +100,7 @@ def _camera(one):
 
 
 def _features(file, masks):
-    """((N, 4) float32 x, y, scale and angle of an image's features, COLMAP's first pixel being
-    centred at 0.5, (N, 128) uint8 descriptors), the largest first.
-    """
+    """((N, 4) float32 x, y, scale, angle, (N, 128) uint8 descriptors), the largest first."""
     cv2 = needed("cv2")
     with Image.open(file) as image:
         size = np.array(image.size)
@@ -114,7 +120,7 @@ def _features(file, masks):
     best = np.argsort(-keypoints[:, 2], kind="stable")[:FEATURES]
     keypoints, descriptors = keypoints[best], descriptors[best]
     larger = size / reduced
-    keypoints[:, :2] = (keypoints[:, :2] + 0.5) * larger
+    keypoints[:, :2] = (keypoints[:, :2] + 0.5) * larger  # COLMAP's first pixel is centred at 0.5
     keypoints[:, 2] *= larger.mean()
     # the root of what they share, by which a few strong gradients count less (Arandjelovic 2012)
     shares = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
@@ -134,9 +140,8 @@ def match(database: Path) -> int:
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         images = sorted(db.read_all_images(), key=lambda image: image.name)
         ids = [image.image_id for image in images]
-        sizes = {camera.camera_id: camera for camera in db.read_all_cameras()}
-        longer = [max(sizes[one.camera_id].width, sizes[one.camera_id].height) for one in images]
-        places = [db.read_keypoints(i)[:, :2] / size for i, size in zip(ids, longer, strict=True)]
+        lenses = {lens.camera_id: max(lens.width, lens.height) for lens in db.read_all_cameras()}
+        places = [db.read_keypoints(i.image_id)[:, :2] / lenses[i.camera_id] for i in images]
         descriptors = [np.array(db.read_descriptors(i).data) for i in ids]
         pairs = pairs_of(places, descriptors)
         left = [(i, j) for i, j in pairs if not db.exists_two_view_geometry(ids[i], ids[j])]
@@ -178,8 +183,9 @@ def matches_of(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _best(products):
-    """((...) places of the largest of the last axis of descriptors' products (..., K), (...) bool
-    whether it is close, and clearly the best). The products, whole numbers below 2^24, are exact.
+    """((...) places of the largest of products (..., K), (...) whether it is close and the best).
+
+    Products of descriptors, whole numbers below 2^24, are exact.
     """
     best = products.argmax(-1)[..., None]
     largest = np.take_along_axis(products, best, -1)
@@ -209,8 +215,7 @@ def forget_focal_lengths(database: Path) -> bool:
                 colmap.Camera.create_from_model_name(one.camera_id, LENS, factor * max(size), *size)
             )
         if told:
-            db.clear_two_view_geometries()
-            colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
+            _verify_anew(colmap, database, db)
     return bool(told)
 
 
@@ -219,6 +224,12 @@ def verification(colmap: Any) -> Any:
     options = colmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     return options
+
+
+def _verify_anew(colmap, database, db):
+    db.clear_two_view_geometries()
+    with Progress("checking pairs of images"):
+        colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
 
 
 def pairs_of(
@@ -247,9 +258,7 @@ def pairs_of(
 
 
 def _alikeness(places, descriptors):
-    """(V, V) how many of their LARGE features images have in common that are not at the same place;
-    0 where these are few.
-    """
+    """(V, V) how many of their LARGE features images share at different places; 0 for few."""
     count = len(places)
     large = np.zeros((count, LARGE, 128), np.float32)  # what is missing is like nothing
     at = np.zeros((count, LARGE, 2), np.float32)
@@ -266,3 +275,74 @@ def _alikeness(places, descriptors):
         alike[i, i + 1 :] = (mutual & moved).sum(1)
     alike[alike < LEAST_ALIKE] = 0
     return alike + alike.T
+
+
+def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
+    """Where most pairs of images share what stands still, remove its matches from the database,
+    check the pairs anew, and return True.
+
+    Images are aligned by shifts, turns and scales, so that the camera may be moved a little.
+    begun: a file that says so before anything is removed; where it exists, this was stopped, and
+    goes on. is_turntable: the object is known to turn.
+    """
+    is_turntable = is_turntable or begun.exists()
+    with quiet(database) as colmap, colmap.Database.open(database) as db:
+        images = db.read_all_images()
+        sizes = {i.camera_id: np.array([i.width, i.height]) for i in db.read_all_cameras()}
+        index = {image.image_id: k for k, image in enumerate(images)}
+        places = []  # complex numbers, 0 in the image's middle, the longer side being 1
+        for image in images:
+            pixels, size = db.read_keypoints(image.image_id)[:, :2], sizes[image.camera_id]
+            places.append((pixels.astype(float) - size / 2) @ [1, 1j] / max(size))
+        pairs = []
+        for number, matches in zip(*db.read_all_matches(), strict=True):
+            ids = colmap.pair_id_to_image_pair(number)
+            if len(matches):
+                pairs.append((ids, index[ids[0]], index[ids[1]], np.array(matches)))
+        if not pairs:
+            return False
+        scales, shifts = _aligned(places, pairs)
+        moved = [s * place + t for s, t, place in zip(scales, shifts, places, strict=True)]
+        still = [abs(moved[i][m[:, 0]] - moved[j][m[:, 1]]) < STILL for _, i, j, m in pairs]
+        counted = [one for one in still if len(one) >= LEAST_MATCHES]
+        shared = sum(one.sum() >= max(LEAST_MATCHES, len(one) / 2) for one in counted)
+        if not is_turntable and shared < LEAST_PAIRS * len(counted):
+            return False
+        votes = [np.zeros((len(place), 2), int) for place in places]
+        for (_, i, j, m), one in zip(pairs, still, strict=True):
+            np.add.at(votes[i], (m[:, 0], one.astype(int)), 1)
+            np.add.at(votes[j], (m[:, 1], one.astype(int)), 1)
+        stays = [(v[:, 1] > 1) & (v[:, 1] > v[:, 0]) for v in votes]
+        begun.touch()
+        with colmap.DatabaseTransaction(db):
+            for (ids, i, j, m), one in zip(pairs, still, strict=True):
+                left = m[~(one | stays[i][m[:, 0]] | stays[j][m[:, 1]])]
+                db.delete_matches(*ids)
+                db.write_matches(*ids, left)
+        _verify_anew(colmap, database, db)
+    return True
+
+
+def _aligned(places: list[np.ndarray], pairs: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """((V,) complex scales with turns, (V,) shifts) that lay images over each other, robustly."""
+    rng, count = np.random.default_rng(0), len(places)
+    drawn = []
+    for _, i, j, matches in pairs:
+        some = matches[rng.permutation(len(matches))[:SAMPLED]]
+        ends = np.full(len(some), i), np.full(len(some), j)
+        drawn.append((*ends, places[i][some[:, 0]], places[j][some[:, 1]]))
+    first, second, one, other = map(np.concatenate, zip(*drawn, strict=True))
+    rows = np.tile(np.arange(len(one)), 4)
+    columns = np.concatenate([first, first + count, second, second + count])
+    scales, shifts = np.ones(count, complex), np.zeros(count, complex)
+    hold = HELD * len(one) / count * np.eye(2 * count)
+    for number in range(ROUNDS):
+        off = abs(scales[first] * one + shifts[first] - scales[second] * other - shifts[second])
+        weight = 1 / (1 + (off / max(STILL, WIDEST * NARROWER**number)) ** 2)
+        values = np.concatenate([one * weight, weight, -other * weight, -weight])
+        system = coo_matrix((values, (rows, columns)), shape=(len(one), 2 * count)).tocsr()
+        normal = (system.conj().T @ system).toarray() + hold
+        found = np.linalg.solve(normal, hold @ np.repeat([1.0, 0.0], count))
+        scales, shifts = found[:count], found[count:]
+        shifts, scales = (shifts - shifts.mean()) / scales.mean(), scales / scales.mean()
+    return scales, shifts

@@ -1,5 +1,5 @@
 """The images of a scene from what a camera gives: upright copies of photographs, or the sharpest
-frames of a video; what is blurred, broken or there twice is left out.
+frames of a video, without what is blurred, broken or there twice; then free of lens distortion.
 """
 
 import logging
@@ -9,12 +9,14 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby, pairwise
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from pp_cl import track
+from pp_cl.engine import Device
 from pp_cl.errors import UserError, shown
 from pp_cl.files import (
     atomic_file,
@@ -23,8 +25,10 @@ from pp_cl.files import (
     is_deep_png,
     is_owned,
     opened_regular,
+    read_rgba,
+    write_png,
 )
-from pp_cl.scene import MASK_FOLDERS
+from pp_cl.scene import MASK_FOLDERS, ImageFile, undistort
 from pp_studio.capture.packages import needed
 
 ENDINGS = (
@@ -51,6 +55,7 @@ EMPTY = 1.0  # sharpness, levels squared: noise alone has more
 NEIGHBOURS = 10  # on either side
 ALIKE = 0.15  # of the neighbours' usual difference
 SAME = 0.3  # levels of 255 by which small copies of one photograph differ at most
+DECODED, MOST_DECODED = 18, 3 * 2**28  # bytes of a pixel that is decoded, and of all at once
 FRAMES, GROUP = 120, 12  # of a video
 LOCAL = ["-protocol_whitelist", "file,pipe"]  # a video names no other machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
@@ -73,15 +78,14 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
     None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
     """
     with atomic_folder(images) as unfinished:
-        is_video = not source.is_dir()
-        taken = _frames(source, unfinished) if is_video else _photographs(source, unfinished)
-        found = list(taken)
+        take = _photographs if source.is_dir() else _frames
+        found = list(take(source, unfinished))
         _leave_out(found)
-        for one in found:
-            if "reason" in one and "name" in one:
-                (unfinished / one["name"]).unlink()
         usable = [one for one in found if "reason" not in one]
         left_out = [one for one in found if "reason" in one]
+        for one in left_out:
+            if "name" in one:
+                (unfinished / one["name"]).unlink()
         if len(usable) < LEAST:
             why = [f"{one['source']} {one['reason']}" for one in left_out[:3]]
             raise UserError(
@@ -91,17 +95,12 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
             )
     for one in usable:
         del one["small"]
-    reasons = [{"source": one["source"], "reason": one["reason"]} for one in left_out]
+    reasons = [{key: one[key] for key in ("source", "reason")} for one in left_out]
     return {"images": usable, "left_out": reasons}
 
 
-# Photographs --------------------------------------------------------------------------------------
-
-
 def _photographs(folder, images):
-    """The facts of each photograph, written to `images` where it can be read; of raw ones that they
-    are left out.
-    """
+    """The facts of each photograph, written to `images` where it can be read, and of raw ones."""
     needed("pillow_heif").register_heif_opener()
     files = listed(folder)
     if not files:
@@ -141,13 +140,13 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]
         found += [here / f for f in files if f.lower().endswith(tuple(endings)) and f[0] != "."]
-    return sorted(found, key=lambda file: _natural(file.relative_to(folder).as_posix()))
 
+    def natural(file):
+        name = file.relative_to(folder).as_posix()
+        parts = re.split(r"(\d+)", name)
+        return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
 
-def _natural(name):
-    """A key by which numbers in names sort as numbers."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
+    return sorted(found, key=natural)
 
 
 def _take(folder, file, target):
@@ -158,20 +157,20 @@ def _take(folder, file, target):
         with opened_regular(file) as opened:
             image = Image.open(opened, formats=FORMATS)
             image.load()
-            turned = ImageOps.exif_transpose(image)
+            turned, told = ImageOps.exif_transpose(image), image.getexif()
             upright = in_srgb(file, turned)
-            is_copied = image.format in COPIED and upright is turned
-            is_copied = is_copied and image.mode in ("RGB", "RGBA", "L")
             is_copied = (
-                is_copied
-                and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+                image.format in COPIED
+                and upright is turned
+                and image.mode in ("RGB", "RGBA", "L")
+                and told.get(ExifTags.Base.Orientation, 1) == 1
                 and not is_deep_png(file)
             )
             content = opened.seek(0) or opened.read() if is_copied else None
-            lens, exif = _lens(image.getexif())
+            lens, exif = _lens(told)
             # folders are of a round each, or of a camera
             facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
-            facts["focal"] = _focal_of_larger(image.getexif().get_ifd(EXIF), image.size)
+            facts["focal"] = _focal_of_larger(told.get_ifd(EXIF), image.size)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
     except Exception as error:  # decoders meet broken bytes with whatever comes up
@@ -191,10 +190,9 @@ def _take(folder, file, target):
 
 
 def _lens(exif):
-    """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a focal
-    length): the rest may be broken, or longer than a JPEG has room for.
-    """
+    """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a length)."""
     exposure, copied = exif.get_ifd(EXIF), Image.Exif()
+    # the rest may be broken, or longer than a JPEG has room for
     copied.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
     wanted = (FOCAL, FOCAL_35, *SENSOR)
     copied.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
@@ -203,10 +201,7 @@ def _lens(exif):
 
 
 def _focal_of_larger(exposure, size):
-    """The focal length in pixels of a photograph that was reduced, or cropped to another shape and
-    reduced, while its EXIF still tells of the sensor's pixels, which COLMAP takes for the
-    photograph's; None where EXIF says nothing of the kind.
-    """
+    """The focal length in pixels of a reduced photograph whose EXIF tells the sensor's, or None."""
     try:
         across, down, density, unit = (float(exposure[tag]) for tag in SENSOR)
         reduced = max(size[0] / across, size[1] / down)
@@ -217,17 +212,13 @@ def _focal_of_larger(exposure, size):
     return focal if is_told and POSSIBLE[0] < focal / max(size) < POSSIBLE[1] else None
 
 
-# Videos -------------------------------------------------------------------------------------------
-
-
 def _frames(video, images):
     """The facts of the sharpest frame of each interval, written to `images`."""
     chosen, is_hdr = _sharpest(video)
     equal = [f"eq(n,{number})" for number in chosen]
     # in groups, since ffmpeg sums no more than a hundred
-    some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
-    wanted = "+".join(f"({one})" for one in some)
-    frames = _decoded(video, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
+    some = [f"({'+'.join(equal[i : i + GROUP])})" for i in range(0, len(equal), GROUP)]
+    frames = _decoded(video, f"select='{'+'.join(some)}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
     next(frames)  # what is said of the video
     for number, frame in zip(track(chosen, "frames", "image"), frames, strict=False):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
@@ -238,16 +229,13 @@ def _frames(video, images):
 
 
 def _sharpest(video):
-    """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR).
-    Frames that repeat the one before, as films of a constant rate have them, lengthen none.
-    """
+    """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR)."""
     frames = _decoded(video, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
     meta = next(frames)
     # an estimate, for the bar alone: what browsers record states no length
     total = round(meta["duration"] * meta["fps"]) or None
-    looking = track(frames, "looking at frames", "frame", total)
     sharpness, pictures, shown = [], [], None  # pictures: that each frame shows, numbered
-    for frame in looking:
+    for frame in track(frames, "looking at frames", "frame", total):
         look = _look(Image.fromarray(frame[..., 0]))
         is_new = shown is None or _difference(shown, look) >= SAME
         shown = look if is_new else shown
@@ -255,6 +243,7 @@ def _sharpest(video):
         pictures.append(pictures[-1] + is_new if pictures else 0)
     if not sharpness:
         raise UserError(f"{video}: holds no frames; give another video")
+    # frames that repeat the one before, as films of a constant rate have them, lengthen none
     count = max(pictures[-1] + 1, FRAMES)
     intervals = groupby(range(len(pictures)), lambda number: pictures[number] * FRAMES // count)
     is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)
@@ -286,13 +275,8 @@ def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[
         ) from None
 
 
-# What is left out ---------------------------------------------------------------------------------
-
-
 def _look(image):
-    """What is compared of an image: its sharpness (the variance of its Laplacian), its size and a
-    small copy.
-    """
+    """Of an image: its sharpness (the variance of its Laplacian), its size and a small copy."""
     cv2 = needed("cv2")
     gray = image.convert("L")
     gray.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
@@ -303,10 +287,14 @@ def _look(image):
 
 def _leave_out(found):
     """Give a reason to each image that is empty, blurred or there twice."""
+
+    def near(values, i):
+        return np.median(values[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+
     good = [one for one in found if "reason" not in one]
-    sharpness = np.array([one["sharpness"] for one in good])
+    sharpness = [one["sharpness"] for one in good]
     for i, one in enumerate(good):
-        usual = np.median(sharpness[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+        usual = near(sharpness, i)
         if one["sharpness"] < EMPTY:
             one["reason"] = "shows nothing sharp"
         elif one["sharpness"] < BLURRED * usual:
@@ -315,16 +303,59 @@ def _leave_out(found):
     steps = [_difference(*two) for two in pairwise(good)]
     last = good[0] if good else None
     for i, one in enumerate(good[1:]):
-        usual = np.median(steps[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
-        if _difference(last, one) < max(SAME, ALIKE * usual):
+        if _difference(last, one) < max(SAME, ALIKE * near(steps, i)):
             one["reason"] = f"shows the same as {last['source']}"
         else:
             last = one
 
 
 def _difference(one, other):
-    """Mean difference of the small copies, in levels, which a change of brightness does not
-    raise.
-    """
+    """Mean difference of the small copies, in levels, whatever their brightness."""
     a, b = (image["small"] - image["small"].mean() for image in (one, other))
     return float(np.abs(a - b).mean())
+
+
+def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[ImageFile]) -> int:
+    """Write those photographs that are not there yet, free of distortion, to the folder `images`:
+    each under the name, in the format and for the camera that it has; returns their number.
+
+    frames: the folder of the photographs as the lens has them. Raises UserError for one that its
+    distortion folds over, and as read_rgba() and write_png() do.
+    """
+    for one in image_files:
+        if one.lens.folds(one.camera):
+            raise UserError(
+                f"{frames / Path(one.name).name}: the lens that was found folds the image over;"
+                " take more photographs with more overlap, and do not zoom"
+            )
+    images.mkdir(exist_ok=True)
+    left = [one for one in image_files if not (images / Path(one.name).name).is_file()]
+    lock = Lock()  # one of several threads uses the device
+
+    def write(one):
+        name = Path(one.name).name
+        image = read_rgba(frames / name)
+        if one.lens:
+            with lock:
+                image = undistort(dev, image, one.camera, one.lens)
+        if name.endswith(".png"):
+            is_opaque = (image[..., 3] == 255).all()
+            write_png(images / name, image[..., :3] if is_opaque else image)
+        else:
+            with atomic_file(images / name) as file:
+                Image.fromarray(image[..., :3]).save(file, "JPEG", **QUALITY)
+
+    most = max(one.camera.width * one.camera.height for one in image_files)
+    threads = min(os.cpu_count() or 1, MOST_DECODED // (DECODED * most))
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        made = pool.map(write, left)
+        list(track(made, "images", "image", len(left)))
+    return len(left)
+
+
+def undistorted_mask(dev: Device, mask: np.ndarray, image_file: ImageFile) -> np.ndarray:
+    """(H, W) uint8 mask of a photograph as the lens has it, (H, W) uint8, for its image."""
+    if not image_file.lens:
+        return mask
+    planes = np.dstack([mask] * 4)
+    return undistort(dev, planes, image_file.camera, image_file.lens)[..., 3]

@@ -17,7 +17,7 @@ from skimage.segmentation import find_boundaries
 from pp_cl import Config, track
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, few_names, shown
-from pp_cl.files import contact_sheet, read_mask, read_rgba, write_png
+from pp_cl.files import atomic_folder, contact_sheet, read_mask, read_rgba, write_png
 from pp_cl.scene import (
     ImageFile,
     cut_out,
@@ -26,18 +26,8 @@ from pp_cl.scene import (
     read_mask_of_size,
     shrink,
 )
-from pp_studio.capture.cut import (
-    FORGIVEN,
-    GROWTHS,
-    cut_out_all,
-    forgiving_hull,
-    gap_of,
-    grown_box,
-    silhouette,
-    whole_mask,
-)
+from pp_studio.capture import cut
 from pp_studio.capture.packages import needed
-from pp_studio.capture.window import dilated, place_of, window
 
 cv2 = needed("cv2")
 
@@ -89,7 +79,7 @@ def write_masks(
     (scene / "masks").mkdir(exist_ok=True)
     left = _without_mask(scene, image_files)
     how = {"kept": len(image_files) - len(left)}
-    shown = [i for i, one in enumerate(image_files) if place_of(one, box)]
+    shown = [i for i, one in enumerate(image_files) if cut.place_of(one, box)]
     shown = shown or list(range(len(image_files)))  # which window() refuses
     beside = {one.name for one in image_files} - {image_files[i].name for i in shown}
     for one in track(left, "masks", "image"):
@@ -106,12 +96,23 @@ def write_masks(
         reading = track(in_view, "reading images", "image")
         windows = [_window(scene, one, box) for one in reading]
         of_object = [points[some[inside[some]]] for some in seen]
-        how |= _uniform(scene, in_view, windows, box, of_object)
-        if _without_mask(scene, in_view):
-            box, found = _cut(scene, in_view, windows, box, points, inside, seen, turns, grows)
-            how |= found
+        how["before a uniform background"] = _uniform(scene, in_view, windows, box, of_object)
+        if left := _without_mask(scene, in_view):
+            how["cut out"] = len(left)
+            for growth in range(1 + cut.GROWTHS):
+                cut.cut_out_all(windows, box, points, inside, seen, turns)
+                larger = cut.grown_box(windows, box) if grows and growth < cut.GROWTHS else None
+                if larger is None:
+                    break
+                box = larger
+                windows = [_window(scene, one, box) for one in in_view]
+            of_name = dict(zip([one.name for one in in_view], windows, strict=True))
+            for one in track(left, "masks", "image"):
+                mask = cut.whole_mask(of_name[one.name], read_rgba(scene / one.name)[..., :3])
+                write_png(mask_file(scene, one.name), mask)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
-    wrong = _contradicting(scene, image_files, box)
+    views = [_reduced(scene, one, CHECKED_SIDE)[0] for one in image_files]
+    wrong = {one.view.name: one.share for one in disagreements(views, box)}
     if wrong:
         shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
         counts += f"; {len(wrong)} contradict the others: {few_names(shares)}"
@@ -123,9 +124,7 @@ def _without_mask(scene, image_files):
 
 
 def _found(scene, image_file, given, sources, fitted, words):
-    """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
-    if it has not.
-    """
+    """(where from, (H, W) uint8 mask, or None) of a photograph, without the others."""
     file, size = scene / image_file.name, (image_file.camera.width, image_file.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)
@@ -176,31 +175,32 @@ def program_words(command: str) -> list[str]:
 
 
 def _written_mask(scene, image_file):
-    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written. Raises
-    UserError for one of another shape.
-    """
+    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written."""
     file = mask_file(scene, image_file.name)
     return read_mask_of_size(file, (image_file.camera.width, image_file.camera.height))
 
 
 def _window(scene, image_file, box):
     """The Window of a photograph, with its mask if that is written."""
-    found = window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
+    found = cut.window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
     if mask_file(scene, image_file.name).is_file():
         found.mask = found.reduced(_written_mask(scene, image_file)) > 127
     return found
 
 
 def _uniform(scene, image_files, windows, box, points):
-    """Write the masks of photographs before a uniform background, where nearly all of those without
-    a mask are. points: (M, 3) of the object that each shows. Returns {what: how many}.
-    """
+    """Write the masks of photographs where nearly all have a uniform background; their number."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
-    found = {i: _before_uniform(windows[i], points[i], with_holes) for i in left}
-    found = {i: mask for i, mask in found.items() if mask is not None}
+    with_holes = len(windows) * cut.FORGIVEN >= 1  # as one that is a spot has one view against it
+    found = {}
+    for i in left:
+        mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
+        if mask is not None:
+            mask, (_, rows, columns) = mask > 127, windows[i].inside(points[i])
+            held = mask[rows, columns].mean() if len(rows) else mask.any()
+            found |= {i: mask} if held >= ON_MASK else {}
     if len(found) < UNIFORM * len(left):
-        return {}
+        return 0
     for i, mask in found.items():
         windows[i].mask = mask
     spots = _spots(windows, found, box) if with_holes and found else {}
@@ -215,22 +215,20 @@ def _uniform(scene, image_files, windows, box, points):
             mask[y0:y1, x0:x1][closed] = 255
         write_png(mask_file(scene, name), mask)
         one.mask = one.reduced(mask) > 127
-    return {"before a uniform background": sum(windows[i].mask is not None for i in found)}
+    return sum(windows[i].mask is not None for i in found)
 
 
 def _spots(windows, numbers, box):
-    """{number of a window: (H, W) bool, the regions in the background's colour that its mask
-    encloses, but behind which the other views see the object}.
-    """
-    hull, _, voxel_size = forgiving_hull([one for one in windows if one.mask is not None], box)
+    """{number of a window: (H, W) bool, holes of its mask where other views see the object}."""
+    hull, _, voxel_size = cut.forgiving_hull([one for one in windows if one.mask is not None], box)
     found = {}
     for i in numbers:
         one = windows[i]
         regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
-        held = silhouette(one, hull, gap_of(one, hull, voxel_size))
+        held = cut.silhouette(one, hull, cut.gap_of(one, hull, voxel_size))
         is_spot = np.bincount(regions.ravel(), held.ravel()) > SPOT * np.bincount(regions.ravel())
         is_spot[0] = False
-        found[i] = dilated(is_spot[regions], 1)
+        found[i] = cut.dilated(is_spot[regions], 1)
     return found
 
 
@@ -250,46 +248,27 @@ def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.n
     return cv2.resize(mask, (width, height)) if (border < 128).mean() >= UNIFORM else None
 
 
-def inside(file: Path, is_turntable: bool) -> np.ndarray | None:
-    """(H, W) uint8: where a photograph shows the object by its alpha, which may hide a wall, or on
-    a turntable by its uniform background; None where neither tells.
+def write_inside(frames: Path, names: Sequence[str], folder: Path, is_turntable: bool) -> None:
+    """Write to the new folder NAME.png, 8-bit gray, of each photograph, white where it shows the
+    object by its alpha, which may hide a wall, or on a turntable by its uniform background; of a
+    turntable none where one of them is not uniform.
     """
-    if file.name.lower().endswith(OPAQUE) and not is_turntable:
-        return None
-    image = read_rgba(file)
-    if (image[..., 3] < 255).any():
-        return np.where(image[..., 3] > 127, np.uint8(255), np.uint8(0))
-    return uniform_mask(image, file.name) if is_turntable else None
-
-
-def _before_uniform(window, points, with_holes):
-    """(H, W) bool: the mask of a window whose background is uniform, and from which all points
-    (M, 3) of the object stand out; else None.
-    """
-    mask = uniform_mask(window.image, window.name, with_holes)
-    if mask is None:
-        return None
-    mask = mask > 127
-    _, rows, columns = window.inside(points)
-    held = mask[rows, columns].mean() if len(rows) else mask.any()
-    return mask if held >= ON_MASK else None
-
-
-def _cut(scene, image_files, windows, box, points, inside, seen, turns, grows):
-    """Cut out what has no mask, and write it. Returns the box, and {what: how many}."""
-    left = [i for i, one in enumerate(windows) if one.mask is None]
-    for growth in range(1 + GROWTHS):
-        cut_out_all(windows, box, points, inside, seen, turns)
-        larger = grown_box(windows, box) if grows and growth < GROWTHS else None
-        if larger is None:
-            break
-        box = larger
-        windows = [_window(scene, one, box) for one in image_files]
-    for i in track(left, "masks", "image"):
-        name = image_files[i].name
-        mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
-        write_png(mask_file(scene, name), mask)
-    return box, {"cut out": len(left)}
+    with atomic_folder(folder) as unfinished:
+        for name in names:
+            if name.lower().endswith(OPAQUE) and not is_turntable:
+                continue
+            image = read_rgba(frames / name)
+            alpha, mask = image[..., 3], None
+            if (alpha < 255).any():
+                mask = np.where(alpha > 127, np.uint8(255), np.uint8(0))
+            elif is_turntable:
+                mask = uniform_mask(image, name)
+            if mask is not None:
+                write_png(unfinished / f"{name}.png", mask)
+            elif is_turntable:
+                for file in unfinished.iterdir():
+                    file.unlink()
+                return
 
 
 def outline_sheet(
@@ -303,22 +282,17 @@ def outline_sheet(
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
     for one in chosen:
-        whole, mask = read_rgba(scene / one.name), _written_mask(scene, one)
-        factor = fitting_downscale(mask.shape, SHOWN_SIZE)
-        image = shrink(whole, factor)[..., :3]
-        held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
+        view, factor = _reduced(scene, one, SHOWN_SIZE)
+        image, held = shrink(read_rgba(scene / one.name), factor)[..., :3], view.image[..., 3] > 127
         image[~held] //= 2
         image[find_boundaries(held, mode="thick")] = OUTLINE
         images.append(image)
     return contact_sheet(images, [Path(one.name).name for one in chosen])
 
 
-def _contradicting(scene, image_files, box):
-    """{name: share of the object that its mask alone rejects} of those that contradict others."""
-    views = []
-    for one in image_files:
-        mask = _written_mask(scene, one)
-        factor = fitting_downscale(mask.shape, CHECKED_SIDE)
-        image = shrink(np.dstack([mask] * 4), factor)
-        views.append(View(one.name, one.camera.downscaled(factor), image))
-    return {one.view.name: one.share for one in disagreements(views, box)}
+def _reduced(scene, one, side):
+    """(a View of a photograph's mask, whose longer side is about this; by which factor)."""
+    mask = _written_mask(scene, one)
+    factor = fitting_downscale(mask.shape, side)
+    image = shrink(np.dstack([mask] * 4), factor)
+    return View(one.name, one.camera.downscaled(factor), image), factor

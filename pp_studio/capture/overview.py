@@ -1,6 +1,4 @@
-"""A drawing of a whole scene from the side and from above: points, cameras as small frusta, and the
-object's box.
-"""
+"""A drawing of a scene from the side and from above: points, cameras, and the object's box."""
 
 import itertools
 from collections.abc import Sequence
@@ -38,7 +36,13 @@ def overview(
         aside = cameras[0].pose[:, 0] - (cameras[0].pose[:, 0] @ up) * up
     aside /= np.linalg.norm(aside)
     corners = np.empty((0, 3)) if box is None else corners_of(box)
-    frusta = _frusta(cameras, eyes)
+    length = FRUSTUM * (np.median(np.linalg.norm(eyes - eyes.mean(0), axis=1)) or 1.0)
+    pyramids = []  # (5, 3) each: eye and image corners of a camera
+    for c in cameras:
+        wide, high = np.array([0, c.width, c.width, 0]), np.array([0, 0, c.height, c.height])
+        rays = np.stack([(wide - c.cx) / c.fx, (high - c.cy) / c.fy, np.ones(4)], axis=1)
+        pyramids.append(np.concatenate([[c.eye], c.eye + length * rays @ c.pose[:, :3].T]))
+    frusta = np.array(pyramids)
     step = max(1, len(points) // MOST_POINTS)
     panels = []
     for title, down in (("from the side", -up), ("from above", np.cross(aside, up))):
@@ -51,7 +55,12 @@ def overview(
         def place(positions, axes=axes, scale=scale, offset=offset):
             return scale * (positions @ axes) + offset
 
-        image = _dots(place(points[::step]), colours[::step], side)
+        dots = np.full((side, side, 3), 255, np.uint8)  # of FINER x FINER pixels
+        for dx, dy in itertools.product(range(FINER), repeat=2):
+            x, y = np.floor(place(points[::step])).T + [[dx], [dy]]
+            inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+            dots[y[inside].astype(int), x[inside].astype(int)] = colours[::step][inside]
+        image = Image.fromarray(dots)
         draw = ImageDraw.Draw(image)
         for frustum in place(frusta):
             eye, *ends = map(tuple, frustum)
@@ -64,24 +73,3 @@ def overview(
         ImageDraw.Draw(image).text((4, 2), title, fill=INK)
         panels.append(np.array(image))
     return np.concatenate(panels, axis=1)
-
-
-def _frusta(cameras, eyes):
-    """(V, 5, 3): eye and image corners of each camera."""
-    size = FRUSTUM * (np.median(np.linalg.norm(eyes - eyes.mean(0), axis=1)) or 1.0)
-    found = []
-    for c in cameras:
-        wide, high = np.array([0, c.width, c.width, 0]), np.array([0, 0, c.height, c.height])
-        rays = np.stack([(wide - c.cx) / c.fx, (high - c.cy) / c.fy, np.ones(4)], axis=1)
-        found.append(np.concatenate([[c.eye], c.eye + size * rays @ c.pose[:, :3].T]))
-    return np.array(found)
-
-
-def _dots(places, colours, side):
-    """Image of FINER x FINER pixels for every place, (N, 2), inside of it."""
-    image = np.full((side, side, 3), 255, np.uint8)
-    for dx, dy in itertools.product(range(FINER), repeat=2):
-        x, y = np.floor(places).T + [[dx], [dy]]
-        inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-        image[y[inside].astype(int), x[inside].astype(int)] = colours[inside]
-    return Image.fromarray(image)

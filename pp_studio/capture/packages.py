@@ -1,6 +1,4 @@
-"""The packages of the extra `capture`: imported where they are needed, pycolmap in a process of its
-own.
-"""
+"""The packages of the extra `capture`, imported where needed; pycolmap in a process of its own."""
 
 import importlib
 import os
@@ -29,11 +27,17 @@ DISTRIBUTIONS = {
 
 
 def needed(module: str) -> ModuleType:
-    """The imported module. Raises UserError with the command that installs it where it is
-    missing.
-    """
+    """The imported module. Raises UserError with what installs it where it is missing."""
+    is_here = module in sys.modules or threading.current_thread() is not threading.main_thread()
     try:
-        return _imported(module)
+        if is_here:
+            return importlib.import_module(module)
+        answer = signal.getsignal(signal.SIGTERM)
+        with deferred():
+            try:
+                return importlib.import_module(module)
+            finally:  # pycolmap would else answer SIGTERM itself, with a stack trace
+                signal.signal(signal.SIGTERM, answer)
     except ImportError as error:
         raise UserError(
             f"capture needs the package {DISTRIBUTIONS[module]} ({error});"
@@ -63,22 +67,8 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
             ) from None
 
 
-def _imported(module):
-    """The module; pycolmap would else answer SIGTERM itself, with a stack trace."""
-    if module in sys.modules or threading.current_thread() is not threading.main_thread():
-        return importlib.import_module(module)
-    answer = signal.getsignal(signal.SIGTERM)
-    with deferred():
-        try:
-            return importlib.import_module(module)
-        finally:
-            signal.signal(signal.SIGTERM, answer)
-
-
 def _begin():
-    """The process ends with its parent, which alone answers signals; only Python writes to
-    stderr.
-    """
+    """The process ends with its parent, which alone answers signals; only Python tells anything."""
     # NumPy's threads beside ours would wait for each other, long where the machine is busy
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -72,17 +72,15 @@ def place(
 
 
 def _mapped(database, images, folder, count, turns):
-    """pycolmap's models of what fits together.
-
-    Without a background, images that are as far apart as those that COLMAP begins with have fewer
-    matches than a pattern has with itself, and closer ones do not tell focal length from lens.
-    """
+    """pycolmap's models of what fits together."""
     with quiet(database) as colmap:
         options = colmap.IncrementalPipelineOptions(
             min_model_size=3, num_threads=cores(), random_seed=0
         )
         # all cameras are refined at the end, and before that whenever there are so many more
         options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH
+        # Without a background, images as far apart as those that COLMAP begins with have fewer
+        # matches than a pattern has with itself; closer ones do not tell focal length from lens.
         if turns:
             usual = np.median(list(_most_matches(database).values()))
             options.min_num_matches = max(options.min_num_matches, int(FEW * usual))
@@ -119,15 +117,13 @@ def _reasons(database, taken, placed):
         features = {name: db.num_keypoints_for_image(i) for name, i in ids.items()}
     usual = np.median([one["sharpness"] for one in taken])
     reasons = {}
-    for one in taken:
-        name = one["name"]
-        if name in placed:
-            continue
-        matches = best.get(ids.get(name), 0)
-        if one["sharpness"] < BLURRED * usual:
-            reasons[name] = f"is blurred (sharpness {one['sharpness'] / usual:.0%} of the usual)"
-        elif features.get(name, 0) < FEW_FEATURES:
-            reasons[name] = f"has few features ({features.get(name, 0)}): blurred, dark or plain"
+    for one in (one for one in taken if one["name"] not in placed):
+        name, sharpness = one["name"], one["sharpness"] / usual
+        found, matches = features.get(name, 0), best.get(ids.get(name), 0)
+        if sharpness < BLURRED:
+            reasons[name] = f"is blurred (sharpness {sharpness:.0%} of the usual)"
+        elif found < FEW_FEATURES:
+            reasons[name] = f"has few features ({found}): blurred, dark or plain"
         elif matches < FEW_MATCHES:
             reasons[name] = f"has few matches with any other ({matches}): too little overlap"
         else:
@@ -137,10 +133,11 @@ def _reasons(database, taken, placed):
 
 def _most_matches(database):
     """{image's id: its matches with the image with which it has most}."""
-    with needed("pycolmap").Database.open(database) as db:
+    colmap = needed("pycolmap")
+    with colmap.Database.open(database) as db:
         best = {image.image_id: 0 for image in db.read_all_images()}
         for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
-            for one in needed("pycolmap").pair_id_to_image_pair(pair):
+            for one in colmap.pair_id_to_image_pair(pair):
                 best[one] = max(best[one], matches)
     return best
 
@@ -150,9 +147,7 @@ def image_files(model: Any) -> list[ImageFile]:
     lists them that has them in its folder `images`.
     """
     found = []
-    for image in sorted(model.images.values(), key=lambda image: image.name):
-        if not image.has_pose:
-            continue
+    for image in _placed(model):
         lens = model.cameras[image.camera_id]
         focal, cx, cy, k1 = lens.params  # of features.LENS
         world = image.cam_from_world().inverse().matrix()
@@ -169,7 +164,25 @@ def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
     index = {number: k for k, number in enumerate(chosen)}
     shown = [
         np.array([index[p.point3D_id] for p in image.points2D if p.point3D_id in index], int)
-        for image in sorted(model.images.values(), key=lambda image: image.name)
-        if image.has_pose
+        for image in _placed(model)
     ]
     return np.array([model.points3D[number].xyz for number in chosen]), shown
+
+
+def _placed(model):
+    return sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name)
+
+
+def undistort_model(model: Any) -> None:
+    """Give pycolmap's model of features.LENS cameras without distortion, and move what its images
+    show to where that is without.
+    """
+    for image in model.images.values():
+        lens = image.camera
+        focal, cx, cy, _ = lens.params
+        directions = lens.cam_from_img(np.array([point.xy for point in image.points2D]))
+        for point, place in zip(image.points2D, focal * directions + [cx, cy], strict=True):
+            point.xy = place
+    for lens in model.cameras.values():
+        focal, cx, cy, _ = lens.params
+        lens.model, lens.params = needed("pycolmap").CameraModelId.PINHOLE, [focal, focal, cx, cy]

@@ -5,7 +5,6 @@ in SCENE/capture/STAGE.json, an image of it in STAGE.png; the same command goes 
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from itertools import takewhile
@@ -30,15 +29,8 @@ from pp_cl.files import (
     write_json,
     write_png,
 )
-from pp_cl.scene import (
-    LensDistortion,
-    frame_keys,
-    named_mask,
-    read_edits,
-    read_json,
-    shrink,
-)
-from pp_studio.capture import STAGES, box, features, frames, masks, pinhole, poses, still
+from pp_cl.scene import LensDistortion, frame_keys, named_mask, read_edits, read_json, shrink
+from pp_studio.capture import STAGES, box, features, frames, masks, poses
 from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
@@ -80,133 +72,120 @@ class Capture:
 
     def __init__(self, scene: Path, given: dict[str, Any], tell: Callable[[str], None]) -> None:
         self.scene, self.given, self.tell = scene, given, tell
-        self.work, self.images = scene / "capture", scene / "images"
-        self.frames = self.work / "frames"
+        self.work, self.frames = scene / "capture", scene / "capture" / "frames"
         self.database, self.model = self.work / "database.db", self.work / "model"
-        self.turns = self.work / "turns"
-        self.options_file = self.work / "options.json"
         self.options: dict[str, Any] = {}
-
-    @property
-    def source(self) -> Path:
-        """The photographs or the video."""
-        return Path(self.options["source"])
+        self.source = Path()  # the photographs or the video
 
     def run(self, begin: str | None = None, *, replace_masks: bool = False) -> None:
         """Do all stages that are not done, or one of them and all after it, and those that depend
         on an option that has changed. Masks that the user has changed are kept, or replaced, too.
         Raises UserError, before anything is removed, where a file of the user's would be lost or
-        what an option names is not there.
+        what an option names is not there, and while another process captures into the folder.
         """
-        with self._locked():
-            changed = self._take_options(begin)
-            anew = {begin, *(OPTIONS[name][0] for name in changed)}
-            anew |= {"masks"} if replace_masks else set()
-            done = list(takewhile(lambda one: one not in anew and self._is_done(one), STAGES))
-            left = list(STAGES)[len(done) :]
-            mended = self._mended() if "masks" in left else []
-            self._check_options(left, [] if replace_masks else mended)
-            if mended and "images" in left and not replace_masks:
-                raise UserError(
-                    f"{mended[0]}: was made or changed by hand, for images that are made again;"
-                    " move it away, or add --replace-masks"
-                )
-            files = {stage: self._files(stage) for stage in left}
-            for stage in left:
-                check_ours(files[stage])
-            for path in mended if replace_masks else ():
-                path.unlink()
-            for stage in reversed(left):
-                if stage != left[0] or stage in anew or stage not in RESUMED:
-                    if stage == "matches" and self.database.exists():
-                        features.forget_matches(self.database)
-                    remove_ours(files[stage])
-                    for name in {*CHANGING} & {*LEFT[stage]}:
-                        (self.scene / name).unlink(missing_ok=True)
-            if changed or not self.options_file.exists():
-                write_json(self.options_file, self.options)
-            for stage in done:
-                new = self._new() if stage == "frames" else ""
-                self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
-            for name in changed:
-                redone = OPTIONS[name][0]
-                self.tell(f"{_option(name)} has changed: {redone} and all after it are repeated")
-            for stage in left:
-                start = time.monotonic()
-                found = getattr(self, f"_{stage}")()
-                seconds = time.monotonic() - start
-                write_json(self._file(stage), found | {"seconds": round(seconds, 1)})
-                self.tell(f"{stage}: {found['line']} ({seconds:.0f} s)")
+        own(self.scene, alone=True)
+        self.work.mkdir(exist_ok=True)
+        try:
+            with FileLock(self.work / ".pp-cl.lock", timeout=0):
+                self._run(begin, replace_masks)
+        except Timeout:
+            raise UserError(f"{self.scene}: another process captures into it; wait") from None
+
+    def _run(self, begin, replace_masks):
+        changed = self._take_options(begin)
+        anew = {begin, *(OPTIONS[name][0] for name in changed)}
+        anew |= {"masks"} if replace_masks else set()
+        done = list(takewhile(lambda one: one not in anew and self._is_done(one), STAGES))
+        left = list(STAGES)[len(done) :]
+        mended = self._mended() if "masks" in left else []
+        self._check_options(left, [] if replace_masks else mended)
+        if mended and "images" in left and not replace_masks:
+            raise UserError(
+                f"{mended[0]}: was made or changed by hand, for images that are made again;"
+                " move it away, or add --replace-masks"
+            )
+        files = {stage: self._files(stage) for stage in left}
+        for stage in left:
+            check_ours(files[stage])
+        for path in mended if replace_masks else ():
+            path.unlink()
+        for stage in reversed(left):
+            if stage != left[0] or stage in anew or stage not in RESUMED:
+                if stage == "matches" and self.database.exists():
+                    features.forget_matches(self.database)
+                remove_ours(files[stage])
+                for name in {*CHANGING} & {*LEFT[stage]}:
+                    (self.scene / name).unlink(missing_ok=True)
+        if changed or not self._file("options").exists():
+            write_json(self._file("options"), self.options)
+        for stage in done:
+            found, came = self._found(stage), ""
+            if stage == "frames":
+                known = {one["source"] for one in (*found["images"], *found["left_out"])}
+                if new := [name for name in self._names() if name not in known]:
+                    came = f"; {few_names(new)} came later: --from frames takes all of them anew"
+            self.tell(f"{stage}: {found['line']} (done before{came})")
+        for name in changed:
+            option = "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
+            redone = OPTIONS[name][0]
+            self.tell(f"{option} has changed: {redone} and all after it are repeated")
+        for stage in left:
+            start = time.monotonic()
+            found = getattr(self, f"_{stage}")()
+            seconds = time.monotonic() - start
+            write_json(self._file(stage), found | {"seconds": round(seconds, 1)})
+            self.tell(f"{stage}: {found['line']} ({seconds:.0f} s)")
+
+    def _file(self, stage, suffix=".json"):
+        return self.work / f"{stage}{suffix}"
+
+    def _found(self, stage):
+        return read_json(self._file(stage))
 
     def _is_done(self, stage):
         return self._file(stage).is_file()
 
-    def _new(self):
-        """What photographs have come since they were taken, in words."""
-        found = self._found("frames")
-        known = {one["source"] for one in (*found["images"], *found["left_out"])}
+    def _names(self):
+        """Of the photographs that the source has now; none of a video."""
         files = frames.listed(self.source) if self.source.is_dir() else []
-        names = [file.relative_to(self.source).as_posix() for file in files]
-        new = [name for name in names if name not in known]
-        return f"; {few_names(new)} came later: --from frames takes all of them anew" if new else ""
-
-    @contextmanager
-    def _locked(self):
-        """While it is entered, no other process captures into the folder, which is made."""
-        own(self.scene, alone=True)
-        try:
-            self.work.mkdir(exist_ok=True)
-            with FileLock(self.work / ".pp-cl.lock", timeout=0):
-                yield
-        except Timeout:
-            raise UserError(f"{self.scene}: another process captures into it; wait") from None
+        return [file.relative_to(self.source).as_posix() for file in files]
 
     def _take_options(self, begin):
         """Fill in the options of this capture; returns the names of those that have changed."""
-        before = {name: value for name, (_, value) in OPTIONS.items()}
+        before, is_first = {name: value for name, (_, value) in OPTIONS.items()}, True
+        if self._file("options").exists():
+            before, is_first = self._found("options"), False
+            if not isinstance(before, dict) or before.keys() != OPTIONS.keys():
+                raise UserError(
+                    f"{self._file('options')}: does not have the options {', '.join(OPTIONS)};"
+                    " delete it, and give them again"
+                )
         self.options = before | self.given
-        if not self.options_file.exists():
-            return []
-        before = read_json(self.options_file)
-        if not isinstance(before, dict) or before.keys() != OPTIONS.keys():
-            raise UserError(
-                f"{self.options_file}: does not have the options {', '.join(OPTIONS)}; delete it,"
-                " and give them again"
-            )
-        self.options = before | self.given
-        changed = [name for name in OPTIONS if self.options[name] != before[name]]
+        self.source = Path(self.options["source"])
+        changed = [name for name in OPTIONS if self.options[name] != before[name] and not is_first]
         if "source" in changed and begin != "frames" and self._is_done("frames"):
-            if not self._has_moved(Path(before["source"])):
+            # photographs of the same names, or a video of the same name, where nothing is now
+            if self.source.is_dir():
+                taken = {one["source"] for one in self._found("frames")["images"]}
+                is_same = taken <= {*self._names()}
+            else:
+                is_same = self.source.name == Path(before["source"]).name
+            if Path(before["source"]).exists() or not is_same:
                 raise UserError(
                     f"{self.scene}: was made from {before['source']}; choose another --out, or"
                     " begin again with --from frames"
                 )
-            write_json(self.options_file, before | {"source": self.options["source"]})
+            write_json(self._file("options"), before | {"source": self.options["source"]})
             changed.remove("source")
         return changed
 
-    def _has_moved(self, before):
-        """Whether the source is what was at another place before, where nothing is now: photographs
-        of the same names, or a video of the same name.
-        """
-        if before.exists():
-            return False
-        if not self.source.is_dir():
-            return self.source.name == before.name
-        taken = {one["source"] for one in self._found("frames")["images"]}
-        names = {file.relative_to(self.source).as_posix() for file in frames.listed(self.source)}
-        return taken <= names
-
     def _check_options(self, left, mended):
-        """Raise UserError where what the options of the stages that are left name is not there.
-        mended: masks that are kept.
-        """
-        if "frames" in left and self._is_done("frames") and self.source.is_dir():
-            count = len(frames.listed(self.source))
-            if count < frames.LEAST:
-                raise UserError(
-                    f"{self.source}: {count} photographs in it, at least {frames.LEAST} are needed"
-                )
+        """Raise UserError where what the options of the stages that are left name is not there."""
+        count, is_new = len(self._names()), "frames" in left and self._is_done("frames")
+        if is_new and self.source.is_dir() and count < frames.LEAST:
+            raise UserError(
+                f"{self.source}: {count} photographs in it, at least {frames.LEAST} are needed"
+            )
         command, given = self.options["mask_command"], self.options["masks"]
         if "masks" not in left:
             return
@@ -222,10 +201,9 @@ class Capture:
                     named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
-        """What a stage has left, and what else lies in its folders, but for masks of others and
-        what changes in place. Its JSON comes first: without it the stage is not done.
-        """
-        found = [self._file(stage), self._file(stage).with_suffix(".png")]
+        """What lies in a stage's folders, but for masks of others and what changes in place."""
+        # its JSON comes first: without it the stage is not done
+        found = [self._file(stage), self._file(stage, ".png")]
         for path in (self.scene / name for name in LEFT[stage] if name not in CHANGING):
             inside = path.rglob("*") if path.is_dir() else [path]
             inside = [one for one in inside if one.is_symlink() or not one.is_dir()]
@@ -239,19 +217,14 @@ class Capture:
         there = [path for path in named if path.is_file()]
         return sorted(set(there) - set(ours(there)))
 
-    def _show(self, stage, image):
-        write_png(self._file(stage).with_suffix(".png"), image)
-
-    def _found(self, stage):
-        return read_json(self._file(stage))
-
-    def _file(self, stage):
-        return self.work / f"{stage}.json"
-
     @cached_property
     def _dev(self):
         """Where distortion is removed."""
         return open_device()
+
+    def _model(self):
+        """pycolmap's model of the cameras, in the world of its own."""
+        return needed("pycolmap").Reconstruction(self.model)
 
     # ---- the stages
 
@@ -260,44 +233,26 @@ class Capture:
         names = [one["name"] for one in evenly(found["images"], masks.SHOWN_VIEWS)]
         shown = [read_rgba(self.frames / name) for name in names]
         shown = [shrink(one, fitting_downscale(one.shape[:2], masks.SHOWN_SIZE)) for one in shown]
-        self._show("frames", contact_sheet(shown, names))
+        write_png(self._file("frames", ".png"), contact_sheet(shown, names))
         left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
-        line = f"{len(found['images'])} images" + _left_out(left_out, "left out")
-        return {"line": line, **found}
+        return {"line": f"{len(found['images'])} images{_but(left_out, 'left out')}", **found}
 
     def _features(self):
-        taken = self._found("frames")["images"]
-        inside = self._inside([one["name"] for one in taken])
+        taken, folder = self._found("frames")["images"], self.work / "inside"
+        if not (folder.is_dir() and any(folder.iterdir())):  # else it was stopped, and goes on
+            masks.write_inside(
+                self.frames, [one["name"] for one in taken], folder, self.options["turntable"]
+            )
+        inside = folder if folder.is_dir() and any(folder.iterdir()) else None
         counts = isolated(
             self.work, features.find_features, self.database, self.frames, taken, inside
         )
-        middle = int(np.median(list(counts.values())))
-        return {"line": f"{middle} in an image", "counts": counts}
-
-    def _inside(self, names):
-        """A folder of masks in which features are looked for: the alpha of cut-outs, and on a
-        turntable what stands before a uniform background; None where it is not uniform, but stands
-        still, or where there are none.
-        """
-        folder = self.work / "inside"
-        if folder.is_dir() and any(folder.iterdir()):  # the stage was stopped, and goes on
-            return folder
-        try:
-            with atomic_folder(folder) as unfinished:
-                for name in names:
-                    mask = masks.inside(self.frames / name, self.options["turntable"])
-                    if mask is not None:
-                        write_png(unfinished / f"{name}.png", mask)
-                    elif self.options["turntable"]:
-                        raise UserError(name)
-        except UserError:
-            return None
-        return folder if any(folder.iterdir()) else None
+        return {"line": f"{int(np.median(list(counts.values())))} in an image", "counts": counts}
 
     def _matches(self):
         pairs = isolated(self.work, features.match, self.database)
-        turntable = self.options["turntable"]
-        turns = isolated(self.work, still.remove_still, self.database, self.turns, turntable)
+        begun, turntable = self.work / "turns", self.options["turntable"]
+        turns = isolated(self.work, features.remove_still, self.database, begun, turntable)
         line = f"{pairs} pairs of images"
         if turns:
             line += "; the object turns before a background that stands still, which is left out"
@@ -309,35 +264,32 @@ class Capture:
         found = isolated(
             self.work, poses.place, self.database, self.frames, self.model, taken, turns
         )
-        model = needed("pycolmap").Reconstruction(self.model)
-        self._show("poses", _seen_from_outside(model, None))
+        self._show("poses", self._model(), None)
         unplaced = [f"{name} {why}" for name, why in found["unplaced"].items()]
         line = (
             f"{found['placed']} of {len(taken)} images, {found['points']} points, reprojection"
-            f" error {found['error']:.2f} pixels"
+            f" error {found['error']:.2f} pixels{_but(unplaced, 'without a place')}"
         )
-        return {"line": line + _left_out(unplaced, "without a place"), **found}
+        return {"line": line, **found}
 
     def _images(self):
-        model = needed("pycolmap").Reconstruction(self.model)
-        taken = poses.image_files(model)
-        made = pinhole.write_images(self._dev, self.frames, self.images, taken)
+        taken = poses.image_files(self._model())
+        made = frames.write_images(self._dev, self.frames, self.scene / "images", taken)
         earlier = f", {len(taken) - made} of them before" if made < len(taken) else ""
         return {"line": f"{len(taken)} without distortion{earlier}"}
 
     def _box(self):
-        model = needed("pycolmap").Reconstruction(self.model)
+        model = self._model()
         cameras = [one.camera for one in poses.image_files(model)]
         world = box.find_world(cameras, poses.points(model)[0])
-        corners = self.options["box"]
-        chosen = world.box if corners is None else np.sort(np.reshape(corners, (2, 3)), axis=0)
-        size = " x ".join(f"{side:.2f}" for side in np.ptp(chosen, axis=0))
+        given = self.options["box"]
+        chosen = world.box if given is None else np.sort(np.reshape(given, (2, 3)), axis=0)
         _move(model, world.scale, world.rotation, world.shift)
         eyes = [one.camera.eye for one in poses.image_files(model)]
         distance = np.median(np.linalg.norm(eyes, axis=1))
-        self._show("box", _seen_from_outside(model, chosen))
+        self._show("box", model, chosen)
         return {
-            "line": f"{size}, the cameras {distance:.2f} from its middle",
+            "line": f"{_size(chosen)}, the cameras {distance:.2f} from its middle",
             "scale": float(world.scale),
             "rotation": world.rotation.tolist(),
             "shift": world.shift.tolist(),
@@ -347,17 +299,10 @@ class Capture:
     def _masks(self):
         model, before = self._world()
         corners, edits = before, read_edits(self.scene)
-        given, dropped = self.options["masks"], edits.dropped
-        is_given = self.options["box"] is not None or edits.box is not None
         taken = {one.name: one for one in poses.image_files(model)}
         image_files = [replace(one, lens=LensDistortion()) for one in taken.values()]
         points, seen = poses.points(model, FOLLOWED)
-        used = [i for i, one in enumerate(image_files) if one.name not in dropped]
         files = self._found("frames")["images"] if self.source.is_dir() else []
-        sources = {one["name"]: one["source"] for one in files}
-
-        def fitted(name, mask):
-            return pinhole.undistorted_mask(self._dev, mask, taken[name])
 
         def write(chosen):
             return masks.write_masks(
@@ -366,57 +311,55 @@ class Capture:
                 corners,
                 points,
                 [seen[i] for i in chosen],
-                given=given and Path(given),
-                sources=sources,
-                fitted=fitted,
+                given=self.options["masks"] and Path(self.options["masks"]),
+                sources={one["name"]: one["source"] for one in files},
+                fitted=lambda name, mask: frames.undistorted_mask(self._dev, mask, taken[name]),
                 command=self.options["mask_command"],
                 turns=self._found("matches")["turns"],
-                grows=not is_given,
+                grows=self.options["box"] is None and edits.box is None,
             )
 
+        used = [i for i, one in enumerate(image_files) if one.name not in edits.dropped]
         line, wrong, corners = write(used)
-        if dropped:  # they have had no say in the others
+        if edits.dropped:  # they have had no say in the others
             write(range(len(image_files)))
-        self._show("masks", masks.outline_sheet(self.scene, image_files, wrong))
+        sheet = masks.outline_sheet(self.scene, image_files, wrong)
+        write_png(self._file("masks", ".png"), sheet)
         if (corners == before).all():
             return {"line": line}
-        size = " x ".join(f"{side:.2f}" for side in np.ptp(corners, axis=0))
-        return {"line": f"{line}; the box cut the object: now {size}", "box": corners.tolist()}
+        return {
+            "line": f"{line}; the box cut the object: now {_size(corners)}",
+            "box": corners.tolist(),
+        }
 
     def _scene(self):
         model, corners = self._world()
         found = poses.image_files(model)
-        places = [
-            {
-                "file_path": one.name,
-                "mask_path": masks.mask_file(Path(), one.name).as_posix(),
-                **_rounded(frame_keys(one.camera)),
-            }
-            for one in found
-        ]
-        pinhole.undistort_model(model)
+        places = []
+        for one in found:
+            mask = masks.mask_file(Path(), one.name).as_posix()
+            keys = {key: _rounded(value) for key, value in frame_keys(one.camera).items()}
+            places.append({"file_path": one.name, "mask_path": mask, **keys})
+        poses.undistort_model(model)
         with atomic_folder(self.scene / "sparse") as unfinished:
             (unfinished / "0").mkdir()
             model.write(unfinished / "0")
         with atomic_path(self.scene / "points.ply") as unfinished:
             model.export_PLY(unfinished)
-        write_json(
-            self.scene / SCENE_FILE,
-            {
-                "camera_model": "OPENCV",
-                "ply_file_path": "points.ply",
-                "aabb": _rounded(corners.tolist()),
-                "frames": places,
-            },
-        )
+        stated = {"camera_model": "OPENCV", "ply_file_path": "points.ply"}
+        write_json(self.scene / SCENE_FILE, stated | {"aabb": _rounded(corners), "frames": places})
         return {"line": f"wrote {self.scene / SCENE_FILE} with {len(found)} photographs"}
 
+    def _show(self, stage, model, corners):
+        """Write the stage's image of a model's points and cameras, and a box (2, 3)."""
+        cameras = [one.camera for one in poses.image_files(model)]
+        colours = np.array([point.color for point in model.points3D.values()])
+        drawn = overview(cameras, corners, poses.points(model)[0], colours, SHOWN_WIDTH)
+        write_png(self._file(stage, ".png"), drawn)
+
     def _world(self):
-        """(pycolmap's model in the scene's world, (2, 3) box of the object there: the user's, if
-        one was chosen in the page of `pp-cl view`; once masks are made, the one that they
-        need).
-        """
-        model, found = needed("pycolmap").Reconstruction(self.model), self._found("box")
+        """(pycolmap's model in the scene's world, (2, 3) box: the user's, or that of the masks)."""
+        model, found = self._model(), self._found("box")
         _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
         edited = read_edits(self.scene).box
         if edited is not None:
@@ -425,16 +368,12 @@ class Capture:
         return model, np.array(grown or found["box"])
 
 
-def _option(name):
-    """What an option is called on the command line."""
-    return "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
+def _size(corners):
+    return " x ".join(f"{side:.2f}" for side in np.ptp(corners, axis=0))
 
 
-def _rounded(found):
-    """Lists and values of dictionaries with DECIMALS."""
-    if isinstance(found, dict):
-        return {key: _rounded(value) for key, value in found.items()}
-    return np.round(found, DECIMALS).tolist()
+def _rounded(values):
+    return np.round(values, DECIMALS).tolist()
 
 
 def _move(model, scale, rotation, shift):
@@ -443,13 +382,6 @@ def _move(model, scale, rotation, shift):
     model.transform(colmap.Sim3d(scale, colmap.Rotation3d(rotation), shift))
 
 
-def _seen_from_outside(model, box):
-    """The image of a model's points and cameras, and a box (2, 3), from two sides."""
-    cameras = [one.camera for one in poses.image_files(model)]
-    colours = np.array([point.color for point in model.points3D.values()])
-    return overview(cameras, box, poses.points(model)[0], colours, SHOWN_WIDTH)
-
-
-def _left_out(lines: Sequence[str], what: str) -> str:
+def _but(lines: Sequence[str], what: str) -> str:
     """`; 3 left out: A, B and 1 more`, empty without lines."""
     return f"; {len(lines)} {what}: {few_names(lines)}" if lines else ""

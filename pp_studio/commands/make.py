@@ -12,7 +12,10 @@ from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
 from pp_cl.config import field_of
 from pp_cl.errors import UserError
+from pp_studio.capture import STAGES
+from pp_studio.commands import render
 from pp_studio.commands.capture import add_hints
+from pp_studio.export import QUICK
 
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
 EPILOG = """FOLDER then holds
@@ -60,9 +63,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Do the steps that are left, and say what to open."""
     from pp_cl import RunFolder, load
+    from pp_cl.scene import read_json, scene_splits
     from pp_studio.export.gaussians import fitted_gaussians
-    from pp_studio.export.result import INDEX, SPLAT, begin_result, is_newer, write_result
+    from pp_studio.export.result import INDEX, SPLAT, VIDEOS, begin_result, is_newer, write_result
     from pp_studio.export.result import MINUTES as PASSED
+    from pp_studio.video import check_video
 
     share, out, is_scene = _share(), Path(options.out), _is_scene(options.source)
     if is_scene:
@@ -70,8 +75,12 @@ def run(options: argparse.Namespace) -> None:
     begin_result(out)
     device = ["--device", options.device] if options.device else []
     folder, scene, masks = RunFolder(out / "run"), options.source, []
-    video, page = _video(), out / INDEX
+    page, video = out / INDEX, VIDEOS[0]
     told: list[str] = []
+    try:
+        check_video("mp4")
+    except UserError:
+        video = VIDEOS[1]
 
     def show(split=""):
         run = load(folder.path, options.device) if folder.checkpoint.exists() else None
@@ -82,10 +91,12 @@ def run(options: argparse.Namespace) -> None:
             masks = ["--masks", options.masks] if options.masks else []
         else:
             scene = str(out / "scene")
-            if not (Path(scene) / "transforms.json").exists():
+            if not Path(scene, "transforms.json").exists():
                 clock.tell_of_capture(options.source)
             _step("capture", options.source, "--out", scene, *_hints(options))
-            told = _captured(Path(scene))
+            *stages, _ = STAGES  # the last one tells what it has written
+            found = {name: read_json(out / f"scene/capture/{name}.json") for name in stages}
+            told = [f"{name}: {one['line']}" for name, one in found.items()]
         if not folder.checkpoint.exists():
             show()
             print(f"wrote {page}: open it in a browser; it grows as parts are done")
@@ -96,14 +107,14 @@ def run(options: argparse.Namespace) -> None:
         else:  # as it began, unless told otherwise, which train refuses
             preset = ["--preset", options.preset] if options.preset else []
         _step("train", scene, "--out", str(folder), *preset, *masks, *device)
-        split = _held_out(scene)
+        split = "test" if "test" in scene_splits(scene) else "train"
         show(split)
         print(f"wrote {page}: with the model; figures, splat and video follow")
         _step("eval", str(folder), "--split", split, *device)
         show(split)
         if not is_newer(out / SPLAT, folder.checkpoint):
             # of which export makes the file
-            fitted_gaussians(load(folder.path, options.device), minutes=OF_SPLAT * clock.left)
+            fitted_gaussians(load(folder.path, options.device), QUICK, OF_SPLAT * clock.left)
             words = ["--format", "splat"]
             _step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
             show(split)
@@ -200,56 +211,26 @@ def _hints(options):
     words = []
     if options.turntable is not None:
         words = ["--turntable" if options.turntable else "--no-turntable"]
-    for name in ("masks", "mask_command"):
-        if getattr(options, name):
-            words += [f"--{name.replace('_', '-')}", getattr(options, name)]
+    if options.masks:
+        words += ["--masks", options.masks]
+    if options.mask_command:
+        words += ["--mask-command", options.mask_command]
     if options.box:
         box = options.box if isinstance(options.box, str) else ",".join(map(repr, options.box))
         words.append(f"--box={box}")
     return words
 
 
-def _captured(scene: Path) -> list[str]:
-    """What the stages of a capture have found, but for what the last one has written."""
-    from pp_cl.scene import read_json
-    from pp_studio.capture import STAGES
-
-    *stages, _ = STAGES
-    return [f"{name}: {read_json(scene / 'capture' / f'{name}.json')['line']}" for name in stages]
-
-
-def _video():
-    """The name of the video: of a format that can be written here."""
-    from pp_studio.export.result import VIDEOS
-    from pp_studio.video import check_video
-
-    try:
-        check_video(VIDEOS[0].partition(".")[2])
-    except UserError:
-        return VIDEOS[1]
-    return VIDEOS[0]
-
-
 def _fps(run, split, minutes):
-    """Frames a second of a video that takes so many minutes, about: by the time that a frame of the
-    evaluation took, of which larger ones are woven.
-    """
+    """Frames a second of a video that takes so many minutes, by what the evaluation took."""
     from pp_cl.scene import read_json
-    from pp_studio.commands.render import FPS, LEAST_HEIGHT, SECONDS
     from pp_studio.large import parts
 
     camera = run.cameras("train")[0]
-    times = max(1, LEAST_HEIGHT / camera.height)
+    times = max(1, render.LEAST_HEIGHT / camera.height)
     larger = camera.resized(round(times * camera.width), round(times * camera.height))
     seconds = read_json(run.folder.metrics(split))["seconds_per_frame"] * parts(run, larger) ** 2
-    return round(min(max(LEAST_FPS, 60 * minutes / (SECONDS * seconds)), FPS))
-
-
-def _held_out(scene):
-    """The split that is measured: train where no views are held out."""
-    from pp_cl.scene import scene_splits
-
-    return "test" if "test" in scene_splits(scene) else "train"
+    return round(min(max(LEAST_FPS, 60 * minutes / (render.SECONDS * seconds)), render.FPS))
 
 
 def _step(name, *words):

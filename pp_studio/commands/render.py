@@ -99,7 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a video of them where one is asked for."""
-    from pp_cl import Progress, load
+    from pp_cl import load
     from pp_cl.files import own
     from pp_studio.export.render_video import render_frames, render_video
     from pp_studio.video import check_video
@@ -119,23 +119,14 @@ def run(options: argparse.Namespace) -> None:
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
     if kind in VIDEOS and not options.out:
         own(out.parent, [out], "move it away, or choose another --out")
-    seconds = []
-    with Progress("rendering", len(cameras), "frame") as bar:
-
-        def on_frame(took):
-            bar.update()
-            if took is not None:
-                seconds.append(took)
-
-        if kind in VIDEOS:
-            render_video(run, cameras, out, options.fps, style, on_frame)
-        else:
-            render_frames(run, cameras, out, style, on_frame)
+    if kind in VIDEOS:
+        seconds = render_video(run, cameras, out, options.fps, style)
+    else:
+        seconds, _ = render_frames(run, cameras, out, style)
     made = f"{len(seconds)} of {len(cameras)} frames"
     if seconds:
         made += f", {statistics.median(seconds) * 1e3:.0f} ms each on {run.dev.name}"
-    print(f"rendered {made}")
-    print(f"wrote {out}")
+    print(f"rendered {made}\nwrote {out}")
 
 
 def _format(options):
@@ -194,9 +185,9 @@ def _frame_count(options, kind):
                 " leave it out"
             )
         return 0
-    count = round((seconds or SECONDS) * fps)
+    seconds = seconds or SECONDS
+    count = round(seconds * fps)
     if not 1 <= count <= MOST_FRAMES:
-        seconds = seconds or SECONDS
         raise UserError(
             f"--seconds {seconds:g}: {seconds * fps:g} frames at {fps:g} a second; ask for 1 to"
             f" {MOST_FRAMES}"
@@ -207,7 +198,7 @@ def _frame_count(options, kind):
 def _cameras(run, path, count, *, size, fov):
     """The cameras of a path, `count` of an orbit or spiral, with size and angle of view."""
     from pp_cl.scene import read_cameras
-    from pp_studio.camera_path import Surroundings
+    from pp_studio.camera_path import around
 
     def shaped(camera):
         camera = camera.resized(*size) if size else camera
@@ -218,9 +209,8 @@ def _cameras(run, path, count, *, size, fov):
     if path not in MADE:
         return [shaped(camera) for camera in run.cameras(path)]
     training = run.cameras("train")
-    around, first = Surroundings(training, run.model.positions()), shaped(training[0])
+    first = shaped(training[0])
     if not size and first.height < LEAST_HEIGHT:
         width = 2 * round(first.width / first.height * LEAST_HEIGHT / 2)
         first = first.resized(width, LEAST_HEIGHT)
-    make = around.orbit if path == "orbit" else around.spiral
-    return make(first, count)
+    return around(path, training, run.model.positions(), first, count)

@@ -69,46 +69,7 @@ def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
     from pp_cl import RunFolder
     from pp_cl.files import own
-    from pp_studio.sweep.result import failed_row, finished_row
-    from pp_studio.sweep.table import TABLES, markdown, run_text, values_text, write_tables
-
-    jobs, out = _jobs(options), Path(options.out)
-    rows, states = {}, {}
-    for job in jobs:
-        states[job.folder] = "to go on" if RunFolder(job.folder).config.exists() else "to do"
-        try:
-            if row := finished_row(job):
-                rows[job.folder], states[job.folder] = row, f"finished: {values_text(row)}"
-        except UserError as error:  # which the job meets again, and tells in its row
-            states[job.folder] = f"will fail: {error}"
-    told = f"{len(jobs)} runs, {len(rows)} of them finished already"
-    if options.dry_run:
-        for job in jobs:
-            print(f"{run_text(failed_row(job, ''))}: {states[job.folder]}")
-        print(f"{told}; nothing was started")
-        return
-    print(told, flush=True)
-    missing = [job for job in jobs if job.folder not in rows]
-    own(out, [out / name for name in TABLES])
-    if missing:
-        rows |= _run(options, missing, len(jobs))
-    # folders as seen from `out`, which may be moved
-    ordered = [
-        rows[job.folder] | {"folder": Path(job.folder).relative_to(out.resolve()).as_posix()}
-        for job in jobs
-    ]
-    shared.write_json_option(options.json, write_tables(out, ordered))
-    print(markdown(ordered))
-    print("wrote " + " and ".join(str(out / name) for name in TABLES))
-    failed = sum("error" in row for row in ordered)
-    if failed:
-        raise Stopped(f"{failed} of {len(jobs)} runs failed; the same command tries them again", 1)
-
-
-def _jobs(options):
-    """The runs that the options ask for. Raises UserError."""
-    from pp_cl import RunFolder
-    from pp_studio.sweep.plan import plan, read_varied
+    from pp_studio.sweep import plan, table
 
     if options.scheduler and options.workers:
         raise UserError("--workers: the cluster of --scheduler has its own; leave one of both out")
@@ -116,23 +77,55 @@ def _jobs(options):
         raise UserError("--json: a dry run measures nothing; leave one of both out")
     if RunFolder(options.out).config.exists():
         raise UserError(f"--out {options.out}: is the folder of a run; choose another")
-    return plan(
+    jobs = plan.plan(
         options.scenes,
         options.out,
         options.seeds,
-        read_varied(options.vary),
+        plan.read_varied(options.vary),
         given=[*shared.read_short(options, ["iterations"]), *options.set],
         preset_name=options.preset,
         metrics=options.metrics,
     )
+    rows, states, out = {}, {}, Path(options.out)
+    for job in jobs:
+        states[job.folder] = "to go on" if RunFolder(job.folder).config.exists() else "to do"
+        try:
+            if row := table.finished_row(job):
+                rows[job.folder], states[job.folder] = row, f"finished: {table.values_text(row)}"
+        except UserError as error:  # which the job meets again, and tells in its row
+            states[job.folder] = f"will fail: {error}"
+    told = f"{len(jobs)} runs, {len(rows)} of them finished already"
+    if options.dry_run:
+        for job in jobs:
+            print(f"{table.run_text(table.failed_row(job, ''))}: {states[job.folder]}")
+        print(f"{told}; nothing was started")
+        return
+    print(told, flush=True)
+    missing = [job for job in jobs if job.folder not in rows]
+    own(out, [out / name for name in table.TABLES])
+    if missing:
+        rows |= _run(options, missing, len(jobs))
+    # folders as seen from `out`, which may be moved
+    ordered = [
+        rows[job.folder] | {"folder": Path(job.folder).relative_to(out.resolve()).as_posix()}
+        for job in jobs
+    ]
+    shared.write_json_option(options.json, table.write_tables(out, ordered))
+    print(table.markdown(ordered))
+    print("wrote " + " and ".join(str(out / name) for name in table.TABLES))
+    failed = sum("error" in row for row in ordered)
+    if failed:
+        raise Stopped(f"{failed} of {len(jobs)} runs failed; the same command tries them again", 1)
 
 
 def _run(options, jobs, total):
-    """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after Ctrl-C or
-    SIGTERM.
-    """
+    """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after a signal."""
     from pp_cl import separate_devices
     from pp_cl.commands.signals import first_signal
+    from pp_cl.errors import require
+
+    # the last one makes certificates
+    require("pp-cl sweep", "dask", "distributed", "cryptography")
     from pp_studio.sweep.cluster import client_of, local_client, run_jobs
     from pp_studio.sweep.table import run_text, values_text
 

@@ -84,9 +84,7 @@ def run(options: argparse.Namespace) -> None:
 
 @contextmanager
 def following(training: "Training") -> Iterator["OnStep"]:
-    """Show a training in the browser while the block runs; gives what is to be called after each
-    step.
-    """
+    """Show a training in the browser while the block runs; gives what to call after each step."""
     from pp_studio.view.run_view import shown_training
 
     with shown_training(training) as (address, show):

@@ -5,9 +5,9 @@ QUICK, BEST = "quick", "best"
 # each alone)}
 QUALITIES = {QUICK: (1000, 1.5), BEST: (7000, 0.0)}
 SCENE, VIEWER = AXES = "scene", "viewer"
+SPLATS, POINTS = ("splat", "splat-spz", "splat-glb"), ("ply", "glb")
 # {format of coordinates: whose axes they have, unless others are asked for}
-AXES_OF = dict.fromkeys(("splat", "splat-spz", "splat-glb", "textured"), VIEWER)
-AXES_OF |= dict.fromkeys(("ply", "glb", "mesh"), SCENE)
+AXES_OF = dict.fromkeys((*SPLATS, "textured"), VIEWER) | dict.fromkeys((*POINTS, "mesh"), SCENE)
 # {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder;
 # what it is)}
 FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
@@ -22,11 +22,7 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         "the same in a tenth of the bytes, for Scaniverse, Spark, PlayCanvas and Babylon.js",
     ),
     "splat-glb": ("splat.glb", (".glb",), "the same as glTF (KHR_gaussian_splatting)"),
-    "ply": (
-        "cloud.ply",
-        (".ply",),
-        "the visible points with colour and everything learned",
-    ),
+    "ply": ("cloud.ply", (".ply",), "the visible points with colour and everything learned"),
     "glb": ("cloud.glb", (".glb",), "the coloured points"),
     "mesh": (
         "mesh.ply",
@@ -39,11 +35,7 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         (".html",),
         "one page that a browser draws without network or installation",
     ),
-    "gallery": (
-        "gallery",
-        (),
-        "a folder of such pages, one a run, with an index and stills",
-    ),
+    "gallery": ("gallery", (), "a folder of such pages, one a run, with an index and stills"),
     "scene": (
         "scene",
         (),

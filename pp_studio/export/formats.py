@@ -1,10 +1,9 @@
 """The formats of `pp-cl export`: which files each one writes."""
 
-from __future__ import annotations
-
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -15,30 +14,26 @@ from pp_cl.engine import View
 from pp_cl.errors import UserError, require
 from pp_cl.files import check_file, check_new_folder, check_ours, image_paths, own, write_text
 from pp_cl.scene import write_scene
-from pp_studio.export import AXES_OF, FORMATS, QUICK, VIEWER
-from pp_studio.export.gltf import gltf_colours, write_glb
-from pp_studio.export.length import metres_per_unit
-from pp_studio.export.mesh import coloured_mesh, write_mesh
-from pp_studio.export.page import fitted, page_text, write_gallery
-from pp_studio.export.points import coloured_points, in_world, inside, write_ply
-from pp_studio.export.splat import (
-    Y_DOWN,
-    Y_UP,
-    in_spz,
-    splats,
-    upright,
-    write_splat_glb,
-    write_splat_ply,
-    write_splat_spz,
+from pp_studio.export import (
+    AXES_OF,
+    FORMATS,
+    QUICK,
+    SPLATS,
+    VIEWER,
+    gaussians,
+    gltf,
+    length,
+    mesh,
+    page,
+    points,
+    splat,
+    texture,
 )
-from pp_studio.export.texture import textured_mesh, write_textured
 
 
 def check_target(name: str, folder: Path, out: Path | None) -> Path:
-    """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says.
-
-    Raises UserError unless it can be written there, and no other file is lost that `out` does not
-    name.
+    """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says. Raises
+    UserError unless it can be written there, and no file is lost that `out` does not name.
     """
     default, suffixes, _ = FORMATS[name]
     path = folder / "export" / default if out is None else out
@@ -69,77 +64,72 @@ def export_run(
     """
     if name not in FORMATS:
         raise UserError(f"no format {name}; choose from {', '.join(FORMATS)}")
-    path, count, metres = Path(path), run.model.cloud.count, metres_per_unit(run)
+    path, count, metres = Path(path), run.model.cloud.count, length.metres_per_unit(run)
     unit = "" if metres == 1 else ", in metres"
     within, turn = None, np.eye(3)
     if box is not None:
         within = np.sort(np.reshape(box, (2, 3)), axis=0)
-        inside(run.model.positions(), within)  # an empty one is refused before any work
+        points.inside(run.model.positions(), within)  # an empty one is refused before any work
     if (axes or AXES_OF.get(name)) == VIEWER:
-        turn = upright(run, Y_DOWN if name == "splat" else Y_UP)
+        turn = splat.upright(run, splat.Y_DOWN if name == "splat" else splat.Y_UP)
 
     def placed(positions):
-        return metres * in_world(positions @ turn.T, run.model.grid.voxel_size)
+        return metres * points.in_world(positions @ turn.T, run.model.grid.voxel_size)
 
-    if name == "mesh":
-        mesh = coloured_mesh(run, within)
-        _begin_default(name, path)
-        write_mesh(path, replace(mesh, vertices=placed(mesh.vertices)))
-        unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
-        return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces{unlit}{unit}"
-    if name == "textured":
-        solid = textured_mesh(run, turn, within)
-        solid.apply_scale(metres)
-        _begin_default(name, path)
-        write_textured(path, solid)
-        return f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
-    if name == "html":
-        gaussians = fitted(run)
-        text = page_text(run, gaussians)
-        _begin_default(name, path)
-        write_text(path, text)
-        return f"{len(gaussians.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     if name == "gallery":
-        return f"{write_gallery(path, chain([run], others))} pages and their index"
+        return f"{page.write_gallery(path, chain([run], others))} pages and their index"
     if name == "scene":
         splits = renderings(run)
         write_scene(splits, path)
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
-    if name in ("splat", "splat-spz", "splat-glb"):
+    write: Callable[[], None]
+    if name == "mesh":
+        made = mesh.coloured_mesh(run, within)
+        write = partial(mesh.write_mesh, path, replace(made, vertices=placed(made.vertices)))
+        unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
+        told = f"{len(made.vertices)} vertices, {len(made.faces)} faces{unlit}{unit}"
+    elif name == "textured":
+        solid = texture.textured_mesh(run, turn, within)
+        solid.apply_scale(metres)
+        write = partial(texture.write_textured, path, solid)
+        told = f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
+    elif name == "html":
+        fitted = gaussians.fitted_gaussians(run)
+        text = page.page_text(run, fitted)
+        write = partial(write_text, path, text)
+        told = f"{len(fitted.table)} Gaussians, {len(text) / 1e6:.1f} MB"
+    elif name in SPLATS:
         if name == "splat-spz":
             require("splat-spz", "gsply")
-        table, origin = splats(run, turn, quality, within)
-        table["position"] *= metres
-        table["deviations"] *= metres
-        _begin_default(name, path)
-        if name == "splat":
-            write_splat_ply(path, table)
-        elif name == "splat-spz":
-            table, times = in_spz(table)
-            write_splat_spz(path, table)
+        table, origin = splat.splats(run, turn, quality, within)
+        for field in ("position", "deviations"):
+            table[field] *= metres
+        if name == "splat-spz":
+            table, times = splat.in_spz(table)
             unit += "" if times == 1 else f", times {times:g}"
+        told = f"{len(table)} Gaussians{unit}"
+        if name == "splat-glb":
+            write = partial(splat.write_splat_glb, path, table, metres * origin)
         else:
-            write_splat_glb(path, table, metres * origin)
-        moved = f", less {', '.join(f'{x:g}' for x in metres * origin)}" if origin.any() else ""
-        return f"{len(table)} Gaussians{unit}{moved if name != 'splat-glb' else ''}"
-    points = coloured_points(run, min_weight, within)
-    points = replace(
-        points, positions=placed(points.positions), radius=np.float32(metres) * points.radius
-    )
-    _begin_default(name, path)
-    if name == "ply":
-        axes = "turned upright, y up" if axes == VIEWER else "its scene's"
-        write_ply(path, points, run.model.cloud, f"{axes}{unit}")
+            kind = splat.write_splat_ply if name == "splat" else splat.write_splat_spz
+            write = partial(kind, path, table)
+            if origin.any():
+                told += f", less {', '.join(f'{x:g}' for x in metres * origin)}"
     else:
-        colours = gltf_colours(points.colours / 255)
-        write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})
-    return f"{len(points.rows)} of {count} points{unit}"
-
-
-def _begin_default(name, path):
-    """Make the folder of a file that has no --out, as its name says."""
-    if path.parts[-2:] == ("export", FORMATS[name][0]):
+        found = points.coloured_points(run, min_weight, within)
+        radius = np.float32(metres) * found.radius
+        found = replace(found, positions=placed(found.positions), radius=radius)
+        told = f"{len(found.rows)} of {count} points{unit}"
+        if name == "ply":
+            axes = "turned upright, y up" if axes == VIEWER else "its scene's"
+            write = partial(points.write_ply, path, found, run.model.cloud, f"{axes}{unit}")
+        else:
+            colours = gltf.gltf_colours(found.colours / 255)
+            write = partial(gltf.write_glb, path, {"POSITION": found.positions, "COLOR_0": colours})
+    if path.parts[-2:] == ("export", FORMATS[name][0]):  # of a file that has no --out
         own(path.parent)
+    write()
+    return told
 
 
 def renderings(run: Run) -> dict[str, list[View]]:
@@ -152,11 +142,9 @@ def renderings(run: Run) -> dict[str, list[View]]:
         splits["test"] = run.image_files("test")
     except UserError as error:
         warnings.warn(f"no test views are exported: {error}", stacklevel=2)
-    return {split: _rendered(run, split, listed) for split, listed in splits.items()}
-
-
-def _rendered(run, split, listed):
-    """The views of a split, named after their files in its folder."""
-    files = image_paths([one.name for one in listed])
-    views = run.rendered(listed, opaque=False)
-    return [replace(v, name=f"{split}/{file}") for v, file in zip(views, files, strict=True)]
+    found = {}
+    for split, listed in splits.items():
+        files, views = image_paths([one.name for one in listed]), run.rendered(listed, opaque=False)
+        named = zip(views, files, strict=True)
+        found[split] = [replace(view, name=f"{split}/{file}") for view, file in named]
+    return found

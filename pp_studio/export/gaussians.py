@@ -1,12 +1,9 @@
 """Gaussians of three axes fitted to a run's images, and where these are few to its renderings
 of as many views between them, as viewers of 3D Gaussian splatting draw them: without a network,
 each widened by a third of a pixel^2, and colours below 0 taken for black. A step draws them for a
-window of another size, so that they look the same in all of them.
-
-The trainer does it, with the footprint "gaussian" and means of features in place of the network.
+window of another size. It is the trainer's, with the footprint "gaussian" and means of features in
+place of the network.
 """
-
-from __future__ import annotations
 
 import copy
 import hashlib
@@ -15,8 +12,9 @@ import math
 import time
 import warnings
 import zipfile
+from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,7 +28,6 @@ from pp_studio.export import BEST, QUALITIES, QUICK
 from pp_studio.export.harmonics import COUNT, fit_harmonics
 
 FILE = "gaussians.npz"  # in the folder of a run
-# Of a Gaussian, see fitted_gaussians()
 GAUSSIAN = np.dtype(
     [
         ("position", "<f4", 3),
@@ -74,6 +71,27 @@ FACTORS = np.array(
 )
 
 
+class Gaussians(NamedTuple):
+    """A run as Gaussians that are drawn without its network, in the axes and units of its scene, as
+    3D Gaussian splatting defines them.
+
+    table: (M,) records of GAUSSIAN. position: (3,) float32, the mean, relative to the origin, (3,)
+    float64. deviations: (3,) float32, standard deviations along a Gaussian's own axes (what files
+    call scales, without a logarithm). turn: (4,) float32, the unit quaternion (w, x, y, z) that
+    turns these axes to the world's. opacity: float32 in (1/255, 0.99], after the sigmoid.
+    harmonics: (9, 3) float32, coefficients of degrees 0 to 2 for the three channels of sRGB less
+    0.5, basis and signs of 3D Gaussian splatting, of the unit direction from the eye to the mean.
+
+    windows: least and most pixels of a window, for one of the run's images each way, in which they
+    look right with all variances on the screen widened by low_pass, pixels^2.
+    """
+
+    table: np.ndarray
+    origin: np.ndarray
+    windows: tuple[float, float] = (1.0, 1.0)
+    low_pass: float = 0.0
+
+
 class WindowCrops(Crops):
     """Crops as windows of any size show them: a pixel is the mean of several of a window's."""
 
@@ -97,17 +115,13 @@ def windows(longest: float) -> tuple[float, float]:
     return least, least * 2**DOUBLINGS
 
 
-def fit_gaussians(
-    run: Run, steps: int, cell: float, minutes: float = math.inf
-) -> tuple[PointCloud, float]:
-    """(Gaussians, the deviation of one without offsets): fitted in so many steps, or as many as
-    take these minutes, from the points that training views show, those in a cubic `cell`, in voxel
-    sizes, as one; 0: each point. Of the features of their SH, which are 3D Gaussian splatting's,
-    the first three are sRGB colour.
+def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) -> PointCloud:
+    """Gaussians that are fitted in so many steps, or as many as take these minutes, from the points
+    that training views show, those in a cubic `cell`, in voxel sizes, as one; 0: each point. Of the
+    features of their SH, which are 3D Gaussian splatting's, the first three are sRGB colour.
     """
     end = time.monotonic() + 60 * minutes
-    dev, coefficients = run.dev, fit_harmonics(run, steps=1)  # the first of many steps
-    cloud = begun(run, coefficients, cell)
+    dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell)  # the first of many steps
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:
@@ -117,9 +131,8 @@ def fit_gaussians(
         views = (views or run.rendered(listed, opaque=True)) + run.rendered(more, opaque=True)
     sides = [side for view in views for side in (view.camera.width, view.camera.height)]
     factor = max(1, min(round(max(sides) / LARGEST), min(sides) // MIN_SIDE))
-    views = [view.reduced(factor * view.downscale) for view in views]
     config = config_of(run, steps)
-    trainer = Trainer(dev, config, model, views)
+    trainer = Trainer(dev, config, model, [one.reduced(factor * one.downscale) for one in views])
     trainer.crops = WindowCrops(trainer.views, config)
     with Progress("fitting Gaussians", steps, "step") as progress:
         while trainer.step < config.train.iterations:
@@ -133,78 +146,65 @@ def fit_gaussians(
                 progress.total = config.train.iterations = min(max(fitting, FEWEST), steps)
     trainer.check()
     trainer.finish()
-    return cloud, config.raster.radius * run.model.grid.voxel_size
+    return cloud
 
 
-def fitted_gaussians(
-    run: Run, quality: str = QUICK, minutes: float = math.inf
-) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of GAUSSIAN, (3,) float64 origin): the run as Gaussians that are drawn without
-    its network, in the axes and units of its scene, as 3D Gaussian splatting defines them.
-
-    position: (3,) float32, the mean, relative to the origin. deviations: (3,) float32, standard
-    deviations along a Gaussian's own axes (what files call scales, without a logarithm). turn: (4,)
-    float32, the unit quaternion (w, x, y, z) that turns these axes to the world's. opacity: float32
-    in (1/255, 0.99], after the sigmoid. harmonics: (9, 3) float32, coefficients of degrees 0 to 2
-    for the three channels of sRGB less 0.5, basis and signs of 3D Gaussian splatting, of the unit
-    direction from the eye to the mean.
-
-    Fitted once for a checkpoint and kept in the run's folder as FILE; later calls read that.
-    quality: one of QUALITIES. minutes: at most, which costs steps. Raises UserError as
-    check_drawable does.
+def fitted_gaussians(run: Run, quality: str | None = None, minutes: float = math.inf) -> Gaussians:
+    """The run's Gaussians, fitted once for a checkpoint and kept in the run's folder as FILE, which
+    later calls read. quality: one of QUALITIES; None: what is kept, else QUICK. minutes: at most,
+    which costs steps. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    path, origin = run.folder.path / FILE, run.model.grid.centre
-    key = _key(run, quality)
-    table = _kept(path, key)
-    if table is None:
-        table = _table(run, *fit_gaussians(run, *QUALITIES[quality], minutes))
-        try:
-            with atomic_file(path) as file:
-                np.savez(file, key=np.array(key), gaussians=table)
-        except UserError as error:
-            warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
-    return table, origin
+    if found := kept_gaussians(run, [quality] if quality else QUALITIES):
+        return found
+    table = _table(run, fit_gaussians(run, *QUALITIES[quality or QUICK], minutes))
+    try:
+        with atomic_file(run.folder.path / FILE) as file:
+            np.savez(file, key=np.array(_key(run, quality or QUICK)), gaussians=table)
+    except UserError as error:
+        warnings.warn(f"{error}; the next export fits the Gaussians again", stacklevel=2)
+    return _fitted(run, table)
 
 
-def kept_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray] | None:
-    """What fitted_gaussians() has kept for the run's checkpoint, of the last quality that was
-    asked for; None where there is nothing.
+def kept_gaussians(run: Run, qualities: Iterable[str] = QUALITIES) -> Gaussians | None:
+    """What fitted_gaussians() has kept for the run's checkpoint, if that is of one of these
+    qualities and not damaged, else None.
     """
-    found = (_kept(run.folder.path / FILE, _key(run, quality)) for quality in QUALITIES)
-    table = next((one for one in found if one is not None), None)
-    return None if table is None else (table, run.model.grid.centre)
+    try:
+        with np.load(run.folder.path / FILE) as stored:
+            key = str(stored["key"])
+            is_kept = any(key == _key(run, quality) for quality in qualities)
+            table = stored["gaussians"] if is_kept else np.empty(0)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return _fitted(run, table) if table.dtype == GAUSSIAN else None
 
 
-def first_gaussians(run: Run) -> tuple[np.ndarray, np.ndarray]:
+def _fitted(run, table):
+    longest = max(max(camera.width, camera.height) for camera in run.cameras("train"))
+    reduced = max(1, round(longest / LARGEST))  # as the fit reduces them
+    least, most = (one / reduced for one in windows(longest / reduced))
+    return Gaussians(table, run.model.grid.centre, (least, most), LOW_PASS)
+
+
+def first_gaussians(run: Run) -> Gaussians:
     """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
     the colours that the network gives them. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    radius = run.config.raster.radius * run.model.grid.voxel_size
     cloud = begun(run, fit_harmonics(run, steps=0, most=FIRST_VIEWS), 0)
-    return _table(run, cloud, DEVIATION * radius), run.model.grid.centre
+    return Gaussians(_table(run, cloud), run.model.grid.centre)
 
 
 def _key(run, quality):
     """What the Gaussians depend on, as text."""
-    cloud, digest = run.model.cloud, hashlib.sha256()
-    for array in (cloud.ids, cloud.offset, cloud.opacity):
-        digest.update(array.get().tobytes())
-    return json.dumps([digest.hexdigest(), run.header["step"], *QUALITIES[quality]])
+    cloud = run.model.cloud
+    arrays = [array.get().tobytes() for array in (cloud.ids, cloud.offset, cloud.opacity)]
+    digest = hashlib.sha256(b"".join(arrays)).hexdigest()
+    return json.dumps([digest, run.header["step"], *QUALITIES[quality]])
 
 
-def _kept(path: Path, key: str) -> np.ndarray | None:
-    """The Gaussians of a file that has this key, None where there is none or it is damaged."""
-    try:
-        with np.load(path) as stored:
-            table = stored["gaussians"] if str(stored["key"]) == key else None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None
-    return table if table is not None and table.dtype == GAUSSIAN else None
-
-
-def _table(run, cloud, deviation):
+def _table(run, cloud):
     """The visible ones as records of GAUSSIAN, relative to the centre of the run's grid."""
     opacity, offset = cloud.opacity.get()[:, 0].clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
@@ -214,7 +214,11 @@ def _table(run, cloud, deviation):
     table["harmonics"] = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
     table["harmonics"][:, 0] -= 0.5 / CONSTANT
     table["opacity"] = opacity[rows]
-    axes, table["deviations"], _ = np.linalg.svd(deviation * triangles(offset[rows]))
+    deviation = run.config.raster.radius * DEVIATION * grid.voxel_size  # of one without offsets
+    lower = np.zeros((len(rows), 3, 3))  # L of the covariances L L^T, by cl/cloud.h
+    lower[:, range(3), range(3)] = np.exp(offset[rows, 3:6])
+    lower[:, [1, 2, 2], [0, 0, 1]] = offset[rows, 6:9]
+    axes, table["deviations"], _ = np.linalg.svd(deviation * lower)
     axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
     table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
     return table
@@ -233,24 +237,10 @@ def check_drawable(run: Run) -> None:
         )
 
 
-def triangles(offset: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) L of the covariances L L^T of Gaussians, in deviations of one without offsets.
-    offset: (N, 16), cl/cloud.h.
-    """
-    lower = np.zeros((len(offset), 3, 3))
-    lower[:, range(3), range(3)] = np.exp(offset[:, 3:6])
-    lower[:, [1, 2, 2], [0, 0, 1]] = offset[:, 6:9]
-    return lower
-
-
 def _fitted_views(run):
-    """The run's training views, none if their exposures differ, or with a warning if they are not
-    there.
-    """
-    if run.header.get("exposed"):
-        return []
+    """The run's training views; none if exposures differ, or, with a warning, they are gone."""
     try:
-        views = run.scene("train").splits["train"]
+        views = [] if run.header.get("exposed") else run.scene("train").splits["train"]
     except UserError as error:
         told = f"the Gaussians are fitted to renderings of the training views alone: {error}"
         warnings.warn(told, stacklevel=2)

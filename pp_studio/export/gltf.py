@@ -1,7 +1,5 @@
 """glTF 2.0 in one binary file (GLB): points, Gaussians or triangles with attributes."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path
@@ -34,29 +32,21 @@ def write_glb(
     origin = np.rint(place.mean(0)) if place.dtype == np.float64 else np.zeros(3)
     arrays["POSITION"] = place = (place - origin).astype(np.float32)
     names = {name: i for i, name in enumerate(arrays)}
-    stored = [np.ascontiguousarray(array) for array in arrays.values()]
-    if faces is not None:
-        stored.append(np.ascontiguousarray(faces, np.uint32).ravel())
-    accessors = [
-        {
-            "bufferView": i,
-            "componentType": TYPES[array.dtype],
-            "normalized": array.dtype == np.uint16,
-            "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
-            "count": len(array),
-        }
-        for i, array in enumerate(stored)
-    ]
-    least, most = place.min(0).tolist(), place.max(0).tolist()
-    accessors[names["POSITION"]] |= {"min": least, "max": most}
-    starts = np.cumsum([0, *(array.nbytes for array in stored)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes}
-        for start, array in zip(starts, stored, strict=False)
-    ]
     primitive: dict[str, Any] = {"mode": POINTS, "attributes": names}
     if faces is not None:
         primitive |= {"mode": TRIANGLES, "indices": len(names), "material": 0}
+        arrays[""] = np.asarray(faces, np.uint32).ravel()
+    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, Any]] = []
+    content = b""
+    for array in arrays.values():
+        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        about = {"componentType": TYPES[array.dtype], "normalized": array.dtype == np.uint16}
+        accessors.append({"bufferView": len(views), **about, "type": kind, "count": len(array)})
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": array.nbytes})
+        content += array.tobytes()
+    least, most = place.min(0).tolist(), place.max(0).tolist()
+    accessors[names["POSITION"]] |= {"min": least, "max": most}
     gltf: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "pp-cl"},
         "scene": 0,
@@ -65,7 +55,7 @@ def write_glb(
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": starts[-1]}],
+        "buffers": [{"byteLength": len(content)}],
     }
     if faces is not None:  # without a material it would be metal
         gltf["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
@@ -76,17 +66,13 @@ def write_glb(
     text = json.dumps(gltf).encode()
     text += b" " * (-len(text) % 4)
     with atomic_file(path) as file:
-        length = 12 + 8 + len(text) + 8 + starts[-1]
-        file.write(struct.pack("<4sII", b"glTF", 2, length))
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(content)))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
-        file.writelines(array.tobytes() for array in stored)
+        file.write(struct.pack("<I4s", len(content), b"BIN\0") + content)
 
 
 def make_unlit(gltf: dict[str, Any]) -> None:
-    """Have viewers show the materials of a glTF document without lamps; those that do not know how
-    light them as before.
-    """
+    """Have viewers that know how show the materials of a glTF document without lamps."""
     for material in gltf.get("materials", ()):
         material["extensions"] = {UNLIT: {}}
     gltf["extensionsUsed"] = [*gltf.get("extensionsUsed", ()), UNLIT]

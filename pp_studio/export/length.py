@@ -1,7 +1,5 @@
 """True size: how many metres a unit of a run's scene is, from one length that is known."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -20,9 +18,7 @@ OPAQUE = 0.5  # least alpha of a pixel that shows the object
 
 
 def metres_per_unit(run: Run) -> float:
-    """What set_length() has found, 1 where it has not been called. Raises UserError for a broken
-    file.
-    """
+    """What set_length() has found, 1 before it was called. Raises UserError for a broken file."""
     path = run.folder.path / FILE
     if not path.exists():
         return 1.0
@@ -42,8 +38,7 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
     how many a unit of the scene is; all exports of coordinates are in metres from then on. first,
     second: PHOTO:X,Y, as `surface_point`. Raises UserError for two points at one place.
     """
-    points = [surface_point(run, text) for text in (first, second)]
-    apart = float(np.linalg.norm(points[0] - points[1]))
+    apart = float(np.linalg.norm(surface_point(run, first) - surface_point(run, second)))
     if apart < run.model.grid.voxel_size:
         raise UserError(f"--length {first} {second}: show the same place; name two far apart")
     found = float(metres) / apart
@@ -55,9 +50,7 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
 
 
 def _straight(run, image_file, x, y):
-    """The pixel that shows without distortion what (x, y) shows of the image; (x, y) itself
-    where the scene, which knows the lens, is not there.
-    """
+    """The pixel without distortion; (x, y) itself where the scene, which knows it, is gone."""
     try:
         listed = scene_frames(run.config.scene.path, edited=False)
     except UserError:
@@ -85,32 +78,25 @@ def surface_point(run: Run, text: str) -> np.ndarray:
         raise UserError(
             f"--length {shown(text)}: write PHOTO:X,Y, for example a.jpg:812,430"
         ) from None
-    image_files = run.image_files("train")
+    refused, image_files = f"--length {shown(text)}: ", run.image_files("train")
     matches = [one for one in image_files if one.name == name or one.name.endswith(f"/{name}")]
-    if len(matches) != 1:
+    if len(matches) > 1:
+        raise UserError(f"{refused}{name} is in several folders; write more of its path")
+    if not matches:
         names = [one.name for one in image_files]
         near = suggestion(name, names).strip() or f"name one such as {names[0]}"
-        raise UserError(
-            f"--length {shown(text)}: "
-            + (
-                f"{name} is in several folders; write more of its path"
-                if matches
-                else f"no training image of that name; {near}"
-            )
-        )
+        raise UserError(f"{refused}no training image of that name; {near}")
     stored = matches[0].camera
     if not (x < stored.width and y < stored.height):
-        raise UserError(
-            f"--length {shown(text)}: the image has {stored.width}x{stored.height} pixels"
-        )
+        raise UserError(f"{refused}the image has {stored.width}x{stored.height} pixels")
     x, y = _straight(run, matches[0], x, y)
     if not (0 <= x < stored.width and 0 <= y < stored.height):
-        raise UserError(f"--length {shown(text)}: lies beyond what is left of the image")
+        raise UserError(f"{refused}lies beyond what is left of the image")
     camera = stored.downscaled(run.config.scene.downscale)
     rendered = run.render(camera)
     column = min(int(x * camera.fx / stored.fx), camera.width - 1)
     row = min(int(y * camera.fy / stored.fy), camera.height - 1)
     if not rendered.alpha[row, column] > OPAQUE:
-        raise UserError(f"--length {shown(text)}: the model shows no object there")
+        raise UserError(f"{refused}the model shows no object there")
     along = np.array([(x - stored.cx) / stored.fx, (y - stored.cy) / stored.fy, 1.0])
     return stored.eye + rendered.median_depth[row, column] * stored.pose[:, :3] @ along

@@ -1,7 +1,8 @@
-"""The surface of a run as a mesh with coloured vertices."""
+"""The surface of a run as a mesh with coloured vertices: by the depth maps of the training views,
+which are fused into one signed distance field, a TSDF (Curless and Levoy 1996).
+"""
 
-from __future__ import annotations
-
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,21 +11,26 @@ import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from pp_cl import Run, track
+from pp_cl import Camera, RenderedView, Run, track
+from pp_cl.engine import Grid
 from pp_cl.errors import UserError
-from pp_studio.export.fusion import box_around, fuse
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.points import (
-    ColouredPoints,
     coloured_points,
     in_world,
     inside,
     place_and_colour,
-    table_of,
-    write_elements,
+    write_vertices,
 )
 
 NEIGHBOURS = 4  # points that colour a vertex
+TRUNCATION = 4.0  # of the distances, in voxel sizes: depths scatter by one or two
+# What a view in which a vertex is hidden says for its being inside, in views. Without it, one ray
+# that slips between the points hollows out what all other views hide.
+HIDDEN = 0.03
+COVERED = 0.5  # alpha from which a pixel shows the object
+MARGIN = 2  # vertices around the points, so that the surface is closed
+SLAB = 1 << 20  # vertices that are projected at once: 50 MB of temporary arrays
 
 
 @dataclass(frozen=True)
@@ -62,22 +68,13 @@ def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.nda
 
 
 def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
-    """surface(), each vertex in the mean colour of the nearest points by their weight over the
-    squared distance.
-    """
-    vertices, faces = surface(run, box)
-    return Mesh(
-        vertices, faces, _colours(vertices, coloured_points(run), run.model.grid.voxel_size)
-    )
-
-
-def _colours(vertices, points: ColouredPoints, voxel_size):
-    """(V, 3) uint8."""
+    """surface(), with the mean colours of the nearest points by weight over squared distance."""
+    (vertices, faces), points = surface(run, box), coloured_points(run)
     count = min(NEIGHBOURS, len(points.rows))
     distance, near = cKDTree(points.positions).query(vertices, list(range(1, count + 1)))
-    weight = points.weight[near] / (distance**2 + voxel_size**2)
+    weight = points.weight[near] / (distance**2 + run.model.grid.voxel_size**2)
     mean = (weight[..., None] * points.colours[near]).sum(1) / weight.sum(1, keepdims=True)
-    return np.rint(mean).astype(np.uint8)
+    return Mesh(vertices, faces, np.rint(mean).astype(np.uint8))
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
@@ -91,8 +88,46 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
             "COLOR_0": gltf_colours(mesh.colours / 255),
         }
         write_glb(path, attributes, faces=mesh.faces)
-        return
-    faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = mesh.faces
-    vertices = table_of(place_and_colour(mesh.vertices, mesh.colours))
-    write_elements(path, {"vertex": vertices, "face": faces})
+    else:
+        write_vertices(path, place_and_colour(mesh.vertices, mesh.colours), mesh.faces)
+
+
+def box_around(grid: Grid, ids: np.ndarray) -> Grid:
+    """The part of a grid around its vertices ids (N,), MARGIN wider on every side."""
+    ijk = grid.coordinates(ids)
+    first, last = ijk.min(0) - MARGIN, ijk.max(0) + MARGIN
+    origin = np.asarray(grid.origin) + grid.voxel_size * first
+    return Grid(tuple(origin.tolist()), grid.voxel_size, tuple((last - first + 1).tolist()))
+
+
+def fuse(
+    grid: Grid, views: Iterable[tuple[Camera, RenderedView]], hidden: float = HIDDEN
+) -> np.ndarray:
+    """(nz, ny, nx) float32 in [-1, 1]: the mean over the views of each vertex's distance to what
+    they show, along the cameras' axes, in TRUNCATION voxel sizes, negative inside.
+
+    A view says nothing of vertices outside its image, and counts as `hidden` views for those more
+    than TRUNCATION voxel sizes behind its surface. What no view says anything of is inside.
+    """
+    total, count = (np.zeros(grid.dims[::-1], np.float32) for _ in range(2))
+    i, j, k = (np.arange(n, dtype=np.float32) for n in grid.dims)
+    j, k, layers = j[:, None], k[:, None, None], max(1, SLAB // (len(i) * len(j)))
+    for camera, rendered in views:
+        depth = np.where(rendered.alpha >= COVERED, rendered.median_depth, np.inf)
+        for first in range(0, len(k), layers):
+            slab = slice(first, first + layers)
+            across, down, z = (
+                row[0] * i + row[1] * j + row[2] * k[slab] + row[3]
+                for row in grid.projection(camera).astype(np.float32)
+            )
+            ahead = np.maximum(z, np.float32(1e-6))
+            column, row = across / ahead, down / ahead
+            shown = (z > 0) & (column >= 0) & (column < camera.width)
+            shown &= (row >= 0) & (row < camera.height)
+            pixel = tuple(np.where(shown, at, 0).astype(np.int32) for at in (row, column))
+            distance = (depth[pixel] - z) / np.float32(TRUNCATION * grid.voxel_size)
+            distance = np.clip(distance, -1, 1)  # -1 where a vertex is hidden
+            weight = np.where(distance > -1, 1, hidden) * shown
+            total[slab] += distance * weight
+            count[slab] += weight
+    return np.where(count > 0, total / np.maximum(count, 1e-6), -1).astype(np.float32)

@@ -1,14 +1,12 @@
 """Runs as HTML files that a browser draws with WebGL2, without the network; a gallery of them."""
 
-from __future__ import annotations
-
 import base64
 import html
 import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,14 +16,7 @@ from pp_cl.errors import name_of
 from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
 from pp_cl.scene import up_of
 from pp_studio.camera_path import level
-from pp_studio.export.gaussians import (
-    LARGEST,
-    LOW_PASS,
-    first_gaussians,
-    fitted_gaussians,
-    kept_gaussians,
-    windows,
-)
+from pp_studio.export.gaussians import Gaussians, fitted_gaussians
 from pp_studio.export.harmonics import COUNT
 from pp_studio.large import render_large
 
@@ -47,40 +38,7 @@ FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
 FILLED = 0.8  # of the shorter side, by the object as it is turned round; lines of text are above
 SAMPLED_POINTS = 20_000
 STILL = 600, 315  # pixels; the least that is shown large beside a link
-
-
-class Gaussians(NamedTuple):
-    """table, origin: as fitted_gaussians() gives them. windows: least and most pixels of a window,
-    for one of the run's images each way, in which they look right with all variances on the screen
-    widened by low_pass, pixels^2.
-    """
-
-    table: np.ndarray
-    origin: np.ndarray
-    windows: tuple[float, float]
-    low_pass: float
-
-
-def fitted(run: Run) -> Gaussians:
-    """The run's Gaussians for viewers. Raises UserError as fitted_gaussians does."""
-    longest = max(max(camera.width, camera.height) for camera in run.cameras("train"))
-    reduced = max(1, round(longest / LARGEST))  # as the fit reduces them
-    least, most = windows(longest / reduced)
-    table, origin = kept_gaussians(run) or fitted_gaussians(run)
-    return Gaussians(table, origin, (least / reduced, most / reduced), LOW_PASS)
-
-
-def unfitted(run: Run) -> Gaussians:
-    """The run's points as Gaussians, for a page before there is time to fit them. Raises UserError
-    as first_gaussians does.
-    """
-    return Gaussians(*first_gaussians(run), (1.0, 1.0), 0.0)
-
-
-def _pixel(run):
-    """What a pixel of the training shows in the middle of the object."""
-    centre, cameras = run.ball[0], run.cameras("train")
-    return float(np.median([np.linalg.norm(c.eye - centre) / min(c.fx, c.fy) for c in cameras]))
+HERE = Path(__file__).parent
 
 
 def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
@@ -103,14 +61,12 @@ def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
     span = np.maximum(high - low, np.float32(1e-6))
     scaled = (table["harmonics"] - low[:, None]) / span[:, None] * 255
     rows["colour"] = np.rint(scaled.clip(0, 255)).reshape(len(rows), -1)
-    lists = {"low": low.tolist(), "span": span.tolist(), "logarithms": logarithms}
-    return rows, {"corner": corner.tolist(), "unit": unit, **lists}
+    about = {"corner": corner.tolist(), "unit": unit, "low": low.tolist(), "span": span.tolist()}
+    return rows, about | {"logarithms": logarithms}
 
 
 def _nearest_axes(deviations, turn):
-    """(deviations (N, 3), bytes (N, 3) of their axes): axes may be swapped with their deviations,
-    and be turned round; of the 24 ways that which turns them least.
-    """
+    """(deviations (N, 3), bytes (N, 3) of their axes), swapped so that they turn least."""
     ways = Rotation.create_group("O")
     own = Rotation.from_quat(np.roll(turn, -1, axis=1))
     # w of the product of two quaternions (x, y, z, w)
@@ -127,32 +83,40 @@ def page_text(run: Run, gaussians: Gaussians, still: str = "", title: str = "") 
     linked to, if any. title: instead of the name of the run's folder.
     """
     rows, about = pack(gaussians.table)
-    data = base64.b64encode(rows.tobytes()).decode()
-    corner = about.pop("corner")
-    header = json.dumps(about | _header(run, gaussians, corner))
-    return filled(
-        "page.html",
-        {
-            "title": html.escape(title or name_of(run.folder.path)),
-            "card": card(still),
-            "about": f"{len(rows):,} Gaussians, {len(data) / 1e6:.1f} MB",
-            "header": header.replace("<", "\\u003c"),
-            "gaussians": data,
-            "script": (Path(__file__).parent / "page.js").read_text("utf-8"),
-        },
-    )
+    data, corner = base64.b64encode(rows.tobytes()).decode(), about.pop("corner")
+    (centre, _), cameras, (eye, up) = run.ball, run.cameras("train"), first_look(run)
+    # what a pixel of the training shows in the middle of the object
+    pixels = [np.linalg.norm(one.eye - centre) / min(one.fx, one.fy) for one in cameras]
+    header = about | {
+        "count": len(rows),
+        "origin": (gaussians.origin + corner).tolist(),
+        "nearest": run.nearest,
+        "centre": centre.tolist(),
+        "pixel": float(np.median(pixels)),
+        "windows": gaussians.windows,
+        "low_pass": gaussians.low_pass,
+        "eye": eye.tolist(),
+        "up": up.tolist(),
+        "fov": FIELD_OF_VIEW,
+    }
+    parts = {
+        "title": html.escape(title or name_of(run.folder.path)),
+        "about": f"{len(rows):,} Gaussians, {len(data) / 1e6:.1f} MB",
+        "header": json.dumps(header).replace("<", "\\u003c"),
+        "gaussians": data,
+        "script": (HERE / "page.js").read_text("utf-8"),
+    }
+    return filled("page.html", parts, still)
 
 
-def card(still: str) -> str:
-    """What programs that show links read of a page's image."""
+def filled(template: str, parts: dict[str, str], still: str) -> str:
+    """A template of this folder with its parts, {name: text}. still: the image that programs show
+    beside a link to the page, if any.
+    """
     large = '<meta name="twitter:card" content="summary_large_image">'
-    return f'<meta property="og:image" content="{still}">\n{large}' if still else ""
-
-
-def filled(template: str, parts: dict[str, str]) -> str:
-    """A template of this folder with its parts, {name: text}."""
-    page = (Path(__file__).parent / template).read_text("utf-8")
-    for name, text in parts.items():
+    card = f'<meta property="og:image" content="{still}">\n{large}' if still else ""
+    page = (HERE / template).read_text("utf-8")
+    for name, text in ({"card": card} | parts).items():
         page = page.replace(f"<!-- {name} -->", text)
     return page
 
@@ -161,50 +125,31 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
     """Write a page and a still of each run into a folder, with an index of them; returns their
     number. Raises UserError as fitted_gaussians and atomic_folder do.
     """
-    cards: dict[str, str] = {}
+    stems: list[str] = []
+    figures = []
     with atomic_folder(folder) as unfinished:
         for run in runs:
-            stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name_of(run.folder.path)).strip("-") or "run"
-            while stem.lower() in {"index", *map(str.lower, cards)}:  # as some disks take names
+            name = name_of(run.folder.path)
+            stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-") or "run"
+            while stem.lower() in {"index", *map(str.lower, stems)}:  # as some disks take names
                 stem += "-2"
-            write_text(unfinished / f"{stem}.html", page_text(run, fitted(run), f"{stem}.png"))
+            stems.append(stem)
+            page = page_text(run, fitted_gaussians(run), f"{stem}.png")
+            write_text(unfinished / f"{stem}.html", page)
             write_png(unfinished / f"{stem}.png", still(run))
-            cards[stem] = html.escape(name_of(run.folder.path))
-        figures = [
-            f'<a href="{stem}.html"><img src="{stem}.png" alt="">{name}</a>'
-            for stem, name in cards.items()
-        ]
-        parts = {"card": card(f"{next(iter(cards))}.png"), "figures": "\n".join(figures)}
-        write_text(unfinished / "index.html", filled("gallery.html", parts))
-    return len(cards)
+            image = f'<img src="{stem}.png" alt="">'
+            figures.append(f'<a href="{stem}.html">{image}{html.escape(name)}</a>')
+        page = filled("gallery.html", {"figures": "\n".join(figures)}, f"{stems[0]}.png")
+        write_text(unfinished / "index.html", page)
+    return len(stems)
 
 
 def still(run: Run) -> np.ndarray:
     """(H, W, 3) uint8: the run as a page of it begins, as large as STILL."""
-    centre, _ = run.ball
-    eye, up = first_look(run)
-    width, height = STILL
+    (eye, up), (width, height) = first_look(run), STILL
     focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-    camera = Camera.look_at(eye, centre, up, fx=focal, width=width, height=height)
+    camera = Camera.look_at(eye, run.ball[0], up, fx=focal, width=width, height=height)
     return to_8bit(render_large(run, camera).colour)
-
-
-def _header(run, gaussians, corner):
-    """What the page must know beside the Gaussians' bytes."""
-    centre, _ = run.ball
-    eye, up = first_look(run)
-    return {
-        "count": len(gaussians.table),
-        "origin": (gaussians.origin + corner).tolist(),
-        "nearest": run.nearest,
-        "centre": centre.tolist(),
-        "pixel": _pixel(run),
-        "windows": gaussians.windows,
-        "low_pass": gaussians.low_pass,
-        "eye": eye.tolist(),
-        "up": up.tolist(),
-        "fov": FIELD_OF_VIEW,
-    }
 
 
 def first_look(run: Run) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,5 @@
 """The points of a run with the colours that its network gives them, as PLY files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import plyfile
 
-from pp_cl import Camera, RenderedView, Run
+from pp_cl import Run
 from pp_cl.engine import PointCloud
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file, to_8bit
-from pp_studio.export.observe import observe
+from pp_studio.export.harmonics import observe
 
 COMMENTS = (
     "red, green, blue: sRGB, as the run shows the point in the training view where it weighs most",
@@ -59,9 +57,13 @@ def coloured_points(
     colours, best = np.zeros((cloud.count, 3), np.uint8), np.zeros(cloud.count, np.float32)
     for seen in observe(run, run.cameras("train"), "colours"):
         weights = seen.point_weights()
-        higher = np.flatnonzero(weights > best)
+        higher, camera = np.flatnonzero(weights > best), seen.camera
         best[higher] = weights[higher]
-        colours[higher] = _colours(run.render(seen.camera), seen.camera, positions[higher])
+        # one whose centre is just outside the image takes the nearest pixel; its depth is above 0
+        column, row, _ = camera.project(positions[higher])
+        column = column.clip(0, camera.width - 1).astype(np.int64)
+        row = row.clip(0, camera.height - 1).astype(np.int64)
+        colours[higher] = to_8bit(run.render(camera).rgba()[row, column, :3])
     rows = np.flatnonzero(best > min_weight)
     if not len(rows):
         raise UserError(
@@ -101,18 +103,10 @@ def in_world(positions: np.ndarray, voxel_size: float) -> np.ndarray:
     return positions if resolution > FINEST * voxel_size else positions.astype(np.float32)
 
 
-def _colours(rendered: RenderedView, camera: Camera, positions):
-    """(M, 3) uint8: a point whose centre is just outside the image takes the nearest pixel."""
-    column, row, _ = camera.project(positions)  # a seen point has a depth above 0
-    column = column.clip(0, camera.width - 1).astype(np.int64)
-    row = row.clip(0, camera.height - 1).astype(np.int64)
-    return to_8bit(rendered.rgba()[row, column, :3])
-
-
 def write_ply(
     path: Path | str, points: ColouredPoints, cloud: PointCloud, frame: str = "its scene's"
 ) -> None:
-    """Write points and what `cloud` learned of them, as write_elements() does. frame: whose axes
+    """Write points and what `cloud` learned of them, as write_vertices() does. frame: whose axes
     and units the positions have, in words.
     """
     columns = place_and_colour(points.positions, points.colours)
@@ -121,31 +115,32 @@ def write_ply(
         values = array.get()[points.rows].astype(np.float32)
         for k in range(block.count):
             order = block.first + k - block.degree**2  # within its degree
-            named = {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
-            columns |= named
+            columns |= {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
     about = (f"pp-cl: points of a run; axes and units: {frame}", *COMMENTS)
-    write_elements(path, {"vertex": table_of(columns)}, about)
+    write_vertices(path, columns, comments=about)
 
 
-def write_elements(
-    path: Path | str, elements: dict[str, np.ndarray], comments: Sequence[str] = ()
+def write_vertices(
+    path: Path | str,
+    columns: dict[str, np.ndarray],
+    faces: np.ndarray | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
-    """Write a binary little-endian PLY file of {name: records}. Raises UserError as atomic_file
-    does.
+    """Write a binary little-endian PLY file of vertices, {property: (M,) array}, and faces (F, 3)
+    of them, if there are any. Raises UserError as atomic_file does.
     """
-    described = [plyfile.PlyElement.describe(rows, name) for name, rows in elements.items()]
+    kinds = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    vertices = np.rec.fromarrays(list(columns.values()), dtype=kinds)
+    elements = [plyfile.PlyElement.describe(vertices, "vertex")]
+    if faces is not None:
+        triangles = np.empty(len(faces), [("vertex_indices", "<i4", (3,))])
+        triangles["vertex_indices"] = faces
+        elements.append(plyfile.PlyElement.describe(triangles, "face"))
     with atomic_file(path) as file:
-        plyfile.PlyData(described, byte_order="<", comments=list(comments)).write(file)
+        plyfile.PlyData(elements, byte_order="<", comments=list(comments)).write(file)
 
 
 def place_and_colour(positions: np.ndarray, colours: np.ndarray) -> dict[str, np.ndarray]:
     """{property of a PLY vertex: (M,) array} of positions and colours, both (M, 3)."""
     columns = dict(zip(COORDINATES, positions.T, strict=True))
     return columns | dict(zip(CHANNELS, colours.T, strict=True))
-
-
-def table_of(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """(M,) records, little-endian, of named columns (M,)."""
-    names = list(columns)
-    formats = [column.dtype.newbyteorder("<") for column in columns.values()]
-    return np.rec.fromarrays(list(columns.values()), dtype=list(zip(names, formats, strict=True)))

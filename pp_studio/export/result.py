@@ -2,10 +2,9 @@
 written at any time, and shows what is there by then.
 """
 
-from __future__ import annotations
-
 import html
 import json
+import shutil
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +14,11 @@ import numpy as np
 
 from pp_cl import Run
 from pp_cl.errors import name_of
-from pp_cl.files import atomic_file, own, write_png, write_text
+from pp_cl.files import atomic_path, own, write_png, write_text
 from pp_cl.scene import scene_frames
 from pp_studio.capture.overview import overview
-from pp_studio.export.page import card, filled, fitted, page_text, still, unfitted
+from pp_studio.export.gaussians import first_gaussians, fitted_gaussians
+from pp_studio.export.page import filled, page_text, still
 
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS, CAMERAS, MASKS = "thumbnail.png", "views.png", "cameras.png", "masks.png"
@@ -29,7 +29,7 @@ WHAT = {
     MODEL: "the model alone, one page that needs no network",
     SPLAT: "3D Gaussians, for SuperSplat, Blender and other viewers",
     STILL: "an image of it",
-}
+} | dict.fromkeys(VIDEOS, "once around the object")
 PLAN_WIDTH = 1000  # pixels of the drawing of the cameras
 
 
@@ -51,51 +51,64 @@ def write_result(
     scene: str = "",
 ) -> None:
     """Write index.html, the model's page and the images that it shows, beside the video and the
-    splats, of which those that are older than the run's checkpoint do not count. What is not there
-    yet is said to come, so that this can be called after each step of the work.
+    splats, if those are newer than the run's checkpoint. What is not there yet is said to come.
 
     run: None before there is a checkpoint; then the cameras and masks of the scene are shown.
     split: whose evaluation is shown. video: the file's name. told: what is to be known of the
     photographs, a line each. scene: its path, or demo; the run's, unless given.
     """
-    title, views, shown = name_of(folder), "", set()
+    title, views, shown = name_of(folder), _later("evaluation"), set()
     if run:
         done = run.folder.checkpoint
         found: dict[str, Any] = {}
         if is_newer(run.folder.metrics(split), done):
             found = json.loads(run.folder.metrics(split).read_text("utf-8"))
             _copy(run.folder.evaluation(split) / "comparison.png", folder / VIEWS)
-            views = _views(split)
+            whose = "that the training has not seen" if split != "train" else "of the training"
+            text = f"Views {whose}: rendered, photographed, and four times their difference."
+            views = f"<p>{text}</p>\n{_image(VIEWS, 'views beside their photographs')}"
         shown = {name for name in (video, SPLAT) if is_newer(folder / name, done)}
         if not is_newer(folder / MODEL, folder / SPLAT if SPLAT in shown else done):
             write_png(folder / STILL, still(run))
-            gaussians = fitted(run) if SPLAT in shown else unfitted(run)
+            gaussians = (fitted_gaussians if SPLAT in shown else first_gaussians)(run)
             write_text(folder / MODEL, page_text(run, gaussians, title=title))
         shown |= {MODEL, STILL}
         model = '<iframe src="model.html" title="The model; drag to turn it"></iframe>'
-        rows, told = _figures(run, found), [*told, *_left_out(run)]
+        rows = _figures(run, found)
+        told = [*told, *run.header.get("notes", [])]
+        if names := run.header.get("left_out"):
+            told.append(f"left out, as their masks contradict the others': {', '.join(names)}")
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the training tells the same
-            listed = scene_frames(scene, "train")
-        model = "\n".join([_later("model"), *_plan(folder, Path(scene), listed)])
-        size = listed[0].camera
+            cameras = [one.camera for one in scene_frames(scene, "train")]
+        model = "\n".join([_later("model"), *_plan(folder, Path(scene), cameras)])
         rows = [
-            ("photographs for the training", str(len(listed))),
-            ("size of the photographs", f"{size.width}x{size.height}"),
+            ("photographs for the training", str(len(cameras))),
+            ("size of the photographs", f"{cameras[0].width}x{cameras[0].height}"),
         ]
-    links = [_link(folder / name) for name in (MODEL, video, SPLAT, STILL) if name in shown]
+    moving = _image(video, "the object from all sides")
+    if video.endswith(".mp4"):
+        moving = f'<video src="{video}" autoplay loop muted playsinline controls></video>'
+    links = []
+    for name in (MODEL, video, SPLAT, STILL):
+        if name in shown:
+            size = (folder / name).stat().st_size / 1e6
+            links.append(f'<li><a href="{name}">{name}</a>, {size:.1f} MB: {WHAT[name]}</li>')
+    items = "\n".join(f"<li>{html.escape(line)}</li>" for line in told)
     parts = {
         "title": html.escape(title),
-        "card": card(STILL if run else CAMERAS),
         "model": model,
-        "video": _player(video) if video in shown else _later("video"),
-        "views": views or _later("evaluation"),
-        "figures": "\n".join(_row(*row) for row in rows),
-        "notes": _notes(told),
+        "video": moving if video in shown else _later("video"),
+        "views": views,
+        "figures": "\n".join(
+            f"<tr><td>{html.escape(name)}</td><td>{html.escape(value)}</td></tr>"
+            for name, value in rows
+        ),
+        "notes": f"<h2>About the photographs</h2>\n<ul>\n{items}\n</ul>" if told else "",
         "files": "\n".join(links) or "<li>none yet</li>",
     }
-    write_text(folder / INDEX, filled("result.html", parts))
+    write_text(folder / INDEX, filled("result.html", parts, STILL if run else CAMERAS))
 
 
 def is_newer(file: Path, other: Path) -> bool:
@@ -103,15 +116,14 @@ def is_newer(file: Path, other: Path) -> bool:
     return file.exists() and file.stat().st_mtime_ns > other.stat().st_mtime_ns
 
 
-def _plan(folder, scene, listed):
+def _plan(folder, scene, cameras):
     """Images of the cameras, and of the masks that a capture has found."""
     capture = scene / "capture"
     if (capture / "box.png").is_file():
         _copy(capture / "box.png", folder / CAMERAS)
     else:
         nothing = np.empty((0, 3))
-        drawn = overview([one.camera for one in listed], None, nothing, nothing, PLAN_WIDTH)
-        write_png(folder / CAMERAS, drawn)
+        write_png(folder / CAMERAS, overview(cameras, None, nothing, nothing, PLAN_WIDTH))
     images = [_image(CAMERAS, "the cameras, from the side and from above")]
     if (capture / "masks.png").is_file():
         _copy(capture / "masks.png", folder / MASKS)
@@ -120,14 +132,12 @@ def _plan(folder, scene, listed):
 
 
 def _copy(file, to):
-    with atomic_file(to) as out:
-        out.write(file.read_bytes())
+    with atomic_path(to) as temporary:
+        shutil.copyfile(file, temporary)
 
 
-def _views(split):
-    views = "that the training has not seen" if split != "train" else "of the training"
-    text = f"Views {views}: rendered, photographed, and four times their difference."
-    return f"<p>{text}</p>\n{_image(VIEWS, 'views beside their photographs')}"
+def _image(name, what):
+    return f'<img src="{name}" alt="{what}">'
 
 
 def _later(what):
@@ -140,45 +150,11 @@ def _figures(run, found):
     if rows:
         rows[0] = (rows[0][0], f"{rows[0][1]} (mean of {len(found['per_image'])} views)")
     cameras = run.cameras("train")
-    rows += [
+    return [
+        *rows,
         ("photographs in the training", str(len(cameras))),
         ("size in the training", f"{cameras[0].width}x{cameras[0].height}"),
         ("points", f"{run.model.cloud.count:,}"),
         ("steps", f"{run.header['step']:,}"),
         ("device", run.dev.name),
     ]
-    return rows
-
-
-def _left_out(run):
-    """What the training says of its photographs."""
-    names = run.header.get("left_out", [])
-    told = [f"left out, as their masks contradict the others': {', '.join(names)}"] if names else []
-    return [*run.header.get("notes", []), *told]
-
-
-def _row(name, value):
-    return f"<tr><td>{html.escape(name)}</td><td>{html.escape(value)}</td></tr>"
-
-
-def _notes(lines):
-    if not lines:
-        return ""
-    items = "\n".join(f"<li>{html.escape(line)}</li>" for line in lines)
-    return f"<h2>About the photographs</h2>\n<ul>\n{items}\n</ul>"
-
-
-def _player(name):
-    if name.endswith(".mp4"):
-        return f'<video src="{name}" autoplay loop muted playsinline controls></video>'
-    return _image(name, "the object from all sides")
-
-
-def _image(name, what):
-    return f'<img src="{name}" alt="{html.escape(what)}">'
-
-
-def _link(file):
-    what = WHAT.get(file.name, "once around the object")
-    size = file.stat().st_size / 1e6
-    return f'<li><a href="{file.name}">{file.name}</a>, {size:.1f} MB: {what}</li>'

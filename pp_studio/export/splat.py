@@ -1,7 +1,5 @@
 """A run as 3D Gaussians without a network: the .ply of 3D Gaussian splatting, .spz, and glTF."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -15,7 +13,7 @@ from pp_studio.export import QUICK
 from pp_studio.export.gaussians import CONSTANT, FACTORS, ORDER, fitted_gaussians
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.harmonics import COUNT, basis
-from pp_studio.export.points import in_world, inside, table_of, write_elements
+from pp_studio.export.points import in_world, inside, write_vertices
 
 # In a .spz: steps of a place in the widest deviation of the smallest Gaussian, and of harmonics
 # above degree 0, half of all bytes: a multiple of 1/128, of which its bytes are. With 1/16 they are
@@ -32,19 +30,23 @@ Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in
 def splats(
     run: Run, turn: np.ndarray, quality: str = QUICK, box: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() of a quality in the world
-    turned by (3, 3), those in a box (2, 3) of the scene or all. Positions are relative to the
-    origin, which is 0 unless float32 is too coarse there. Raises UserError as fitted_gaussians and
-    inside() do.
+    """((M,) records of GAUSSIAN, (3,) origin): fitted_gaussians() of a quality in the world turned
+    by (3, 3), those in a box (2, 3) of the scene or all. The origin is 0 unless float32 is too
+    coarse there. Raises UserError as fitted_gaussians() and inside() do.
     """
-    table, centre = fitted_gaussians(run, quality)
+    table, centre, *_ = fitted_gaussians(run, quality)
     positions = table["position"] + centre
     held = inside(positions, box)
     table, positions = table[held], positions[held] @ turn.T
     near = in_world(positions, run.model.grid.voxel_size).dtype == np.float32
     origin = np.zeros(3) if near else np.rint(positions.mean(0))
     table["position"] = positions - origin
-    table["harmonics"] = _turned(table["harmonics"], turn)
+    # coefficients of turned directions, by some of these
+    seen = np.random.default_rng(0).normal(size=(64, 3))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
+    matrix = np.linalg.lstsq(after, before, rcond=None)[0]
+    table["harmonics"] = np.einsum("jk,nkc->njc", matrix, table["harmonics"])
     axes = Rotation.from_matrix(turn) * Rotation.from_quat(np.roll(table["turn"], -1, axis=1))
     table["turn"] = np.roll(axes.as_quat(), 1, axis=1)
     return table, origin
@@ -55,19 +57,8 @@ def upright(run: Run, up: tuple[float, float, float]) -> np.ndarray:
     return Rotation.align_vectors([up], [up_of(run.cameras("train"))])[0].as_matrix()
 
 
-def _turned(coefficients, turn):
-    """Coefficients (M, 9, 3) of turned directions."""
-    seen = np.random.default_rng(0).normal(size=(64, 3))
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
-    matrix = np.linalg.lstsq(after, before, rcond=None)[0]
-    return np.einsum("jk,nkc->njc", matrix, coefficients)
-
-
 def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
-    """Write splats() as the training code of 3D Gaussian splatting does. Raises UserError as
-    atomic_file does.
-    """
+    """Write splats() as 3D Gaussian splatting's own code does. Raises UserError as atomic_file."""
     nothing = np.zeros(len(table), np.float32)
     columns = dict(zip(("x", "y", "z"), table["position"].T, strict=True))
     columns |= dict.fromkeys(("nx", "ny", "nz"), nothing)
@@ -80,7 +71,7 @@ def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
     columns |= {f"scale_{i}": np.log(table["deviations"][:, i]) for i in range(3)}
     columns |= {f"rot_{i}": table["turn"][:, i] for i in range(4)}
     # brush turns a model by this comment; others take y for the vertical axis anyway
-    write_elements(path, {"vertex": table_of(columns)}, ["Vertical axis: y"])
+    write_vertices(path, columns, comments=["Vertical axis: y"])
 
 
 def in_spz(table: np.ndarray) -> tuple[np.ndarray, float]:
@@ -98,9 +89,7 @@ def in_spz(table: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def write_splat_spz(path: Path, table: np.ndarray) -> None:
-    """Write splats() with y up, as in_spz() gives them, as Niantic's .spz. Raises UserError as
-    atomic_path does.
-    """
+    """Write splats() with y up, of in_spz(), as Niantic's .spz. Raises UserError as atomic_path."""
     from gsply import GSData, write_spz
 
     place = table["position"]
@@ -126,9 +115,7 @@ def write_splat_spz(path: Path, table: np.ndarray) -> None:
 
 
 def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> None:
-    """Write splats() and their origin as glTF 2.0 with KHR_gaussian_splatting. Raises UserError as
-    atomic_file does.
-    """
+    """Write splats() as glTF 2.0 (KHR_gaussian_splatting). Raises UserError as atomic_file."""
     extension, place = "KHR_gaussian_splatting", table["position"]
     attributes = {
         "POSITION": place + origin if origin.any() else place,

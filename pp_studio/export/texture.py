@@ -2,8 +2,6 @@
 renderings of its training views.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +12,11 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from pp_cl import Camera, Progress, RenderedView, Run
+from pp_cl import Progress, Run, track
 from pp_cl.errors import require
 from pp_cl.files import atomic_file, to_8bit
-from pp_studio.export.fusion import COVERED
 from pp_studio.export.gltf import make_unlit
-from pp_studio.export.mesh import surface
-from pp_studio.export.observe import progress
+from pp_studio.export.mesh import COVERED, surface
 
 FACES = 60_000  # at most: marching cubes make more of the same surface
 SIDE = 2048  # texels
@@ -113,32 +109,23 @@ def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     seen, hidden = (np.zeros((len(positions), 4)) for _ in range(2))
-    for camera in progress(run.cameras("train"), "texture"):
-        colours, ahead, cosine = _looked_up(
-            run.render(camera), camera, positions, normals, HIDDEN * run.model.grid.voxel_size
-        )
-        weight = np.where(ahead & (cosine > LEAST_COSINE), np.maximum(cosine, 0) ** SHARPNESS, 0)
-        seen += weight[:, None] * colours
+    for camera in track(run.cameras("train"), "texture", "view"):
+        rendered, (x, y, z) = run.render(camera), camera.project(positions)
+        shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        place = np.stack([np.where(shown, y, 0.5) - 0.5, np.where(shown, x, 0.5) - 0.5])
+        row, column = np.rint(place).astype(int).clip(0, [[camera.height - 1], [camera.width - 1]])
+        shown &= rendered.alpha[row, column] >= COVERED
+        rgba = rendered.rgba()
+        channels = [map_coordinates(rgba[..., c], place, order=1, mode="nearest") for c in range(3)]
+        colours = np.stack([*channels, np.ones(len(z))], 1) * shown[:, None]
+        towards = camera.eye - positions
+        cosine = (normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
+        behind = rendered.median_depth[row, column] + HIDDEN * run.model.grid.voxel_size
+        direct = shown & (z < behind) & (cosine > LEAST_COSINE)
+        seen += np.where(direct, np.maximum(cosine, 0) ** SHARPNESS, 0)[:, None] * colours
         hidden += colours
     total = np.where(seen[:, 3:] > 0, seen, hidden)
     return total[:, :3] / np.maximum(total[:, 3:], 1e-12)
-
-
-def _looked_up(rendered: RenderedView, camera: Camera, positions, normals, behind):
-    """(colours (T, 4), with 1 where the rendering shows the object and 0 elsewhere; whether texels
-    are not hidden; cosines between their normals and the directions to the eye).
-    """
-    x, y, z = camera.project(positions)
-    shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    place = np.stack([np.where(shown, y, 0.5) - 0.5, np.where(shown, x, 0.5) - 0.5])
-    row, column = np.rint(place).astype(int).clip(0, [[camera.height - 1], [camera.width - 1]])
-    shown &= rendered.alpha[row, column] >= COVERED
-    rgba = rendered.rgba()
-    channels = [map_coordinates(rgba[..., c], place, order=1, mode="nearest") for c in range(3)]
-    colours = np.stack([*channels, np.ones(len(z))], 1) * shown[:, None]
-    towards = camera.eye - positions
-    cosine = (normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
-    return colours, shown & (z < rendered.median_depth[row, column] + behind), cosine
 
 
 def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:

@@ -13,23 +13,15 @@ from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdo
 from datetime import datetime
 from typing import Any
 
+import dask
+from distributed import Client, Event, LocalCluster, WorkerPlugin, get_worker
 from tqdm import tqdm
 
 from pp_cl import evaluate_run, train_scene
 from pp_cl.errors import UserError, one_line
 from pp_cl.scene import scene_splits
 from pp_studio.sweep.plan import Job
-from pp_studio.sweep.result import failed_row, finished_row
-
-try:
-    import dask
-    from cryptography import x509  # noqa: F401 what Dask makes certificates with
-    from distributed import Client, Event, LocalCluster, WorkerPlugin, get_worker
-except ImportError as error:
-    raise UserError(
-        f"pp-cl sweep needs Dask ({error.name} is missing); install it with"
-        " `pip install dask distributed cryptography`"
-    ) from None
+from pp_studio.sweep.table import failed_row, finished_row
 
 LOOPBACK = "127.0.0.1"
 ANSWER = 20  # seconds that a scheduler, and its first worker, have to answer
@@ -71,29 +63,28 @@ def run_job(job: Job, device: str | None, is_stopped: Callable[[], bool]) -> dic
             log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} process {os.getpid()}\n")
             if is_stopped():
                 return failed_row(job, "stopped")
-            return _trained_and_evaluated(job, device, is_stopped)
+            if row := finished_row(job):
+                return row
+            if "test" not in scene_splits(job.scene):
+                raise UserError(f"{job.scene}: has no split test, which a sweep measures; add one")
+            run = train_scene(
+                job.scene,
+                job.folder,
+                job.preset,
+                device,
+                settings={key: text for key, text, _ in job.given},
+                is_stopped=is_stopped,
+            )
+            if not run.header["finished"]:
+                return failed_row(job, "stopped")
+            evaluate_run(run, "test", job.metrics)
+            return finished_row(job) or failed_row(job, "its evaluation is not whole")
         except UserError as error:
             return failed_row(job, str(error))
         except Exception as error:
             traceback.print_exc()
             what = f"{type(error).__name__}: {one_line(error, 500)}"
             return failed_row(job, f"{what}; see {job.log}")
-
-
-def _trained_and_evaluated(job, device, is_stopped):
-    """The row of the job. Raises UserError as training and evaluation do."""
-    if row := finished_row(job):
-        return row
-    if "test" not in scene_splits(job.scene):
-        raise UserError(f"{job.scene}: has no split test, which a sweep measures; add one")
-    settings = {key: text for key, text, _ in job.given}
-    run = train_scene(
-        job.scene, job.folder, job.preset, device, settings=settings, is_stopped=is_stopped
-    )
-    if not run.header["finished"]:
-        return failed_row(job, "stopped")
-    evaluate_run(run, "test", job.metrics)
-    return finished_row(job)
 
 
 # ---- the cluster
@@ -171,16 +162,13 @@ def run_jobs(
             stop.set()
             until = time.monotonic() + ENDING
         for future in [future for future in pending if future.done()]:
-            yield _row(future, pending.pop(future))
+            job = pending.pop(future)
+            if future.status == "finished":
+                yield future.result()
+            elif future.status == "error":  # its workers have ended
+                yield failed_row(job, f"{one_line(future.exception(), 500)}; see {job.log}")
+            else:
+                yield failed_row(job, "the scheduler is gone; the same command goes on")
         time.sleep(TICK)
     for job in pending.values():
         yield failed_row(job, "stopped")
-
-
-def _row(future, job):
-    """The row of a task that has ended."""
-    if future.status == "finished":
-        return future.result()
-    if future.status == "error":  # its workers have ended
-        return failed_row(job, f"{one_line(future.exception(), 500)}; see {job.log}")
-    return failed_row(job, "the scheduler is gone; the same command goes on")

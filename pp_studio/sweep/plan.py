@@ -83,7 +83,9 @@ def plan(
         setting = dict(zip(varied, values, strict=True))
         own = [*given, *((key, text, "--vary") for key, text in setting.items())]
         path = configure(preset(preset_name or "tiny"), scene, own).scene.path
-        slug = "_".join(f"{key}={_file_name(text)}" for key, text in setting.items())
+        # another part of a file's name for each text
+        quoted = {key: quote(t, safe=",", errors="surrogateescape") for key, t in setting.items()}
+        slug = "_".join(f"{key}={text}" for key, text in quoted.items())
         for seed in seeds:
             folder = Path(out).resolve() / name / slug / f"seed-{seed}"
             seeded = (*own, ("train.seed", str(seed), "--seeds"))
@@ -95,8 +97,3 @@ def plan(
                     " one name another --out"
                 )
     return list(jobs.values())
-
-
-def _file_name(text):
-    """A text as part of a file's name, another one for each text."""
-    return quote(text, safe=",", errors="surrogateescape")

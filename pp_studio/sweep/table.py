@@ -1,14 +1,20 @@
-"""The table of a sweep: means and spread over seeds, means over scenes; as Markdown and JSON."""
+"""The rows of a sweep, read from the folders of its runs, and their table: means and spread over
+seeds, means over scenes; as Markdown and JSON.
+"""
 
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pp_cl import RunFolder
+from pp_cl.config import load_config, refuse_setting, run_config
+from pp_cl.errors import UserError
 from pp_cl.files import write_json, write_text
+from pp_studio.sweep.plan import Job
 
 TABLES = ("sweep.json", "sweep.md")
-Row = dict[str, Any]  # of a run, see sweep/result.py, or of means
+Row = dict[str, Any]  # of a run, or of means
 
 # {key of a row: (column, format of a number)}
 COLUMNS = {
@@ -18,6 +24,41 @@ COLUMNS = {
     "points": ("points", ".0f"),
     "seconds": ("seconds", ".1f"),
 }
+
+
+def failed_row(job: Job, error: str) -> Row:
+    """The row of a run that failed: "scene", "settings", "seed", "folder" and "error", one line."""
+    about = {"scene": job.name, "settings": job.varied, "seed": job.seed, "folder": job.folder}
+    return about | {"error": error}
+
+
+def finished_row(job: Job) -> Row | None:
+    """The row of a run that is trained and evaluated: "scene", "settings", "seed", "folder", its
+    metrics, "points", "seconds" of training (None where the log is lost) and "device"; else None.
+
+    Raises UserError where the folder holds a run with other settings.
+    """
+    folder = RunFolder(job.folder)
+    if not (folder.config.exists() and folder.checkpoint.exists()):
+        return None
+    config, there = run_config(folder, job.scene, job.preset, job.given), load_config(folder.config)
+    if config.train.iterations != there.train.iterations:
+        refuse_setting(folder, "train.iterations", there.train.iterations, config.train.iterations)
+    if there.scene.path != config.scene.path:
+        return None  # for the training to refuse or, if it is the same scene, to go on with
+    try:
+        result = folder.measured()
+    except UserError:
+        return None  # is measured again
+    if not (result and result["finished"] and result["step"] == config.train.iterations):
+        return None
+    if not {*job.metrics} <= result["mean"].keys():
+        return None
+    seconds = [row["seconds"] for row in folder.rows() if row.get("finished")]
+    row = failed_row(job, "") | {name: result["mean"][name] for name in job.metrics}
+    del row["error"]
+    row |= {"points": result["points"], "device": result["device"]}
+    return row | {"seconds": seconds[-1] if seconds else None}
 
 
 def scene_means(rows: Sequence[Row]) -> list[Row]:
@@ -75,15 +116,13 @@ def markdown(rows: Sequence[Row]) -> str:
     for name, good, bad, what, row in labelled:
         count = f"{good} of {good + bad}{what}" if bad else f"{good}{what}"
         cells = [_cell(row, key) for key in shown]
-        lines.append([f"{name} {_setting(row)}".strip().replace("|", "\\|"), count, *cells])
+        lines.append([" ".join([name, *_settings(row)]).replace("|", "\\|"), count, *cells])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     lines.insert(1, ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])])
-    table = "".join(
-        f"| {line[0].ljust(widths[0])} | "
-        + " | ".join(map(str.rjust, line[1:], widths[1:]))
-        + " |\n"
-        for line in lines
-    )
+    table = ""
+    for name, *cells in lines:
+        padded = [name.ljust(widths[0]), *map(str.rjust, cells, widths[1:])]
+        table += f"| {' | '.join(padded)} |\n"
     failed = [f"- {run_text(row)}: {row['error']}\n" for row in rows if "error" in row]
     return table + ("\nFailed:\n\n" + "".join(failed) if failed else "")
 
@@ -94,14 +133,14 @@ def _cell(row, key):
     return " ± ".join(format(part[key], COLUMNS[key][1]) for part in parts if key in part) or "-"
 
 
-def _setting(row):
-    """What is varied in a row, as --vary takes it."""
-    return " ".join(f"{key}={text}" for key, text in row["settings"].items())
-
-
 def run_text(row: Row) -> str:
     """The run of a row: scene, setting and seed."""
-    return " ".join(filter(None, [row["scene"], _setting(row), f"seed {row['seed']}"]))
+    return " ".join([row["scene"], *_settings(row), f"seed {row['seed']}"])
+
+
+def _settings(row):
+    """What is varied in a row, as --vary takes it."""
+    return [f"{key}={text}" for key, text in row["settings"].items()]
 
 
 def values_text(row: Row) -> str:
@@ -116,7 +155,6 @@ def write_tables(out: Path, rows: Sequence[Row]) -> dict[str, Any]:
     """Write the rows as TABLES to the folder; returns what the first holds."""
     means = scene_means(rows)
     content = {"runs": list(rows), "scenes": means, "mean": overall_means(means)}
-    in_json, in_markdown = (out / name for name in TABLES)
-    write_json(in_json, content)
-    write_text(in_markdown, markdown(rows))
+    write_json(out / TABLES[0], content)
+    write_text(out / TABLES[1], markdown(rows))
     return content

@@ -1,6 +1,4 @@
-"""What a run shows to a camera, as 8-bit images: colours, depth, normals, ..., or a photograph
-beside them.
-"""
+"""What a run shows to a camera, as 8-bit images: colours, depth, normals, or a photograph."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -38,10 +36,9 @@ def draw(
     on_part: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, str]:
     """((H, W, 3) uint8, a line on what it shows). views: the run's training views, none where its
-    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. share: of
-    the points, the most opaque ones, in (0, 1]. exposure: in stops. on_part: called before each
-    part of the work. Raises UserError where there is no photograph to show, and where the model
-    computes NaN.
+    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. share: of the
+    most opaque points, in (0, 1]. exposure: in stops. on_part: called before each part of the work.
+    Raises UserError where there is no photograph to show, and where the model computes NaN.
     """
     truth, line = np.empty(0), ""
     if show in OWN_CAMERA:
@@ -49,40 +46,41 @@ def draw(
             raise UserError("the photographs are not there")
         view = views[nearest_view([one.camera for one in views], camera, run.ball[0])]
         camera, line, truth = view.camera, view.name, Target(run.dev).whole(view)
+    run = most_opaque(run, share) if share < 1 else run
     if show == "photograph":
         image = to_8bit(truth)
+    elif show == "fragments":
+        # the whole view, as until="weights" would change the buffers that a training goes on with
+        between = run.depth_range(camera)
+        whole = run.renderer.forward(camera, run.gamma, early_stop=early_stop, depth_range=between)
+        counts = whole.fragments()
+        image = colour_scale(counts, 0, counts.max(), counts > 0)
+        line = f"0 to {counts.max()} fragments"
     else:
-        shown = most_opaque(run, share) if share < 1 else run
-        image, scale = _rendered(shown, camera, show, early_stop, truth, on_part)
-        line += scale
+        rendered = render_large(run, camera, early_stop=early_stop, on_part=on_part)
+        is_known = rendered.alpha >= LEAST_ALPHA
+        if show == "alpha":
+            image = to_8bit(np.repeat(rendered.alpha[..., None], 3, axis=2))
+        elif show == "depth":
+            centre, radius = run.ball
+            middle = (centre - camera.eye) @ camera.pose[:, 2]
+            low, high = max(middle - radius, 0.0), max(middle + radius, 0.0)
+            image, line = (
+                colour_scale(rendered.depth, low, high, is_known),
+                f"{low:.3g} to {high:.3g}",
+            )
+        elif show == "normals":
+            normals = normals_from_depth(np.where(is_known, rendered.depth, np.nan), camera)
+            image = to_8bit(np.where(np.isnan(normals), DARK, (normals + 1) / 2))
+        elif show == "error":
+            image = to_8bit(ERROR_SCALE * np.abs(rendered.colour - truth))
+            line += f", error x{ERROR_SCALE}"
+        else:
+            image = to_8bit(rendered.colour)
     if exposure:
         light = srgb_to_linear(np.arange(256) / 255) * 2.0**exposure
         image = to_8bit(linear_to_srgb(light))[image]
     return image, line
-
-
-def _rendered(run, camera, show, early_stop, truth, on_part):
-    """(image, its scale) of what is rendered."""
-    if show == "fragments":
-        # the whole view, as until="weights" would change the buffers that a training goes on with
-        options = {"early_stop": early_stop, "depth_range": run.depth_range(camera)}
-        counts = run.renderer.forward(camera, run.gamma, **options).fragments()
-        return colour_scale(counts, 0, counts.max(), counts > 0), f"0 to {counts.max()} fragments"
-    rendered = render_large(run, camera, early_stop=early_stop, on_part=on_part)
-    is_known = rendered.alpha >= LEAST_ALPHA
-    if show == "alpha":
-        return to_8bit(np.repeat(rendered.alpha[..., None], 3, axis=2)), ""
-    if show == "depth":
-        centre, radius = run.ball
-        middle = (centre - camera.eye) @ camera.pose[:, 2]
-        low, high = max(middle - radius, 0.0), max(middle + radius, 0.0)
-        return colour_scale(rendered.depth, low, high, is_known), f"{low:.3g} to {high:.3g}"
-    if show == "normals":
-        normals = normals_from_depth(np.where(is_known, rendered.depth, np.nan), camera)
-        return to_8bit(np.where(np.isnan(normals), DARK, (normals + 1) / 2)), ""
-    if show == "error":
-        return to_8bit(ERROR_SCALE * np.abs(rendered.colour - truth)), f", error x{ERROR_SCALE}"
-    return to_8bit(rendered.colour), ""
 
 
 def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:
@@ -122,8 +120,7 @@ def colour_scale(values: Any, low: float, high: float, is_known: np.ndarray) -> 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """(H, W, 3) float64 unit normals in world axes, towards the camera, of the surface that a depth
     map (H, W) along the camera's axis shows; NaN where a pixel or a neighbour that is needed has
-    none. Of the two neighbours in each direction the one of the nearer depth is taken, so that
-    edges stay sharp.
+    none. Of two neighbours the one of the nearer depth is taken, so that edges stay sharp.
     """
     positions = depth[..., None] * (camera.rays() @ camera.pose[:, :3])
 

@@ -58,9 +58,9 @@ class _MovedError(Exception):
 
 
 class ModelPage:
-    """run: that of the last take(). views: its training views, none where the
-    photographs are gone. most_pixels: of a rendering. is_training: the model changes while it is
-    shown, and has no memory for a copy. woken: is set when a tab wants something.
+    """run: that of the last take(). views: its training views, none where the photographs are gone.
+    most_pixels: of a rendering. is_training: the model changes while it is shown, and has no memory
+    for a copy. woken: is set when a tab wants something.
     """
 
     def __init__(
@@ -96,7 +96,6 @@ class ModelPage:
         self._status = server.gui.add_markdown("")
         with switches(server):
             self._add_switches(run.config.raster.early_stop, is_training)
-            self._add_path_and_curve()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._disconnected)
 
@@ -106,15 +105,15 @@ class ModelPage:
         for i, show in enumerate(SHOWN):
             command = gui.add_command(f"Show {show}", hotkey=str(i + 1))
             command.on_trigger(lambda _, show=show: setattr(self._show, "value", show))
-        self._stop = gui.add_slider(
-            "Early stop", min=0.0, max=0.5, step=0.001, initial_value=early_stop
-        )
-        self._share = gui.add_slider(
-            "Points kept, %", min=1, max=100, step=1, initial_value=100, visible=not is_training
-        )
-        self._exposure = gui.add_slider(
-            "Exposure, stops", min=-3.0, max=3.0, step=0.1, initial_value=0.0
-        )
+
+        def slider(name, least, most, step, value, **options):
+            return gui.add_slider(
+                name, min=least, max=most, step=step, initial_value=value, **options
+            )
+
+        self._stop = slider("Early stop", 0.0, 0.5, 0.001, early_stop)
+        self._share = slider("Points kept, %", 1, 100, 1, 100, visible=not is_training)
+        self._exposure = slider("Exposure, stops", -3.0, 3.0, 0.1, 0.0)
         self._shown = gui.add_checkbox("Training views", True, hint="click one to go there")
         trained = [(one, one.value) for one in (self._stop, self._share, self._exposure)]
         for handle in (self._show, self._shown, *(one for one, _ in trained)):
@@ -122,28 +121,21 @@ class ModelPage:
         gui.add_button("As trained").on_click(
             lambda _: [setattr(handle, "value", value) for handle, value in trained]
         )
-        gui.add_button("Save image").on_click(self._want_file)
-
-    def _add_path_and_curve(self):
-        gui = self._server.gui
+        gui.add_button("Save image").on_click(self._with_tab(self._want_file))
         with gui.add_folder("Camera path", expand_by_default=False):
-            gui.add_button("Add this camera").on_click(self._add_key)
+            gui.add_button("Add this camera").on_click(self._with_tab(self._add_key))
             gui.add_button("Remove the last").on_click(self._remove_key)
-            self._seconds = gui.add_slider("Seconds", min=1, max=60, step=1, initial_value=4)
-            gui.add_button("Save path.json").on_click(self._send_path)
+            self._seconds = slider("Seconds", 1, 60, 1, 4)
+            gui.add_button("Save path.json").on_click(self._with_tab(self._send_path))
+        series = [{"label": "step"}, {"label": "PSNR", "scale": "dB", "stroke": BLUE}]
+        series.append({"label": "loss", "scale": "loss", "stroke": ORANGE})
+        axes = [{"stroke": GREY}, {"scale": "dB", "stroke": BLUE}]
+        axes.append({"scale": "loss", "stroke": ORANGE, "side": 1})  # 1: on the right
         self._curve = gui.add_uplot(
             tuple(np.zeros((len(LOGGED), 0))),
-            (
-                {"label": "step"},
-                {"label": "PSNR", "scale": "dB", "stroke": BLUE},
-                {"label": "loss", "scale": "loss", "stroke": ORANGE},
-            ),
+            tuple(series),
             scales={"x": {"time": False}, "dB": {}, "loss": {"distr": 3}},  # 3: logarithmic
-            axes=(
-                {"stroke": GREY},
-                {"scale": "dB", "stroke": BLUE},
-                {"scale": "loss", "stroke": ORANGE, "side": 1},  # 1: on the right
-            ),
+            axes=tuple(axes),
             aspect=1.5,
             visible=False,
         )
@@ -153,11 +145,12 @@ class ModelPage:
     async def _connected(self, client):
         async def moved(seen):
             if camera := self._space.camera(seen):
-                if client.client_id not in self._tabs:
-                    self._tabs[client.client_id] = Tab(
-                        client, camera, splat=self._add_splat(client)
-                    )
-                tab = self._tabs[client.client_id]
+                tab = self._tabs.get(client.client_id)
+                if tab is None:
+                    tab = self._tabs[client.client_id] = Tab(client, camera)
+                    if self._splat:  # the browser draws it until there is a rendering
+                        client.scene.set_background_image(WHITE)
+                        tab.splat = client.scene.add_gaussian_splats("/splat", **self._splat)
                 tab.camera, tab.moved = camera, time.monotonic()
                 splat = self._by_browser(tab)
                 if splat and not splat.visible:
@@ -168,13 +161,6 @@ class ModelPage:
         client.camera.on_update(moved)
         await moved(client.camera)
 
-    def _add_splat(self, client):
-        """Have a tab's browser draw the Gaussians, at first until there is a rendering."""
-        if self._splat is None:
-            return None
-        client.scene.set_background_image(WHITE)
-        return client.scene.add_gaussian_splats("/splat", **self._splat)
-
     def _by_browser(self, tab):
         """The Gaussians that the tab's browser draws while its camera moves, if it does."""
         is_wanted = self._took > SLOW and self._show.value == SHOWN[0]
@@ -183,33 +169,35 @@ class ModelPage:
     async def _disconnected(self, client):
         self._tabs.pop(client.client_id, None)
 
+    def _with_tab(self, act):
+        """What calls act(tab) of the tab that an event is of."""
+        return lambda event: act(tab) if (tab := self._tabs.get(event.client_id)) else None
+
     def _switched(self, _event):
         self._frustums.visible = self._shown.value and self._show.value not in OWN_CAMERA
         for tab in list(self._tabs.values()):
             tab.moved = time.monotonic()
         self.woken.set()
 
-    def _want_file(self, event):
-        if tab := self._tabs.get(event.client_id):
-            self._wanted.append(tab)
-            self.woken.set()
+    def _want_file(self, tab):
+        self._wanted.append(tab)
+        self.woken.set()
 
-    def _add_key(self, event):
-        if tab := self._tabs.get(event.client_id):
-            self._keys.append(self._camera(tab))
-            name = f"/path/{len(self._keys)}"
-            self._space.add_frustum(self._server, name, self._keys[-1], color=CHOSEN)
+    def _add_key(self, tab):
+        self._keys.append(self._camera(tab))
+        name = f"/path/{len(self._keys)}"
+        self._space.add_frustum(self._server, name, self._keys[-1], color=CHOSEN)
 
     def _remove_key(self, _event):
         if self._keys:
             self._server.scene.remove_by_name(f"/path/{len(self._keys)}")
             self._keys.pop()
 
-    def _send_path(self, event):
+    def _send_path(self, tab):
         if self._keys:
             frames = through(self._keys, round(FPS * _value(self._seconds)))
             text = json.dumps({"frames": [frame_keys(camera) for camera in frames]})
-            event.client.send_file_download("path.json", text.encode(), save_immediately=True)
+            tab.client.send_file_download("path.json", text.encode(), save_immediately=True)
 
     # ---- what the thread that has the device calls
 
@@ -267,16 +255,14 @@ class ModelPage:
         return tab.camera.resized(*(max(MIN_SIDE, round(scale * side)) for side in (width, height)))
 
     def _gaussians(self):
-        """Arguments of viser's add_gaussian_splats: those that were fitted to the run, if any; of
-        their colours the mean of all directions.
-        """
+        """Arguments of viser's add_gaussian_splats, with mean colours, if any are fitted."""
         if (found := kept_gaussians(self.run)) is None:
             return None
-        table, origin = found
+        table = found.table
         turn = Rotation.from_quat(np.roll(table["turn"], -1, axis=1)).as_matrix()
         axes = turn * table["deviations"][:, None] / self._space.radius
         return {
-            "centers": self._space.page(table["position"] + origin).astype(np.float32),
+            "centers": self._space.page(table["position"] + found.origin).astype(np.float32),
             "covariances": (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
             "rgbs": (0.5 + CONSTANT * table["harmonics"][:, 0]).clip(0, 1),
             "opacities": table["opacity"][:, None],
@@ -293,9 +279,7 @@ class ModelPage:
             return None
 
     def _send(self, tab, is_draft):
-        """Draw the rendering that a tab shows behind its frustums; what takes longer than a draft
-        is given up when the tab's camera moves.
-        """
+        """Draw what a tab shows behind its frustums; but for drafts until its camera moves."""
         start, moved, camera = time.perf_counter(), tab.moved, self._camera(tab)
         if is_draft:
             most = min(camera.width, camera.height) // MIN_SIDE

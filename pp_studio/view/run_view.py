@@ -4,7 +4,7 @@ import math
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from pp_cl import OnStep, Run, RunFolder, Training, load
@@ -45,9 +45,7 @@ class RunView:
                 self.page.woken.wait(0.1)
 
     def look(self) -> None:
-        """Take up the checkpoint and the log where they have changed. A broken checkpoint leaves
-        the last model in place.
-        """
+        """Take up the checkpoint and the log where they have changed; no broken checkpoint."""
         if self._is_new(self._folder.checkpoint):
             try:
                 self._take(load(self._folder.path, self._dev, scene=self._scene))
@@ -60,13 +58,10 @@ class RunView:
             self.page.set_rows(logged(self._folder))
 
     def _is_new(self, path):
-        try:
-            stat = path.stat()
-        except OSError:
-            return False
-        before = self._seen.get(path)
-        self._seen[path] = stat.st_mtime_ns, stat.st_size, stat.st_ino
-        return self._seen[path] != before
+        with suppress(OSError):
+            stat, before = path.stat(), self._seen.get(path)
+            self._seen[path] = stat.st_mtime_ns, stat.st_size, stat.st_ino
+            return self._seen[path] != before
 
     def _take(self, run):
         self.told.content = ""
@@ -84,10 +79,9 @@ class RunView:
 
 def logged(folder: RunFolder) -> list[dict[str, Any]]:
     """The rows of a run's log, none of one that cannot be read."""
-    try:
+    with suppress(UserError):
         return folder.rows()
-    except UserError:
-        return []
+    return []
 
 
 @contextmanager

@@ -50,9 +50,7 @@ class ScenePage:
             for split in sorted(scene_splits(folder), key=lambda split: split != "train")
         }
         # one that lies in two splits is one view, which the page's list takes but once
-        listed = {view.name: view for views in self.splits.values() for view in views}
-        views = list(listed.values())
-        self._cameras = {view.name: view.camera for view in views}
+        self._cameras = {view.name: view.camera for some in self.splits.values() for view in some}
         cameras = list(self._cameras.values())
         self._points, colours = sparse_points(folder)
         box, _ = self._box()
@@ -73,12 +71,14 @@ class ScenePage:
         ]
         for end in self._ends:
             end.on_update(self._dragged)
-        self._add_switches([view.name for view in views])
+        self._status = server.gui.add_markdown("")
+        with switches(server):
+            self._add_switches(server.gui, list(self._cameras))
         self._frustums = {}
-        for view in views:
-            frustum = self._space.add_frustum(server, f"/views/{view.name}", view.camera)
-            frustum.on_click(lambda _, name=view.name: setattr(self._view, "value", name))
-            self._frustums[view.name] = frustum
+        for name, camera in self._cameras.items():
+            frustum = self._space.add_frustum(server, f"/views/{name}", camera)
+            frustum.on_click(lambda _, name=name: setattr(self._view, "value", name))
+            self._frustums[name] = frustum
         self._choose()
 
     def _add_points(self, points, colours):
@@ -89,13 +89,7 @@ class ScenePage:
                 "/points", points, colours[::step], precision="float32", **size
             )
 
-    def _add_switches(self, names):
-        gui = self._server.gui
-        self._status = gui.add_markdown("")
-        with switches(self._server):
-            self._add_box_and_view(gui, names)
-
-    def _add_box_and_view(self, gui, names):
+    def _add_switches(self, gui, names):
         with gui.add_folder("Box"):
             step = 1e-3 * self._space.radius
             self._corners = [gui.add_vector3(n, (0.0,) * 3, step=step) for n in ("From", "To")]
@@ -122,18 +116,14 @@ class ScenePage:
         middle = looked_at(cameras)
         reach = WIDE * np.median([np.linalg.norm(c.eye - middle) for c in cameras])
         near = self._points[np.linalg.norm(self._points - middle, axis=1) < 2 * reach]
-        if len(near):
-            box = np.percentile(near, (2, 98), axis=0)
-            if (box[1] > box[0]).all():
-                return box, False
-        return np.stack([middle - reach, middle + reach]), False
+        box = np.percentile(near, (2, 98), axis=0) if len(near) else np.zeros((2, 3))
+        is_wide = (box[1] > box[0]).all()
+        return box if is_wide else np.stack([middle - reach, middle + reach]), False
 
     # ---- what viser's threads call
 
     def _change(self, toggled=None, **changed):
-        """Write what the user has changed: box, dropped, or `toggled`, a view that is dropped or
-        kept after all. What cannot be is not written.
-        """
+        """Write what the user has changed, if it can be. toggled: a view, dropped or kept."""
         line = f"written to {EDITS}"
         with self._lock:
             try:
@@ -165,18 +155,11 @@ class ScenePage:
             self._status.content = str(error)
             return
         low, high = self._space.page(box)
-        self._server.scene.add_box(
-            "/box",
-            CHOSEN if is_given else SUGGESTED,
-            high - low,
-            position=(low + high) / 2,
-            opacity=0.15,
-            side="double",
-        )
-        for end, at, handle, corner in zip(
-            self._ends, (low, high), self._corners, box, strict=True
-        ):
-            end.position, handle.value = at, tuple(corner.tolist())
+        colour, options = CHOSEN if is_given else SUGGESTED, {"opacity": 0.15, "side": "double"}
+        middle = (low + high) / 2
+        self._server.scene.add_box("/box", colour, high - low, position=middle, **options)
+        for i, at in enumerate((low, high)):
+            self._ends[i].position, self._corners[i].value = at, tuple(box[i].tolist())
         chosen = self._view.value
         for name, frustum in self._frustums.items():
             usual = CHOSEN if name == chosen else VIEW

@@ -1,7 +1,5 @@
 """The web server of the viewer: viser's, started quietly on one address."""
 
-from __future__ import annotations
-
 import io
 import logging
 import socket

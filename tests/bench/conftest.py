@@ -1,5 +1,3 @@
-"""Short measurements."""
-
 import pytest
 
 from pp_cl.bench import timing
@@ -7,6 +5,5 @@ from pp_cl.bench import timing
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Few runs."""
     monkeypatch.setattr(timing, "SECONDS", 0.0)
     monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)

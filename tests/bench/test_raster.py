@@ -1,5 +1,3 @@
-"""pp_cl/bench/raster.py: its errors and numbers are what they say."""
-
 import pytest
 
 from pp_cl.bench.raster import BLENDS, SCENES, features_error

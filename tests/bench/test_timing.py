@@ -1,5 +1,3 @@
-"""Runs take turns, errors are what they say, rows become lines and an image."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""The types by which argparse reads options, and options that commands share."""
-
 import json
 import sys
 
@@ -41,7 +39,6 @@ def test_texts_become_what_is_meant(tmp_path):
 
 
 def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypatch):
-    """One rule for every command."""
     monkeypatch.setattr("pp_cl.drivers.list_devices", lambda **_: [])
     file = tmp_path / "a.json"
     for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):
@@ -77,8 +74,6 @@ def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
         ("compare", "a", "b", "--json"),
         ("eval", "a", "--scene"),
         ("info", "a", "--device"),
-        ("export", "a", "--format", "ply", "--out"),
-        ("train", "a", "--out"),
     ],
 )
 def test_an_empty_value_is_refused(words, capsys):
@@ -96,7 +91,6 @@ def test_an_empty_value_is_refused(words, capsys):
         ("A B --json out", {"subject": "A", "truth": "B", "json": "out"}),
         ("--json out RUN", {"subject": "RUN", "json": "out"}),
         ("A B --metrics", {"truth": "B", "metrics": options.METRICS}),
-        ("A B --metrics --json", {"metrics": options.METRICS, "json": None}),
         ("A B --metrics psnr", {"truth": "B", "metrics": ("psnr",)}),
     ],
 )

@@ -1,5 +1,3 @@
-"""What long stages and a training show while they run, on a terminal and elsewhere."""
-
 import io
 import time
 from types import SimpleNamespace
@@ -29,7 +27,6 @@ def soon(monkeypatch):
 
 
 def until(stream, text):
-    """Wait until the stream shows the text."""
     end = time.monotonic() + 10
     while text not in stream.getvalue():
         assert time.monotonic() < end, stream.getvalue()
@@ -82,7 +79,6 @@ def test_on_a_terminal_a_bar_moves_by_itself():
 
 @pytest.mark.parametrize("kind", [io.StringIO, Terminal])
 def test_a_training_tells_its_rate_points_and_memory(kind):
-    """Of 400 steps, 100 are done before."""
     trainer = SimpleNamespace(step=100, dev=SimpleNamespace(bytes=3 * 2**29))
     config = SimpleNamespace(train=SimpleNamespace(iterations=400))
     stream = kind()

@@ -1,5 +1,3 @@
-"""pp-cl selftest: the table, the exit status, the JSON file; what it refuses."""
-
 import json
 import shutil
 
@@ -14,7 +12,6 @@ NAMES = ("device: scan", "training: split opacities", "training: moving average"
 
 @pytest.fixture
 def few(monkeypatch):
-    """Three cases, the second of refine.cl."""
     monkeypatch.setattr(run, "CASES", [c for name in NAMES for c in run.CASES if c.name == name])
 
 

@@ -1,5 +1,3 @@
-"""Ctrl-C and SIGTERM: one line, soon; a training ends its step and writes a checkpoint."""
-
 import signal
 import subprocess
 import sys
@@ -18,12 +16,10 @@ from pp_cl.errors import UserError
 
 @pytest.fixture(scope="module")
 def whole(finished):
-    """The checkpoint of a training that was not stopped."""
     return (finished / "checkpoint.npz").read_bytes()
 
 
 def signalling(monkeypatch, at, number):
-    """Trainer.train_step that sends this process a signal in the middle of a step."""
     train_step = Trainer.train_step
 
     def stepping(self):
@@ -83,15 +79,6 @@ def test_a_second_signal_stops_at_once_and_so_does_one_in_the_first_step(
     *_, line = capsys.readouterr().err.splitlines()
     assert ("goes on from" if saved else "starts over") in line
     assert load_checkpoint(file)[0]["step"] == saved if saved else not file.exists()
-
-
-def test_other_commands_promise_nothing(capsys, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("pp_cl.commands.compare.run", interrupted)
-    assert main(["compare", "a", "b"]) == 130
-    assert capsys.readouterr().err == "pp-cl: interrupted\n"
 
 
 @pytest.mark.parametrize("number", STOPPING)

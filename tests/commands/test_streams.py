@@ -1,5 +1,3 @@
-"""The program with streams as shells give them: it ends as it would have, without a traceback."""
-
 import io
 import os
 import subprocess
@@ -14,7 +12,6 @@ NO_RUN = b"pp-cl: no/such/run/config.json: No such file or directory; is this th
 
 
 def program(words, **options):
-    """The ended process of pp-cl."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
     words = [sys.executable, "-m", "pp_cl", *words]
     return subprocess.run(words, timeout=120, check=False, **options)

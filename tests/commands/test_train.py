@@ -1,9 +1,6 @@
-"""`pp-cl train`: what it prints about how settings were read."""
-
 import json
 
 import numpy as np
-import pytest
 from support.refused import failure
 from support.runs import SETTINGS, arguments
 from support.scenes import write_ball_scene
@@ -18,7 +15,6 @@ from pp_cl.session.training import train_scene
 
 
 def trained_lines(capsys, *words):
-    """Lines on stdout of a training of two steps that must go well."""
     few = ["--iterations", "2", "--points", "300", "--set", "network.widths=16,16,16"]
     assert main(["train", *map(str, words), *few]) == 0
     return capsys.readouterr().out.splitlines()
@@ -64,7 +60,6 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
 
 
 def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
-    """Of images of another size: by a start without a checkpoint, and with --config."""
     scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
     words = arguments(scene, folder.path, train__refine_at="0,0", raster__radius=0)
     with monkeypatch.context() as patch:
@@ -78,12 +73,6 @@ def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
     assert not {"train.refine_at", "raster.radius"} & {key for key, _, _ in given}
     own = [("raster.radius", "0.9", "--set")]
     assert run_config(folder, scene, None, own).raster.radius == 0.9
-
-
-def test_a_setting_has_one_origin(tmp_path):
-    given = [("train.seed", "3", "--set"), ("train.seed", "4", "--seed")]
-    with pytest.raises(UserError, match="--seed: train.seed is set by --set, too"):
-        run_config(RunFolder(tmp_path / "run"), "demo", None, given)
 
 
 def test_a_checkpoint_goes_on_with_what_the_model_does_not_depend_on(tmp_path):
@@ -113,7 +102,6 @@ def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
 
 
 def test_a_run_begins_with_the_settings_of_another(tmp_path, capsys):
-    """All but those of its scene; resumed with the same words, and others on top."""
     scene, file = write_ball_scene(tmp_path / "ball", views=4), tmp_path / "first" / "config.json"
     changed = ("--set", "train.sh_eps=0.02", "--downscale", "1")
     trained_lines(capsys, scene, "--out", tmp_path / "first", *changed)
@@ -130,10 +118,3 @@ def test_a_run_begins_with_the_settings_of_another(tmp_path, capsys):
     assert main([*words, "--seed", "3"]) == 0 and "finished" in capsys.readouterr().out
     assert main([*words, "--seed", "3", "--iterations", "4"]) == 0
     assert "trained 4 steps" in capsys.readouterr().out
-
-
-def test_a_file_and_a_preset_are_refused(tmp_path):
-    scene = write_ball_scene(tmp_path / "ball", views=4)
-    words = ["train", scene, "--out", str(tmp_path / "run"), "--config", str(tmp_path / "no.json")]
-    assert "--preset" in failure(*words, "--preset", "tiny")
-    assert "no.json" in failure(*words)

@@ -1,7 +1,3 @@
-"""Drivers that crash, hang or build nothing are named and hurt nobody; Intel's runtime is found
-beside pp-cl.
-"""
-
 import json
 import os
 import shutil
@@ -25,7 +21,6 @@ pytestmark = [
 
 
 def compiled(library, *flags):
-    """A driver's library of tests/drivers/icd.c."""
     source = Path(__file__).with_name("icd.c")
     subprocess.run([COMPILER, "-shared", "-fPIC", *flags, "-o", library, source], check=True)
     return library
@@ -51,7 +46,6 @@ def vendors(tmp_path, monkeypatch):
 
 
 def python(code):
-    """What a fresh process prints, on both streams."""
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout + ran.stderr
@@ -63,7 +57,6 @@ def listed(code="import sys; from pp_cl.cli import main; sys.exit(main(['devices
 
 
 def test_drivers_that_crash_and_one_that_builds_nothing(vendors, tmp_path):
-    """When it is loaded, or when it builds, as one of several that a process tries."""
     vendors("crash", "-DCRASHES")
     vendors("late", "-DCRASHES_IN_BUILD")
     vendors("broken")
@@ -115,7 +108,6 @@ def test_intels_runtime_is_found_beside_pp_cl(tmp_path, monkeypatch):
 def test_what_was_found_is_kept_and_found_anew_where_its_file_is_damaged(
     session_device, tmp_path, monkeypatch
 ):
-    """Or where it cannot be written, or nothing worked."""
     shown, probed = drivers.try_drivers(again=True), []
     monkeypatch.setattr(drivers, "_probe", lambda _: probed.append(0) or shown)
 
@@ -159,7 +151,6 @@ def test_without_a_driver_nothing_is_listed(monkeypatch):
 
 
 def test_a_lock_of_a_killed_process_keeps_nobody_waiting(tmp_path, monkeypatch):
-    """In pyopencl's cache; one that is held stays."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     old, held = (tmp_path / "pyopencl" / name / "lock" for name in ("old", "held"))
     for lock in (old, held):

@@ -1,11 +1,6 @@
-"""The device that was the fastest when measured is taken: once for all commands and processes, and
-anew for another version of a driver.
-"""
+"""The device that was the fastest when measured is taken."""
 
 import json
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -42,7 +37,6 @@ def measured(monkeypatch, tmp_path):
 
 
 def first(found):
-    """The index of the device that is taken."""
     return speeds.by_speed(found)[0][0]
 
 
@@ -111,8 +105,6 @@ def test_commands_say_which_one_and_why(measured, monkeypatch, capsys):
     monkeypatch.setattr("pp_cl.engine.device.device.describe", lambda d: dict.fromkeys(NAMES, 1))
     assert main(["devices", "--json"]) == 0
     assert [row["default"] for row in json.loads(capsys.readouterr().out)] == [False, True]
-    assert main(["devices"]) == 0
-    assert [line.endswith(", taken by default") for line in capsys.readouterr().out.splitlines()]
     device = SimpleNamespace(name="b", info={"platform": "B"})
     assert drivers.device_line(device, None) == "device: b [B], the fastest of 2"
     assert drivers.device_line(device, "B") == "device: b [B]"
@@ -121,32 +113,3 @@ def test_commands_say_which_one_and_why(measured, monkeypatch, capsys):
 
 
 NAMES = ("name", "platform", "compute_units", "memory_bytes")
-
-
-def test_processes_measure_once_and_choose_alike(session_device, tmp_path):
-    """Four at the same time, with the kept speed of the first; one device counts as two."""
-    code = """
-        import sys
-        from pp_cl import drivers, speeds
-        listed = [one for one in drivers.list_devices() if one[2] is None]
-        measured = speeds._measured
-        speeds._measured = lambda: print("measured", file=sys.stderr) or measured()
-        print(speeds.kept_speeds([device for _, device, _ in listed]))
-    """
-    environment = {**os.environ, "PP_CACHE": str(tmp_path)}
-    lines = "\n".join(line.strip() for line in code.splitlines())
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-c", lines],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(4)
-    ]
-    told = [process.communicate() for process in started]
-    assert len({out for out, _ in told}) == 1 and [p.returncode for p in started] == [0] * 4
-    assert sum(err.count("measured") for _, err in told) == 1
-    kept = json.loads((tmp_path / speeds.SPEEDS).read_text())
-    assert kept[speeds._key(session_device.device)] > 0.1

@@ -1,5 +1,3 @@
-"""The script of docs/api.md: a training from numpy arrays, with no folder, no file, no command."""
-
 import re
 from pathlib import Path
 

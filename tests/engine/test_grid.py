@@ -1,5 +1,3 @@
-"""The grid's arithmetic near the world's origin and far from it."""
-
 import tracemalloc
 from fractions import Fraction
 

@@ -1,7 +1,3 @@
-"""The stages in their order: whole images and their gradients against the float64 twins chained
-together.
-"""
-
 from dataclasses import replace
 
 import numpy as np
@@ -90,9 +86,6 @@ def test_image_and_gradients(dev, rng, name, early_stop, blend):
 
 
 def test_padding_does_not_move_the_image(dev, rng):
-    """A camera whose size is no multiple of 4 shows the same features as the larger one,
-    cropped.
-    """
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, RasterConfig(radius=0.85))
     whole = renderer.forward(camera, GAMMA, until="features").features.get()
@@ -152,7 +145,6 @@ def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, 
 
 
 def test_an_image_beyond_the_boxes_of_points_is_refused(dev, rng):
-    """Before anything is launched: they would wrap."""
     camera = replace(ring_cameras(1, 16)[0], width=2**16)
     renderer = Renderer(dev, make_model(dev, rng), RasterConfig(radius=0.85))
     with pytest.raises(UserError, match="65536x16 pixels: at most 65535 each way"):

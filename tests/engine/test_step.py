@@ -1,8 +1,3 @@
-"""Training: it learns, it is deterministic, and a run that was killed ends like one that was
-not.
-"""
-
-import re
 import shutil
 
 import numpy as np
@@ -11,7 +6,6 @@ from support.checkpoints import load_checkpoint
 from support.refused import failure
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
-from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.config import preset
 from pp_cl.engine.grid import Grid
@@ -54,21 +48,7 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
 
 
-def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(scene, tmp_path, monkeypatch):
-    whole, run = tmp_path / "whole", tmp_path / "run"
-    changes = {"network__blocks": "gated", "train__iterations": 80}
-    assert main(arguments(scene, whole, **changes)) == 0
-    losses = [r["loss"] for r in rows(whole)[:-1]]
-    assert np.mean(losses[-3:]) < 0.6 * losses[0]
-    train_and_interrupt(scene, run, 47, monkeypatch, **changes)
-    assert main(["train", scene, "--out", str(run)]) == 0  # the settings are the run's
-    assert checkpoint(run) == checkpoint(whole)
-    told = failure(*arguments(scene, run, network__blocks="single"))
-    assert "network.blocks is gated there, single asked for" in told
-
-
 def test_a_training_begins_with_the_network_of_another_run(scene, finished, tmp_path, monkeypatch):
-    """Which it needs no more once it has begun."""
     run, whole, other = tmp_path / "run", tmp_path / "whole", tmp_path / "other"
     shutil.copytree(finished, other)
     given = {"network__rate": "1e-12,1e-12", "train__ema": "false"}
@@ -112,15 +92,6 @@ def test_where_the_demos_network_is_taken(dev, scene, widths, is_taken):
             np.testing.assert_array_equal(dev.download(array), expected)
 
 
-def test_what_has_a_rate_of_0_is_left_alone(scene, tmp_path, monkeypatch):
-    changes = {"train__sh_rate": "0.5,0.25,0", "train__offset_rate": "0,0"}
-    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch, **changes)
-    _, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
-    assert not arrays["points.sh2"].any() and not arrays["points.offset"].any()
-    assert arrays["points.sh0"].any() and arrays["points.sh1"].any()
-    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
-
-
 def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path):
     lower, zero = tmp_path / "lower", tmp_path / "zero"
     assert main(arguments(scene, lower, points__sh_degree=0)) == 0
@@ -144,35 +115,3 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
     assert "at once" in failure(*arguments(scene, tmp_path / "smaller", **changes))
     assert not (tmp_path / "smaller").exists()
-
-
-def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
-    """The ball fills about half of its box, so 1500 cells hold some 750 points."""
-    monkeypatch.setattr("pp_cl.scene.hull.CELL_CAP", 1500)
-    assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
-    told = re.search(r"^points: only (\d+) of the 1500 asked .*$", capsys.readouterr().out, re.M)
-    assert 500 < int(told[1]) < 1500
-
-
-@pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])
-def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
-    out = tmp_path / "run"
-    changes = {"raster__footprint": footprint, "raster__radius": radius, "train__iterations": 30}
-    changes |= {"raster__max_tracked": 64, "raster__early_stop": 0.001, "train__crop": 0}
-    changes |= {"train__prune_weight": 0}
-    assert main(arguments(scene, out, **changes)) == 0
-    losses = [r["loss"] for r in rows(out)[:-1]]
-    assert losses[-1] < losses[0]
-
-
-def test_the_distortion_loss_brings_the_fragments_of_a_pixel_together(scene, tmp_path):
-    """Their mean depth and their median depth differ less."""
-    apart = []
-    for weight in (0, 30):
-        out = tmp_path / str(weight)
-        assert main(arguments(scene, out, train__distortion_weight=weight)) == 0
-        run = load(out)
-        images = [run.render(view.camera) for view in run.scene("test").splits["test"]]
-        seen = [(p.depth[p.alpha > 0.5], p.median_depth[p.alpha > 0.5]) for p in images]
-        apart.append(np.mean([np.abs(mean - median).mean() for mean, median in seen]))
-    assert apart[1] < 0.7 * apart[0]

@@ -32,7 +32,6 @@ SETTINGS = {
 
 
 def make_trainer(dev, scene, folder, name):
-    """A trainer of the preset, with its settings changed."""
     settings = EVERY_STEP | SETTINGS[name]
     config = configure(
         preset(name.partition(",")[0]), str(scene), [(k, v, "test") for k, v in settings.items()]

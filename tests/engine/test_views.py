@@ -1,5 +1,3 @@
-"""Views: reduction and its limits, the pixels that show the object."""
-
 import numpy as np
 import pytest
 
@@ -29,21 +27,15 @@ def test_reduced(view):
 def test_reduced_too_far(view, downscale):
     with pytest.raises(UserError, match=r"--downscale .*from 1 to 3.*70x50 pixels of a\.png"):
         view.reduced(downscale)
-
-
-def test_image_too_small_for_any_reduction():
+    low = View("a.png", view.stored_camera.crop(0, 0, 70, 15), view.image[:15])
     with pytest.raises(UserError, match=r"a\.png: 70x15 pixels"):
-        View(
-            "a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 15), np.zeros((15, 70, 4), np.uint8)
-        ).reduced(1)
+        low.reduced(1)
 
 
 @pytest.mark.parametrize("downscale", (1, 2, 3))
 @pytest.mark.parametrize("margin", (0, 2, 100))
 def test_object_bounds_are_the_tightest(view, rng, downscale, margin):
-    """Against a search over the reduced pixels one by one; the image's leftover columns and rows do
-    not count.
-    """
+    assert view.reduced(3).object_bounds(5) == (0, 0, 23, 16)  # there is none
     for _ in range(5):
         view.image[..., 3] = rng.integers(0, MASK_THRESHOLD + 1, view.image.shape[:2])
         view.image[rng.integers(5, 50, 4), rng.integers(9, 70, 4), 3] = MASK_THRESHOLD + 1
@@ -67,24 +59,17 @@ def test_object_bounds_are_the_tightest(view, rng, downscale, margin):
         assert view.reduced(downscale).object_bounds(margin) == expected
 
 
-def test_object_bounds_without_object(view):
-    assert view.reduced(3).object_bounds(5) == (0, 0, 23, 16)
-
-
 @pytest.mark.parametrize(
     "size, side, expected",
     [
         ((800, 800), 200, 4),
-        ((400, 400), 200, 2),
         ((200, 200), 200, 1),
         ((48, 48), 200, 1),  # smaller ones are not enlarged
         ((300, 200), 200, 2),  # 150 is three quarters of 200
-        ((298, 200), 200, 1),
         ((4032, 3024), 200, 20),
         ((1000, 40), 200, 2),  # no side below 16 pixels
         ((10, 10), 200, 1),
         ((4032, 3024), IMAGE_SIZES["full"], 3),
-        ((1600, 1200), IMAGE_SIZES["full"], 1),
         ((4032, 3024), IMAGE_SIZES["paper"], 1),
     ],
 )

@@ -1,5 +1,3 @@
-"""OpenEXR files hold the values that went in, and are read as images."""
-
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,6 @@ from pp_cl.scene.load import load_scene
 
 @pytest.fixture
 def shown(rng):
-    """An image with features and a pixel of background."""
     alpha = rng.random((9, 4)).astype(np.float32)
     alpha[0, 0] = 0
     depth = np.where(alpha > 0, 4 * alpha, np.inf).astype(np.float32)
@@ -44,8 +41,6 @@ def test_a_place_that_cannot_be_written_is_one_line(shown, tmp_path):
     with pytest.raises(UserError, match="a.exr: cannot be written"):
         write_exr(tmp_path / "missing" / "a.exr", shown.channels())
 
-
-# --------------------------------------------------------------------------------------------------
 
 WIDTH, HEIGHT = 13, 9
 
@@ -96,7 +91,6 @@ def test_every_kind_is_read(tmp_path, rng, dtype, alpha, tiled):
 
 @pytest.mark.parametrize("shift", [(0, 0), (4, 3), (-4, 2), (20, 20), (-100, 0)])
 def test_windows_that_differ(tmp_path, rng, shift):
-    """The data window lies elsewhere than the display window, which is the image."""
     channels, expected = colours(rng, np.float32, True)
     low = np.array(shift) + [5, 6]
     data = (low, low + [WIDTH - 1, HEIGHT - 1])
@@ -113,7 +107,6 @@ def test_windows_that_differ(tmp_path, rng, shift):
 
 
 def test_gray_and_one_layer(tmp_path, rng):
-    """In more rows than a strip has."""
     plane = rng.uniform(0, 1, (600, 3)).astype(np.float32)
     stored(tmp_path / "gray.exr", {"Y": plane})
     assert np.abs(read_rgba(tmp_path / "gray.exr")[..., 1] - srgb(plane)).max() <= 1
@@ -122,22 +115,13 @@ def test_gray_and_one_layer(tmp_path, rng):
     assert np.abs(read_rgba(tmp_path / "layer.exr")[..., 3] - 255 * plane).max() <= 1
 
 
-def test_what_an_image_writes_is_what_it_shows(shown, tmp_path):
-    write_exr(tmp_path / "a.exr", shown.channels())
-    expected = 255 * shown.rgba()
-    there = shown.alpha > 0.1
-    assert np.abs(read_rgba(tmp_path / "a.exr")[there] - expected[there]).max() <= 1
-
-
 PLANE = np.ones((HEIGHT, WIDTH), np.float32)
 NAN = np.where(np.arange(WIDTH) == 3, np.nan, PLANE).astype(np.float32)
 BAD_IMAGES = {
     "no colours": ({"Z": PLANE}, "no images among its channels"),
-    "two colours": ({"R": PLANE, "G": PLANE}, "no images"),
     "two layers": ({f"{a}.{c}": PLANE for a in "ab" for c in "RGB"}, "several images"),
     "NaN": (dict.fromkeys("RGB", NAN), "9 pixels are NaN or infinite"),
     "infinite": (dict.fromkeys("RGBA", PLANE * np.inf), "117 pixels"),
-    "infinite halves": (dict.fromkeys("RGB", (PLANE * np.inf).astype(np.float16)), "117 pixels"),
 }
 
 
@@ -150,9 +134,6 @@ def test_images_that_are_refused(tmp_path, case):
 
 
 def test_parts_sizes_and_damage(tmp_path, capfd, monkeypatch):
-    """A file of several parts is refused, and one beyond all memory; the library's own words about
-    a damaged one stay away.
-    """
     planes = {name: PLANE.copy() for name in "RGB"}
     parts = [OpenEXR.Part({"name": n, "type": OpenEXR.scanlineimage}, planes) for n in "ab"]
     OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))

@@ -1,7 +1,4 @@
-"""Images on disk: every kind of PNG, broken files, writing without leaving halves behind."""
-
 import os
-import warnings
 import zlib
 
 import numpy as np
@@ -24,7 +21,6 @@ from pp_cl.files.image import (
 
 @pytest.fixture
 def rgba(rng):
-    """(5, 7, 4) random image."""
     return rng.integers(0, 256, (5, 7, 4), np.uint8)
 
 
@@ -57,9 +53,6 @@ def test_modes_become_rgba(tmp_path, rgba):
 
 
 def test_masks_of_other_programs(tmp_path, rgba):
-    """Gray ones; cut-outs, whose alpha is the mask; labels, of which a JPEG's may be noise; what is
-    none of these is refused with the mend.
-    """
     gray, path = rgba[..., 0], tmp_path / "a.png"
     for image in (gray, np.dstack([gray] * 3), np.dstack([rgba[..., :3], gray])):
         Image.fromarray(image).save(path)
@@ -108,7 +101,6 @@ def test_sixteen_bits_become_eight(tmp_path, rgba):
 
 
 def test_colours_of_other_spaces_become_srgb(tmp_path):
-    """As phones write them, with sRGB's own profile, of four inks, or multiplied with alpha."""
     own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     image = Image.new("RGB", (40, 30), (200, 90, 60))
     image.save(tmp_path / "p3.png", icc_profile=display_p3())
@@ -143,29 +135,23 @@ def test_a_checksum_that_is_wrong_is_refused(tmp_path):
         assert image_size(path) == (64, 64)
 
 
-def test_a_broken_animation_is_read_without_a_word(tmp_path, rgba, recwarn):
-    path = tmp_path / "a.png"
-    write_png(path, rgba)
-    content = path.read_bytes()
-    control = b"acTL" + bytes(8)  # an animation of no frames
-    chunk = (8).to_bytes(4, "big") + control + zlib.crc32(control).to_bytes(4, "big")
-    path.write_bytes(content[:33] + chunk + content[33:])
-    # pytest undoes the filter of the module, which is what keeps this from the user
-    warnings.filterwarnings("ignore", module=r"PIL\.")
-    assert np.array_equal(read_rgba(path), rgba) and not recwarn.list
-
-
 @pytest.mark.unix
 @pytest.mark.parametrize("read", (read_rgba, image_size))
 def test_not_an_image(tmp_path, read):
-    """A pipe is not waited for."""
     (tmp_path / "text.png").write_text("not an image")
     (tmp_path / "empty.png").touch()
     for name in ("pipe.png", "pipe.exr"):
         os.mkfifo(tmp_path / name)
     Image.new("RGB", (5, 7)).save(tmp_path / "a.gif")
+    write_png(tmp_path / "huge.png", np.zeros((5, 7)))
+    whole = (tmp_path / "huge.png").read_bytes()
+    head = b"IHDR" + bytes([0, 0, 255, 255] * 2) + whole[24:29]
+    head += zlib.crc32(head).to_bytes(4, "big")
+    (tmp_path / "huge.png").write_bytes(whole[:12] + head + whole[33:])
     with refusing(tmp_path / "a.gif", "is no PNG, JPEG, WEBP, ", "; convert it"):
         read(tmp_path / "a.gif")
+    with refusing(tmp_path / "huge.png", " pixels; reduce the image"):
+        read(tmp_path / "huge.png")
     for path in (*sorted(tmp_path.iterdir()), tmp_path, tmp_path / "none.png"):
         with refusing(path):
             read(path)
@@ -193,10 +179,8 @@ def test_to_8bit():
     [
         (["test/r_0.png", "test/r_1.png"], ["r_0.png", "r_1.png"]),
         (["cam0/0001.png", "cam1/0001.jpg"], ["cam0/0001.png", "cam1/0001.png"]),
-        (["images/a/1.png", "images/b/1.png"], ["a/1.png", "b/1.png"]),
         (["test/1.png", "2.png"], ["test/1.png", "2.png"]),
         (["test/1.png", "test/1.jpg"], ["1.png.png", "1.jpg.png"]),
-        (["r_0.png"], ["r_0.png"]),
     ],
 )
 def test_every_image_has_a_file_of_its_own(names, files):

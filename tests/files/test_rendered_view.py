@@ -1,5 +1,3 @@
-"""A rendered view over any background, transparent, in linear light."""
-
 import io
 import weakref
 from dataclasses import replace
@@ -61,9 +59,8 @@ def test_it_is_saved_and_shown_in_a_notebook(rng, tmp_path):
     np.testing.assert_array_equal(there, white[..., :3])
 
 
-@pytest.mark.parametrize("n", [1, 4, 9])
+@pytest.mark.parametrize("n", [1, 4])
 def test_the_mean_of_samples(rng, n):
-    """Of which the first is held, and one more."""
     samples, held = [view_and_colours(rng)[0] for _ in range(n)], []
 
     def drawn():

@@ -1,8 +1,5 @@
-"""The folder of a run: its log survives whatever stands in it, and a full disk is told."""
-
 import errno
 import json
-import os
 import signal
 
 import numpy as np
@@ -22,7 +19,6 @@ def write(folder, *lines):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A run's folder with three rows in its log."""
     folder = RunFolder(tmp_path)
     write(folder, *(json.dumps(row).encode() for row in ROWS))
     return folder
@@ -33,9 +29,6 @@ def rows(folder):
 
 
 def test_rows_after_the_step_are_cut_off_and_made_again(folder, recwarn):
-    """Also what a kill left of a row, and the row of the end; a row that is being written is not
-    there yet.
-    """
     with folder.log.open("ab") as file:
         file.write(b'{"step": 20, "sec')
     assert folder.rows() == ROWS
@@ -59,16 +52,12 @@ def test_a_log_of_at_most_so_many_bytes(folder, monkeypatch):
         b'{"step": 10, "sec',
         b"\xff\xfe",
         b'{"step": 10}',
-        b'{"step": 10, "seconds": "1"}',
         b'{"step": 10, "seconds": 1.0, "psnr": NaN}',
-        b'{"step": 10, "seconds": 1e999}',
         b"[" * 100_000,
         b'{"step": 10, "seconds": 1.0, "rates": ' + b"[" * 900 + b"]" * 900 + b"}",
-        b'{"step": 10.0, "seconds": 1.0}',
         b'{"step": -10, "seconds": 1.0}',
         b'{"step": 4, "seconds": 1.0}',
         b'{"step": 10, "seconds": 0.1}',
-        b'{"step": 10, "seconds": -1}',
         b'{"step": 10, "seconds": ' + b"9" * 400 + b"}",
         b'{"step": 10, "seconds": 1.0, "psnr": "20"}',
         b'{"step": 10, "seconds": 1.0, "rates": {"sh": [1, -Infinity]}}',
@@ -77,7 +66,6 @@ def test_a_log_of_at_most_so_many_bytes(folder, monkeypatch):
     ],
 )
 def test_a_damaged_log_is_cut_off_there(folder, line):
-    """And told in one line."""
     write(folder, json.dumps(ROWS[0]).encode(), line, json.dumps(ROWS[2]).encode())
     with pytest.warns(UserWarning, match="line 2 is no row of a log"):
         assert folder.rows() == ROWS[:1]
@@ -107,7 +95,6 @@ def test_a_full_disk_is_one_line_that_names_the_log(folder):
 
 
 def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_path, monkeypatch):
-    """Where config.json cannot be written, nothing else is there that would look foreign."""
     folder = RunFolder(tmp_path / "run")
 
     def fail(*_):
@@ -126,9 +113,6 @@ def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_p
 
 
 def test_images_without_a_checkpoint_go_and_others_stay(tmp_path):
-    """They may show other settings; a file of the user is none of them, nor is one that the user
-    has changed.
-    """
     folder = RunFolder(tmp_path)
     folder.create("{}")
     ours = [tmp_path / "masks.png", folder.previews / "step_000030.png"]
@@ -157,31 +141,3 @@ def test_a_file_system_without_locks_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.files.run_folder.FileLock.acquire", acquire)
     with pytest.raises(UserError, match="run/.pp-cl.lock: cannot be locked .No locks available"):
         RunFolder(tmp_path / "run").owned().__enter__()
-
-
-def test_the_name_of_the_owner_is_not_worth_a_finished_training(tmp_path, monkeypatch):
-    def unlink(self, missing_ok=False):
-        raise OSError(errno.EIO, "Input/output error")
-
-    folder = RunFolder(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr("pathlib.Path.unlink", unlink)
-        with folder.owned():
-            pass
-    with folder.owned():
-        assert (tmp_path / ".pp-cl.owner").read_text().startswith(f"process {os.getpid()} ")
-    assert not (tmp_path / ".pp-cl.owner").exists()
-
-
-def test_a_log_that_fails_when_it_is_closed_is_one_line(folder):
-    class Failing:
-        name = str(folder.log)
-
-        def close(self):
-            raise OSError(errno.EIO, "Input/output error")
-
-    log = folder.open_log(10)
-    log.__exit__()
-    vars(log)["_file"] = Failing()
-    with pytest.raises(UserError, match="log.jsonl: cannot be written .Input/output error"), log:
-        pass

@@ -1,5 +1,3 @@
-"""The curves for TensorBoard."""
-
 import json
 import sys
 

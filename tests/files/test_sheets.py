@@ -1,5 +1,3 @@
-"""The sheet of predictions beside the truth and the error."""
-
 import numpy as np
 
 from pp_cl.files.image import read_rgba
@@ -7,7 +5,6 @@ from pp_cl.files.sheets import GAP, HEADER, contact_sheet, write_comparison
 
 
 def tile(picture, row, column, height, width):
-    """One image of the sheet."""
     y, x = HEADER + row * (HEADER + height + GAP), column * (width + GAP)
     return picture[y : y + height, x : x + width]
 

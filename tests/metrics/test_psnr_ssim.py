@@ -1,5 +1,3 @@
-"""PSNR and SSIM against their definitions; everything is measured on 8-bit images."""
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from pp_cl.reference.lpips import random_weights
 
 @pytest.fixture
 def pair(rng):
-    """Two uint8 images that resemble each other."""
     a = rng.integers(0, 256, (19, 23, 3))
     return a.astype(np.uint8), np.clip(a + rng.integers(-60, 60, a.shape), 0, 255).astype(np.uint8)
 

@@ -1,5 +1,3 @@
-"""The box that the masks allow, and what is said of masks and cameras that leave no point."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""The demo's object and images: distances and silhouettes against the float64 oracle, mesh,
-gloss, the written folder.
-"""
-
 import numpy as np
 import pytest
 import trimesh

@@ -38,11 +38,9 @@ def arc(rng, angle):
 
 
 CAPTURES = {
-    "parallel": lambda rng: wall(rng, 0),
     "held by hand": lambda rng: wall(rng, 0.2),
     "converging": converging,
     "walk": walk,
-    "short arc": lambda rng: arc(rng, 0.4),
     "long arc": lambda rng: arc(rng, 4),
 }
 

@@ -1,7 +1,3 @@
-"""Visual hull and grid: the kernels against the float64 oracle, the search for the voxel size, the
-errors.
-"""
-
 from dataclasses import replace
 
 import numpy as np
@@ -23,20 +19,12 @@ def positions_of(found):
     return found.grid.positions(found.ids)
 
 
-def noise_view(rng, eye, size, share):
-    """View with `share` of its pixels in the mask, at random, alphas at and beside the threshold
-    among them.
-    """
-    alpha = np.where(rng.random(size[::-1]) < share, MASK_THRESHOLD + 1, MASK_THRESHOLD)
-    return View(
-        "noise",
-        ball_camera(eye, np.zeros(3), size),
-        alpha[..., None].repeat(4, -1).astype(np.uint8),
-    )
-
-
 def test_a_carving_in_parts_is_the_same(dev, rng, monkeypatch):
-    views = [noise_view(rng, np.array(eye), (64, 48), 0.1) for eye in ((3.0, 1, 0.5), (-2.0, 2, 1))]
+    views = []
+    for eye in np.array([(3.0, 1, 0.5), (-2.0, 2, 1)]):
+        alpha = np.where(rng.random((48, 64)) < 0.1, MASK_THRESHOLD + 1, MASK_THRESHOLD)
+        image = alpha[..., None].repeat(4, -1).astype(np.uint8)
+        views.append(View("noise", ball_camera(eye, np.zeros(3), (64, 48)), image))
     carver, grid = Carver(dev, views), Grid((-1, -1, -1), 2 / 40, (40, 13, 7))
     bits = []
 
@@ -59,7 +47,6 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
 
 
 def test_what_two_of_many_images_see_is_dropped(dev):
-    """Two cameras look at one place, three at another."""
     here, there, one = np.zeros(3), np.array([9.0, 9, 9]), Grid((0, 0, 0), 0.1, (1, 1, 1))
     ahead = [(place, place + 4 * axis) for place in (here, there) for axis in np.eye(3)][1:]
     image = np.full((64, 64, 4), 255, np.uint8)
@@ -83,7 +70,6 @@ def test_the_left_and_upper_borders_belong_to_an_image(dev):
 
 @pytest.fixture
 def carvings(monkeypatch):
-    """The (Grid, number of vertices inside) of all carvings of a test, in their order."""
     made, carve = [], Carver.carve
 
     def recorded(self, grid, forgiven=0):
@@ -162,7 +148,6 @@ def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
 
 
 def cropped(view):
-    """The view cropped to its mask, which touches all borders."""
     used = [np.flatnonzero((view.image[..., 3] > 0).any(axis)) for axis in (0, 1)]
     (x0, x1), (y0, y1) = ((int(u[0]), int(u[-1]) + 1) for u in used)
     camera = view.camera.crop(x0, y0, x1 - x0, y1 - y0)
@@ -194,7 +179,6 @@ def test_close_ups_bound_the_object_only_where_no_image_shows_it_whole(dev, whol
 @pytest.mark.large
 @pytest.mark.parametrize("stated", [None, (1.0, 9.0), (3.9, 4.1)])
 def test_depth_range_holds_every_point(dev, stated):
-    """One that the dataset states is kept, or widened."""
     views = [replace(view, depth_range=stated) for view in ball_views()]
     found = build_grid(dev, views, 2000)
     distances = [np.linalg.norm(positions_of(found) - v.camera.eye, axis=1) for v in views]
@@ -225,6 +209,13 @@ def test_a_box_that_is_stated_bounds_what_the_masks_allow(dev):
     found = build_grid(dev, ball_views(), 2000, box)
     assert (found.grid.box[0] > box[0] - 2 * found.grid.voxel_size).all()
     assert (found.grid.box[1] < CENTRE + [1.6, 0.4 + 2 * found.grid.voxel_size, 1.6]).all()
+
+
+@pytest.mark.large
+def test_without_masks_a_box_that_is_stated_is_filled(dev):
+    views = [replace(view, image=np.full_like(view.image, 255)) for view in ball_views()]
+    box = np.stack([CENTRE - 0.5, CENTRE + 0.5])
+    np.testing.assert_allclose(build_grid(dev, views, 2000, box).grid.box, box, atol=0.1)
 
 
 @pytest.mark.parametrize("points", (0, -3, 2**27 + 1))

@@ -1,5 +1,3 @@
-"""What tells whether a scene is the one that a run has learned."""
-
 import hashlib
 import json
 from dataclasses import replace
@@ -12,7 +10,6 @@ from support.scenes import move_scene, write_ball_scene
 from pp_cl.scene.identity import difference, identity, unpacked_views
 from pp_cl.scene.image_file import pixel_digest
 from pp_cl.scene.load import load_scene, scene_frames
-from pp_cl.settings import SceneConfig
 
 
 @pytest.fixture
@@ -26,7 +23,6 @@ def views_of(folder, **options):
 
 
 def repaint(file, channel):
-    """Change one channel of one pixel by one."""
     pixels = np.array(Image.open(file))
     pixels[20, 20, channel] ^= 1
     Image.fromarray(pixels).save(file)
@@ -80,20 +76,6 @@ def test_other_pixels_are_named(folder, channel):
     assert difference(header, scene_frames(folder), views).startswith(
         "train/r_1.png, train/r_5.png: other pixels"
     )
-
-
-def test_masks_of_their_own_belong_to_the_pixels(folder, tmp_path):
-    (tmp_path / "masks").mkdir()
-    for i in range(8):
-        mask = np.full((48, 48), 255, np.uint8)
-        mask[:, : 4 + i] = 0
-        Image.fromarray(mask).save(tmp_path / "masks" / f"r_{i}.png")
-    rule = SceneConfig(masks=str(tmp_path / "masks"))
-    header = identity(views_of(folder, masks=rule))
-    pixels = np.array(Image.open(tmp_path / "masks/r_2.png"))
-    Image.fromarray(255 - pixels).save(tmp_path / "masks/r_2.png")
-    views = views_of(folder, masks=rule)
-    assert difference(header, scene_frames(folder), views).startswith("train/r_2.png: other pixels")
 
 
 def test_other_cameras_and_names_are_told_and_more_views_are_none(folder):

@@ -23,7 +23,6 @@ SPLITS = ("train", "test")
 
 
 def with_hand(folder, colour):
-    """The ball's scene, something of an RGBA colour before every second image."""
     write_ball_scene(folder)
     for split in SPLITS:
         for file in sorted((folder / split).iterdir())[::2]:
@@ -34,7 +33,6 @@ def with_hand(folder, colour):
 
 
 def hand_masks(folder, rest=0, hand=255):
-    """Masks of the hand in a folder, named like the images."""
     for split in SPLITS:
         (folder / split).mkdir(parents=True)
         for i in range(0, 8 if split == "train" else 2, 2):
@@ -145,22 +143,3 @@ def test_the_lens_moves_them_as_it_moves_the_image(tmp_path, dev):
         assert ignored.mean() < 0.12
         off = view.image.astype(int) - other.image
         assert np.abs(off[~ignored & (other.image[..., 3] > 128)]).max() < 40
-
-
-def test_a_block_with_an_ignored_pixel_is_ignored(rng):
-    """At any crop and jitter, also where a crop reaches outside."""
-    ignored = rng.random((31, 33)) < 0.1
-    scene = View("a.png", None, np.zeros((31, 33, 4), np.uint8), downscale=3, ignored=ignored)
-    for box, jitter in (((0, 0, 11, 10), (0, 0)), ((-2, 3, 9, 9), (2, 1)), ((8, 7, 5, 6), (1, 0))):
-        found = scene.ignored_crop(box, jitter)
-        for y, x in np.ndindex(found.shape):
-            left, top = 3 * (box[0] + x) + jitter[0], 3 * (box[1] + y) + jitter[1]
-            block = ignored[max(top, 0) : max(top + 3, 0), max(left, 0) : max(left + 3, 0)]
-            assert found[y, x] == block.any()
-
-
-def test_a_folder_that_has_none(tmp_path):
-    scene = with_hand(tmp_path / "scene", (0, 0, 0, 255))
-    for folder, told in ((tmp_path / "none", "no such folder"), (tmp_path, "no mask")):
-        status, lines = spoken(["train", scene, "--out", tmp_path / "run", "--ignore", folder])
-        assert status == 2 and told in lines[-1]

@@ -1,5 +1,3 @@
-"""Lens distortion: OpenCV's formulas by hand, and images that were distorted come back."""
-
 import json
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Loading scenes: what is missing or contradictory is one line."""
-
 import json
 import shutil
 
@@ -55,7 +53,6 @@ def test_a_split_without_images(tmp_path):
 
 @pytest.mark.parametrize("left", [0, 3])
 def test_cameras_of_a_test_without_images_are_no_split(tmp_path, left):
-    """As add-ons of Blender write them: frames without images, or none."""
     write_scene(tmp_path)
     write_scene(tmp_path, "test", edit=lambda data: data.update(frames=data["frames"][:left]))
     for image in tmp_path.glob("test_*.png"):
@@ -109,7 +106,6 @@ def test_an_image_that_cannot_be_reduced_costs_its_view(tmp_path):
 
 @pytest.mark.parametrize("listed", (True, False))
 def test_pictures_that_are_there_twice(tmp_path, listed):
-    """Where the scene has no lists no picture is in both splits; where it has, that is told."""
     (tmp_path / "images").mkdir()
     data = write_scene(tmp_path / "images", count=20)
     frames = data["frames"]
@@ -166,6 +162,5 @@ def test_lenses_that_float32_cannot_hold(tmp_path, key, value, told):
 
 
 def test_a_folder_that_may_not_be_read(tmp_path, monkeypatch):
-    """It may well hold a scene."""
     monkeypatch.setattr("os.access", lambda path, _: path != tmp_path)
     refused(tmp_path, tmp_path, "cannot be read; check its permissions")

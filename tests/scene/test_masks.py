@@ -1,5 +1,3 @@
-"""Masks from files, from a uniform background, and none."""
-
 import json
 import warnings
 
@@ -7,13 +5,13 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
-from support.refused import refusing
 from support.runs import arguments
 from support.scenes import ball_image, ring_cameras, write_ball_scene
-from support.transforms_scenes import SIZE, write_scene
+from support.transforms_scenes import write_scene
 
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
+from pp_cl.drivers import open_device
 from pp_cl.engine.views import MASK_THRESHOLD
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
@@ -29,7 +27,6 @@ TOLERANCE = 10.0
 
 
 def disc(size=60, radius=20.0, soft=0.0):
-    """(size, size) alpha of a disc in the middle."""
     y, x = np.mgrid[:size, :size] + 0.5 - size / 2
     alpha = (np.hypot(x, y) < radius).astype(float)
     return gaussian_filter(alpha, soft) if soft else alpha
@@ -41,12 +38,8 @@ def over(alpha, colour, background):
     return np.dstack([np.rint(255 * image), np.full(alpha.shape, 255)]).astype(np.uint8)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("background", [(1, 1, 1), (0, 0, 0), (0.1, 0.8, 0.2), (0.4, 0.4, 0.45)])
 def test_a_uniform_background_is_cut_out(rng, background):
-    """With the noise of a camera, and shading of a few levels across the image."""
     alpha = disc()
     image = over(alpha, (0.7, 0.2, 0.25), background).astype(float)
     image[..., :3] += rng.normal(0, 2, image[..., :3].shape) + np.linspace(-3, 3, 60)[:, None]
@@ -96,12 +89,8 @@ def test_an_object_at_the_border_does_not_decide():
     assert (found[:25, :30] == 255).all() and (found[25:] == 0).all()
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("named", ["{stem}.png", "{name}.png", "{stem}.jpg"])
 def test_a_folder_of_masks(tmp_path, rng, named):
-    """Outside of the scene's folder, which the format's own masks and alpha give way to."""
     (tmp_path / "scene").mkdir()
     write_scene(tmp_path / "scene")
     masks = tmp_path / "masks"
@@ -144,42 +133,7 @@ def test_alpha_is_taken_or_left(tmp_path, source, opaque):
         assert (view.image[..., 3] == 255).all() == opaque
 
 
-@pytest.fixture
-def masked(tmp_path):
-    """(folder of a scene without alpha, folder of its masks)."""
-    write_scene(tmp_path)
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    for i in range(3):
-        image = tmp_path / f"train_{i}.png"
-        write_png(image, read_rgba(image)[..., :3])
-        write_png(masks / f"train_{i}.png", np.ones((SIZE[1], SIZE[0])))
-    return tmp_path, masks
-
-
-BAD = {
-    "missing": (lambda m: (m / "train_1.png").unlink(), "train_1.png: has no mask, as others have"),
-    "a folder": (
-        lambda m: ((m / "train_1.png").unlink(), (m / "train_1.png").mkdir()),
-        "train_1.png: has no mask, as others have",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_masks(masked, case):
-    scene, masks = masked
-    change, words = BAD[case]
-    change(masks)
-    with refusing(scene, words):
-        load_scene(scene, masks=SceneConfig(masks=str(masks)))
-
-
-# --------------------------------------------------------------------------------------------------
-
-
 def opaque_ball(folder, background=(255, 255, 255)):
-    """The ball's scene with opaque images over a colour."""
     write_ball_scene(folder, views=10, size=40)
     for file in folder.rglob("*.png"):
         rgba = read_rgba(file)
@@ -217,15 +171,11 @@ def test_without_masks_points_fill_what_all_cameras_see(dev, tmp_path):
         open_scene(dev, config, ("train",))
 
 
-def test_a_box_that_is_given_holds_the_points(dev, tmp_path):
-    given = [("scene.box", "1,-1,-0.5,-0.9,0.8,0.5", "test"), ("scene.mask_from", "box", "test")]
-    config = configure(preset("tiny"), opaque_ball(tmp_path / "white"), given)
-    box = scene_box(config)
+def test_a_box_that_is_given():
+    """That it holds the points: tests/scene/test_hull.py."""
+    given = [("scene.box", "1,-1,-0.5,-0.9,0.8,0.5", "test")]
+    box = scene_box(configure(preset("tiny"), "demo", given))
     np.testing.assert_array_equal(box, [[-0.9, -1, -0.5], [1, 0.8, 0.5]])
-    views = open_scene(dev, config, ("train",)).splits["train"]
-    found = build_grid(dev, views, 3000, box).grid.box
-    assert (found >= box[0] - 1e-9).all() and (found <= box[1] + 1e-9).all()
-    np.testing.assert_allclose(np.ptp(found, axis=0), np.ptp(box, axis=0), rtol=0.2)
     assert scene_box(configure(preset("tiny"), "demo")) is None
 
 
@@ -240,6 +190,9 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
         write_png(tmp_path / "masks" / f"r_{i}.png", mask)
     rule = SceneConfig(masks=str(tmp_path / "masks"))
     views = load_scene(tmp_path / "ball", masks=rule).splits["train"]
+    (tmp_path / "masks/r_2.png").rename(tmp_path / "masks/other.png")
+    with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, as others have"):
+        load_scene(tmp_path / "ball", masks=rule)
     agreed = agreeing(dev, views)  # a mask that is white says that the object fills the image
     assert (
         agreed.views == views and disagreements(views, build_grid(dev, views, 1000).grid.box) == []
@@ -281,4 +234,4 @@ def test_the_choice_is_kept_with_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir("/")
     stored = json.loads((tmp_path / "run" / "config.json").read_text())["scene"]
     assert stored["masks"] == str(tmp_path / "masks")
-    assert load(tmp_path / "run").scene("train").splits["train"][3].has_mask
+    assert load(tmp_path / "run", open_device()).scene("train").splits["train"][3].has_mask

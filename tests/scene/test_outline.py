@@ -1,5 +1,3 @@
-"""The outline of points, against the ball that they fill."""
-
 import numpy as np
 import pytest
 from support.ball_views import CENTRE, RADIUS, ball_camera, ball_view

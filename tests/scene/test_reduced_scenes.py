@@ -1,5 +1,3 @@
-"""Images that are reduced while they are read: numbers, choice, what a training sees."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +16,6 @@ PHONE = (4000, 3000)
 
 @pytest.mark.parametrize("factor", (1, 2, 3, 7, 64))
 def test_blocks_become_their_mean(rng, factor):
-    """Against float64, where every block is looked at on its own."""
     image = rng.integers(0, 256, (150, 131, 4), dtype=np.uint8)
     image[:70, :, 3] = 255
     image[100:, :70, 3] = 0
@@ -40,9 +37,7 @@ def test_blocks_become_their_mean(rng, factor):
         (150, 8, 4),
         (300, 8, 8),  # 4: 9e8
         (300, 1, 1),
-        (300, 2, 2),
         (300, 7, 7),
-        (300, 16, 8),
         (170, 12, 4),  # 3: 9e8
         (5000, 8, 8),  # too many even so: as small as the training wants them
     ],
@@ -71,7 +66,6 @@ def opened(dev, scene, downscale):
 
 
 def same(one, other):
-    """Whether two cameras are the same, to the last bit."""
     return (one.packed((1, 2)) == other.packed((1, 2))).all() and one.fx == other.fx
 
 

@@ -1,5 +1,3 @@
-"""Images without a mask, where others have one."""
-
 import numpy as np
 import pytest
 from support.same_scene import held_out
@@ -15,7 +13,6 @@ SIDE = 300
 
 @pytest.fixture(scope="module")
 def views():
-    """Of a ball, with its mask as their alpha."""
     return [
         View(f"{i:02d}.png", camera, ball_image(camera))
         for i, camera in enumerate(ring_cameras(15, SIDE))
@@ -23,7 +20,6 @@ def views():
 
 
 def opaque(view):
-    """The image without its mask, on a background in colours."""
     image = view.image.copy()
     image[view.image[..., 3] == 0, :3] = (200, 30, 30)
     image[..., 3] = 255
@@ -31,7 +27,6 @@ def opaque(view):
 
 
 def test_what_is_not_ignored_is_right(dev, views):
-    """And that is all but a rim."""
     bare = [opaque(view) for view in views[::3]]
     masked = [view for i, view in enumerate(views) if i % 3]
     for view, true in zip(within_silhouettes(dev, masked, bare), views[::3], strict=True):

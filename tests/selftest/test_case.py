@@ -1,5 +1,3 @@
-"""How results are measured: by hand, and that nothing which is not finite passes."""
-
 from functools import partial
 
 import numpy as np

@@ -81,7 +81,6 @@ def test_a_point_is_moved_by_one_group_or_not_at_all(dev, monkeypatch):
 
 
 def limit_groups(dev, monkeypatch, most):
-    """Makes the device a GPU that runs so many work-items together of any kernel."""
     made = Kernel.__init__
 
     def limited(kernel, *args, **named):

@@ -1,7 +1,3 @@
-"""Running cases: the worst check counts, an exception or a NaN fails its case and no other; what is
-printed and stored.
-"""
-
 import json
 
 import numpy as np
@@ -13,7 +9,6 @@ from pp_cl.selftest.run import HEAD, Row, as_json, line, run_case, run_cases, se
 
 
 def case(*checks, name="a: case", variant=None):
-    """A Case that yields these checks."""
     return Case(name, lambda dev, rng: iter(checks), variant)
 
 

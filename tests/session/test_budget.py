@@ -1,5 +1,3 @@
-"""Trainings that are given minutes: how many steps these allow, and that a run keeps to them."""
-
 import json
 import signal
 from types import SimpleNamespace
@@ -49,15 +47,6 @@ def test_the_promise_is_kept_as_fog_clears_and_grids_are_refined(minutes, refine
         assert len(refined) == sum(share < 1 for share in refine_at)
     shares = [step / train.iterations for step in refined]
     assert all(abs(share - asked) < 0.2 for share, asked in zip(shares, refine_at, strict=False))
-
-
-@pytest.mark.parametrize("slower", [1.5, 2.5])
-def test_a_machine_that_gets_busy_at_last_costs_steps_and_little_time(slower):
-    def seconds_of(share, level):
-        return 0.05 * (slower if share > 0.85 else 1.0)
-
-    total, _, _ = simulated(5, (1.0, 1.0), seconds_of)
-    assert 0.95 * 300 < total < 1.1 * 300
 
 
 def test_what_comes_before_the_first_step_is_in_the_minutes():

@@ -1,5 +1,3 @@
-"""The memory that a training is said to need against what it allocates, and what is refused."""
-
 import gc
 
 import numpy as np
@@ -49,7 +47,6 @@ BALL = {"points.count": 4000, "scene.downscale": 1, "network.blocks": "double"}
 def test_it_is_within_15_percent_of_what_a_training_takes(
     plain, tmp_path, monkeypatch, size, settings
 ):
-    """Without prunings, so that it is known how many points there are; smoothing is due, too."""
     monkeypatch.setattr("pp_cl.engine.step.SMOOTHING_EVERY", 8)
     scene = write_ball_scene(tmp_path / "ball", size=size)
     settings |= {"train.iterations": 24, "train.prune_weight": 0}
@@ -63,7 +60,6 @@ def test_it_is_within_15_percent_of_what_a_training_takes(
 
 
 def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
-    """Of a training with a small network."""
     config = preset(base)
     settings = {"network.widths": "16,16,16", "raster.radius": "0.85"} | changes
     for key, value in settings.items():
@@ -105,7 +101,6 @@ def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
 
 
 def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
-    """Its points are half as wide once, not twice."""
     made = memory_plan(dev, train__refine_at="0.4,1", train__prune_weight="0", size=(400, 300))
     finer = Grid(GRID.origin, GRID.voxel_size / 2, tuple(2 * n for n in GRID.dims))
     planned, found = made.need_of(GRID, 20_000, (2, 6)), made.need_of(finer, 160_000, (2, 6), 7000)
@@ -128,15 +123,11 @@ def test_images_are_counted_as_they_are_kept(dev):
     assert many - one == 100 * 500 * 375 * 4
 
 
-# ---- what there is
-
-
 def check(made, points=20_000):
     made.check_points(GRID, points, (2, 6))
 
 
 def refusal(made, points=20_000):
-    """The one line by which a training is refused; it names what to lower."""
     with pytest.raises(UserError) as caught:
         check(made, points)
     text = str(caught.value)
@@ -185,7 +176,6 @@ def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
 
 @pytest.mark.slow
 def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, monkeypatch, capsys):
-    """More points are left than they were taken to be."""
     scene = write_ball_scene(tmp_path / "ball", size=64)
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}

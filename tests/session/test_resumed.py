@@ -1,7 +1,3 @@
-"""What a training goes on with, and what it refuses: other settings, another scene, checkpoints
-that lack something.
-"""
-
 import itertools
 import json
 import shutil
@@ -36,7 +32,6 @@ def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, cap
 
 
 def measured_psnr(out):
-    """Of the held-out views of a run."""
     assert main(["eval", str(out)]) == 0
     return json.loads((out / "eval" / "metrics.json").read_text())["mean"]["psnr"]
 
@@ -61,7 +56,6 @@ def refined(scene, tmp_path_factory):
 def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
     refined, tmp_path, monkeypatch, capsys, iterations, stop
 ):
-    """To averages that are due at once, and to a step by which another refinement would be due."""
     monkeypatch.setattr(*LOOKS)
     capsys.readouterr()
     (whole, stopped), (out, words) = [tmp_path / name for name in ("whole", "stopped")], refined
@@ -90,8 +84,6 @@ def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
 
 
 def interrupted_after(step, train_step=Trainer.train_step):
-    """A train_step() that is interrupted once so many steps are done."""
-
     def stopping(self):
         if self.step == step:
             raise KeyboardInterrupt
@@ -113,7 +105,6 @@ def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path,
 def test_another_scene_is_refused_at_any_state_of_the_run(
     runs, scene, tmp_path, monkeypatch, steps
 ):
-    """With a checkpoint, before the first, and when the run is finished."""
     out, other = tmp_path / "run", write_ball_scene(tmp_path / "other", views=7)
     if steps == 60:
         runs.trained(out, scene)
@@ -126,7 +117,6 @@ def test_another_scene_is_refused_at_any_state_of_the_run(
 
 
 def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch):
-    """Stopped before and after the refinement, which comes after the averages' beginning."""
     monkeypatch.setattr(*LOOKS)
     scene = write_ball_scene(tmp_path / "ball")
     changes = {"train__refine_at": "0.9,1", "points__count": 300, "train__prune_weight": 0.05}

@@ -1,9 +1,10 @@
-"""What a training decides of its beginning."""
+import re
 
 import pytest
-from support.runs import spoken
+from support.runs import arguments, spoken
 from support.scenes import write_ball_scene
 
+from pp_cl.cli import main
 from pp_cl.config import load_config
 
 
@@ -20,8 +21,16 @@ def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
     assert load_config(out / "config.json").raster.radius == radius
 
 
-def test_other_footprints_are_given_a_radius(tmp_path):
-    scene = write_ball_scene(tmp_path / "ball")
-    words = ["train", scene, "--out", tmp_path / "run", "--set", "raster.footprint=disc"]
-    status, lines = spoken(words)
-    assert status == 2 and "raster.radius: is automatic" in lines[-1] and "0.0015" in lines[-1]
+AUTOMATIC = {"points__count": 60, "train__refine_at": "0,0", "train__iterations": 30}
+
+
+def test_too_little_memory_makes_the_finest_grid_coarser(tmp_path, capsys):
+    """It is refined all the same: 60 points for ever are 11 pixels apart."""
+    scene, told = write_ball_scene(tmp_path / "ball", size=96), []
+    for name, gib in (("enough", 0), ("less", 0.03)):
+        words = arguments(scene, tmp_path / name, 1, **AUTOMATIC, train__memory_gib=gib)
+        assert main(words) == 0
+        hull = re.search(r"(\S+) pixels apart, later (\S+), ", capsys.readouterr().out)
+        told.append([float(pixels) for pixels in hull.groups()])
+    assert told[0] == pytest.approx([3, 1.5], rel=0.05)
+    assert 1.1 < told[1][1] / told[0][1] < 3

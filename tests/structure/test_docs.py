@@ -1,5 +1,3 @@
-"""The documents: what they name exists, and the README names every page."""
-
 import re
 from pathlib import Path
 
@@ -17,7 +15,6 @@ PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
 
 
 def named_files(text: str, folder: Path) -> list[Path]:
-    """The files that a document in `folder` links to, or names as a path from the root."""
     links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text)
     paths = {p for p in PATH.findall(text) if not PLACEHOLDER.search(p)}
     return [folder / link for link in links] + [ROOT / path for path in sorted(paths)]
@@ -69,7 +66,6 @@ def test_links_into_a_page_name_one_of_its_headings():
 
 
 def anchors(page: Path) -> set[str]:
-    """The names by which links reach the headings of a page."""
     headings = re.findall(r"(?m)^#+ (.*)$", page.read_text("utf-8"))
     return {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}
 

@@ -1,5 +1,3 @@
-"""Kernel files have the module that launches them; packages that are imported are declared."""
-
 import ast
 import configparser
 import re

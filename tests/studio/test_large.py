@@ -1,5 +1,3 @@
-"""Renderings that are finer than the training's images."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,6 @@ from pp_studio.large import parts, render_large
 
 @pytest.fixture
 def run(runs, scene, tmp_path, dev):
-    """A run of the ball, 24 x 24 pixels."""
     return load(device=dev, folder=runs.trained(tmp_path / "run", scene, train__iterations=40))
 
 

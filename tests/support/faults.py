@@ -117,9 +117,6 @@ def _place(path, folder=None):
     return path if folder is None else os.path.join(_place(folder), path)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def run_command(words, run=""):
     """(exit status, what is wrong with how it ended): it may warn, and tells of its end in one
     line, which names a file of the run.

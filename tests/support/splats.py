@@ -17,16 +17,8 @@ def read_splats(path):
         return np.stack([vertex[f"{name}_{i}"] for i in range(count)], 1).astype(np.float64)
 
     rest = columns("f_rest", 45).reshape(-1, 3, 15).transpose(0, 2, 1)
-    w, x, y, z = columns("rot", 4).T
-    norm = w * w + x * x + y * y + z * z
-    turn = np.array(
-        [
-            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-        ]
-    )
-    axes = np.moveaxis(turn / norm, 2, 0) * np.exp(columns("scale", 3))[:, None]
+    turn = Rotation.from_quat(np.roll(columns("rot", 4), -1, axis=1)).as_matrix()
+    axes = turn * np.exp(columns("scale", 3))[:, None]
     return {
         "positions": np.stack([vertex[name] for name in "xyz"], 1).astype(np.float64),
         "harmonics": np.concatenate([columns("f_dc", 3)[:, None], rest], 1),

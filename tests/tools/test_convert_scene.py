@@ -1,5 +1,3 @@
-"""One scene in every format: the same cameras, images and masks come back."""
-
 import numpy as np
 import pytest
 from support.same_scene import held_out, same, views
@@ -14,7 +12,6 @@ PLACE = {"co3d": "object/sequence"}  # of the scene in what is written
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_what_is_written_comes_back(tmp_path, name):
-    """With its splits where a format has them."""
     many = views(centred=name == "llff", alike=name in ("llff", "nsvf"))
     given = {"test": many[:4], "train": many[4:9], "val": many[9:]}
     if name in ("colmap", "llff", "neus"):

@@ -1,5 +1,3 @@
-"""tools/memory_peaks.py: its trainings make sense, and its rows are what plan and devices say."""
-
 import pytest
 from support.scenes import write_ball_scene
 

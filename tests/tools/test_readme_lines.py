@@ -1,5 +1,3 @@
-"""README.md's commands print README.md's lines."""
-
 import json
 
 import pytest

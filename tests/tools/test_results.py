@@ -1,9 +1,3 @@
-"""tools/results.py: what was measured is kept for the code that it was measured of, and fits the
-tables; a training and its evaluation become a row.
-"""
-
-import pytest
-
 from tools import docs_tables
 from tools import results as TOOL
 
@@ -40,11 +34,3 @@ def test_tables_and_plots(tmp_path):
         assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
     TOOL.draw(TOOL.trained(FOUND), TOOL.timed(FOUND), tmp_path)
     assert len({*tmp_path.glob("*.png")}) == 4
-
-
-@pytest.mark.slow
-def test_a_training_becomes_a_row(tmp_path):
-    row = TOOL.train(TOOL.Training("demo", "demo", "tiny", 4), tmp_path)
-    assert row.keys() == ROW.keys()
-    assert (row["size"], row["steps"], row["views"]) == ("200x200", 4, 16)
-    assert row["psnr"] > 5 and row["minutes"] > 0 and row["points"] > 1000

@@ -1,5 +1,3 @@
-"""tools/stages.py: a finished run goes on, is left as it is, and every stage has its times."""
-
 from support.scenes import write_ball_scene
 
 from pp_cl.session.training import train_scene

@@ -1,6 +1,4 @@
-"""Tables of arrays, packed arrays, transfers that are not waited for, and rows moved without a
-second array; the selftest has sizes and gathers.
-"""
+"""What the selftest leaves open: it has sizes and gathers."""
 
 import weakref
 from types import SimpleNamespace
@@ -25,7 +23,6 @@ TABLE = {"place": ((5, 4), np.float32), "box": ((5, 4), np.uint16)}
 
 
 def test_arrays_are_what_the_table_declares(dev):
-    """Allocated anew only where they change, and released before that."""
     before, buffers = dev.bytes, Buffers(dev)
     buffers.require(TABLE)
     place, box = buffers.place, buffers.box
@@ -39,7 +36,6 @@ def test_arrays_are_what_the_table_declares(dev):
 
 
 def test_packed_arrays(dev, rng):
-    """Of any shapes and types, empty ones too; of a shorter one the front is sent."""
     rows = [((31, 3), np.float32), ((2, 0), np.int32), ((257,), np.uint32), ((1,), np.float32)]
     packed, before = PackedArrays(dev), dev.bytes
     values = [rng.integers(1, 9, shape).astype(dtype) for shape, dtype in rows]
@@ -57,7 +53,6 @@ def test_packed_arrays(dev, rng):
 
 
 def test_a_pending_value_is_what_the_kernels_before_it_left(dev, rng):
-    """Whatever is enqueued after it."""
     first, second = (rng.normal(size=257).astype(np.float32) for _ in range(2))
     array = dev.upload(first)
     before = read_later(dev, array)
@@ -85,7 +80,6 @@ def test_kernels_that_fail_on_the_device_are_told_of(dev, monkeypatch):
 
 
 def test_what_is_sent_may_be_dropped_at_once(dev, rng):
-    """The host's copy lives until it has arrived, and no longer."""
     array, expected = dev.empty((31, 7), np.int32), None
     for _ in range(20):
         expected = rng.integers(0, 99, (31, 7), dtype=np.int32)
@@ -100,7 +94,6 @@ def test_what_is_sent_may_be_dropped_at_once(dev, rng):
 @pytest.mark.parametrize("shape", [(), (16,), (3, 16), (7,)])
 @pytest.mark.parametrize("pieces", [1, 3, 1000])
 def test_compact(dev, rng, monkeypatch, shape, pieces):
-    """As a new array, in place by a few pieces, and in place row by row; every bit is kept."""
     source = rng.integers(0, 2**32, (257, *shape), dtype=np.uint32).view(np.float32)
     indices = np.flatnonzero(rng.random(257) < 0.6).astype(np.uint32)
     scratch_bytes = 4 * int(np.prod(shape)) * -(-len(indices) // pieces)

@@ -1,5 +1,3 @@
-"""A device: its buffers, its errors, its programs and its debug levels."""
-
 import atexit
 import gc
 import re
@@ -33,7 +31,6 @@ kernel void divide(
 
 @pytest.fixture
 def tiny(tmp_path, monkeypatch):
-    """A kernel folder of the test's own."""
     (tmp_path / "tiny.cl").write_text(TINY)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
     return tmp_path
@@ -47,9 +44,6 @@ def test_a_device_that_nobody_has_is_gone_with_its_memory(session_device):
     del device
     gc.collect()
     assert gone() is None
-
-
-# ---- buffers
 
 
 def test_upload_fill_zeros_copy(dev, rng):
@@ -113,18 +107,14 @@ def test_buffers_are_held_to_the_largest_allocation_and_to_the_memory(plain):
     plain.empty((50,))
 
 
-def test_a_smaller_largest_allocation_can_be_asked_for(monkeypatch):
-    largest = open_device().info["max_allocation_bytes"]
-    for text, expected in (("0.5", 2**19), ("1e9", largest)):
-        monkeypatch.setenv("PP_MAX_ALLOCATION", text)
-        assert open_device().info["max_allocation_bytes"] == expected
-
-
 @pytest.mark.parametrize(
     "variable, text",
-    [("PP_MAX_ALLOCATION", t) for t in ("0", "-1", "nan", "much")]
-    + [("PP_DEBUG", t) for t in ("4", "-1", "yes", "1.5")]
-    + [("PP_FORM", "tpu")],
+    [
+        ("PP_MAX_ALLOCATION", "0"),
+        ("PP_MAX_ALLOCATION", "nan"),
+        ("PP_DEBUG", "4"),
+        ("PP_FORM", "tpu"),
+    ],
 )
 def test_a_bad_variable_is_one_line(monkeypatch, variable, text):
     monkeypatch.setenv(variable, text)
@@ -144,8 +134,6 @@ def test_a_cpu_works_as_one_unless_told_otherwise(dev, monkeypatch):
 
 @pytest.mark.parametrize("error", [cl.MemoryError, cl.RuntimeError, cl.LogicError])
 def test_a_driver_that_gives_up_is_a_user_error(plain, error):
-    """And a wrong call of it keeps its traceback."""
-
     def refuse(*_):
         raise error("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
 
@@ -163,9 +151,6 @@ def test_fresh_guarded_buffers_are_nan(dev):
     assert (dev.empty((33,), np.uint32).get() == 0xFFFFFFFF).all()
 
 
-# ---- programs and debug levels
-
-
 def test_a_build_error_names_file_options_and_cause(plain, tiny):
     (tiny / "broken.cl").write_text(
         "kernel void f(\n    global float *x)  // (N)\n{ x[0] = undeclared_thing; }\n"
@@ -181,7 +166,6 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
     ("platform", "kind", "large"),
     [
         ("Intel(R) OpenCL Graphics", "GPU", True),
-        ("Intel(R) OpenCL HD Graphics", "GPU", True),
         ("Intel(R) OpenCL", "CPU", False),
         ("Apple", "GPU", False),  # which drives Intel's GPUs too, and refuses unknown options
         ("NVIDIA CUDA", "GPU", False),
@@ -216,7 +200,6 @@ def test_a_kernel_folder_with_a_space_is_refused(plain, tmp_path, monkeypatch):
 
 @pytest.fixture
 def debugged(session_device, tiny, monkeypatch):
-    """Makes a device of a given PP_DEBUG that runs TINY on some values."""
     made = []
 
     def make(level, values, guarded=False):
@@ -270,9 +253,6 @@ def test_debug_3_takes_infinity_where_the_kernel_says_so(debugged, tiny):
     debugged("3", [1, 0])
     with pytest.raises(FloatingPointError, match="y has 1 NaN or Inf, first at 0"):
         debugged("3", [np.nan, 0])
-
-
-# ---- stages
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="only Unix has the signal")

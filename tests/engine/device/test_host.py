@@ -1,5 +1,3 @@
-"""The memory of the machine, as Linux and a container tell it."""
-
 import mmap
 
 import numpy as np

@@ -27,7 +27,6 @@ kernel void rounding(
 
 
 def test_no_worse_than_opencl_allows(dev, rng, tmp_path, monkeypatch):
-    """And no better under `make test-coarse`."""
     (tmp_path / "rounding.cl").write_text(SOURCE)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
     a, b = (np.exp(rng.normal(0, 5, (COUNT, 16))).astype(np.float32) for _ in range(2))

@@ -1,5 +1,3 @@
-"""Which variant a convolution takes, and the sizes that its kernels are built with."""
-
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +6,6 @@ from pp_cl.bench.conv import Layer, layer_errors
 from pp_cl.engine.layers.choice import (
     CPUS,
     GPU,
-    OFFERED,
     VARIANTS,
     blocking_of,
     can_run,
@@ -43,13 +40,6 @@ def test_the_shipped_choice(dev, monkeypatch, direction):
         assert shipped((128,), co, 4096, k) == "local"
 
 
-def test_each_device_is_offered_what_it_takes(dev, monkeypatch):
-    for is_cpu, name in ((True, "CPU"), (False, "GPU")):
-        monkeypatch.setattr(dev, "is_cpu", is_cpu)
-        shapes = [ConvShape("forward", 3, (16,), 16, (side, side)) for side in (8, 64)]
-        assert {choose(dev, shape) for shape in shapes} <= {*OFFERED[name]}
-
-
 def test_a_variant_asked_for_runs_where_it_can(dev):
     assert choose(dev, ConvShape("forward", 3, (16,), 16, (8, 8)), "winograd") == "winograd"
     assert choose(dev, ConvShape("forward", 3, (16, 3), 16, (8, 8)), "winograd") == "direct"
@@ -63,12 +53,6 @@ def test_a_cpu_takes_the_row_of_its_vectors(width, row):
     device = SimpleNamespace(native_vector_width_float=width)
     assert blocking_of(SimpleNamespace(is_cpu=True, device=device)) is CPUS[row]
     assert blocking_of(SimpleNamespace(is_cpu=False, device=device)) is GPU
-
-
-def test_tiles_are_multiplied_in_whole_groups():
-    for blocking in CPUS.values():
-        for tiles, together in (blocking.winograd, blocking.winograd_narrow):
-            assert tiles % together == 0
 
 
 @pytest.mark.usefixtures("cpu_form")

@@ -1,5 +1,3 @@
-"""Lists of tiles, and the layers beside the convolutions that compute some of them only."""
-
 import re
 
 import numpy as np
@@ -41,8 +39,6 @@ def test_lists_and_wrong_sizes(dev):
 
 @pytest.mark.parametrize("height, width, channels", [(1, 1, 16), (5, 7, 20), (33, 6, 17)])
 def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
-    """The other tiles of a result are as before."""
-
     def normal(scale, channels):
         size = (scale * height, scale * width, channels)
         return rng.normal(size=size).astype(np.float32)

@@ -1,5 +1,3 @@
-"""The network with fewer tiles, against the one that computes all."""
-
 from collections import Counter
 
 import numpy as np
@@ -7,14 +5,12 @@ import pytest
 from support.comparisons import relative_error
 
 import pp_cl.engine.network.unet
-from pp_cl.engine.layers.tiles import SIDE, grid_shape
 from pp_cl.engine.network.layers import convolutions, gradient_of, unet_layers
 from pp_cl.engine.network.tile_plan import (
     LOSS_BORDER,
     LOSS_RADIUS,
     gradient_radius,
     halve,
-    map_tiles,
     receptive_radius,
 )
 from pp_cl.engine.network.unet import UNet
@@ -45,7 +41,6 @@ CASES = [
 
 @pytest.fixture
 def always(monkeypatch):
-    """Choose tiles in small images, too, and however many remain."""
     monkeypatch.setattr(pp_cl.engine.network.unet, "LEAST_PIXELS", 0)
     monkeypatch.setattr(pp_cl.engine.network.unet, "MOST_COMPUTED", 1)
 
@@ -68,7 +63,6 @@ def active_mask(x):
 
 
 def run(dev, net, x, grad_y, *, sparse):
-    """[image, gradient of x, gradients of the parameters] as the device computes them."""
     other = halve((grad_y != GRADIENT).any(2), 2)
     plan = net.plan_tiles(x.shape[:2], active_mask(x), other) if sparse else None
     x = dev.upload(x)
@@ -120,9 +114,6 @@ def test_few_tiles_in_large_images_only(dev, rng):
 
 @pytest.mark.parametrize("blocks", BLOCKS)
 def test_radius_is_what_a_change_reaches(rng, blocks):
-    """In float64, for a change at every place of a period of the pooling and the border far
-    away.
-    """
     layers, ones = unet_layers((1, 1, 1), 1, 1, blocks), np.ones((96, 96, 1))
     parameters = {}
     for layer in convolutions(layers):
@@ -148,32 +139,6 @@ def test_radius_is_what_a_change_reaches(rng, blocks):
     radius["image"] = radius["out"]
     for name, far in reached.items():
         assert far <= radius[name] <= far + 3, name
-
-
-@pytest.mark.parametrize("level", [0, 1, 2])
-@pytest.mark.parametrize("border", [0, 3, 100])
-def test_map_tiles(rng, level, border):
-    height, width = 148, 260
-    shape = grid_shape(height >> level, width >> level)
-    active = rng.random(shape) < 0.3
-    found = map_tiles((height, width), level, active, border)
-    tiles = np.arange(active.size).reshape(shape)
-    assert found.computed.ravel()[found.source.ravel()].all()
-    assert (found.source == tiles)[active].all()
-    assert not active.ravel()[found.source[~active]].any()
-    assert found.count().sum() == active.size
-    assert (found.count()[active] == 1).all()
-    np.testing.assert_array_equal(found.count() > 0, found.computed)
-    side = SIDE << level
-    for place, source in np.ndenumerate(found.source):
-        for index, other, length in zip(
-            place, divmod(source, shape[1]), (height, width), strict=True
-        ):
-            inner = [
-                border * SIDE <= i * side and (i + 1) * side <= length - border * SIDE
-                for i in (index, other)
-            ]
-            assert other == index or all(inner)
 
 
 def test_the_loss_sees_the_border_no_further():

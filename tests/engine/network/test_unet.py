@@ -1,8 +1,4 @@
-"""The network against float64, its buffers, and what is refused."""
-
-import gc
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +8,6 @@ from pp_cl.bench.unet import plain_parameters
 from pp_cl.engine.network.layers import (
     convolutions,
     multiplications,
-    share_buffers,
     unet_layers,
 )
 from pp_cl.engine.network.unet import UNet
@@ -82,26 +77,6 @@ def test_sizes_may_change_between_images(dev, rng):
         np.testing.assert_array_equal(net.backward(grad_y).get(), alone.backward(grad_y).get())
 
 
-def test_its_memory_is_free_as_soon_as_it_is_dropped(plain):
-    """Without a garbage collection: compression and benches make one network after another."""
-    x, grad_y = plain.zeros((8, 8, 16)), plain.zeros((8, 8, 3))
-
-    def use(net):
-        net.forward(x, training=False)
-        net.forward(x)
-        net.backward(grad_y)
-
-    use(UNet(plain, (16, 16, 16)))  # what all networks share stays
-    gc.collect()
-    before = plain.bytes
-    gc.disable()
-    try:
-        use(UNet(plain, (16, 16, 16)))
-        assert plain.bytes == before
-    finally:
-        gc.enable()
-
-
 def test_initial_values_are_pytorchs(dev):
     net = UNet(dev, (16, 32, 64), seed=0)
     for name, values in plain_parameters(net, net.parameters).items():
@@ -129,23 +104,7 @@ def test_wrong_use_is_refused(dev):
     [("double", 6_968_579, 966e9), ("single", 3_133_443, 494e9), ("gated", 6_102_275, 978e9)],
 )
 def test_size_of_the_papers_network(blocks, parameters, operations):
-    """The parameters worked out by hand, and the multiplications at 800x800, with the 1x1
-    convolutions before the upsampling.
-    """
     layers = unet_layers((128, 256, 512), blocks=blocks)
     shapes = [layer.weight_shape() for layer in convolutions(layers)]
     assert sum(math.prod(shape) + shape[0] for shape in shapes) == parameters
     assert multiplications(layers, 800, 800) == pytest.approx(operations, rel=1e-3)
-
-
-def test_arrays_of_one_buffer_never_overlap(rng):
-    firsts = np.sort(rng.integers(0, 20, 40))
-    spans = [(i, first, first + rng.integers(0, 6)) for i, first in enumerate(firsts)]
-    shapes = {i: (rng.integers(1, 9), 3) for i in range(40)}
-    buffers = share_buffers(spans, shapes)
-    assert sorted(name for buffer in buffers for name in buffer.names) == list(range(40))
-    assert len(buffers) < 20
-    for buffer in buffers:
-        held = [spans[name] for name in buffer.names]
-        assert all(a[2] < b[1] for a, b in pairwise(held))
-        assert buffer.floats == max(np.prod(shapes[name]) for name in buffer.names)

@@ -1,6 +1,4 @@
-"""Both blends: gradients against finite differences of the float64 twins with which the selftest
-compares them, weights by hand, the bits; the basis of the shading.
-"""
+"""Gradients against finite differences of the float64 twins that the selftest compares with."""
 
 import numpy as np
 import pytest
@@ -124,7 +122,6 @@ def test_two_runs_give_the_same_bits(dev, rule, early_stop):
 
 
 def test_a_point_at_the_eye(dev):
-    """It has no direction, and is left out even where near = 0 would let it in."""
     scene = PairedPoints(dev, AXIS, np.zeros((1, 3)), 0.0, depth_range=(0.0, 6.0))
     assert scene.pairs.total == 0
 

@@ -1,5 +1,3 @@
-"""Depth of what is seen, against the exact intersection of rays and balls."""
-
 from dataclasses import replace
 
 import numpy as np

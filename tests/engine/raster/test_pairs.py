@@ -1,5 +1,3 @@
-"""Hits: those of crops, of miscounts and of long lists; buffers that are reused; the bits."""
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -16,7 +14,6 @@ from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 
 
 def by_point(pairs):
-    """[(pixels, falloff)] of each point."""
     offsets = pairs.point_offset.get()[1:-1]
     falloff = pairs.pair_point_falloff.get()[: pairs.total, 1].view(np.float32)
     pixels = np.split(pairs.pair_pixel.get()[: pairs.total], offsets)
@@ -70,14 +67,12 @@ def test_lists_of_all_lengths_side_by_side_are_sorted(dev, rng, lengths):
 
 
 def bits(pairs):
-    """[arrays] of what is valid of the pairs."""
     names = ("pair_pixel", "pair_point_falloff", "pair_key")
     arrays = [getattr(pairs, name).get()[: pairs.total] for name in names]
     return [*arrays, pairs.point_offset.get(), pairs.pixel_offset.get()]
 
 
 def test_more_capacity_is_a_number_of_the_kernels():
-    """A quarter more than needed, but no more than uint32 can number."""
     for total, expected in ((900, 1000), (1001, 1251), (3_500_000_000, MOST_PAIRS)):
         assert capacity_needed(SimpleNamespace(capacity=1000, total=total)) == expected
 

@@ -1,5 +1,3 @@
-"""Points to camera axes: which are culled, and boxes."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +6,7 @@ import pytest
 from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster import project
-from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
+from pp_cl.engine.raster.project import project_grid
 from pp_cl.reference import dense
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points, some_ids
 
@@ -25,29 +23,8 @@ def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
     assert drawn(positions + [0, 0, 0.5], 0.5) == [True, False, True, False]
 
 
-@pytest.mark.parametrize("kind", FOOTPRINTS)
-def test_boxes_hold_the_fragments_and_little_more(dev, rng, kind):
-    """At most three columns and rows more on each side: a disc's tip may miss all pixel centres."""
-    camera = make_camera()
-    positions, radius = make_points(rng, 400), rng.uniform(0.05, 0.4, 400)
-    if kind == "gaussian":  # as wide as the others
-        radius /= dense.DEVIATIONS
-    scene = PairedPoints(dev, camera, positions, radius, kind=kind)
-    fragments = scene.fragments().reshape(400, camera.height, camera.width)
-    boxes, compared = scene.projected.point_box.get().astype(int), 0
-    for i in np.flatnonzero(fragments.any(axis=(1, 2))):
-        rows, columns = np.nonzero(fragments[i])
-        first, last = boxes[i, :2], boxes[i, 2:]
-        least, most = (columns.min(), rows.min()), (columns.max(), rows.max())
-        assert (first <= least).all() and (last >= most).all()
-        assert (first >= np.subtract(least, 3)).all() and (last <= np.add(most, 3)).all()
-        compared += 1
-    assert compared > 200
-
-
 @pytest.mark.parametrize("kind", ["disc", "soft"])
 def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, kind):
-    """Crops at all borders of the points; offsets that move them towards these."""
     grid = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
     ids = some_ids(rng, grid, 12_000)
     offset = rng.choice([-0.5, 0.5], (len(ids), 4)).astype(np.float32)
@@ -83,7 +60,6 @@ def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, k
 
 @pytest.mark.parametrize("deviation, bound", [(0.02, 0.1), (0.1, 0.01), (0.4, 0.01)])
 def test_a_pixel_of_samples_is_nearly_the_mean_of_a_viewers(dev, rng, deviation, bound):
-    """Gaussians of a fifth of a pixel, less than a viewer's, of one and of four."""
     camera = replace(make_camera(30, 30), samples=3.0)
     viewer = replace(camera.resized(90, 90), samples=1.0)
     for position in make_points(rng, 20)[:, None]:

@@ -1,5 +1,3 @@
-"""The pixel jitter of the crops that a training draws."""
-
 from dataclasses import replace
 
 import numpy as np

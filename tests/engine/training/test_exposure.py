@@ -1,7 +1,3 @@
-"""Images of one object at different exposures: that they differ is seen, their gains are found, and
-a training that stops goes on with them.
-"""
-
 import json
 import shutil
 from dataclasses import replace
@@ -38,8 +34,6 @@ def write_demo(dev, folder, gains):
 
 @pytest.fixture(scope="module")
 def exposed(runs, tmp_path_factory):
-    """(scene, finished run)."""
-
     def make(folder):
         scene = write_demo(open_device(), folder / "scene", GAINS)
         assert main(arguments(scene, folder / "run", **SETTINGS)) == 0
@@ -51,7 +45,6 @@ def exposed(runs, tmp_path_factory):
 
 
 def test_gains_are_found_and_a_training_goes_on_with_them(exposed, tmp_path, monkeypatch):
-    """They are right but for what harmonics of the direction take for the object's."""
     (scene, finished), run, saved = exposed, tmp_path / "run", 0
     for stop in (DECIDED - 1, DECIDED, STEPS - 1):
         train_and_interrupt(scene, run, stop - saved, monkeypatch, **SETTINGS)
@@ -67,7 +60,6 @@ def test_gains_are_found_and_a_training_goes_on_with_them(exposed, tmp_path, mon
 
 
 def test_views_are_compared_without_and_with_their_best_gains(exposed, capsys):
-    """The images for testing are two of those for training."""
     _, run = exposed
     assert main(["eval", str(run)]) == 0
     result = json.loads((run / "eval" / "metrics.json").read_text())
@@ -80,7 +72,6 @@ def test_views_are_compared_without_and_with_their_best_gains(exposed, capsys):
 
 
 def test_gains_explain_nothing_where_there_is_no_error(dev):
-    """As of an object that is black in all images."""
     exposure, alpha = Exposure(dev, 2, is_applied=False), dev.upload(np.ones((5, 7)), np.float32)
     for view in range(2):
         exposure.fit(view, dev.zeros((5, 7, 3)), dev.zeros((5, 7, 3)), alpha, (0, 0))

@@ -1,16 +1,10 @@
-"""The loss against scikit-image and finite differences, which the selftest compares with float64;
-and what the mask term does to a training.
-"""
+"""The loss against scikit-image and finite differences: the selftest compares it with float64."""
 
 import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 from support.comparisons import relative_error
-from support.runs import arguments
-from support.scenes import write_ball_scene
 
-from pp_cl import load
-from pp_cl.cli import main
 from pp_cl.engine.training.loss import Loss
 from pp_cl.errors import Diverged
 from pp_cl.reference import loss as oracle_loss
@@ -95,49 +89,9 @@ def test_sizes_may_change_between_calls(dev, rng):
         assert relative_error(grad.get(), expected_grad) < 2e-6
 
 
-def test_its_terms_by_name(dev, rng):
-    """As they are when they are asked for, though the next step has begun."""
-    loss, images_of = Loss(dev, 0.2), [images(rng, 20, 31) for _ in range(2)]
-    readings = []
-    for step, (prediction, target) in enumerate(images_of):
-        loss.forward_backward(dev.upload(prediction), dev.upload(target))
-        if step == 0:
-            loss.add_distortion(dev.upload(np.full(620, 0.5), np.float32), 2.0, scale=1 / 620)
-        readings.append(loss.read(step + 1))
-    for step, (prediction, target) in enumerate(images_of):
-        expected, _ = oracle_loss.loss(prediction, target, 0.2)
-        found = readings[step].get()
-        assert found.pop("loss") == pytest.approx(expected[0] + 1.0 * (step == 0), rel=1e-5)
-        assert found.pop("ssim") == pytest.approx(1 - expected[2], rel=1e-5)
-        assert found.pop("psnr") == pytest.approx(-10 * np.log10(expected[3]), rel=1e-5)
-        assert found == pytest.approx({"l1": expected[1]} | ({} if step else {"distortion": 0.5}))
-
-
 def test_an_overflow_is_told_where_the_loss_is_finite(dev):
     """The square of 1e30 overflows, its absolute value does not."""
     loss = Loss(dev, 0.0)
     loss.forward_backward(dev.upload(np.full((3, 3, 3), 1e30), np.float32), dev.zeros((3, 3, 3)))
     with pytest.raises(Diverged, match=r"at step 2 \(psnr\)$"):
         loss.read(2).get()
-
-
-def test_the_mask_is_learned(tmp_path):
-    """The alpha of the test views is nearer to that of the images, and exceeds it less."""
-    scene, errors = write_ball_scene(tmp_path / "ball"), []
-    for weight in (0, 3):
-        out = tmp_path / str(weight)
-        assert main(arguments(scene, out, train__mask_weight=weight)) == 0
-        run = load(out)
-        views = run.scene("test").splits["test"]
-        alphas = [(run.render(view.camera).alpha, reduced_alpha(view)) for view in views]
-        difference = np.array([rendered - given for rendered, given in alphas])
-        errors.append((np.maximum(difference, 0).mean(), np.maximum(-difference, 0).mean()))
-    (excess, shortfall), (excess_left, shortfall_left) = errors
-    assert excess_left < 0.8 * excess and shortfall_left < 0.9 * shortfall
-
-
-def reduced_alpha(view):
-    """(H, W) of the reduced image."""
-    k, camera = view.downscale, view.camera
-    alpha = view.image[..., 3].reshape(camera.height, k, camera.width, k)
-    return alpha.mean(axis=(1, 3)) / 255

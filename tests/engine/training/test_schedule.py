@@ -1,5 +1,3 @@
-"""pp_cl/engine/training/schedule.py: the values of the formulas, worked out by hand."""
-
 import math
 
 import numpy as np
@@ -17,32 +15,19 @@ from pp_cl.engine.training.schedule import (
 )
 from pp_cl.settings import NetworkConfig, TrainConfig
 
-SH_RATES = [
-    (
-        (0.5, 0.05, 0),
-        {0: 0.5, 250: 0.49428, 500: 0.48862, 1000: 0.4775, 25000: 0.15811, 50000: 0.05},
-    ),
-    (
-        (0.25, 0.025, 500),
-        {0: 0.0025, 250: 0.17548, 500: 0.24431, 1000: 0.23875, 25000: 0.07906, 50000: 0.025},
-    ),
-    (
-        (0.125, 0.0125, 1000),
-        {0: 0.00125, 250: 0.04805, 500: 0.08673, 1000: 0.11937, 25000: 0.03953, 50000: 0.0125},
-    ),
-]
 
-
-@pytest.mark.parametrize(("arguments", "values"), SH_RATES)
+@pytest.mark.parametrize(
+    ("arguments", "values"),
+    [
+        ((0.5, 0.05, 0), {0: 0.5, 250: 0.49428, 25000: 0.15811, 50000: 0.05}),
+        ((0.125, 0.0125, 1000), {0: 0.00125, 500: 0.08673, 1000: 0.11937, 50000: 0.0125}),
+    ],
+)
 def test_published_rates(arguments, values):
     first, last, delay_steps = arguments
     for step, value in values.items():
         rate = learning_rate(step, 50000, first, last, delay_steps=delay_steps)
         assert rate == pytest.approx(value, abs=6e-6)
-
-
-def test_rate_stays_after_the_end():
-    assert learning_rate(200, 100, 0.5, 0.05) == pytest.approx(0.05)
 
 
 def test_gamma():
@@ -60,11 +45,9 @@ def test_the_distortion_weight_rises_from_nothing():
     "shares, iterations, changes, expected",
     [
         ("0.33,0.67", 11_000, {}, [3630, 7370]),
-        ("0.33,0.67", 1000, {}, [330, 670]),
         ("0.33,0.67", 60, {}, [20]),  # 64 times as many points, of which none was pruned
         ("0.33,0.67", 500, {}, [165]),  # the pruning at 250 finds points that were seen 85 times
         ("0.33,0.67", 2, {}, [1]),
-        ("0.35,1", 100, {}, [35]),
         ("0.33,0.67", 60, {"train.prune_weight": 0}, [20, 40]),
         ("0.5,0.5", 100, {"train.prune_weight": 0}, [50]),
         ("1,1", 8000, {}, []),
@@ -88,13 +71,8 @@ def test_ema_weight():
     assert due == list(range(2975, 3500, 17))
     assert weights[2975] == 1
     assert weights[2992] == weights[due[-1]] == pytest.approx(1 - math.exp(-17 / 175))
-
-
-@pytest.mark.parametrize("steps", [1, 2, 7, 100])
-def test_short_trainings_average_too(steps):
-    weights = [ema_weight(step, steps) for step in range(steps)]
-    assert next(w for w in weights if w) == 1
-    assert all(0 <= w <= 1 for w in weights)
+    for steps in (1, 2, 7):  # short trainings average, too
+        assert next(filter(None, (ema_weight(step, steps) for step in range(steps)))) == 1
 
 
 @pytest.mark.parametrize(
@@ -112,10 +90,8 @@ def test_what_is_slower_in_longer_trainings(steps, meant_for, scale):
     "low, high, size, limit",
     [
         (10, 50, 16, 64),
-        (20, 30, 16, 64),
         (0, 5, 16, 64),
         (60, 64, 16, 64),
-        (0, 64, 64, 64),
         (3, 60, 64, 64),
     ],
 )

@@ -1,5 +1,3 @@
-"""Cameras of other programs' files, against poses worked out by hand."""
-
 import json
 
 import numpy as np
@@ -20,12 +18,10 @@ def written(folder, content):
 
 
 def world(camera):
-    """4x4 camera-to-world, OpenGL's axes, as a list."""
     return (np.vstack([camera.pose, [0, 0, 0, 1]]) @ TO_GL).tolist()
 
 
 def splatting(camera):
-    """A camera of cameras.json: OpenCV's axes."""
     return {
         "id": 0,
         "img_name": "a",
@@ -81,7 +77,6 @@ def test_a_size_is_taken_from_the_command_where_the_file_has_none(tmp_path):
 
 
 def changed(name, key, value):
-    """CONTENTS[name] with one key of its second camera changed."""
     content = json.loads(json.dumps(CONTENTS[name]))
     listed = content if isinstance(content, list) else content.get("frames", ())
     listed = listed or content["camera_path"]
@@ -94,17 +89,15 @@ def changed(name, key, value):
     [
         ("[]", "must hold one camera"),
         ("3", "holds no cameras"),
-        ({"frames": 3}, "frames: must hold"),
         ({"camera_path": [7]}, r"camera_path\[0\]: must be a JSON object"),
         (changed("cameras.json", "position", [1, 2]), r"\[1\].position"),
         (changed("cameras.json", "rotation", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "no rotation"),
         (changed("cameras.json", "fx", None), "fx: is missing"),
-        (changed("cameras.json", "width", -3), "width"),
         (changed("cameras.json", "height", 1e9), "height"),
+        (changed("camera_path.json", "fov", None), "fov: is missing"),
         (changed("camera_path.json", "fov", 200), "fov"),
         (changed("camera_path.json", "camera_type", "fisheye"), "camera_type"),
         (changed("transforms.json", "latlong", True), "latlong"),
-        (changed("camera_path.json", "fov", None), "fov: is missing"),
         (changed("camera_path.json", "camera_to_world", [1] * 15), "camera_to_world"),
         (changed("transforms.json", "k4", 0.1), "undistort"),
     ],

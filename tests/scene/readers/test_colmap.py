@@ -1,5 +1,3 @@
-"""The reader of COLMAP's models: text and binary, its conventions, and every kind of bad input."""
-
 import shutil
 import struct
 import tracemalloc
@@ -25,7 +23,6 @@ BY_COLMAP = Path(__file__).parent / "colmap_models"
 
 @pytest.fixture(params=[True, False], ids=["binary", "text"])
 def written(request, tmp_path):
-    """(folder, splits) of a scene."""
     splits = held_out(views(size=SIZE))
     colmap.write(tmp_path, splits, request.param)
     return tmp_path, splits
@@ -33,14 +30,12 @@ def written(request, tmp_path):
 
 @pytest.fixture
 def text(tmp_path):
-    """A folder with a text model."""
     colmap.write(tmp_path, held_out(views(size=SIZE)), binary=False)
     return tmp_path
 
 
 @pytest.fixture
 def binary(tmp_path):
-    """The same with a binary model."""
     colmap.write(tmp_path, held_out(views(size=SIZE)))
     return tmp_path
 
@@ -105,7 +100,6 @@ def test_models(text, line, focal, lens):
 
 @pytest.mark.parametrize("form", ["binary", "text"])
 def test_a_model_that_colmap_wrote(tmp_path, form):
-    """The same images from both forms, their cameras where the demo's are."""
     shutil.copytree(BY_COLMAP / form, tmp_path / "sparse" / "0")
     (tmp_path / "images").mkdir()
     numbers = (0, 9, 20, 31, 42, 53)
@@ -129,7 +123,6 @@ def test_binary_goes_before_text(binary):
 
 
 def test_text_as_other_programs_write_it(text):
-    """A byte order mark, CR LF, empty lines and comments before an image, 2D points."""
     before = read_split(text, "train", [])
     for name in ("cameras.txt", "images.txt"):
         file = text / "sparse" / "0" / name
@@ -137,6 +130,9 @@ def test_text_as_other_programs_write_it(text):
         file.write_bytes(b"\xef\xbb\xbf" + lines.replace("\n", "\r\n").encode())
     for got, expected in zip(read_split(text, "train", []), before, strict=True):
         assert got.name == expected.name and np.array_equal(got.camera.pose, expected.camera.pose)
+    for file in (text / "sparse/0").glob("*.txt"):
+        file.write_text(file.read_text("utf-8-sig"), encoding="utf-16")
+    assert [one.name for one in read_split(text, "train", [])] == [one.name for one in before]
 
 
 def test_2d_points_take_no_memory(tmp_path):
@@ -153,19 +149,13 @@ def test_2d_points_take_no_memory(tmp_path):
     tracemalloc.stop()
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def edit(folder, name, change):
-    """Change the lines of a text file of the model that are no comments."""
     file = folder / "sparse" / "0" / name
     lines = [line for line in file.read_text().split("\n") if not line.startswith("#")]
     file.write_text("\n".join(change(lines)))
 
 
 def second(change):
-    """Changes the second image's, or camera's, words."""
-
     def changed(lines):
         at = 2 if lines[1] == "" else 1
         lines[at] = " ".join(change(lines[at].split()))
@@ -188,6 +178,7 @@ BAD_TEXT = {
     "no size": ("cameras.txt", replaced(2, f"{2**40}"), "line 2"),
     "quaternion": ("images.txt", replaced(1, "3"), "000001.png"),
     "huge place": ("images.txt", replaced(5, "1e300"), "000001.png"),
+    "a place that is NaN": ("images.txt", replaced(5, "nan"), "000001.png"),
     "no lines of 2D points": ("images.txt", lambda lines: lines[::2], "line 2"),
     "broken 2D points": ("images.txt", lambda lines: [lines[0], "1 2", *lines[2:]], "line 2"),
     "escape sequence in a name": ("images.txt", replaced(9, "\x1b[2J.png"), "line 3"),
@@ -204,6 +195,7 @@ LEFT_OUT = {
     "huge principal point": "train",
     "quaternion": "train",
     "huge place": "train",
+    "a place that is NaN": "train",
     "other shape": "train",
     "no size": "train",
     "unknown camera": "train",
@@ -261,13 +253,6 @@ def test_panoramas_are_no_unknown_lens(text):
     refused(text, "EQUIRECTANGULAR is panoramic")
 
 
-def test_a_text_model_in_utf_16(text):
-    before = read_split(text, "train", [])
-    for file in (text / "sparse/0").glob("*.txt"):
-        file.write_text(file.read_text(), encoding="utf-16")
-    assert [one.name for one in read_split(text, "train", [])] == [one.name for one in before]
-
-
 def test_more_records_or_letters_than_a_model_has(written, monkeypatch):
     folder, _ = written
     monkeypatch.setattr("pp_cl.scene.readers.colmap.MOST_RECORDS", 10)
@@ -282,11 +267,9 @@ BAD_BYTES = {
     "cut in a name": ("images.bin", lambda b: b[:76]),
     "a count beyond all memory": ("images.bin", lambda b: struct.pack("<Q", 2**60) + b[8:]),
     "2D points beyond the end": ("images.bin", lambda b: b[:-8] + struct.pack("<Q", 9)),
-    "2D points beyond all files": ("images.bin", lambda b: b[:-8] + struct.pack("<Q", 2**64 - 1)),
     "more than the count": ("cameras.bin", lambda b: b + b"x"),
     "model number": ("cameras.bin", lambda b: b[:12] + struct.pack("<i", 99) + b[16:]),
     "name": ("images.bin", lambda b: b[:72] + b"\xff" + b[73:]),
-    "empty": ("cameras.bin", lambda b: b""),
     "no name": ("images.bin", lambda b: b[:72] + b[82:]),
 }
 

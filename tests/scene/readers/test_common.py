@@ -1,7 +1,3 @@
-"""What readers share: images inside the scene's folder, masks by name, splits, arrays of other
-programs, all read without trust.
-"""
-
 import shutil
 import zipfile
 from pathlib import Path
@@ -57,7 +53,6 @@ def made(tmp_path):
 
 @pytest.mark.parametrize("name", FOLDERS)
 def test_links_of_the_user_are_followed(made, name):
-    """Of one image, and of whole folders, as large data lies on another disk."""
     folder, *places = made(name)
     before = load_scene(folder).splits["train"]
     escape(sorted(places[0].iterdir())[2])
@@ -99,7 +94,6 @@ HARMED = [
 def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(
     made, name, place, harm
 ):
-    """By its image, or by its mask; of nine views for training eight must be left."""
     folder, images, masks = made(name)
     where, (do, why) = images if place == "image" else masks, HARM[harm]
     before = {view.name: view.stored_camera for view in load_scene(folder).splits["train"]}
@@ -142,14 +136,10 @@ def test_masks_of_another_size(made, name):
 
 @pytest.mark.parametrize("name", ["colmap", "llff", "neus"])
 def test_no_folder_of_masks_at_all(made, name):
-    """The images' own alpha counts, where no file names masks."""
     folder, _, masks = made(name)
     shutil.rmtree(masks)
     for view in load_scene(folder).splits["train"]:
         assert (view.image[..., 3] == 255).all()
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_every_eighth_is_held_out():
@@ -177,7 +167,6 @@ def test_every_eighth_is_held_out():
     ],
 )
 def test_which_image_a_name_means(tmp_path, given, there):
-    """As other programs write them on other machines; masks and depths are never taken for one."""
     for path in ("masks/a.png", "depth/a.png", there):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_bytes(b"")
@@ -240,9 +229,6 @@ def test_a_mask_is_named_like_its_image(tmp_path, mask):
     assert find_masks(tmp_path, images) == {images[0]: f"masks/sub/{mask}"}
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def test_what_numpy_writes(tmp_path, rng):
     array = rng.normal(size=(4, 3))
     for index, stored in enumerate((array, np.asfortranarray(array), array.astype("<f4"))):
@@ -279,11 +265,9 @@ FLOATS = "{'descr': '<f8', 'fortran_order': False, 'shape': %s}"
 HEADERS = {
     "open bracket": "{'descr': '<f8', 'fortran_order': False, 'shape': (3,",
     "negative": FLOATS % "(-1, 4)",
-    "twice negative": FLOATS % "(-1, -4)",
     "nothing times much": FLOATS % f"(0, {10**30})",
     "too many dimensions": FLOATS % f"({'1, ' * 70})",
     "pairs": "{'descr': ('<f8', (2,)), 'fortran_order': False, 'shape': (2,)}",
-    "bytes beyond memory": FLOATS.replace("<f8", "<u1") % f"({2**26},)",
     "shape beyond all memory": FLOATS % f"({2**40}, {2**20})",
     "too early": FLOATS % "(17,)",
     "nested": "(" * 500,
@@ -307,15 +291,12 @@ def test_headers_that_lie(tmp_path, case):
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01\0", b"\x93NUMPY\x02\0" + bytes(100)])
 def test_what_is_no_array(tmp_path, content):
     (tmp_path / "a.npy").write_bytes(content)
-    with refusing(tmp_path / "a.npy"):
-        read_npy(tmp_path / "a.npy")
-    with refusing(tmp_path / "a.npy"):
-        read_npz(tmp_path / "a.npy", "cam")
+    for read in (read_npy, lambda file: read_npz(file, "cam")):
+        with refusing(tmp_path / "a.npy"):
+            read(tmp_path / "a.npy")
 
 
-@pytest.mark.parametrize(
-    "array", [np.array([None]), np.array("K"), 1j * np.ones(3), np.array([np.nan]), [np.inf], 1e31]
-)
+@pytest.mark.parametrize("array", [np.array([None]), np.array("K"), 1j * np.ones(3), [np.inf]])
 def test_what_holds_no_finite_numbers(tmp_path, array):
     np.save(tmp_path / "a.npy", array)
     with refusing(tmp_path / "a.npy"):
@@ -323,7 +304,6 @@ def test_what_holds_no_finite_numbers(tmp_path, array):
 
 
 def test_all_arrays_of_a_file_count(tmp_path, monkeypatch):
-    """Small as each may be: 16 numbers fit, two arrays of 9 do not."""
     monkeypatch.setattr(common, "MOST_ARRAYS", 128)
     np.savez(tmp_path / "a.npz", cam_1=np.zeros(16), other=np.zeros(9))
     assert len(read_npz(tmp_path / "a.npz", "cam_")) == 1

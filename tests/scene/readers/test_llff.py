@@ -1,5 +1,3 @@
-"""The reader of LLFF's format."""
-
 import numpy as np
 import pytest
 from support.same_scene import held_out, views
@@ -10,20 +8,6 @@ from pp_cl.scene.readers.llff import read_split
 from tools.scene_formats import llff
 
 FILE = "poses_bounds.npy"
-
-
-@pytest.fixture
-def scene(tmp_path):
-    llff.write(tmp_path, held_out(views(centred=True)))
-    return tmp_path
-
-
-def edit(folder, change):
-    """change(rows) gives the rows to store."""
-    np.save(folder / FILE, change(np.load(folder / FILE)))
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def test_axes_are_down_right_and_back(tmp_path):
@@ -40,9 +24,6 @@ def test_axes_are_down_right_and_back(tmp_path):
     np.testing.assert_allclose((right, down, depth), (0.3, -0.2, 4), atol=1e-12)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15, 11)
     assert image_file.depth_range is None and image_file.mask is None
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def cell(column, value):
@@ -62,8 +43,9 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_poses(scene, case):
+def test_bad_poses(tmp_path, case):
     change, word = BAD[case]
-    edit(scene, change)
+    llff.write(tmp_path, held_out(views(centred=True)))
+    np.save(tmp_path / FILE, change(np.load(tmp_path / FILE)))
     check = left_out if word == "row 2" else refused
-    check(scene, scene / FILE, word)
+    check(tmp_path, tmp_path / FILE, word)

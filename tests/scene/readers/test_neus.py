@@ -1,5 +1,3 @@
-"""The reader of NeuS's and DTU's format."""
-
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +21,14 @@ def scene(tmp_path):
 
 
 def edit(folder, change):
-    """change({name: array}) of the file of cameras."""
     with np.load(folder / FILE) as stored:
         arrays = dict(stored)
     change(arrays)
     np.savez(folder / FILE, **arrays)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("scale", [1.0, 1e-4, 3e5])
 def test_a_projection_is_known_up_to_its_scale(tmp_path, scale):
-    """Also where file and folders have the other names."""
     given = held_out(views())
     neus.write(tmp_path, given)
     edit(tmp_path, lambda a: a.update({name: scale * matrix for name, matrix in a.items()}))
@@ -87,12 +80,7 @@ def test_the_sphere_gives_the_depth_range(scene):
     assert near == pytest.approx(1e-2) and far > 10
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def world(change):
-    """change(matrix) of the third camera."""
-
     def changed(arrays):
         arrays["world_mat_2"] = change(arrays["world_mat_2"].copy())
 
@@ -100,13 +88,11 @@ def world(change):
 
 
 def skewed(matrix):
-    """K with 1 % of shear."""
     matrix[:3] = np.array([[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]) @ matrix[:3]
     return matrix
 
 
 def scale(matrix):
-    """A scale_mat for the third camera."""
     return lambda arrays: arrays.update(scale_mat_2=np.array(matrix))
 
 

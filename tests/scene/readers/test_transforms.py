@@ -1,5 +1,3 @@
-"""The reader of NeRF-synthetic's format: its conventions, and every kind of bad input."""
-
 import json
 import math
 import os
@@ -13,8 +11,6 @@ from pp_cl.files.image import read_rgba
 from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
-
-# -------------------------------------------------------------------------------------------------
 
 
 def test_views_and_names(tmp_path, capfd):
@@ -111,7 +107,6 @@ def test_angle_of_height_and_single_focal_length(tmp_path):
 
 
 def test_rows_and_rounding_of_the_pose(tmp_path, rng):
-    """3x4 is read as 4x4 is; a rotation that is rounded, or scaled, comes out orthonormal."""
     exact = opengl_pose([1, 2, 0.5])
     rough, scaled = exact.copy(), exact * [3.7, 3.7, 3.7, 1]
     rough[:3, :3] += rng.uniform(-1e-4, 1e-4, (3, 3))
@@ -125,23 +120,18 @@ def test_rows_and_rounding_of_the_pose(tmp_path, rng):
         assert np.array_equal(pose[:, 3], exact[:3, 3])
 
 
-# --------------------------------------------------------------------------------------------------
-
 MATRIX = opengl_pose([3, 0, 1])
 BAD_FRAMES = {
     "no path": ("file_path", None),
+    "a number as path": ("file_path", 7),
     "no such image": ("file_path", "./train_9"),
     "an image twice": ("file_path", "train_0.png"),
     "no matrix": ("transform_matrix", None),
     "NaN": ("transform_matrix", np.where(np.eye(4) == 1, np.nan, MATRIX).tolist()),
-    "3x3": ("transform_matrix", MATRIX[:3, :3].tolist()),
-    "words": ("transform_matrix", "unknown"),
-    "truths": ("transform_matrix", np.eye(4, dtype=bool).tolist()),
     "scaled": ("transform_matrix", (MATRIX * [1.01, 1.01, 1.05, 1]).tolist()),
     "mirrored": ("transform_matrix", (MATRIX * [-1, 1, 1, 1]).tolist()),
     "transposed": ("transform_matrix", MATRIX.T.tolist()),
     "negative focal length": ("fl_x", -5),
-    "focal length in words": ("fl_x", "50mm"),
     "NaN number": ("cx", math.nan),
     "huge number": ("fl_y", 10**400),
     "angle over pi": ("camera_angle_x", 40),
@@ -152,25 +142,8 @@ BAD_FRAMES = {
 }
 
 
-def test_the_mend_fits_the_lens(tmp_path):
-    for key, value, told in (
-        ("camera_model", "EQUIRECTANGULAR", "is panoramic"),
-        ("equirectangular", True, "is panoramic"),
-        ("k4", 0.01, "let it fit the lens without"),
-    ):
-        write_scene(tmp_path, edit=lambda data, k=key, v=value: data.update({k: v}))
-        refused(tmp_path, told)
-
-
-def test_motion_is_told(tmp_path):
-    write_scene(tmp_path, edit=lambda data: data["frames"][1].update(time=0.5))
-    with pytest.warns(UserWarning, match="motion is not modelled"):
-        load_scene(tmp_path)
-
-
 @pytest.mark.parametrize("case", BAD_FRAMES)
 def test_bad_frame(tmp_path, case):
-    """The message names the file, the frame and the key."""
     key, value = BAD_FRAMES[case]
     write_scene(tmp_path, edit=lambda data: data["frames"][1].update({key: value}))
     refused(tmp_path, tmp_path / "transforms_train.json", f"frames[1].{key}:")
@@ -188,10 +161,8 @@ def test_a_bad_depth_range(tmp_path, near, far, key):
     ("change", "place"),
     (
         ({"camera_angle_x": "wide"}, "camera_angle_x:"),
-        ({"camera_angle_x": 1e-300}, "camera_angle_x:"),
         ({"camera_angle_x": None}, "frames[0].fl_x:"),
         ({"frames": []}, "frames:"),
-        ({"frames": {}}, "frames:"),
         ({"frames": "all"}, "frames:"),
         ({"frames": [[1, 2]]}, "frames[0].file_path:"),
     ),
@@ -205,11 +176,8 @@ def test_bad_keys_of_the_whole_file(tmp_path, change, place):
     ("text", "words"),
     (
         ('{\n "frames": [,]\n}', ("line 2", "column 13")),
-        ("", ("line 1", "column 1")),
         ("[1, 2]", ("object",)),
         ("[" * 100_000, ("JSON",)),
-        ('{"w": ' + "9" * 5000 + "}", ("JSON",)),
-        ("\udcff\udcfe", ("JSON",)),
     ),
 )
 def test_broken_json(tmp_path, text, words):
@@ -225,9 +193,16 @@ def test_a_copy_beside_transforms_json_is_no_split(tmp_path):
     assert len(load_scene(tmp_path).splits["train"]) == 2
 
 
-def test_what_is_perspective_by_its_keys_is_read(tmp_path):
+def test_what_is_perspective_by_its_keys_is_read_and_motion_is_told(tmp_path):
     keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None}
-    assert len(train_views(tmp_path, **keys)) == 3
+
+    def edit(data):
+        for i, frame in enumerate(data["frames"]):
+            frame.update(keys, time=i / 2)
+
+    write_scene(tmp_path, edit=edit)
+    with pytest.warns(UserWarning, match="motion is not modelled"):
+        assert len(load_scene(tmp_path).splits["train"]) == 3
 
 
 @pytest.mark.parametrize("keys", ({"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}))
@@ -243,7 +218,6 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
 
 @pytest.mark.unix
 def test_a_pipe_is_no_file_of_cameras(tmp_path):
-    """Nor is it waited for."""
     write_scene(tmp_path)
     os.mkfifo(tmp_path / "transforms_val.json")
     assert "val" not in transforms.splits(tmp_path)
@@ -256,7 +230,6 @@ def test_a_pipe_is_no_file_of_cameras(tmp_path):
     "change, told",
     [
         (lambda frames: frames[2].update(file_path=None), "frames[2].file_path: is missing"),
-        (lambda frames: frames[2].update(file_path=5), "frames[2].file_path: must be the path"),
         (lambda frames: frames.__setitem__(2, "none"), "frames[2].file_path: is missing"),
         (lambda frames: frames[2].update(near=1.0), "frames[2].far: near and far must both"),
     ],

@@ -1,5 +1,3 @@
-"""The box of an object from sparse points, with the table on which it stands."""
-
 import numpy as np
 import pytest
 from support.scenes import ring_cameras

@@ -1,7 +1,3 @@
-"""Features lie where photographs show them, whatever their size, and pairs are chosen by what they
-have in common.
-"""
-
 import numpy as np
 import pytest
 from PIL import Image

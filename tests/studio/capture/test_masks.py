@@ -1,5 +1,3 @@
-"""Masks of photographs with known cameras, from each of their sources."""
-
 import shlex
 import sys
 from dataclasses import replace
@@ -26,9 +24,9 @@ from tools.capture_demo import ROOM, cameras, room
 
 pytest.importorskip("cv2")
 
-from pp_studio.capture import backdrop, cut
+from pp_studio.capture import cut
+from pp_studio.capture.cut import Window, window
 from pp_studio.capture.masks import mask_file, outline_sheet, program_words, write_masks
-from pp_studio.capture.window import Window, window
 
 SIZE, VIEWS = 96, 12
 SCREEN = (20, 200, 60)
@@ -67,31 +65,26 @@ class Capture:
             self.seen.append(found[is_shown & (rng.uniform(size=len(found)) < 0.5)])
 
     def write(self, **options):
-        """The line of write_masks."""
         line, _, self.box = write_masks(
             self.folder, self.image_files, self.box, self.points, self.seen, **options
         )
         return line
 
     def agreement(self):
-        """(V,) intersection over union of each mask with the true one."""
         found = [read_mask(self.file(i)) > 127 for i in range(len(self.truth))]
         pairs = zip(found, self.truth, strict=True)
         return np.array([(a & b).sum() / (a | b).sum() for a, b in pairs])
 
     def file(self, number):
-        """The mask of a photograph."""
         return mask_file(self.folder, self.image_files[number].name)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Votes that take no time."""
     monkeypatch.setattr(cut, "CELLS", 48**3)
 
 
 def ball(folder, spoil=None):
-    """A Capture of a ball that is not green."""
     cameras = ring_cameras(VIEWS, SIZE)
     views = [(camera, ball_image(camera) * np.uint8([1, 0, 1, 1])) for camera in cameras]
     surface = np.random.default_rng(5).normal(size=(200, 3))
@@ -101,12 +94,10 @@ def ball(folder, spoil=None):
 
 @pytest.fixture
 def capture(tmp_path):
-    """A Capture whose masks are not known."""
     return ball(tmp_path / "scene")
 
 
 def given_masks(capture, folder):
-    """A folder of the true masks, named like the photographs."""
     folder.mkdir()
     for one, mask in zip(capture.image_files, capture.truth, strict=True):
         Image.fromarray(np.uint8(255 * mask)).save(folder / Path(one.name).name)
@@ -114,7 +105,6 @@ def given_masks(capture, folder):
 
 
 def test_the_object_is_cut_out_of_any_background(capture):
-    """From sparse points alone."""
     line = capture.write()
     assert f"{VIEWS} cut out" in line
     assert capture.agreement().min() > 0.95
@@ -123,7 +113,6 @@ def test_the_object_is_cut_out_of_any_background(capture):
 
 @pytest.mark.slow
 def test_a_box_that_cuts_the_object_grows(capture):
-    """Where it has no points, and but for what it stands on."""
     whole, cut_off = capture.box.copy(), capture.box.copy()
     cut_off[1, [0, 2]] = 0.4
     capture.box = cut_off
@@ -146,17 +135,6 @@ def turned(folder, views, box, surface, wall):
     capture.points = capture.points[: capture.count]
     capture.seen = [seen[seen < capture.count] for seen in capture.seen]
     return capture
-
-
-@pytest.mark.slow
-def test_an_object_that_turns_is_told_from_the_wall(dev, tmp_path):
-    """Which shows between the demo's rings in every photograph."""
-    around = cameras(2 * SIZE, "turntable")
-    views = [(one, render(dev, one)) for one in around[::2]]
-    surface, still = demo_mesh(dev, 64)[0][::20], room(around[0])
-    capture = turned(tmp_path / "scene", views, OBJECT_BOX, surface, lambda _: still)
-    capture.write(turns=True)
-    assert capture.agreement().min() > 0.915
 
 
 def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
@@ -182,11 +160,11 @@ def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
         windows[-1].mask = masks[-1][0]
     beside = [~binary_dilation(mask, iterations=3) for mask, _ in masks]
     for found, (mask, same), out in zip(
-        backdrop.differences(windows, capture.points, beside), masks, beside, strict=True
+        cut.differences(windows, capture.points, beside), masks, beside, strict=True
     ):
-        assert (found[out] <= backdrop.SLIGHT).all()
+        assert (found[out] <= cut.SLIGHT).all()
         assert (found[mask & ~binary_dilation(same, iterations=2)] > 50).all()
-        assert (found[binary_erosion(same, iterations=2)] == backdrop.UNSEEN).all()
+        assert (found[binary_erosion(same, iterations=2)] == cut.UNSEEN).all()
 
 
 def share_held(capture, place, wanted):
@@ -206,7 +184,6 @@ def share_held(capture, place, wanted):
 
 
 def test_the_other_views_carve_what_one_takes_for_the_object(tmp_path):
-    """What looks like the object stands beside it in one photograph."""
     place = np.s_[20:40, 16:40]
 
     def bystander(image):
@@ -220,7 +197,6 @@ def test_the_other_views_carve_what_one_takes_for_the_object(tmp_path):
 
 
 def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
-    """A stain of the wall's colour in the middle of the object in one photograph."""
     place = np.s_[40:56, 40:56]
 
     def stain(image):
@@ -233,20 +209,7 @@ def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
     assert voted > 0.8
 
 
-def test_what_is_there_is_kept_and_helps(capture):
-    """A second start makes what is missing, the same but for what the kept masks change."""
-    capture.write()
-    first, mask = capture.agreement(), capture.file(3).read_bytes()
-    capture.file(5).unlink()
-    line = capture.write()
-    assert f"{VIEWS - 1} kept" in line
-    assert "1 cut out" in line
-    assert capture.file(3).read_bytes() == mask
-    assert capture.agreement()[5] > first[5] - 0.05
-
-
 def test_a_mask_that_the_user_has_written_has_the_shape_of_its_image(capture):
-    """Of another size it is resized, of another shape it is named."""
     capture.write()
     with Image.open(capture.file(3)) as mask:
         mask.resize((SIZE // 2, SIZE // 2)).save(capture.file(3))
@@ -277,24 +240,13 @@ def test_given_masks_come_first(capture, tmp_path):
 
 
 def test_masks_that_contradict_the_others_are_named(capture, tmp_path):
-    """One is shifted by a third of the image."""
     folder = given_masks(capture, tmp_path / "given")
     wrong = np.roll(capture.truth[4], SIZE // 3, axis=1)
     Image.fromarray(np.uint8(255 * wrong)).save(folder / "04.png")
     assert "04.png" in capture.write(given=folder)
 
 
-def test_a_given_mask_that_is_missing_is_named(capture, tmp_path):
-    """Before anything is cut."""
-    folder = given_masks(capture, tmp_path / "given")
-    (folder / "07.png").unlink()
-    with pytest.raises(UserError, match=r"07\.png"):
-        capture.write(given=folder)
-    assert not capture.file(7).exists()
-
-
 def test_alpha_is_the_mask(capture):
-    """Of photographs that have one."""
     for one, mask in zip(capture.image_files, capture.truth, strict=True):
         rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
         Image.fromarray(np.dstack([rgb, np.uint8(255 * mask)])).save(capture.folder / one.name)
@@ -303,7 +255,6 @@ def test_alpha_is_the_mask(capture):
 
 
 def before_a_screen(capture):
-    """Give all photographs a green background."""
     for one, mask in zip(capture.image_files, capture.truth, strict=True):
         rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
         rgb[~mask] = SCREEN
@@ -346,7 +297,6 @@ mask.save(sys.argv[2])
 
 
 def program(tmp_path, text):
-    """The command of a Python program in a folder whose name has a space."""
     file = tmp_path / "a program" / "mask.py"
     file.parent.mkdir()
     file.write_text(text)
@@ -354,7 +304,6 @@ def program(tmp_path, text):
 
 
 def test_a_program_makes_the_masks(capture, tmp_path):
-    """It is given each photograph and where to write; the alpha of a cut-out is the mask."""
     capture.image_files, capture.seen = capture.image_files[:2], capture.seen[:2]
     cut_out = "cut = Image.open(sys.argv[1]).convert('RGB')\ncut.putalpha(mask)\ncut.save"
     text = PROGRAM.replace("mask.save", cut_out)
@@ -373,7 +322,6 @@ def test_a_program_makes_the_masks(capture, tmp_path):
     ],
 )
 def test_a_program_that_fails_is_named(capture, tmp_path, text, said):
-    """With the photograph and its last word."""
     with refusing("00.png", said):
         capture.write(command=program(tmp_path, text))
     assert not capture.file(0).exists()
@@ -381,7 +329,6 @@ def test_a_program_that_fails_is_named(capture, tmp_path, text, said):
 
 @pytest.mark.parametrize("command", ["", "rembg {image}", "rembg '{image} {mask}"])
 def test_a_command_that_cannot_be_one_is_refused(command):
-    """Before anything is read."""
     with pytest.raises(UserError, match="--mask-command"):
         program_words(command)
 
@@ -395,7 +342,6 @@ BOXES = {
 
 @pytest.mark.parametrize("case", BOXES)
 def test_a_box_without_an_object_is_refused(capture, case):
-    """There is nothing to begin with."""
     capture.box = np.array(BOXES[case])
     with pytest.raises(UserError, match="--box"):
         capture.write()

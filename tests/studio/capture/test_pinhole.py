@@ -1,5 +1,3 @@
-"""Photographs, masks and COLMAP's model without the distortion of the lens."""
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -9,7 +7,8 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.lens import LensDistortion, undistort
-from pp_studio.capture.pinhole import undistort_model, undistorted_mask, write_images
+from pp_studio.capture.frames import undistorted_mask, write_images
+from pp_studio.capture.poses import undistort_model
 
 colmap = pytest.importorskip("pycolmap")
 CAMERA = Camera(np.eye(3, 4), 80.0, 80.0, 48.0, 32.0, 96, 64)
@@ -59,7 +58,6 @@ def test_masks_move_as_their_photographs_do(dev):
 
 
 def seen(model, image):
-    """(number, point) of what an image of pycolmap's model shows."""
     return enumerate(model.image(image).points2D)
 
 

@@ -1,5 +1,3 @@
-"""The command pp-cl export: what it writes where, and one line for whatever is wrong."""
-
 import json
 import shutil
 
@@ -13,7 +11,6 @@ from pp_studio.export import FORMATS
 
 @pytest.fixture(scope="module")
 def unfinished(tmp_path_factory):
-    """A run that was interrupted."""
     folder = tmp_path_factory.mktemp("export")
     scene = write_ball_scene(folder / "ball", views=6, size=40)
     with pytest.MonkeyPatch.context() as patch:

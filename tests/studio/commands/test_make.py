@@ -1,5 +1,3 @@
-"""`pp-cl make`: what is left is done, and a folder tells of it."""
-
 import importlib
 import re
 import shutil
@@ -74,7 +72,6 @@ def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, mo
 
 @pytest.mark.parametrize("stage, number", [("eval", signal.SIGTERM), ("render", signal.SIGINT)])
 def test_a_signal_ends_it_and_the_same_command_goes_on(made, capsys, monkeypatch, stage, number):
-    """20 moments of a process: test_make_stopped.py."""
     scene, folder = made
     words, real = ["make", scene, "--out", str(folder)], importlib.import_module(COMMANDS[stage])
     for name in ("index.html", "video.mp4"):
@@ -117,7 +114,6 @@ class Enough(Exception):
     ],
 )
 def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
-    """With what is known of them; the preset follows from the minutes."""
     steps = []
 
     def step(name, *given):

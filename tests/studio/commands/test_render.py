@@ -1,5 +1,3 @@
-"""`pp-cl render`: videos and frames as asked for, what is taken up again, what is refused."""
-
 import json
 import shutil
 from pathlib import Path
@@ -19,7 +17,6 @@ from pp_studio.export import render_video
 
 @pytest.fixture(scope="module")
 def trained(finished):
-    """Folder of a small run, as text."""
     return str(finished)
 
 
@@ -46,16 +43,8 @@ def test_a_video_whose_frames_would_fill_the_memory_is_not_begun(trained, tmp_pa
 
 
 def test_a_video_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypatch):
-    words = [
-        "render",
-        trained,
-        "--out",
-        str(tmp_path / "video.gif"),
-        "--seconds",
-        "1",
-        "--fps",
-        "4",
-    ]
+    words = ["render", trained, "--out", str(tmp_path / "video.gif")]
+    words += ["--seconds", "1", "--fps", "4"]
     write, done = render_video.write_png, []
 
     def stopping(path, image):
@@ -83,7 +72,6 @@ def test_a_video_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeyp
 
 
 def test_sizes_have_folders_of_their_own_and_need_no_scene(trained):
-    """The run's name is no UTF-8, and its scene is gone."""
     run = Path(trained)
     run = shutil.copytree(run, run.with_name("run \udcff"))
     config = json.loads((run / "config.json").read_text())
@@ -97,13 +85,6 @@ def test_sizes_have_folders_of_their_own_and_need_no_scene(trained):
     assert names == large | {"orbit_32x32.mp4"}
     assert "/nowhere" in failure(*words[:2], "--path", "test")
     assert "choose another" in failure(*words[:2], "--format", "exr")
-
-
-def test_an_empty_folder_that_one_is_in_takes_frames(trained, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["render", trained, "--path", "test", "--out", "."]) == 0
-    names = {path.name for path in tmp_path.iterdir() if path.name[0] != "."}
-    assert names == {"00000.png", "00001.png", "frames.json"}
 
 
 def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys):
@@ -137,8 +118,6 @@ def test_transparent_frames_and_colours(trained, tmp_path):
     nothing = alpha == 0
     assert (images["0,255,0"][nothing][:, :3] == (0, 255, 0)).all()
     assert (images["black"][nothing][:, :3] == 0).all()
-    green = images["0,255,0"][..., 1] - images["black"][..., 1]
-    assert np.abs(green - (255 - alpha)).max() <= 2
 
 
 def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
@@ -151,9 +130,3 @@ def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
     distance = 4.0  # of the cameras from the ball's centre
     assert there.any() and (np.abs(channels["Z"][there] - distance) < 1).all()
     assert np.isinf(channels["Z"][channels["A"] == 0]).all()
-
-
-def test_a_path_of_no_frame_is_refused(trained):
-    """Four seconds at a frame in ten."""
-    told = failure("render", trained, "--fps", "0.1")
-    assert "--seconds 4: 0.4 frames at 0.1 a second; ask for 1 to" in told

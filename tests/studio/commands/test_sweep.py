@@ -1,5 +1,3 @@
-"""`pp-cl sweep`: what it refuses, its plan, and whole sweeps with workers that die."""
-
 import json
 import os
 import re
@@ -28,14 +26,12 @@ ROOT = Path(__file__).parents[3]
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """Two scenes that differ."""
     folder = tmp_path_factory.mktemp("scenes")
     return [write_ball_scene(folder / "ball"), write_ball_scene(folder / "globe", views=5)]
 
 
 @pytest.fixture
 def nothing_starts(monkeypatch):
-    """Dask cannot be imported."""
     monkeypatch.setitem(sys.modules, "pp_studio.sweep.cluster", None)
     monkeypatch.setitem(sys.modules, "distributed", None)
 
@@ -69,16 +65,11 @@ def test_a_finished_sweep_needs_no_dask(tmp_path, capsys, nothing_starts):
     assert [row["folder"] for row in stored["runs"]] == ["demo/seed-1", "demo/seed-2"]
 
 
-# ---- whole sweeps
-
-
 def start(words, **options):
-    """The command as a process of its own, in the background."""
     return subprocess.Popen([sys.executable, "-m", "pp_cl", *words], cwd=ROOT, **options)
 
 
 def first(find, seconds=100):
-    """What find() returns once it is true."""
     last = time.monotonic() + seconds
     while time.monotonic() < last:
         if found := find():
@@ -92,13 +83,11 @@ def checkpoints(out):
 
 
 def worker_of(checkpoint):
-    """Process id of the last worker that had the run."""
     log = checkpoint.parent.with_suffix(".log").read_text()
     return int(re.findall(r"process (\d+)", log)[-1])
 
 
 def undisturbed(dev, job):
-    """Evaluation of the job, trained in this process."""
     folder = RunFolder(job.folder)
     open_training(dev, folder, run_config(folder, job.scene, None, job.given), None).run()
     return evaluate_run(load(folder.path, dev), "test", job.metrics)
@@ -107,7 +96,6 @@ def undisturbed(dev, job):
 @pytest.mark.unix
 @pytest.mark.slow
 def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkeypatch):
-    """The table is that of trainings that nobody disturbed, in this process."""
     out = tmp_path / "out"
     words = words_of(scenes, out, "--seeds", "1,2", "--workers", "2")
     with start(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as sweep:
@@ -175,7 +163,6 @@ def scheduler():
 @pytest.mark.unix
 @pytest.mark.slow
 def test_a_scheduler_started_by_hand(scenes, scheduler, tmp_path, capsys):
-    """A run that fails leaves the others alone; Ctrl-C ends a training with its checkpoint."""
     out, broken = tmp_path / "out", Path(write_ball_scene(tmp_path / "broken"))
     (broken / "transforms_train.json").write_text("{")
     words = words_of([broken, scenes[0]], out, "--scheduler", scheduler)
@@ -186,15 +173,3 @@ def test_a_scheduler_started_by_hand(scenes, scheduler, tmp_path, capsys):
     assert "transforms_train.json" in bad["error"] and "psnr" not in bad
     assert 5 < good["psnr"] < 40
     assert "| broken |        0 of 1 |" in told.out and "1 of 2 scenes" in told.out
-
-    (job,) = jobs_of(scenes[1:], out)
-    long = {"train.iterations": 100_000}
-    words = words_of(scenes[1:], out, "--scheduler", scheduler, changes=long)
-    with start(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as sweep:
-        first(Path(job.folder, "checkpoint.npz").exists)
-        sweep.send_signal(signal.SIGINT)
-        told = sweep.stderr.read()
-    assert sweep.returncode == 130 and "the same command goes on" in told
-    with RunFolder(job.folder).owned():  # nobody trains there any more
-        header, _ = load_checkpoint(Path(job.folder, "checkpoint.npz"))
-    assert not header["finished"] and header["step"] > 4

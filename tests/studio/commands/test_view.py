@@ -1,5 +1,3 @@
-"""`pp-cl view` as a process, and `pp-cl train --view`."""
-
 import json
 import signal
 import socket
@@ -23,14 +21,12 @@ SECONDS = 60
 
 @pytest.fixture
 def begun(tmp_path):
-    """A run that has its settings and no checkpoint."""
     folder = RunFolder(tmp_path / "run")
     folder.create(run_config(folder, write_ball_scene(tmp_path / "ball")).to_json())
     return folder.path
 
 
 def started(*words):
-    """A process `pp-cl view`."""
     return subprocess.Popen(
         [sys.executable, "-m", "pp_cl", "view", *map(str, words)],
         stdout=subprocess.PIPE,
@@ -45,9 +41,10 @@ def status(address):
 
 
 @pytest.mark.unix
-@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_the_address_works_and_a_signal_ends_it_cleanly(begun, number, code):
-    process = started(begun, "--port", "0")
+@pytest.mark.parametrize("what, number", [("run", signal.SIGTERM), ("ball", signal.SIGINT)])
+def test_the_address_works_and_a_signal_ends_it_cleanly(begun, what, number):
+    """Of a run, and of a scene."""
+    process = started(begun.with_name(what), "--port", "0")
     try:
         address = process.stdout.readline().split()[1]
         assert address.startswith("http://127.0.0.1:")
@@ -56,26 +53,7 @@ def test_the_address_works_and_a_signal_ends_it_cleanly(begun, number, code):
         out, err = process.communicate(timeout=SECONDS)
     finally:
         process.kill()
-    assert (process.returncode, err, out) == (code, "pp-cl: interrupted\n", "")
-
-
-@pytest.mark.unix
-def test_a_scene_is_shown_from_the_background_of_a_shell(tmp_path):
-    """Where Ctrl-C is ignored, and SIGTERM is not."""
-    scene = write_ball_scene(tmp_path / "ball")
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        process = started(scene, "--port", "0")
-    finally:
-        signal.signal(signal.SIGINT, before)
-    try:
-        assert status(process.stdout.readline().split()[1]) == 200
-        process.send_signal(signal.SIGINT)
-        process.send_signal(signal.SIGTERM)
-        assert process.communicate(timeout=SECONDS) == ("", "pp-cl: interrupted\n")
-        assert process.returncode == 143
-    finally:
-        process.kill()
+    assert (process.returncode, err, out) == (128 + number, "pp-cl: interrupted\n", "")
 
 
 def test_a_busy_port_is_one_line_and_status_2(begun):
@@ -101,7 +79,6 @@ def test_without_viser_the_first_line_says_so(begun, tmp_path, capsys, monkeypat
 
 
 def test_a_training_shows_itself_in_the_browser_until_it_ends(tmp_path, capfd, monkeypatch):
-    """The browser is a script that notes the address it gets, and what answers there."""
     browser, noted = tmp_path / "browser.py", tmp_path / "noted"
     browser.write_text(
         "import sys, urllib.request\n"
@@ -120,7 +97,6 @@ def test_a_training_shows_itself_in_the_browser_until_it_ends(tmp_path, capfd, m
 
 
 def wait_for_the_browser(monkeypatch, noted):
-    """Let the training's first step take until the page was opened."""
     from pp_cl.engine.step import Trainer
 
     train_step = Trainer.train_step

@@ -1,5 +1,3 @@
-"""A small run that all exports are made of."""
-
 import pytest
 
 from pp_cl.run import load
@@ -15,5 +13,4 @@ def run_folder(runs, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def run(session_device, run_folder):
-    """The run, loaded."""
     return load(run_folder, session_device)

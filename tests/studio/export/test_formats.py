@@ -1,5 +1,3 @@
-"""Every format, from run to file; renderings as a scene."""
-
 import shutil
 
 import numpy as np

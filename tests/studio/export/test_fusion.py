@@ -1,5 +1,3 @@
-"""Depth maps become signed distances."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +6,8 @@ from support.scenes import ring_cameras
 
 from pp_cl.engine.grid import Grid
 from pp_cl.files.rendered_view import RenderedView
-from pp_studio.export import fusion
-from pp_studio.export.fusion import fuse
+from pp_studio.export import mesh
+from pp_studio.export.mesh import fuse
 
 RADIUS = 0.8
 GRID = Grid((-1.0, -1.05, -1.1), 0.06, (34, 36, 38))
@@ -43,7 +41,7 @@ def test_the_sign_is_that_of_the_ball(views):
 
 def test_slabs_change_nothing(views, monkeypatch):
     whole = fuse(GRID, views[:3])
-    monkeypatch.setattr(fusion, "SLAB", 3000)
+    monkeypatch.setattr(mesh, "SLAB", 3000)
     assert np.array_equal(fuse(GRID, views[:3]), whole)
 
 

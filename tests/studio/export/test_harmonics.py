@@ -1,12 +1,9 @@
-"""Harmonics that reproduce the images."""
-
 import numpy as np
 import pytest
 from support.models import blend_matrix
 
 from pp_cl.files.rendered_view import RenderedView
-from pp_studio.export.harmonics import basis, fit_harmonics
-from pp_studio.export.observe import directions, observe
+from pp_studio.export.harmonics import basis, fit_harmonics, observe
 
 
 def test_the_functions_of_the_basis_are_orthogonal():
@@ -24,8 +21,8 @@ def test_the_functions_of_the_basis_are_orthogonal():
 
 def drawn(run, coefficients, seen):
     """(HW, 3): coefficients (N, 9, 3), blended over white."""
-    positions = run.model.positions()
-    at, matrix = basis(directions(positions, seen.camera)), blend_matrix(seen)
+    towards, matrix = run.model.positions() - seen.camera.eye, blend_matrix(seen)
+    at = basis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
     return matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
 
 

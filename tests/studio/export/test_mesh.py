@@ -1,5 +1,3 @@
-"""The mesh lies on the ball, and reads back as it was."""
-
 import numpy as np
 import pytest
 import trimesh

@@ -1,17 +1,11 @@
-"""What a view's blend weights say of its points, as a matrix."""
-
-import json
-import shutil
-
 import numpy as np
 import pytest
 from support.models import blend_matrix
 
-from pp_cl.run import load
-from pp_studio.export.observe import observe
+from pp_studio.export.harmonics import observe
 
 
-def check(run):
+def test_rows_sum_to_alpha_up_to_an_early_stop_and_columns_to_the_points_weights(run):
     for seen in observe(run, run.cameras("test"), "test"):
         matrix, weights = blend_matrix(seen), seen.point_weights()
         assert matrix.shape == (30 * 30, run.model.cloud.count) and weights.max() > 0.1
@@ -21,23 +15,6 @@ def check(run):
         stopped = missing > 1e-5
         assert stopped.any() and (alpha[stopped] == 1).all()
         assert missing.min() > -1e-5 and missing.max() < run.config.raster.early_stop
-
-
-def test_rows_sum_to_alpha_up_to_an_early_stop_and_columns_to_the_points_weights(run):
-    check(run)
-
-
-def test_dropped_fragments_are_no_part_of_it(run_folder, session_device, tmp_path):
-    shutil.copytree(run_folder, tmp_path / "run")
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    config["raster"]["early_stop"] = 0.3
-    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
-    run = load(tmp_path / "run", session_device)
-    camera = run.cameras("test")[0]
-    whole = load(run_folder, session_device)
-    (seen,), (all_seen,) = (list(observe(r, [camera], "")) for r in (run, whole))
-    assert 0 < blend_matrix(seen).nnz < blend_matrix(all_seen).nnz
-    check(run)
 
 
 def test_it_blends_what_the_rasteriser_blends(run):

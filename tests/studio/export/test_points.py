@@ -1,5 +1,3 @@
-"""Each point has the colour of the view in which it weighs most; the files hold what went in."""
-
 import numpy as np
 import plyfile
 import pytest
@@ -8,17 +6,12 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.files.srgb import linear_to_srgb
 from pp_studio.export.gltf import gltf_colours
-from pp_studio.export.observe import observe
+from pp_studio.export.harmonics import observe
 from pp_studio.export.points import coloured_points, write_ply
 
 
-@pytest.fixture(scope="module")
-def points(run):
-    return coloured_points(run)
-
-
-def test_colours_are_those_of_the_best_view(run, points):
-    cameras = run.cameras("train")
+def test_colours_are_those_of_the_best_view(run):
+    points, cameras = coloured_points(run), run.cameras("train")
     weights = np.stack([seen.point_weights() for seen in observe(run, cameras, "")])
     images = [to_8bit(run.render(camera).rgba()[..., :3]) for camera in cameras]
     positions = run.model.positions()
@@ -40,16 +33,9 @@ def test_no_points_are_one_line(run):
         coloured_points(run, min_weight=1000)
 
 
-@pytest.fixture(scope="module")
-def written(run, tmp_path_factory):
-    """(file, points)."""
-    path, points = tmp_path_factory.mktemp("ply") / "a.ply", coloured_points(run, min_weight=0.05)
+def test_the_ply_reads_back_by_plyfile(run, tmp_path):
+    path, points = tmp_path / "a.ply", coloured_points(run, min_weight=0.05)
     write_ply(path, points, run.model.cloud)
-    return path, points
-
-
-def test_the_ply_reads_back_by_plyfile(run, written):
-    path, points = written
     data = plyfile.PlyData.read(str(path))
     vertex = data["vertex"]
     assert not data.text and data.byte_order == "<" and len(vertex) == len(points.rows)
@@ -74,17 +60,9 @@ def test_the_ply_reads_back_by_plyfile(run, written):
         assert name in comments
 
 
-def test_colours_are_in_linear_light():
-    srgb = np.repeat(np.array([[0], [10], [128], [255]]), 3, axis=1) / 255
-    # IEC 61966-2-1: 10 is on its straight part
-    expected = np.array([0, 10 / 255 / 12.92, ((128 / 255 + 0.055) / 1.055) ** 2.4, 1])
-    assert gltf_colours(srgb)[:, 0].tolist() == np.rint(65535 * expected).tolist()
-    assert (gltf_colours(srgb)[:, 3] == 65535).all()
-    assert gltf_colours(np.array([[-0.1, 1.1, 0.0]])).tolist() == [[0, 65535, 0, 65535]]
-
-
 def test_no_level_of_a_dark_colour_is_lost():
     levels = np.arange(256)
     stored = gltf_colours(np.repeat(levels[:, None] / 255, 3, axis=1))
     read = 255 * linear_to_srgb(stored[:, :3] / 65535)
     assert np.array_equal(np.rint(read), np.repeat(levels[:, None], 3, axis=1))
+    assert gltf_colours(np.array([[-0.1, 1.1, 0.0]])).tolist() == [[0, 65535, 0, 65535]]

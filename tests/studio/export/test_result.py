@@ -1,5 +1,3 @@
-"""The folder that `make` fills, at any moment of the work."""
-
 import os
 import re
 import shutil
@@ -41,7 +39,6 @@ def test_before_the_training_it_shows_cameras_and_masks(tmp_path):
 
 @pytest.fixture
 def trained(run_folder, session_device, tmp_path):
-    """A run of its own, whose files are all as old."""
     folder = shutil.copytree(run_folder, tmp_path / "run")
     shutil.rmtree(folder / "eval", ignore_errors=True)
     os.utime(folder / "checkpoint.npz", ns=(10**18, 10**18))
@@ -50,8 +47,8 @@ def trained(run_folder, session_device, tmp_path):
 
 def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
     folder, pages = tmp_path / "made", []
-    for name in ("fitted", "unfitted"):
-        monkeypatch.setattr(result, name, lambda _, name=name: name)
+    for name in ("fitted", "first"):
+        monkeypatch.setattr(result, f"{name}_gaussians", lambda _, name=name: name)
     monkeypatch.setattr(result, "page_text", lambda run, of, title: pages.append(of) or "the model")
     begin_result(folder)
     write_result(trained, "test", folder, "video.mp4")
@@ -60,7 +57,7 @@ def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
     (folder / "video.mp4").write_bytes(b"film")
     os.utime(folder / "video.mp4", ns=(10**18 - 1,) * 2)  # of the checkpoint before
     write_result(trained, "test", folder, "video.mp4")
-    assert shown(folder)[1] == {"model.html", "thumbnail.png"} and pages == ["unfitted"]
+    assert shown(folder)[1] == {"model.html", "thumbnail.png"} and pages == ["first"]
     for name in ("video.mp4", "splat.ply"):
         (folder / name).write_bytes(b"made")
     measured = RunFolder(trained.folder.path).evaluation("test")
@@ -73,6 +70,6 @@ def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
     text, named = shown(folder)
     assert named == {"model.html", "video.mp4", "splat.ply", "views.png", "thumbnail.png"}
     assert "30.5 (mean of 2 views)" in text and "LPIPS" in text and "still to come" not in text
-    assert pages == ["unfitted", "fitted"]  # the model's page is that of the splat now
+    assert pages == ["first", "fitted"]  # the model's page is that of the splat now
     write_result(trained, "test", folder, "video.mp4")
     assert len(pages) == 2

@@ -1,5 +1,3 @@
-"""Splat files: the layout that others read, and what they show when drawn as others draw them."""
-
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -45,7 +43,6 @@ LAYOUT += [f"rot_{i}" for i in range(4)]
 
 @pytest.fixture(scope="module", autouse=True)
 def steps():
-    """As many as make them look like the run."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(QUALITIES, QUICK, (400, 0.0))
         yield
@@ -53,7 +50,6 @@ def steps():
 
 @pytest.fixture(scope="module")
 def y_up(run, steps):
-    """(table, origin)."""
     return splats(run, upright(run, Y_UP))
 
 
@@ -65,7 +61,6 @@ def ply(run, steps, tmp_path_factory):
 
 
 def turned(run, camera):
-    """The camera in the world of the .ply."""
     up = up_of(run.cameras("train"))
     turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
     return replace(camera, pose=turn @ camera.pose)
@@ -140,9 +135,9 @@ def test_windows_are_as_large_as_people_have_them(run, size, least, most):
 
 
 def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
-    table, origin = fitted_gaussians(run)
+    table, origin, *_ = fitted_gaussians(run)
     monkeypatch.setattr(gaussians, "Trainer", Mock(side_effect=InterruptedError))
-    again, _ = fitted_gaussians(run)
+    again, *_ = fitted_gaussians(run)
     assert np.array_equal(table, again)
     positions = table["position"] + origin
     assert cKDTree(run.model.positions()).query(positions)[0].max() < 4 * run.model.grid.voxel_size
@@ -159,9 +154,6 @@ def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
 
 
 def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatch):
-    """And to as many renderings between them if they are few; to renderings alone where exposures
-    differ, or where the scene is gone.
-    """
     monkeypatch.setattr(gaussians, "Trainer", fitted := Mock(side_effect=InterruptedError))
 
     def views():
@@ -173,16 +165,16 @@ def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatc
     assert len(found) == 2 * len(images)
     for one, other in zip(images, found, strict=False):
         assert one.name == other.name and (one.image == other.image).all()
-    with monkeypatch.context() as patch:  # as if they were large
+    rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
+    assert [view.image.shape for view in found[len(images) :]] == rendered
+    with monkeypatch.context() as patch:  # as if they were large, and enough
         patch.setattr("pp_cl.engine.views.MIN_SIDE", 8)
         patch.setattr(gaussians, "MIN_SIDE", 8)
         patch.setattr(gaussians, "LARGEST", 15)
-        assert {view.camera.width for view in views()} == {15}
-    rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
-    assert [view.image.shape for view in found[len(images) :]] == rendered
-    with monkeypatch.context() as patch:
         patch.setattr(gaussians, "ENOUGH", len(images))
-        assert [view.name for view in views()] == [view.name for view in images]
+        assert [(view.name, view.camera.width) for view in views()] == [
+            (view.name, 15) for view in images
+        ]
     monkeypatch.setitem(run.header, "left_out", [found[0].name])
     assert [view.name for view in views()][:2] == [found[1].name, found[2].name]
     monkeypatch.setitem(run.header, "exposed", True)

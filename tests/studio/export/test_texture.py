@@ -1,5 +1,3 @@
-"""Textured meshes: every texel of a face once, and the run's colours on the surface."""
-
 import numpy as np
 import pytest
 import trimesh

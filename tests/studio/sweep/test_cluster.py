@@ -1,5 +1,3 @@
-"""Dask as a sweep uses it: who listens where, and what it says of tasks that fail."""
-
 import os
 import re
 import signal
@@ -15,7 +13,7 @@ from support.sweeps import jobs_of
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_studio.sweep import cluster
-from pp_studio.sweep.result import finished_row
+from pp_studio.sweep.table import finished_row
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +23,6 @@ def _about_worker():
 
 
 def _tell_devices():
-    """In a worker: a job's row is its device."""
     cluster.run_job = lambda job, device, is_stopped: device
 
 
@@ -61,14 +58,12 @@ def test_nobody_at_the_address(monkeypatch, address):
 
 @pytest.fixture
 def job(tmp_path):
-    """A planned run of a small scene, whose log has a folder."""
     (job,) = jobs_of([write_ball_scene(tmp_path / "ball")], tmp_path / "out", [4])
     job.log.parent.mkdir(parents=True)
     return job
 
 
 def test_a_stopped_run_goes_on_and_is_measured(job):
-    """The checkpoint that it leaves holds the step that it was stopped in."""
     asked = []
 
     def is_stopped():

@@ -1,15 +1,12 @@
-"""What a run's folder tells of it."""
-
 import pytest
 from support.sweeps import jobs_of, pretend
 
 from pp_cl.files.run_folder import RunFolder
-from pp_studio.sweep.result import finished_row
+from pp_studio.sweep.table import finished_row
 
 
 @pytest.fixture
 def job(tmp_path):
-    """A planned run of the demo."""
     return jobs_of(["demo"], tmp_path / "out", [4])[0]
 
 

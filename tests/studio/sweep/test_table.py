@@ -1,5 +1,3 @@
-"""The arithmetic of a sweep's table, and how it looks."""
-
 import json
 
 import pytest

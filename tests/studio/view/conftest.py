@@ -1,5 +1,3 @@
-"""One small run for the tests of the viewer, and a server."""
-
 import pytest
 
 from pp_studio.view.server import started
@@ -13,7 +11,6 @@ def trained(runs, scene, tmp_path_factory):
 
 @pytest.fixture
 def copied(trained, tmp_path):
-    """A copy of that run, for tests that change it."""
     for name in ("config.json", "checkpoint.npz", "log.jsonl"):
         (tmp_path / name).write_bytes((trained / name).read_bytes())
     return tmp_path

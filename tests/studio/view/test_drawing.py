@@ -1,5 +1,3 @@
-"""What a run shows to a camera."""
-
 from dataclasses import replace
 
 import numpy as np

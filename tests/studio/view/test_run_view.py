@@ -1,5 +1,3 @@
-"""A run and a training as tabs see them, without a browser."""
-
 import contextlib
 import io
 import json
@@ -29,7 +27,6 @@ CAMERA = ring_cameras(3, 96)[2]  # of tabs, finer than the training, as JPEG los
 
 @pytest.fixture
 def view(served, dev, copied):
-    """The small run, loaded."""
     found = RunView(served[0], dev, RunFolder(copied))
     found.look()
     return found
@@ -45,7 +42,6 @@ def looking(view, address, camera=CAMERA):
 
 
 def drawn(view):
-    """Draw what is wanted until nothing is, a while after the last movement."""
     time.sleep(1.5 * STILL)
     while view.page.draw_next():
         pass
@@ -133,21 +129,6 @@ def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
     assert not view.page.draw_next()
 
 
-def test_the_page_says_what_it_waits_for_until_there_is_a_picture(served, dev, copied):
-    def said(opened):
-        node = opened.nodes.get("/waiting")
-        return node and node["props"]["text"]
-
-    found = RunView(served[0], dev, RunFolder(copied))
-    with tab(served[1]) as opened:
-        assert said(opened) == f"reading {copied}"
-    found.look()
-    with looking(found, served[1]) as opened:
-        assert "kernels" in said(opened)
-        drawn(found)
-        opened.receive("RemoveSceneNodeMessage", lambda message: message["name"] == "/waiting")
-
-
 def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monkeypatch):
     with looking(view, served[1]) as opened:
         [seen] = view.page._tabs.values()
@@ -165,7 +146,7 @@ def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monke
 
 
 def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copied, monkeypatch):
-    table, _ = fitted_gaussians(load(copied, dev))
+    table, *_ = fitted_gaussians(load(copied, dev))
     view = RunView(served[0], dev, RunFolder(copied))
     view.look()
     monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)

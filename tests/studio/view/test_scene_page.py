@@ -1,12 +1,9 @@
-"""The page of a scene: what it shows, and what its users write."""
-
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.refused import failure
 from support.viewing import tab, wait
 
 from pp_cl.scene.load import scene_frames
@@ -15,7 +12,6 @@ from pp_studio.view.scene_page import DROPPED, ScenePage, hull_points
 
 @pytest.fixture
 def folder(scene, tmp_path):
-    """A copy of the ball with three sparse points."""
     shutil.copytree(scene, tmp_path / "ball")
     model = tmp_path / "ball" / "sparse" / "0"
     model.mkdir(parents=True)
@@ -33,7 +29,6 @@ def page(served, folder):
 
 @pytest.fixture
 def opened(page, served):
-    """A Tab of the page."""
     with tab(served[1]) as found:
         yield found
 
@@ -44,7 +39,6 @@ def edits(folder):
 
 
 def told(opened, words):
-    """Wait until the page says something."""
     opened.receive("GuiUpdateMessage", lambda m: words in str(m["updates"].get("_markdown")))
 
 
@@ -83,9 +77,6 @@ def test_a_box_is_set_dragged_and_removed(page, opened, folder):
     opened.set("Remove", True)
     told(opened, "box suggested\n\nwritten")
     assert edits(folder) == {}
-
-
-def test_what_is_no_box_is_refused_and_the_page_shows_what_is(page, opened, folder):
     opened.set("From", [9, -1, -1])
     opened.set("Set", True)
     told(opened, "must be two corners")
@@ -109,15 +100,12 @@ def test_views_are_dropped_and_taken_back(page, opened, folder):
     assert edits(folder) == {}
 
 
-def test_one_view_of_each_split_stays(page, opened, folder):
+def test_one_view_of_each_split_stays_and_a_broken_file(page, opened, folder):
     names = [view.name for view in scene_frames(folder)]
     (folder / "pp_cl.json").write_text(json.dumps({"dropped": names[1:]}))
     opened.set("Drop", True)
     told(opened, "no view of split train would be left")
     assert edits(folder) == {"dropped": names[1:]}
-
-
-def test_a_broken_file_is_told(page, opened, folder):
     (folder / "pp_cl.json").write_text("{")
     opened.set("Drop", True)
     told(opened, "pp_cl.json")
@@ -133,7 +121,3 @@ def test_without_sparse_points_the_hull_is_shown(dev, served, scene):
         assert "/points" not in opened.nodes
         page.fill()
         opened.receive("PointCloudMessage")
-
-
-def test_the_run_of_a_scene_is_not_asked_for(folder):
-    assert "--scene: only of a run" in failure("view", folder, "--scene", folder)

@@ -1,5 +1,3 @@
-"""The server: where it listens, and what it does not do."""
-
 import json
 import logging
 import socket
