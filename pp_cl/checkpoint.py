@@ -1,6 +1,5 @@
-"""The checkpoint of a run: a .npz of uncompressed arrays and a JSON header. It is written
-atomically; before memory is taken for what is read, it is compared with the size of its part of the
-file and with the run's settings.
+"""The checkpoint of a run: a .npz of uncompressed arrays and a JSON header. Before memory is taken
+for what is read, it is compared with its part of the file and with the run's settings.
 """
 
 import json
@@ -31,10 +30,11 @@ FORMAT = 4  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
 # {key of the header: its types as JSON has them}, and those that it may lack
-KEYS: dict[str, tuple[type, ...]] = {"views": (list,), "step": (int,)}
-KEYS |= {"finished": (bool,), "initial_points": (int,), "grid": (dict,), "depth_range": (list,)}
-KEYS |= {"pixels": (dict, type(None)), "format": (int,), "extended_from": (int,)}
-KEYS |= {"exposed": (bool,), "left_out": (list,), "notes": (list,)}
+KEYS: dict[str, tuple] = dict.fromkeys(
+    ("step", "initial_points", "format", "extended_from"), (int,)
+)
+KEYS |= dict.fromkeys(("views", "depth_range", "left_out", "notes"), (list,))
+KEYS |= {"finished": (bool,), "exposed": (bool,), "grid": (dict,), "pixels": (dict, type(None))}
 OPTIONAL = {"extended_from", "exposed", "left_out", "notes"}
 MEND = "delete it to train again, or restore a copy"
 OTHER_RUN = "its config.json may belong to another run"
@@ -42,11 +42,9 @@ Arrays = Mapping[str, np.ndarray | DeviceRows]
 
 
 def save_checkpoint(path: Path, header: dict[str, Any], arrays: Arrays) -> None:
-    """Write {name: array} and a JSON header as np.savez does, without a copy of a whole array. The
-    same content gives the same bytes: no times are stored. The SH coefficients of a finished run
-    become float16, which changes its images by less than 0.001 dB (docs/training.md). Raises
-    Diverged for NaN and Inf, UserError for a header that is too large to be read, and leaves the
-    file as it was.
+    """Write {name: array} and a JSON header as np.savez does, without a copy of a whole array and
+    without times. The SH coefficients of a finished run become float16 (docs/training.md). Raises
+    Diverged for NaN and Inf, UserError for a header that is too large to be read.
     """
     text = json.dumps({"format": FORMAT, **header}, sort_keys=True).encode()
     if len(text) > MOST_HEADER:
@@ -99,10 +97,8 @@ class Form(NamedTuple):
 
 
 class Checkpoint:
-    """An opened checkpoint. header: its JSON object; forms: {name: Form} of the other arrays as
-    they are stored, none of which has been read.
-
-    Raises ValueError, and what zipfile raises, for anything else than save_checkpoint() writes.
+    """An opened checkpoint. header: its JSON object; forms: {name: Form} of its arrays. Raises
+    ValueError, and what zipfile raises, for anything else than save_checkpoint() writes.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
@@ -136,9 +132,7 @@ class Checkpoint:
             return np.lib.format.read_array(member, allow_pickle=False)
 
     def array(self, name: str) -> np.ndarray:
-        """One of its arrays, float32 where float16 is stored. Raises UserError naming file and
-        array where it cannot be read, or holds NaN or Inf.
-        """
+        """One of its arrays, float32 where float16 is stored. Raises UserError."""
         with _refused(self.path):
             array = self._read(name)
         if not _is_finite(array):
@@ -148,11 +142,8 @@ class Checkpoint:
 
 @contextmanager
 def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
-    """The checkpoint in the folder of a run with these settings, until the block ends. Its header
-    has the KEYS, and its forms are exactly those of stored_forms().
-
-    Raises UserError naming the file when it is missing, truncated, corrupt, of another format, or
-    not of this run.
+    """The checkpoint in the folder of a run with these settings, until the block ends. Raises
+    UserError naming the file when it is missing, broken, of another format, or not of this run.
     """
     path = folder.checkpoint
     if not path.is_file():
@@ -163,8 +154,11 @@ def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
         problem, mend = _problem_of_header(stored.header, config.train.iterations), MEND
         if not problem:
             problem, mend = _problem_of_forms(stored, config), OTHER_RUN
-        if not problem and not _are_ids(stored.array("points.ids"), stored.header["grid"]):
-            problem, mend = "points.ids are no vertices of its grid in ascending order", MEND
+        if not problem:
+            ids, grid = stored.array("points.ids"), stored.header["grid"]
+            is_ascending = bool((ids[1:] > ids[:-1]).all())
+            if not is_ascending or (Grid.of_header(grid).coordinates(ids) >= grid["dims"]).any():
+                problem, mend = "points.ids are no vertices of its grid in ascending order", MEND
         if problem:
             raise UserError(f"{path}: {problem}; {mend}")
         yield stored
@@ -173,18 +167,14 @@ def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
 def load_run_state(
     folder: RunFolder, config: Config
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(header, arrays) of the checkpoint in the folder of a run with these settings. Raises
-    UserError as opened_run does.
-    """
+    """(header, arrays) of opened_run()."""
     with opened_run(folder, config) as stored:
         return stored.header, {name: stored.array(name) for name in stored.forms}
 
 
 @contextmanager
 def _refused(path):
-    """What is wrong with the file becomes a UserError; zipfile meets broken bytes with whatever
-    comes up.
-    """
+    """What is wrong becomes a UserError: zipfile meets broken bytes with whatever comes up."""
     try:
         yield
     except UserError:
@@ -222,9 +212,7 @@ def _problem_of_header(header, steps):
 
 
 def _problem_of_forms(stored, config):
-    """How the names, shapes and dtypes of a checkpoint differ from what the settings call for; ""
-    where they do not.
-    """
+    """How a checkpoint's arrays differ from what the settings call for; "" where they do not."""
     header, forms = stored.header, stored.forms
     ids = forms.get("points.ids")
     n = ids.shape[0] if ids and len(ids.shape) == 1 else 0
@@ -232,8 +220,12 @@ def _problem_of_forms(stored, config):
     most = min(math.prod(header["grid"]["dims"]), header["initial_points"] * 8**refined)
     if not 0 < n <= most:
         return f"points.ids is {ids or 'missing'}, expected 1 to {most} points"
-    step = None if header["finished"] else header["step"]
-    gains = 0 if step is None else _views_with_gains(header, config)
+    step, gains = None if header["finished"] else header["step"], 0
+    if step is not None and config.train.exposure != "off":
+        views = len(header["views"]) - len(header.get("left_out", []))
+        # gains are kept until it is decided that the training needs none
+        if "exposed" in header or step < decided_at(header.get("extended_from", 0), views):
+            gains = views
     expected = stored_forms(config, n, step, gains)
     for name in sorted(expected.keys() | forms.keys()):
         found, wanted = forms.get(name), expected.get(name)
@@ -244,31 +236,14 @@ def _problem_of_forms(stored, config):
     return ""
 
 
-def _are_ids(ids, grid):
-    """Whether they are what kernels may index a grid with."""
-    is_ascending = bool((ids[1:] > ids[:-1]).all())
-    return is_ascending and bool((Grid.of_header(grid).coordinates(ids) < grid["dims"]).all())
-
-
-def _views_with_gains(header, config):
-    """How many views have gains in the checkpoint of an unfinished training, which are kept until
-    it is decided that it needs none.
-    """
-    views = len(header["views"]) - len(header.get("left_out", []))
-    begun = header.get("extended_from", 0)
-    has_gains = "exposed" in header or header["step"] < decided_at(begun, views)
-    return views if has_gains and config.train.exposure != "off" else 0
-
-
 def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> dict[str, Form]:
-    """{name: Form} of the arrays that a checkpoint holds after `step` steps, None: of a finished
-    training, with n points left. gains: the views that have them.
+    """{name: Form} of the arrays of a checkpoint with n points after `step` steps, None: finished.
+    gains: the views that have them.
     """
     degrees = SH_DEGREES[: config.points.sh_degree + 1]
     sh_dtype = np.float16 if step is None else np.float32
     network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
-    table: dict[str, Any] = {"points.ids": ((n,), np.uint32)}
-    table["points.offset"] = (n, 4), np.float32
+    table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.offset": ((n, 4), np.float32)}
     table["points.opacity"] = (n, OPACITIES), np.float32
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}

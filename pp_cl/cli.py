@@ -1,7 +1,4 @@
-"""The command line: builds the parser from the commands, turns exceptions into exit statuses.
-
-Bad input is one line on stderr and exit status 2.
-"""
+"""The command line: builds the parser from the commands, turns exceptions into exit statuses."""
 
 import argparse
 import importlib
@@ -26,9 +23,7 @@ class _UsageError(UserError):
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse with one-line errors that name the nearest word, without values that are empty, and
-    with a status that tells whether the help was printed.
-    """
+    """argparse with one-line errors that name the nearest word, and without empty values."""
 
     def error(self, message):
         taker = next((word for word in ("--json", "--metrics") if word in self._words), "")
@@ -49,7 +44,10 @@ class _Parser(argparse.ArgumentParser):
     def _get_value(self, action, text):
         if text == "" and action.nargs != argparse.PARSER:
             raise argparse.ArgumentError(action, "is empty; write it, or leave it out")
-        return super()._get_value(action, text)
+        try:
+            return super()._get_value(action, text)
+        except UserError as error:  # of a type
+            raise argparse.ArgumentError(action, str(error)) from None
 
     def _check_value(self, action, value):
         if action.choices is not None and value not in action.choices:
@@ -65,9 +63,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def program(argv: Sequence[str] | None = None) -> int:
-    """main() of a process of its own: it ends soon after Ctrl-C or SIGTERM whatever it is doing, a
-    further Ctrl-C ends what Python does after it, and streams may be as shells give them: closed,
-    full, without a reader.
+    """main() of a process of its own: it ends soon after Ctrl-C or SIGTERM whatever it is doing,
+    and streams may be as shells give them: closed, full, without a reader.
     """
     signals.watch()
     for name in ("stdout", "stderr"):
@@ -106,37 +103,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         except BaseException as error:
             if caught:  # whatever came of it: an import, say, or the end of another process
                 return _fail(signals.INTERRUPTED, 128 + caught[0])
-            return _told(error)
-
-
-def _told(error):
-    """The exit status after an exception, which is told in a line; what is a bug is raised."""
-    try:
-        raise error
-    except _UsageError:
-        _show(str(error))
-        return 2
-    except UserError:
-        return _fail(str(error))
-    except BrokenPipeError:  # as in `pp-cl train ... | head`
-        return _fail("nobody reads the output any more", 128 + SIGPIPE)
-    except OSError:
-        what = f"{error.filename or 'file'}: {error.strerror or error}"
-        return _fail(f"{what}; {mend(error)}")
-    except BuildError:
-        print(error.log.rstrip(), file=sys.stderr)
-        return _fail(
-            f"{error}; update the driver, choose another device with --device, or report the lines"
-            " above"
-        )
-    except MemoryError:
-        return _fail("the host has no memory left; lower --points or raise --downscale")
-    except ImportError:
-        if "failed to map segment" not in str(error):  # as the loader says it
+            match error:
+                case _UsageError():
+                    _show(str(error))
+                    return 2
+                case UserError():
+                    return _fail(str(error))
+                case BrokenPipeError():  # as in `pp-cl train ... | head`
+                    return _fail("nobody reads the output any more", 128 + SIGPIPE)
+                case OSError():
+                    what = f"{error.filename or 'file'}: {error.strerror or error}"
+                    return _fail(f"{what}; {mend(error)}")
+                case BuildError():
+                    print(error.log.rstrip(), file=sys.stderr)
+                    return _fail(
+                        f"{error}; update the driver, choose another device with --device, or"
+                        " report the lines above"
+                    )
+                case MemoryError():
+                    return _fail("the host has no memory left; lower --points or raise --downscale")
+                case ImportError() if "failed to map segment" in str(error):  # as the loader says
+                    return _fail(f"no memory to load a library ({error}); raise `ulimit -v`")
+                case KeyboardInterrupt():
+                    return _fail(signals.INTERRUPTED, 128 + signal.SIGINT)
             raise
-        return _fail(f"no memory to load a library ({error}); raise its limit (ulimit -v)")
-    except KeyboardInterrupt:
-        return _fail(signals.INTERRUPTED, 128 + signal.SIGINT)
 
 
 def _show_warning(message, *_args, **_kwargs):

@@ -1,6 +1,4 @@
-"""Reads the settings of a run from presets, command-line texts and config.json, and checks them;
-errors name the setting.
-"""
+"""Reads and checks the settings of a run from presets, command-line texts and config.json."""
 
 import dataclasses
 import json
@@ -92,23 +90,18 @@ def _word(value):
     return word
 
 
-def _truth(value):
-    return {"true": True, "1": True, "false": False, "0": False}[str(value).lower()]
-
-
+TRUTHS = {"true": True, "1": True, "false": False, "0": False}
 # type of a setting: (its name in errors, conversion of a value or its text)
 KINDS = {
     int: ("a whole number", whole),
     float: ("a finite number", finite),
     str: ("a word", _word),
-    bool: ("true or false", _truth),
+    bool: ("true or false", lambda value: TRUTHS[str(value).lower()]),
 }
 
 
 def validate(config: Config, origin: str, origins: Mapping[str, str] | None = None) -> None:
-    """Raise UserError naming the origin and the first key whose value is not allowed. origins: of
-    keys that come from elsewhere.
-    """
+    """Raise UserError naming the origin, that of `origins` first, of a key that is not allowed."""
 
     def where(key):
         return f"{(origins or {}).get(key, origin)}: {key}"
@@ -138,9 +131,8 @@ def _check(value, where, *, least, most, choices, **_):
 
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
     """The config with another scene, to which masks in its folder move along, and the given
-    settings: (key, value or its text, origin).
-
-    Raises UserError naming the first that makes no sense, and for scene.path among them.
+    settings: (key, value or its text, origin). Raises UserError naming the first that makes no
+    sense, and for scene.path among them.
     """
     given, origins = list(given), dict[str, str]()
     for key, _, origin in given:
@@ -176,7 +168,7 @@ def begin_with(
     path: Path | str, given: list[tuple[str, Any, str]]
 ) -> tuple[str, list[tuple[str, Any, str]]]:
     """(preset, settings) of another run's config.json, all but those of its scene, with the given
-    ones on top: (key, value or its text, origin). Raises UserError as load_config.
+    ones on top. Raises UserError as load_config.
     """
     config = load_config(path)
     length = "train.minutes" if config.train.minutes else "train.iterations"
@@ -222,8 +214,7 @@ def load_config(path: Path | str) -> Config:
         if not isinstance(values, dict):
             raise broken(f"{shown(section, 40)} is no section of settings")
         found |= {f"{section}.{key}": value for key, value in values.items()}
-    config = preset(name)
-    config.automatic = automatic
+    config = Config(name, automatic)
     for key, section, item in every_setting(config):
         if key not in found:
             raise broken(f"{key} is missing")
@@ -231,8 +222,8 @@ def load_config(path: Path | str) -> Config:
         if not _is_alike(value, item.default):
             raise broken(f"{key} is {quoted(value, 40)}, not like {text_of(item.default)}")
         setattr(section, item.name, _convert(value, item.default, f"{path}: {key}"))
-    for key in found:
-        raise broken(f"unknown key {shown(key, 100)}")
+    if found:
+        raise broken(f"unknown key {shown(min(found), 100)}")
     validate(config, str(path))
     if not config.scene.path:
         raise broken("scene.path is empty")
@@ -265,18 +256,13 @@ def field_of(key: str) -> dataclasses.Field:
 
 
 def help_lines() -> list[str]:
-    """Lines `section.key = default  (help)` of all settings, each with the values of the presets
-    that differ: the text of `--help`.
-    """
-    return [
-        f"  {key} = {text_of(item.default)}  ({item.metadata['help']})"
-        + "".join(
-            f"  {name}: {text_of(changes[key])}"
-            for name, changes in PRESETS.items()
-            if key in changes
-        )
-        for key, _, item in every_setting(Config())
-    ]
+    """Lines `section.key = default  (help)` of all settings, with presets' values that differ."""
+    lines = []
+    for key, _, item in every_setting(Config()):
+        changed = [(name, own[key]) for name, own in PRESETS.items() if key in own]
+        others = "".join(f"  {name}: {text_of(value)}" for name, value in changed)
+        lines.append(f"  {key} = {text_of(item.default)}  ({item.metadata['help']}){others}")
+    return lines
 
 
 # ---- the settings of a training in a folder: of a new one, or of one that goes on
@@ -296,12 +282,9 @@ def run_config(
     given: Iterable[tuple[str, Any, str]] = (),
 ) -> Config:
     """Config of a training in `folder`: that of the run there, else the preset's, with the given
-    settings.
-
-    scene: a folder, or the word demo. given: (key, value or its text, origin). A run that has a
-    checkpoint must have the same values, but a finished one may be asked for other
-    train.iterations: with more of them it goes on. Raises UserError naming the first setting that
-    differs or makes no sense, or what is wrong with the scene's files.
+    settings: (key, value or its text, origin). A run that has a checkpoint must have the same
+    values, but a finished one may have another length. Raises UserError naming the first setting
+    that differs or makes no sense, or what is wrong with the scene's files.
     """
     given, stored = list(given), load_config(folder.config) if folder.config.exists() else None
     other_preset = stored is not None and preset_name not in (None, stored.preset)
@@ -314,7 +297,7 @@ def run_config(
         return _resumed(folder, stored, scene, given)
     if not stored or other_preset:
         return scene_config(scene, preset_name or "tiny", given)
-    # a training that was stopped before its first checkpoint: what its images automatic is open
+    # a training that was stopped before its first checkpoint: what was automatic is open
     # again
     for key in stored.automatic:
         assign(stored, key, field_of(key).default, "preset")
@@ -327,8 +310,8 @@ def scene_config(
     scene: str, preset_name: str, given: Iterable[tuple[str, Any, str]] = ()
 ) -> Config:
     """Config of a preset for a scene, with the given settings: unless scene.downscale is among
-    them, images are reduced to about the preset's size, by the largest training image, as long as
-    the smallest keeps enough pixels. Raises UserError as configure() and scene_frames() do.
+    them, images are reduced to about the preset's size. Raises UserError as configure() and
+    scene_frames() do.
     """
     # here, so that --help needs neither numpy nor OpenCL
     from pp_cl.engine.views import MIN_SIDE, fitting_downscale
@@ -346,9 +329,7 @@ def scene_config(
 
 
 def _resumed(folder, stored, scene, given):
-    """The settings of a run with a checkpoint, which may change in FREE alone, and where it is
-    finished in its length.
-    """
+    """The settings of a run with a checkpoint: FREE may change, of a finished one LENGTH, too."""
     from pp_cl.checkpoint import opened_run
 
     config, free = configure(load_config(folder.config), scene, given), {*FREE}

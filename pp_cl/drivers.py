@@ -18,7 +18,6 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
@@ -61,14 +60,11 @@ _tried: dict[str, Found] = {}  # {_kept_in() of the drivers: what this process k
 
 
 def open_device(choice: str | None = None) -> Device:
-    """Device chosen by `choice`, else PP_DEVICE, else the one that was the fastest of those that
-    work.
+    """Device chosen by `choice`, else PP_DEVICE, else the fastest of those that work.
 
-    choice: "platform:device" as printed by `pp-cl devices`, or a part of the platform's or device's
-    name; a platform's comes first, as PoCL's devices carry the name of the processor ("intel" means
-    Intel's driver wherever there is one), then the whole of a device's; of several the fastest.
-    Raises UserError when nothing matches or nothing works; never takes another device than the one
-    asked for.
+    choice: "platform:device" as printed by `pp-cl devices`, or a part of the platform's name, the
+    whole or a part of the device's, in this order, as PoCL's devices carry the name of the
+    processor; of several the fastest. Raises UserError when nothing matches or works.
     """
     choice = choice or os.environ.get("PP_DEVICE")
     found = list_devices()
@@ -78,13 +74,12 @@ def open_device(choice: str | None = None) -> Device:
         best = min(working)
         alike = [one for m, one in zip(matches, found, strict=True) if m == best]
         return Device(by_speed(alike)[0][1])
-    listed = "; ".join(
-        [
-            f"{i} {d.name.strip()} ({d.platform.name.strip()}) {problem or 'works'}"
-            for i, d, problem in found
-        ]
-        + [f"{driver} {problem}" for driver, problem in list_left_out()]
-    )
+    told = [
+        f"{i} {device.name.strip()} ({device.platform.name.strip()}) {problem or 'works'}"
+        for i, device, problem in found
+    ]
+    told += [f"{driver} {problem}" for driver, problem in list_left_out()]
+    listed = "; ".join(told)
     if choice and found and min(matches) == NONE:
         raise UserError(f"device {choice!r}: no such OpenCL device; found {listed}")
     asked = f"device {choice!r}: " if choice else ""
@@ -108,8 +103,8 @@ def _match(found, choice):
 
 
 def list_devices(*, again: bool = False) -> list[Listed]:
-    """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices whose drivers
-    neither crash nor hang. again: drivers are tried anew, not only those that are not known yet.
+    """[(index "platform:device", cl.Device, problem or None)] of the devices whose drivers neither
+    crash nor hang. again: drivers are tried anew, also those that are known.
     """
     _give_cache()
     tried = try_drivers(again=again)
@@ -118,7 +113,7 @@ def list_devices(*, again: bool = False) -> list[Listed]:
         known.setdefault(tuple(name), []).append(problem)
     usable = {n: lib for n, lib in find_drivers().items() if n not in tried["left_out"]}
     found: list[Listed] = []
-    for p, (_, owner) in enumerate(load_drivers(usable)):
+    for p, owner in enumerate(load_drivers(usable)):
         for d, device in enumerate(devices_of(owner)):
             problems = known.get(identity(device))
             if not problems and not again:  # another version, or a device more
@@ -133,9 +128,9 @@ def list_left_out() -> list[tuple[str, str]]:
 
 
 def separate_devices() -> list[str]:
-    """Indices "platform:device" of the devices that can work side by side: PP_DEVICE alone if it is
-    set, else the one that open_device() takes, and where it is a GPU the others that work. What two
-    platforms list under one name is taken for one. Raises UserError where nothing works.
+    """Indices "platform:device" of the devices that can work side by side: PP_DEVICE alone if set,
+    else the one that open_device() takes, and where it is a GPU the others that work, each name of
+    one platform. Raises UserError where nothing works.
     """
     if os.environ.get("PP_DEVICE"):
         return [os.environ["PP_DEVICE"]]
@@ -171,10 +166,6 @@ def mend() -> str:
     return f"install a driver with `{command}`; docs/install.md names those of GPUs"
 
 
-def _is_gpu(device):
-    return bool(device.type & cl.device_type.GPU)
-
-
 def devices_of(platform: cl.Platform) -> list[cl.Device]:
     """The devices of a platform."""
     try:
@@ -202,9 +193,8 @@ def find_problem(device: cl.Device) -> str | None:
 
 
 def _give_cache():
-    """Drivers and pyopencl fail where the user's cache cannot be written (containers, service
-    accounts): a temporary one. And with the lock of a process that was killed in it, pyopencl waits
-    a minute at each build.
+    """A temporary cache where the user's cannot be written, in which drivers and pyopencl fail;
+    and none with locks of killed processes, for which pyopencl waits a minute at each build.
     """
     # pyopencl 2026.1 reads this variable, unset or not, where its cache cannot be written: KeyError
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
@@ -233,7 +223,7 @@ def _give_cache():
 
 def find_drivers() -> dict[str, str]:
     """{name: library}: of each .icd file on Linux, else "" for all that the system's loader finds;
-    and of Intel's runtime if it came with pp-cl, whose name is its library.
+    and of Intel's runtime beside pp-cl, whose name is its library.
     """
     chosen = next((os.environ[name] for name in CHOSEN if os.environ.get(name)), "")
     drivers: dict[str, str] = {}
@@ -253,9 +243,7 @@ def find_drivers() -> dict[str, str]:
 
 
 def runtime_library() -> Path | None:
-    """The library of Intel's CPU runtime if it is installed beside pp-cl. Its own .icd file names a
-    place where it is not, and on Windows no loader would look for it.
-    """
+    """The library of Intel's CPU runtime beside pp-cl: its own .icd file names another place."""
     with suppress(PackageNotFoundError):
         for file in files(RUNTIME) or []:
             if file.name in RUNTIME_LIBRARIES and (path := Path(str(file.locate()))).is_file():
@@ -269,8 +257,8 @@ def in_conda() -> bool:
 
 
 def try_drivers(*, again: bool = False) -> Found:
-    """What is found of these drivers. It is kept in the user's cache, and found anew where they are
-    not known yet, where none works, or if it is asked for `again`.
+    """What is found of these drivers, as kept in the user's cache; found anew where they are not
+    known yet, where none works, or `again`.
     """
     drivers = find_drivers()
     file = _kept_in(drivers)
@@ -284,9 +272,7 @@ def try_drivers(*, again: bool = False) -> Found:
 
 
 def _kept_in(drivers):
-    """The name of the file of what is found of these drivers, another for other ones and for other
-    versions of them: several environments share a cache.
-    """
+    """The file's name of what is found of these drivers, another for other versions of them."""
     about = [cl.VERSION_TEXT]
     for names in drivers.items():
         file = next(filter(os.path.isfile, reversed(names)), None)
@@ -326,66 +312,54 @@ def _probe(drivers):
 
 
 def report() -> None:
-    """Try the drivers in the JSON object sys.argv[1], {name: library}, and print as JSON the rows
-    of their devices. The name of each driver is printed before it is tried; one that takes longer
-    than SECONDS ends the process.
+    """Try the drivers in sys.argv[1], JSON of {name: library}, and print as JSON the rows of their
+    devices, the name of each driver before it is tried. One that takes SECONDS ends the process.
     """
 
     def begin(name: str) -> None:
         print(f"\n{BEGINS}{json.dumps(name)}", flush=True)  # noqa: T201 - read by _probe()
         faulthandler.dump_traceback_later(SECONDS, exit=True)
 
-    rows: list[list[str | None]] = []
-    for name, owner in load_drivers(json.loads(sys.argv[1]), begin):
+    drivers: dict[str, str] = json.loads(sys.argv[1])
+    owners: dict[int, str] = {}  # {address of a platform: its driver}
+    for name, library in drivers.items():
         begin(name)
+        owners |= dict.fromkeys(_addresses(library) if library else (), name)
+    unnamed = next((name for name, library in drivers.items() if not library), "")
+    rows: list[list[str | None]] = []
+    for owner in load_drivers(drivers):
+        begin(owners.get(owner.int_ptr, unnamed))
         rows += [[*identity(device), find_problem(device)] for device in devices_of(owner)]
     print(f"\n{json.dumps(rows)}", flush=True)  # noqa: T201 - read by _probe()
     os._exit(0)  # some drivers crash when a process ends
 
 
-def load_drivers(
-    drivers: dict[str, str], begin: Callable[[str], object] = lambda name: None
-) -> list[tuple[str, cl.Platform]]:
-    """[(name of its driver, platform)] of some drivers; the system's loader is shown no others.
-
-    drivers: of find_drivers(). begin: called with the name of a driver before it is loaded.
-    """
-    owners: dict[int, str] = {}  # {address of a platform: its driver}
-    for name, library in drivers.items():
-        begin(name)
-        if library:  # else the loader finds it
-            owners |= dict.fromkeys(_addresses(library), name)
-    found = [] if [*drivers] == [*drivers.values()] else _listed_by_loader(drivers)
-    # Intel's runtime works without a loader: it dispatches calls, too
-    runtime = [address for address, name in owners.items() if drivers[name] == name]
-    found += [cl.Platform.from_int_ptr(address) for address in runtime]
-    unnamed = next((name for name, library in drivers.items() if not library), "")
-    return [(owners.get(platform.int_ptr, unnamed), platform) for platform in found]
-
-
-def _listed_by_loader(drivers):
-    """The platforms that the system's loader lists, which reads what it finds at its first use: of
-    these drivers, where their libraries are known.
-    """
+def load_drivers(drivers: dict[str, str]) -> list[cl.Platform]:
+    """The platforms of some drivers; the system's loader is shown no others at its first use."""
     libraries = [library for name, library in drivers.items() if library != name]
-    names = ("OCL_ICD_VENDORS", "PYOPENCL_HOME") if any(libraries) else ()
-    before, found = {name: os.environ[name] for name in names if name in os.environ}, []
+    # Intel's runtime works without a loader: it dispatches calls, too
+    runtime = [address for name in drivers if drivers[name] == name for address in _addresses(name)]
+    found = _listed_by_loader(libraries) if libraries else []
+    return found + [cl.Platform.from_int_ptr(address) for address in runtime]
+
+
+def _listed_by_loader(libraries):
+    before, found = dict(os.environ), []
     with tempfile.TemporaryDirectory(prefix="pp-cl-drivers-") as folder:
         for i, library in enumerate(libraries):
             Path(folder, f"{i}.icd").write_text(f"{library}\n", "utf-8")
-        os.environ.update(dict.fromkeys(names, folder))
+        if any(libraries):
+            os.environ |= {"OCL_ICD_VENDORS": folder, "PYOPENCL_HOME": folder}
         with suppress(cl.Error):  # of a loader that finds none
             found = cl.get_platforms()
-    for name in names:
-        del os.environ[name]
-    os.environ.update(before)
+    for name in ("OCL_ICD_VENDORS", "PYOPENCL_HOME"):
+        os.environ.pop(name, None)
+    os.environ |= before
     return found
 
 
 def _addresses(library):
-    """Where the platforms of a driver's library lie; [] where it cannot be loaded, as a loader
-    would leave it out.
-    """
+    """Where the platforms of a driver's library lie; [] where it cannot be loaded."""
     try:
         # WinDLL finds what the library needs beside it
         driver = ctypes.WinDLL(library) if sys.platform == "win32" else ctypes.CDLL(library)

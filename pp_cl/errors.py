@@ -11,8 +11,8 @@ NAMES_SHOWN = 3  # of many, in a message
 
 
 def one_line(text: object, most: int = MOST_LINE) -> str:
-    """A message as a terminal can show it: what others wrote in it may break no line, hold no
-    control characters and be no longer than that; what is too long lacks its middle.
+    """A message as a terminal can show it: on one line, without control characters, and without
+    its middle where it is longer than that.
     """
     text = str(text)
     if len(text) > most:
@@ -21,17 +21,15 @@ def one_line(text: object, most: int = MOST_LINE) -> str:
 
 
 class UserError(Exception):
-    """Bad input or environment. The message names the file (and key) and the mend; it is made one
-    line.
-    """
+    """Bad input or environment. The message, one line, names the file (and key) and the mend."""
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(message))
 
 
 class Unusable(UserError):
-    """What makes one view of a scene unusable, while the others may do without it. message: as of a
-    UserError, or that error itself. why: in a few words, the same for all views of a kind.
+    """What makes one view of a scene unusable, while the others may do without it. why: in a few
+    words, the same for all views of a kind.
     """
 
     def __init__(self, message: object, why: str) -> None:
@@ -55,8 +53,8 @@ class BuildError(RuntimeError):
 
 
 class Stopped(Exception):
-    """A command ended in good order before all was done. The message is one line that says how to
-    go on; status: the exit status, 128 and the number of the signal that ended it, else 1.
+    """A command ended in good order before all was done. The message says how to go on; status: the
+    exit status, 128 and the number of the signal that ended it, else 1.
     """
 
     def __init__(self, message: str, status: int) -> None:
@@ -77,9 +75,7 @@ def name_of(folder: Path) -> str:
 
 
 def shown(text: str, most: int = 100) -> str:
-    """What others wrote, for a message: on one line, without control characters, of at most `most`
-    characters.
-    """
+    """one_line() of what others wrote, for a message, of at most `most` characters."""
     text = one_line(" ".join(text[: 4 * most].split()))
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
@@ -99,8 +95,8 @@ def few_names(names: Sequence[str]) -> str:
 
 
 def suggestion(word: str, words: Iterable[str]) -> str:
-    """`did you mean X? ` for the one of the nearest words with the longest run of the same
-    letters, to stand before the list of them all; empty where none is near.
+    """`did you mean X? ` for the one of the nearest words with the longest run of the same letters,
+    else "".
     """
     word = word[:100]
     near = difflib.get_close_matches(word, list(words))

@@ -1,14 +1,12 @@
 """Measures a run on the views of a split."""
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pp_cl.engine.training.target import Target
-from pp_cl.engine.views import View
 from pp_cl.files.atomic import own, remove_ours, write_json
 from pp_cl.files.image import image_paths, write_png
 from pp_cl.files.sheets import write_comparison
@@ -18,21 +16,6 @@ from pp_cl.progress import Progress, track
 from pp_cl.run import Run, load
 
 SHOWN_VIEWS = 4  # rows of the comparison image
-
-
-class Rendered(NamedTuple):
-    """A view as the run renders it.
-
-    image, truth: (H, W, 3) float32 in [0, 1]. alpha: (H, W) of the truth. computed: fraction of the
-    network's multiplications that were computed; the others would have seen background alone.
-    """
-
-    name: str
-    image: np.ndarray
-    truth: np.ndarray
-    alpha: np.ndarray
-    seconds: float
-    computed: float
 
 
 def evaluate_run(
@@ -45,35 +28,19 @@ def evaluate_run(
     scene: str | None = None,
     out: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Measure a run, or the one in a folder, as `pp-cl eval` does, into `out`, else into its own
-    folder; returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write
-    every view, too. device, scene: of a folder, as load() takes them.
+    """Measure a run, or the one in a folder, as `pp-cl eval` does; writes metrics.json, whose
+    content it returns, and comparison.png into the folder `out`, else RUN/eval, or RUN/eval/SPLIT
+    for other splits than test. Where the run's images had gains, views are also measured after the
+    best ones, exposed_alike().
+
+    metrics: out of psnr, ssim, lpips. save_images: write every view to images/ there, too. device,
+    scene: of a folder, as load() takes them. Raises UserError for a missing or broken split, and
+    for files that would be lost.
     """
     run = run if isinstance(run, Run) else load(run, device, scene=scene)
-    return evaluate(run, split, metrics, save_images=save_images, out=out)
-
-
-def evaluate(
-    run: Run,
-    split: str,
-    metrics: tuple[str, ...],
-    *,
-    save_images: bool = False,
-    out: Path | str | None = None,
-) -> dict[str, Any]:
-    """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
-    RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former. Where the
-    run's images had gains, views are also measured after the best ones, exposed_alike().
-
-    metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. Progress shows on stderr. Raises UserError
-    for a missing or broken split, a folder that may not be written, an `out` that holds something
-    else than an evaluation, and a file in the place of one that it writes which no evaluation has
-    written as it is now.
-    """
     target = run.folder.evaluation(split) if out is None else Path(out)
-    scene = run.scene(split)
-    views = scene.splits[split]
+    here = run.scene(split)
+    views = here.splits[split]
     images = [target / "images" / file for file in image_paths([view.name for view in views])]
     measure = Metrics(run.dev, metrics)
     written = [target / "metrics.json", target / "comparison.png", *(images if save_images else [])]
@@ -82,14 +49,23 @@ def evaluate(
         remove_ours((target / "images").rglob("*"))
     rows: list[dict[str, Any]] = []
     costs, shown = [], []
-    every = render_views(run, views)
-    for i, rendered in enumerate(track(every, "measuring", "view", len(views))):
-        image, truth = rendered.image, rendered.truth
-        rows.append({"name": rendered.name} | measure(image, truth))
+    result: dict[str, Any]
+    targets = Target(run.dev)
+    with Progress("building kernels"):
+        run.render(views[0].camera)
+    for i, view in enumerate(track(views, "measuring", "view")):
+        start = time.perf_counter()
+        rendered = run.renderer.forward(view.camera, run.gamma)
+        image, computed = run.checked(rendered.clamped()), rendered.computed_fraction
+        costs.append((time.perf_counter() - start, computed))
+        del rendered  # else its arrays would stay beside the larger ones of the next view
+        whole = targets.crop(view, (0, 0, view.camera.width, view.camera.height))
+        truth, alpha = (array.get() for array in whole)
+        truth = view.ignoring(truth, image)
+        rows.append({"name": view.name} | measure(image, truth))
         if "exposed" in run.header:
-            matched = exposed_alike(truth, image, rendered.alpha)
+            matched = exposed_alike(truth, image, alpha)
             rows[-1]["after_gains"] = measure(image, matched)
-        costs.append((rendered.seconds, rendered.computed))
         if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
             shown.append((image, truth))
         if save_images:
@@ -99,50 +75,19 @@ def evaluate(
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
     if "exposed" in run.header:
         result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
-    result |= _about(run, costs) | _published(scene, split, views)
+    header, cameras = run.header, [view.file_camera for view in views]
+    points = {"initial": header["initial_points"], "final": run.model.cloud.count}
+    published = published_rows(here.name, cameras)
+    differs = differences(here.name, cameras, views[0].file_downscale, split) if published else ""
+    result |= {
+        "step": header["step"],
+        "finished": header["finished"],
+        "points": points | {"grid": header["grid"]["dims"]},
+        "seconds_per_frame": float(np.median([seconds for seconds, _ in costs])),
+        "computed_fraction": float(np.mean([computed for _, computed in costs])),
+        "published": published,
+        "published_differs": differs,
+    }
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
-
-
-def _published(scene, split, views):
-    """{"published": rows of the scene, "published_differs": how this measurement differs from
-    them}.
-    """
-    cameras = [view.file_camera for view in views]
-    rows = published_rows(scene.name, cameras)
-    differs = differences(scene.name, cameras, views[0].file_downscale, split) if rows else ""
-    return {"published": rows, "published_differs": differs}
-
-
-def _about(run, costs):
-    """What metrics.json says of the run. costs: [(seconds, fraction computed)] of each view."""
-    seconds, computed = zip(*costs, strict=True)
-    return {
-        "step": run.header["step"],
-        "finished": run.header["finished"],
-        "points": {
-            "initial": run.header["initial_points"],
-            "final": run.model.cloud.count,
-            "grid": run.header["grid"]["dims"],
-        },
-        "seconds_per_frame": float(np.median(seconds)),
-        "computed_fraction": float(np.mean(computed)),
-    }
-
-
-def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
-    """Each view as the run renders it, in turn."""
-    target = Target(run.dev)
-    with Progress("building kernels"):
-        run.render(views[0].camera)
-    for view in views:
-        start = time.perf_counter()
-        result = run.renderer.forward(view.camera, run.gamma)
-        image, computed = run.checked(result.clamped()), result.computed_fraction
-        seconds = time.perf_counter() - start
-        del result  # else its arrays would stay beside the larger ones of the next view
-        whole = target.crop(view, (0, 0, view.camera.width, view.camera.height))
-        truth, alpha = (array.get() for array in whole)
-        truth = view.ignoring(truth, image)
-        yield Rendered(view.name, image, truth, alpha, seconds, computed)

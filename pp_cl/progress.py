@@ -28,9 +28,9 @@ _told = time.monotonic()  # when the last line was due
 
 
 class Progress:
-    """A stage that is running: to be entered while it does. what: it does, such as `matching`;
-    total: how many units it takes, None where nobody knows; done: units that were done before.
-    stream: sys.stderr if not given. The text of `note` follows what is done.
+    """A stage, to be entered while it runs. what: it does, such as `matching`; total: its units,
+    None where nobody knows; done: those done before; stream: sys.stderr if not given. The text of
+    `note` follows what is done.
     """
 
     def __init__(
@@ -93,22 +93,20 @@ class Progress:
 
     def _line(self, seconds):
         """What a file shows after so many seconds of the stage."""
-        done, passed = self._done - self._first, tqdm.format_interval(seconds)
+        done = self._done - self._first
         parts = [f"{self._done} of {self.total} {self._unit}s"] if self.total else []
         if self.total and done:
             left = tqdm.format_interval((self.total - self._done) * seconds / done)
             parts += [f"{done / seconds:.3g} a second", f"{left} left"]
         else:
-            parts.append(f"{passed} so far")
+            parts.append(f"{tqdm.format_interval(seconds)} so far")
         return f"{self._what}: {', '.join(parts + [self.note] * bool(self.note))}"
 
 
 def track(
     items: Iterable[Item], what: str, unit: str, total: int | None = None, **options: Any
 ) -> Iterator[Item]:
-    """The items in turn, each of which is done when the next is asked for. total: their number,
-    where they do not tell it. options: of Progress.
-    """
+    """The items in turn, under a Progress. total: their number, where they do not tell it."""
     if total is None and isinstance(items, Sequence):
         total = len(items)
     with Progress(what, total, unit, **options) as progress:

@@ -38,7 +38,7 @@ NEAREST = 0.05  # of a point to the eye, in radii of the object
 
 @dataclass
 class Run:
-    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py."""
+    """The model of a run's last checkpoint, and the header of that."""
 
     dev: Device
     folder: RunFolder
@@ -60,13 +60,18 @@ class Run:
         return gamma_at(steps if self.header["finished"] else self.header["step"], steps)
 
     def scene(self, split: str) -> Scene:
-        """The run's scene with one split, without views that the training has left out or that
-        show another place than the model's. Raises UserError where it is missing, broken or another
-        one than the run has learned.
+        """The run's scene with one split, without views that training has left out or that show
+        another place. Raises UserError where it is missing, broken or another than the run's.
         """
         check_scene(self.config.scene.path)
         scene = open_scene(self.dev, self.config, (split,))
-        self._compare(lambda: scene.splits.get("train") or self._some_views())
+
+        def trained():
+            if "train" in scene.splits or not self.header["pixels"]:
+                return scene.splits.get("train", [])
+            return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
+
+        self._compare(trained)
         views, gone = scene.splits[split], set(self.header.get("left_out", []))
         gone |= {v.name for v in misplaced(self.model.grid, self.model.cloud.ids.get(), views)}
         left = [view for view in views if view.name not in gone]
@@ -78,15 +83,8 @@ class Run:
         warnings.warn(f"{self.config.scene.path}: {told}", stacklevel=2)
         return replace(scene, splits={split: left}, notes=[*scene.notes, told])
 
-    def _some_views(self):
-        if not self.header["pixels"]:
-            return []
-        return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
-
     def _compare(self, read):
-        """Raise UserError unless the scene's training views are those of the run. read: gives those
-        whose pixels are compared, too.
-        """
+        """Raise UserError unless the training views, of read() also the pixels, are the run's."""
         path, header = self.config.scene.path, self.header
         try:
             views = read()
@@ -105,8 +103,8 @@ class Run:
             )
 
     def image_files(self, split: str) -> list[ImageFile]:
-        """A split's views without their pixels. The run itself keeps those of train; for others
-        raises UserError where the scene is missing, broken, or another one by names and cameras.
+        """A split's views without their pixels. The run keeps those of train; for others raises
+        UserError where the scene is missing, broken, or another one by names and cameras.
         """
         if split == "train":
             return unpacked_views(self.header["views"])
@@ -116,28 +114,27 @@ class Run:
         return listed
 
     def cameras(self, split: str = "test") -> list[Camera]:
-        """The cameras of a split's views at the resolution of the run. Raises UserError where the
-        scene is not there.
-        """
+        """The cameras of image_files(), at the run's resolution. Raises UserError."""
         downscale = self.config.scene.downscale
         return [one.camera.downscaled(downscale) for one in self.image_files(split)]
 
     def rendered(self, image_files: Sequence[ImageFile], *, opaque: bool) -> list[View]:
-        """Views at the resolution of the run whose images are its own renderings. opaque: over
-        white, as it was trained; else straight RGBA. Progress shows on stderr.
+        """Views at the run's resolution whose images are its own renderings. opaque: over white, as
+        it was trained; else straight RGBA.
         """
         views = []
         for one in track(image_files, "rendering", "view"):
             camera = one.camera.downscaled(self.config.scene.downscale)
             rendered = self.render(camera)
-            image = _over_white(rendered) if opaque else rendered.rgba()
+            white = np.dstack([rendered.colour, np.ones_like(rendered.alpha)])
+            image = white if opaque else rendered.rgba()
             views.append(View(one.name, camera, to_8bit(image), one.depth_range))
         return views
 
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:
-        """(centre (3,), radius), world units, of the smallest ball around the middle of the box of
-        the points that holds them all.
+        """(centre (3,), radius) of the smallest ball around the middle of the points' box that
+        holds them all.
         """
         points = self.model.positions()
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -161,19 +158,19 @@ class Run:
         if samples < 1 or side * side != samples:
             raise ValueError(f"{samples} samples are no square number")
         shifts = (np.arange(side) + 0.5) / side - 0.5
-        depths = self.depth_range(camera)
-        rendered = mean_rendered_view(
-            rendered_picture(
-                self.renderer,
-                camera.shifted(dx, dy),
-                self.gamma,
-                with_features=features,
-                early_stop=early_stop,
-                depth_range=depths,
-            )
-            for dy in shifts
-            for dx in shifts
-        )
+        options = {"early_stop": early_stop, "depth_range": self.depth_range(camera)}
+
+        def sample(dx, dy):
+            result = self.renderer.forward(camera.shifted(dx, dy), self.gamma, **options)
+            with self.dev.stage("depth"):
+                found = depth_forward(
+                    self.dev, result.points, result.pairs, result.weights, result.size
+                )
+            arrays = (*found, result.features) if features else found
+            layers = [result.cropped(self.dev.download(array)) for array in arrays]
+            return RenderedView(result.clamped(), *layers)
+
+        rendered = mean_rendered_view(sample(dx, dy) for dy in shifts for dx in shifts)
         self.checked(rendered.colour)
         return rendered
 
@@ -183,9 +180,7 @@ class Run:
         return NEAREST * self.ball[1]
 
     def checked(self, image: np.ndarray) -> np.ndarray:
-        """An image of the run. Raises UserError naming the checkpoint where it holds NaN: finite
-        parameters may be too large to compute with.
-        """
+        """An image of the run. Raises UserError naming the checkpoint where it holds NaN."""
         if np.isnan(image).any():
             raise UserError(
                 f"{self.folder.checkpoint}: its parameters are too large, the image holds NaN;"
@@ -202,29 +197,6 @@ class Run:
         return max(distance - radius, self.nearest), distance + radius
 
 
-def _over_white(rendered):
-    return np.pad(rendered.colour, ((0, 0), (0, 0), (0, 1)), constant_values=1)
-
-
-def rendered_picture(
-    renderer: Renderer,
-    camera: Camera,
-    gamma: float,
-    *,
-    with_features: bool = False,
-    **options: Any,
-) -> RenderedView:
-    """Colour, alpha and depth of a camera; with its features where asked for. options: of
-    Renderer.forward().
-    """
-    dev, result = renderer.dev, renderer.forward(camera, gamma, **options)
-    with dev.stage("depth"):
-        arrays = depth_forward(dev, result.points, result.pairs, result.weights, result.size)
-    alpha, depth, median = (result.cropped(dev.download(array)) for array in arrays)
-    features = result.cropped(dev.download(result.features)) if with_features else None
-    return RenderedView(result.clamped(), alpha, depth, median, features=features)
-
-
 def scene_is_there(path: str) -> bool:
     """Whether a run's scene can be read, or made by the program."""
     return path == DEMO or Path(path).is_dir()
@@ -237,9 +209,7 @@ def check_scene(path: str) -> None:
 
 
 def stored_config(folder: RunFolder, scene: str | None = None) -> Config:
-    """The settings of a run. scene: the folder of its scene, if that has moved. Raises UserError
-    where either is missing or broken.
-    """
+    """The settings of a run. scene: the folder of its scene, if it has moved. Raises UserError."""
     if scene is not None:
         check_scene(scene)
     config = load_config(folder.config)
@@ -247,9 +217,7 @@ def stored_config(folder: RunFolder, scene: str | None = None) -> Config:
 
 
 def find_run(path: Path | str) -> RunFolder:
-    """The run in a folder: the folder itself, or the one that `pp-cl make` has put into it, unless
-    the folder is a scene.
-    """
+    """The run in a folder: itself, or the one that `pp-cl make` has put into it, unless a scene."""
     folder, made = RunFolder(path), RunFolder(Path(path) / "run")
     if folder.config.exists() or not made.config.exists():
         return folder
@@ -260,24 +228,17 @@ def find_run(path: Path | str) -> RunFolder:
     return folder
 
 
-def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Run:
-    """The run in a folder, finished or not. scene: the folder of its scene, if that has moved.
-    Raises UserError naming the file that is missing or broken.
+def load(
+    folder: Path | str, device: str | Device | None = None, *, scene: str | None = None
+) -> Run:
+    """The run in a folder, finished or not. device: an opened one, or as `pp-cl devices` lists
+    them, else the default. scene: the folder of its scene, if that has moved. Raises UserError
+    naming the file that is missing or broken.
     """
+    dev = device if isinstance(device, Device) else open_device(device)
     place = find_run(folder)
     config = stored_config(place, scene)
     header, arrays = load_run_state(place, config)
     net = UNet.of_settings(dev, config.network)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
     return Run(dev, place, config, header, model)
-
-
-def load(
-    folder: Path | str, device: str | Device | None = None, *, scene: str | None = None
-) -> Run:
-    """The run in a folder, finished or not. device: an opened one, or as `pp-cl devices` lists
-    them, else the default one. scene: the folder of its scene, if that has moved. Raises UserError
-    naming the file that is missing or broken.
-    """
-    dev = device if isinstance(device, Device) else open_device(device)
-    return load_run(dev, folder, scene=scene)

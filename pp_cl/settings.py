@@ -42,16 +42,10 @@ class SceneConfig:
     masks: str = setting("", "masks named like the photographs, white on the object")
     ignore: str = setting("", "masks that are white where photographs say nothing")
     mask_tolerance: float = setting(
-        10.0,
-        "largest CIELAB distance from the background's colour that still counts as background",
-        0.1,
-        100,
+        10.0, "largest CIELAB distance from the background's colour that is background", 0.1, 100
     )
     box: tuple = setting(
-        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        "two corners x, y, z of a box that the points fill (zeros: none)",
-        -1e30,
-        1e30,
+        (0.0,) * 6, "two corners x, y, z of a box that the points fill (zeros: none)", -1e30, 1e30
     )
 
 
@@ -89,16 +83,10 @@ class RasterConfig:
         choices=("softmax", "alpha"),
     )
     max_tracked: int = setting(
-        0,
-        "number of a pixel's nearest fragments that receive gradients (0: all)",
-        0,
-        2**31 - 1,
+        0, "number of a pixel's nearest fragments that receive gradients (0: all)", 0, 2**31 - 1
     )
     early_stop: float = setting(
-        0.01,
-        "stop blending a pixel once no further fragment can weigh more than this share (0: never)",
-        0,
-        0.5,
+        0.01, "stop blending once no fragment can weigh more than this share (0: never)", 0, 0.5
     )
 
 
@@ -130,10 +118,7 @@ class TrainConfig:
     """The optimisation."""
 
     iterations: int = setting(
-        8_000,
-        "training steps; every schedule ends at the last; more of them extend a finished run",
-        1,
-        10**8,
+        8_000, "training steps, where every schedule ends; more extend a finished run", 1, 10**8
     )
     minutes: float = setting(
         0.0,
@@ -176,27 +161,16 @@ class TrainConfig:
         1e3,
     )
     sh_rate: tuple = setting(
-        (0.5, 0.25, 0.125),
-        "first learning rate of SH degrees 0, 1, 2, ten times the last; at rate 0 a degree stays 0",
-        0,
-        100,
+        (0.5, 0.25, 0.125), "first learning rate of SH degrees 0, 1, 2, ten times the last", 0, 100
     )
     sh_eps: float = setting(
-        0.01,
-        "eps of the SH step, times 3*H*W of the training image, so that the crop size does not"
-        " matter",
-        1e-30,
-        1e3,
+        0.01, "eps of the SH step, times 3*H*W of the training image", 1e-30, 1e3
     )
     opacity_rate: tuple = setting(
         (3e-2, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
     )
     lobe_rate: float = setting(
-        1.0,
-        "learning rate of the opacities' harmonics of degree 1, times opacity_rate; half of it of"
-        " degree 2 (0: opacities do not depend on the direction)",
-        0,
-        100,
+        1.0, "rate of the opacities' harmonics, times opacity_rate (0: no harmonics)", 0, 100
     )
     offset_rate: tuple = setting(
         (1e-2, 1e-3),
@@ -214,11 +188,7 @@ class TrainConfig:
         10**8,
     )
     sh_smoothing: float = setting(
-        0.03,
-        "per step, pull the SH towards the mean of the grid neighbours by this times their"
-        " learning rate (0: off)",
-        0,
-        0.25,
+        0.03, "each step's pull of the SH to neighbours, times their rate (0: off)", 0, 0.25
     )
     prune_weight: float = setting(
         0.05,
@@ -244,19 +214,10 @@ class TrainConfig:
     checkpoint_minutes: float = setting(
         10.0, "minutes after which the next step writes a checkpoint (0: never)", 0, 10**6
     )
-    memory_gib: float = setting(
-        0.0,
-        "device memory that training may use, in GiB (0: all)",
-        0,
-        2**20,
-    )
+    memory_gib: float = setting(0.0, "device memory for training, in GiB (0: all)", 0, 2**20)
     log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
     eval_every: int = setting(
-        0,
-        "steps between two measurements of a few views of the split val, else test: test_psnr"
-        " in log.jsonl (0: none)",
-        0,
-        10**8,
+        0, "steps between measurements of a few val, else test views (0: none)", 0, 10**8
     )
 
 

@@ -1,6 +1,4 @@
-"""How fast OpenCL devices are, and which one is taken: measured once, for all commands and
-environments that share the user's cache.
-"""
+"""How fast OpenCL devices are, measured once, and which one is taken."""
 
 import json
 import math
@@ -45,8 +43,7 @@ def is_gpu(device: cl.Device) -> bool:
 
 def by_speed(found: Sequence[Listed]) -> list[Listed]:
     """Those that work, the one that is taken first: the fastest, but Intel's driver of CPUs before
-    another that is not CLEARLY faster. Where no speed could be kept, and commands might differ,
-    GPUs come first and then Intel's.
+    another that is not CLEARLY faster. Where no speed could be kept, GPUs first, then Intel's.
     """
     working = [one for one in found if one[2] is None]
     speeds = kept_speeds([device for _, device, _ in working]) if len(working) > 1 else {}
@@ -67,8 +64,8 @@ def _is_intels(device):
 
 
 def kept_speeds(devices: Sequence[cl.Device]) -> dict[str, float]:
-    """{"platform, name, version": GFLOP/s}, as kept in the user's cache; {} without one. Where a
-    device is not known there, all are measured, by one process for all that ask meanwhile.
+    """{"platform, name, version": GFLOP/s} as kept in the user's cache, {} without one. Where a
+    device is not known there, all are measured, once for all processes that ask meanwhile.
     """
     try:
         folder = make_cache_folder()
@@ -111,9 +108,7 @@ def _measured():
 
 
 def measure(found: Sequence[Listed]) -> None:
-    """Print as JSON kept_speeds() of the devices that work. They take turns, and the best of each
-    counts, as other work may disturb them.
-    """
+    """Print as JSON kept_speeds() of the devices that work, which take turns; the best counts."""
     runs: dict[str, Callable[[], None]] = {}
     for _, device, problem in found:
         with suppress(Exception):  # of a driver: a device that cannot do it comes last

@@ -12,7 +12,7 @@ from support.scenes import move_scene, write_ball_scene
 from pp_cl.cli import main
 from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
 from pp_cl.metrics.shape import read_mesh
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_studio.export.gltf import write_glb
 from pp_studio.export.mesh import Mesh, write_mesh
 from pp_studio.export.points import coloured_points, in_world, write_ply
@@ -65,7 +65,7 @@ def test_exact_moves_give_the_same_bits(at_origin, far):
 
 @pytest.fixture(scope="module")
 def far_run(far, session_device):
-    return load_run(session_device, far[-1])
+    return load(far[-1], session_device)
 
 
 def glb_points(path):

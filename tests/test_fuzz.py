@@ -47,7 +47,7 @@ from pp_cl.files.run_folder import Log, RunFolder
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.scene.load import find_reader, load_scene
+from pp_cl.scene.load import load_scene, scene_splits
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
@@ -254,7 +254,7 @@ def check_camera(camera):
 
 
 def read_scene(folder):
-    assert all(isinstance(split, str) for split in find_reader(folder).splits(folder))
+    assert all(isinstance(split, str) for split in scene_splits(folder))
     return load_scene(folder, ("train", "test"))
 
 

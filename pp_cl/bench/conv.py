@@ -1,7 +1,4 @@
-"""`pp-cl bench conv`: time against error of the variants of every convolution of the network.
-
-Errors are against float64 (reference/network.py), of an image of at most CHECK_SIDE pixels a side.
-"""
+"""`pp-cl bench conv`: time against error of every convolution of the network, by variant."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -13,15 +10,7 @@ import numpy as np
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.engine.device.buffers import PackedArrays
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.choice import (
-    OFFERED,
-    VARIANTS,
-    blocking_of,
-    can_run,
-    device_class,
-    lay_out,
-    work_table,
-)
+from pp_cl.engine.layers import choice
 from pp_cl.engine.layers.conv import (
     DIRECTIONS,
     Blocking,
@@ -42,11 +31,8 @@ RESULTS = {"forward": slice(0, 1), "weights": slice(1, 2), "input": slice(3, Non
 
 @dataclass
 class Layer:
-    """A convolution with its input.
-
-    parts: (H, W, C) float32, what is concatenated to the input. weight: (CO, CI, K, K). bias:
-    (CO,). grad_out: (H, W, CO). relu: whether the output passes through one; the gradient of the
-    input is masked by the input's own.
+    """A convolution with its input: parts (H, W, C) float32, weight (CO, CI, K, K), bias (CO,),
+    grad_out (H, W, CO). relu: of the output, and of the input, which masks its gradient.
     """
 
     parts: Sequence[np.ndarray]
@@ -64,9 +50,7 @@ class Layer:
         co: int,
         k: int = 3,
     ) -> "Layer":
-        """Of a ReLU's outputs of so many `channels`, with weights of PyTorch's initial size and
-        normal gradients.
-        """
+        """Of a ReLU's outputs, with weights of PyTorch's initial size and normal gradients."""
         bound = 1 / np.sqrt(sum(channels) * k * k)
         weight = rng.uniform(-bound, bound, (co, sum(channels), k, k)).astype(np.float32)
         bias = rng.uniform(-bound, bound, co).astype(np.float32)
@@ -75,9 +59,7 @@ class Layer:
 
     @cached_property
     def expected(self) -> list[np.ndarray]:
-        """Float64 [output, gradients of the weights and the bias as the device lays them out,
-        gradient of each part].
-        """
+        """Float64 [output, gradients of packed weights and bias, gradient of each part]."""
         x = np.concatenate(self.parts, 2)
         out = reference.convolution(x, self.weight, self.bias)
         grad_x = reference.convolution(self.grad_out, reference.flipped(self.weight))
@@ -104,9 +86,7 @@ class Layer:
 
 
 class UploadedLayer:
-    """The arrays of a Layer on the device, and those that its convolution fills. variants: names of
-    those that are offered to the device and can run it.
-    """
+    """A Layer's arrays on the device. variants: those offered to the device that can run it."""
 
     def __init__(self, dev: Device, layer: Layer):
         self.dev, self.relu = dev, layer.relu
@@ -119,7 +99,11 @@ class UploadedLayer:
         co, k = layer.weight.shape[0], layer.weight.shape[2]
         sources = [part.shape[2] for part in layer.parts]
         self.table = PackedArrays(dev)
-        self.variants = [v for v in OFFERED[device_class(dev)] if can_run(v, k, *sources, co)]
+        self.variants = [
+            v
+            for v in choice.OFFERED[choice.device_class(dev)]
+            if choice.can_run(v, k, *sources, co)
+        ]
 
     def runner(self, variant: str, direction: str, blocking: Blocking) -> Callable:
         """A function that computes a direction by a variant and waits for it."""
@@ -134,19 +118,18 @@ class UploadedLayer:
     def compute(
         self, variant: str, blocking: Blocking, direction: str, tiles: Tiles | None
     ) -> None:
-        """Compute a direction by a variant, as the network does in each step of a training, with
-        the weights laid out anew.
-        """
-        dev, parts, grad_out, kernels = self.dev, self.parts, self.grad_out, VARIANTS[variant]
+        """Compute a direction by a variant, as each step of a training does."""
+        dev, kernels = self.dev, choice.VARIANTS[variant]
+        parts, grad_out = self.parts, self.grad_out
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
         tiles = tiles or all_tiles(dev, height, width)
         shape = ConvShape(direction, self.weight.shape[1], channels, co, (height, width))
         conv = Conv(dev, blocking, variant, shape, self.weight, self.bias)
-        for name, (needed, _) in work_table(variant, shape).items():
+        for name, (needed, _) in choice.work_table(variant, shape).items():
             n = math.prod(needed)
             setattr(conv, name, dev.scratch(f"bench: {name}", n)[:n].reshape(needed))
-        lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
+        choice.lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
         if direction == "forward":
             kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)
             return
@@ -177,17 +160,13 @@ def _direction_errors(layer, computed, direction):
 def bench_conv(
     dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
-    """Rows of every distinct convolution of the network at size x size, by direction and variant.
-
-    blocks: as UNet takes them.
-    """
-    rng, seen, blocking = np.random.default_rng(0), set(), blocking_of(dev)
+    """Rows of every distinct convolution of the network at size x size, by direction, variant."""
+    rng, blocking = np.random.default_rng(0), choice.blocking_of(dev)
+    distinct: dict[tuple, Any] = {}
     for layer in convolutions(unet_layers(widths, blocks=blocks)):
+        distinct.setdefault((layer.kernel_size, layer.level, layer.sources, layer.channels), layer)
+    for layer in distinct.values():
         side, k = size >> layer.level, layer.kernel_size
-        key = (k, side, layer.sources, layer.channels)
-        if key in seen:
-            continue
-        seen.add(key)
         timed, checked = (
             Layer.random(rng, (n, n), layer.sources, layer.channels, k)
             for n in (side, min(side, CHECK_SIDE))

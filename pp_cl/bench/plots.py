@@ -3,31 +3,19 @@
 from pathlib import Path
 from typing import Any
 
-from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 
 LEAST_ERROR = 1e-9  # an error of 0 has no logarithm: drawn there, far below float32's
 
 
-def figure_of(file: str | None) -> Any | None:
-    """A matplotlib figure for a file, None where there is to be none. Raises UserError without
-    matplotlib.
-    """
-    if not file:
-        return None
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UserError(
-            f"--plot {file}: needs matplotlib; install it with `pip install matplotlib`"
-        ) from None
-    return Figure(figsize=(9, 6), layout="constrained")
-
-
-def plot_time_and_error(figure: Any, rows: list[dict], path: str) -> None:
+def plot_time_and_error(rows: list[dict], path: str, title: str = "") -> Any:
     """Draw time against error, both logarithmic, of the rows that have one, with a colour for each
-    variant of a bench, direction and blend, and write the figure.
+    variant of a bench, direction and blend; write the matplotlib figure, and return it.
     """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    figure.suptitle(title)
     axes = figure.add_subplot(xscale="log", yscale="log")
     axes.set(xlabel="milliseconds", ylabel="error against float64")
     series: dict[str, list[dict]] = {}
@@ -43,3 +31,4 @@ def plot_time_and_error(figure: Any, rows: list[dict], path: str) -> None:
     axes.legend(fontsize="small")
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())
+    return figure

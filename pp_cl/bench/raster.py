@@ -1,9 +1,4 @@
-"""`pp-cl bench raster`: time, bytes and error of the rasteriser's stages, by number of points,
-image side and blend, on two made scenes.
-
-Times are wall clock until the stage's work is done, with both blends in turn. Errors are against
-float64, of CHECKED_POINTS points in CHECKED_SIDE x CHECKED_SIDE pixels, some hundred in a pixel.
-"""
+"""`pp-cl bench raster`: times and errors of the rasteriser's stages, with both blends in turn."""
 
 from __future__ import annotations
 
@@ -40,11 +35,8 @@ HIGHER_SH = 0.1
 
 
 class GridScene:
-    """About n discs of the paper's radius on a grid inside the unit ball, seen from a distance of 4
-    under 40 degrees, by the renderer, in an image of size x size pixels.
-
-    positions: (N, 3), world. opacity: (N,) float32, uniform in [0.7, 1]: in a trained model few are
-    lower. The camera looks along no axis of the grid.
+    """About n discs of the paper's radius on a grid inside the unit ball, seen along none of its
+    axes, under 40 degrees. positions: (N, 3). opacity: (N,) in [0.7, 1], as in a trained model.
     """
 
     footprint, depth_range = "disc", (2.0, 6.0)
@@ -90,9 +82,7 @@ class GridScene:
 
 
 class PulsarScene:
-    """What a GridScene has, of n spheres, uniform in a cube of side 1 at a depth of 1 to 2, as in
-    Pulsar's own benchmark. Focal length and sensor are equal, opacities are 1.
-    """
+    """The same of Pulsar's own benchmark: n opaque spheres in a cube at a depth of 1 to 2."""
 
     footprint, depth_range = "sphere", (0.6, 2.5)
 
@@ -133,9 +123,7 @@ class PulsarScene:
         return result
 
     def backward(self, blend: str, result: RenderResult) -> None:
-        """Stages `backward` and `spheres`: gradients of features and opacities, then of positions
-        and radii.
-        """
+        """Gradients of features and opacities, then of positions and radii."""
         dev, opacity = self.dev, self.point_opacity
         view = result.points, result.pairs, result.weights
         with dev.stage("backward"):
@@ -162,8 +150,7 @@ SCENES: dict[str, type[Scene]] = {"grid": GridScene, "pulsar": PulsarScene}
 
 def features_error(scene: Scene, blend: str, features: np.ndarray) -> float:
     """Largest difference of an image's (H, W, 16) features from float64, over the range of the
-    points' features and the background, 1. Pixels where float32's rounding may decide over a
-    fragment are left out. Every point meets every pixel: for small scenes.
+    points' features and the background, but where rounding may decide over a fragment.
     """
     geometry = dense.geometry(
         scene.camera, scene.positions, RADIUS, scene.footprint, depth_range=scene.depth_range

@@ -1,6 +1,4 @@
-"""Spheres anywhere, as Pulsar has them, beside the engine's points on a grid: their projection, and
-the gradients of their positions and radii, which no training needs.
-"""
+"""Spheres anywhere, as Pulsar has them, beside the engine's points on a grid."""
 
 import math
 
@@ -53,9 +51,7 @@ def project_spheres(
 def find_all_pairs(
     dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], capacity: int = 1
 ) -> Pairs:
-    """The fragments in an image of size (height, width), with a capacity for all, tried first with
-    `capacity`. Waits for the device. Raises UserError as capacity_needed() does.
-    """
+    """The fragments in an image of size (height, width); `capacity` is tried first."""
     while True:
         pairs = find_pairs(dev, b, points, size, capacity)
         pairs.read_count(dev)
@@ -75,10 +71,7 @@ def spheres_backward(
     opacity: Array,
     gamma: float,
 ) -> tuple[Array, Array]:
-    """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
-
-    pair_gradient: of blend_backward(). opacity: (N,).
-    """
+    """(grad_positions (N, 3) in world axes, grad_radius (N,)), after blend_backward()."""
     n = pairs.points
     grad_positions, grad_radius = dev.empty((n, 3)), dev.empty((n,))
     dev.program("bench/spheres").launch(

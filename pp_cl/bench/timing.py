@@ -1,8 +1,4 @@
-"""Times of runs in turn, errors against float64, and the rows of what was timed as a table.
-
-Times are wall clock, launches included: every run once a round, so that a machine that slows down
-slows all of them.
-"""
+"""Wall-clock times of runs in turn, errors against float64, and rows of a table."""
 
 import time
 from collections.abc import Callable
@@ -18,11 +14,9 @@ LEAST_ROUNDS, MOST_ROUNDS, SECONDS = 5, 50, 1.5
 def interleave(
     runs: dict[Any, Callable], rounds: int | None = None, pause: float = 0.0
 ) -> dict[Any, list[float]]:
-    """{name: [milliseconds]} of functions that return when their work is done, called in turn,
-    after one round unmeasured.
-
-    rounds: their number; None = LEAST_ROUNDS to MOST_ROUNDS, within SECONDS. pause: seconds before
-    each call, for threads of the previous one that still spin, waiting for work.
+    """{name: [milliseconds]} of functions called in turn, after one round unmeasured. rounds: None:
+    LEAST_ROUNDS to MOST_ROUNDS, within SECONDS. pause: seconds before each call, in which threads
+    of the previous one stop spinning.
     """
     times: dict[Any, list[float]] = {name: [] for name in runs}
     for run in runs.values():
@@ -41,9 +35,7 @@ def interleave(
 
 
 def errors(actual: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
-    """(relative L2 error, largest absolute difference). Raises FloatingPointError if a value is NaN
-    or Inf.
-    """
+    """(relative L2 error, largest difference). Raises FloatingPointError for NaN and Inf."""
     actual, expected = np.asarray(actual, np.float64), np.asarray(expected, np.float64)
     if not np.isfinite(actual).all():
         raise FloatingPointError("a result holds NaN or Inf")
@@ -55,26 +47,21 @@ def errors(actual: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 def variant_rows(
     about: dict, runs: dict[str, Callable], found: dict[str, tuple], *, flops: int
 ) -> list[dict]:
-    """A row for each variant, timed in turn: `about`, its time, speed and errors.
-
-    about: keys that all rows share. runs: {variant: function}. found: {variant: (relative L2,
-    largest)}. flops: floating-point operations of one run, counted as direct convolutions.
+    """A row for each variant, timed in turn. about: what rows share. found: {variant: errors()}.
+    flops: floating-point operations of one run, counted as direct convolutions.
     """
-    rows = []
-    for variant, times in interleave(runs).items():
-        ms = float(np.median(times))
-        rows.append(
-            {"variant": variant}
-            | about
-            | {
-                "ms": ms,
-                "ms_range": [min(times), max(times)],
-                "gflops": flops / ms * 1e-6,
-                "rel_l2": found[variant][0],
-                "max_err": found[variant][1],
-            }
-        )
-    return rows
+    return [
+        {
+            "variant": variant,
+            **about,
+            "ms": float(np.median(times)),
+            "ms_range": [min(times), max(times)],
+            "gflops": flops / float(np.median(times)) * 1e-6,
+            "rel_l2": found[variant][0],
+            "max_err": found[variant][1],
+        }
+        for variant, times in interleave(runs).items()
+    ]
 
 
 COLUMNS = "{:6} {:38} {:9} {:>9} {:>8} {:>8}  {}".format

@@ -21,9 +21,7 @@ STEPS = 5  # that are timed each way, after one that builds the kernels
 
 
 def host_cost(trainer: Trainer, steps: int) -> dict[str, Any]:
-    """{"host_ms", "launches"} of a step, medians of some: the time of the processor that Python and
-    the driver take to enqueue it, without the waits for the device; and what is launched.
-    """
+    """{"host_ms": the processor's time to enqueue a step, "launches"}, medians of some steps."""
     dev, ms, launches = trainer.dev, [], []
     for _ in range(steps):
         start, before = time.thread_time() - dev.waited, dev.launches
@@ -34,10 +32,8 @@ def host_cost(trainer: Trainer, steps: int) -> dict[str, Any]:
 
 
 def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
-    """One row of the last steps of a training, without a refinement before them, with medians over
-    the steps.
-
-    The points fill the scene's hull, with opacities in [0.3, 1], as a trained model has them.
+    """One row of medians over the last steps of a training, whose points fill the scene's hull with
+    opacities in [0.3, 1], as a trained model has them.
     """
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, config.points.count, scene_box(config))

@@ -1,8 +1,4 @@
-"""`pp-cl bench unet`: time against error of the variants of the convolutions, as a network.
-
-Errors are against float64 (reference/network.py), over the whole image, at most CHECK_SIZE wide and
-high: of a larger image its upper left part, taken as an image of its own.
-"""
+"""`pp-cl bench unet`: time against error of the variants of the convolutions, as a network."""
 
 from collections.abc import Callable, Iterator
 
@@ -25,10 +21,7 @@ def bench_unet(
     dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
     """Rows of the whole network at size x size, as shipped and by every variant: forward, and train
-    = forward and backward to the input and the weights.
-
-    The errors of train are those of the gradient (input's, or a weight's or bias's) where they are
-    largest. blocks: as UNet takes them.
+    = forward and backward to the input and the weights, with the errors of the worst gradient.
     """
     rng = np.random.default_rng(0)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
@@ -60,11 +53,8 @@ def bench_unet(
 def make_network(
     dev: Device, widths: tuple[int, int, int], variant: str = AUTO, blocks: str = "double"
 ) -> UNet:
-    """A network by a variant; the parameters do not depend on it. blocks: as UNet takes them.
-
-    The weights are uniform in +-sqrt(6 / (CI K K)) (He et al. 2015), so that values keep their size
-    through the layers as they do in a trained network. With UNet's own initial weights they fade,
-    and the error of an image that is 0.5 and little else says nothing.
+    """A network by a variant, with He's initial weights: by UNet's own, values fade through the
+    layers, and the error of an image that is 0.5 and little else says nothing.
     """
     net = UNet(dev, widths, blocks=blocks, variant=variant)
     for name, parameter in net.parameters.items():
@@ -74,9 +64,7 @@ def make_network(
 
 
 def network_runner(net: UNet, x: Array, grad_image: Array | None = None) -> Callable:
-    """A function that makes an image, as evaluation does, and waits for it; with an image's
-    gradient it makes all gradients, too, as training does.
-    """
+    """A function that makes an image, and of an image's gradient all gradients, and waits."""
 
     def run():
         net.forward(x, training=grad_image is not None)
@@ -99,9 +87,7 @@ def plain_parameters(net: UNet, arrays: dict[str, Array]) -> dict[str, np.ndarra
 def network_errors(
     net: UNet, *, outputs: dict, grad_image: np.ndarray
 ) -> dict[str, tuple[float, float]]:
-    """{"forward": errors, "train": errors} of the network. outputs: of reference.network, in
-    float64; grad_image: (H, W, 3).
-    """
+    """{"forward", "train": errors}. outputs: of reference.network; grad_image: (H, W, 3)."""
     dev = net.dev
     parameters = plain_parameters(net, net.parameters)
     image = net.forward(dev.upload(outputs["x"], np.float32)).get()

@@ -1,6 +1,4 @@
-"""The commands: a module each, with HELP, add_arguments(parser) and run(options). Only here is
-printed.
-"""
+"""The commands: modules with HELP, add_arguments(parser), run(options). Only here is printed."""
 
 __all__ = ["COMMANDS"]
 

@@ -5,7 +5,7 @@ from itertools import chain
 from typing import Any
 
 from pp_cl.commands import options as shared
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, require
 from pp_cl.settings import BLOCKS
 
 HELP = "time against error of the convolutions, the network, the rasteriser, a training"
@@ -83,13 +83,14 @@ def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write the files asked for. Raises UserError, before anything is
     measured, for options that make no sense and files that cannot be written.
     """
-    from pp_cl.bench.plots import figure_of, plot_time_and_error
+    from pp_cl.bench.plots import plot_time_and_error
     from pp_cl.bench.timing import HEAD, line
     from pp_cl.drivers import open_device
 
     foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
     shared.refuse(options, foreign, f"bench {options.what} has no such option")
-    figure = figure_of(options.plot)
+    if options.plot:
+        require("--plot", "matplotlib")
     given = {options.what: vars(options)}
     if options.what == "all":
         given = {name: vars(options) | changes for name, changes in SMALL.items()}
@@ -102,9 +103,8 @@ def run(options: argparse.Namespace) -> None:
             print(line(rows[-1]), flush=True)
     result = {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
     shared.write_json_option(options.json, result)
-    if figure:
-        figure.suptitle(dev.name)
-        plot_time_and_error(figure, rows, options.plot)
+    if options.plot:
+        plot_time_and_error(rows, options.plot, dev.name)
 
 
 def _prepared(name, options):
@@ -137,6 +137,4 @@ def _prepared(name, options):
         return lambda dev: chain.from_iterable(bench_step(dev, config) for config in configs)
     sizes, bench = options.size or [256], bench_conv if name == "conv" else bench_unet
     blocks = options.blocks or "double"
-    return lambda dev: chain.from_iterable(
-        bench(dev, size, widths, blocks=blocks) for size in sizes
-    )
+    return lambda dev: chain.from_iterable(bench(dev, n, widths, blocks=blocks) for n in sizes)

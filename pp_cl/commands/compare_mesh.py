@@ -1,6 +1,4 @@
-"""How well a run's points fill the surface of a mesh, before and after training: a row of Table 4
-of the PlenopticPoints supplemental.
-"""
+"""How well a run's points fill the surface of a mesh: a row of the supplemental's Table 4."""
 
 from typing import Any
 
@@ -23,35 +21,32 @@ DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 
 
 def mesh_shape(dev: Device, mesh: Mesh, voxel_size: float | None, samples: int) -> dict[str, Any]:
-    """{"grid": {"dims", "voxel_size"}, "surface": vertices nearest to the mesh} for a grid of this
-    voxel size around the mesh; None: the finest that points may have. Raises UserError as
-    sample_surface does.
+    """{"grid": {"dims", "voxel_size"}, "samples", "surface": vertices nearest to the mesh} for a
+    grid of this voxel size around the mesh; None: the finest that points may have.
     """
     box = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
     chosen = voxel_size or smallest_voxel_size(box, CELL_CAP)
-    surface = _sampled(dev, mesh, Grid.centred_in(box, chosen), samples)
-    return _facts(surface.grid, surface, samples)
+    surface, facts = _sampled(dev, mesh, Grid.centred_in(box, chosen), samples)
+    return facts | {"grid": _grid_facts(surface.grid)}
 
 
 def _sampled(dev, mesh, grid, samples):
-    """sample_surface() under a progress bar, which shows on a terminal."""
+    """(sample_surface() under a progress bar, the facts of it)."""
     with Progress("sampling", samples, "sample") as bar:
-        return sample_surface(dev, mesh, grid, samples, advance=bar.update)
+        surface = sample_surface(dev, mesh, grid, samples, advance=bar.update)
+    return surface, {"grid": _grid_facts(grid), "samples": samples, "surface": surface.count}
 
 
-def _facts(grid, surface, samples):
-    facts = {"grid": {"dims": list(grid.dims), "voxel_size": grid.voxel_size}}
-    return facts | {"samples": samples, "surface": surface.count}
+def _grid_facts(grid):
+    return {"dims": list(grid.dims), "voxel_size": grid.voxel_size}
 
 
 def run_shape(
     dev: Device, folder: RunFolder, mesh: Mesh | None, samples: int, *, scene: str | None = None
 ) -> dict[str, Any]:
-    """{"grid", "surface", "before", "after": as overlap()} of a run: the hull's points before
-    training, on the run's last grid, and those that are left.
-
-    mesh: in the world of the scene; None: the demo's own. scene: where the run's scene is now, if
-    it has moved. Raises UserError for a run without checkpoint, a scene or a mesh that is missing.
+    """The facts of mesh_shape() of a run's last grid, and overlap() "before" training, of the
+    hull's points, and "after" it. mesh: in the scene's world; None: the demo's own. scene: where
+    it is now. Raises UserError for a checkpoint, a scene or a mesh that is missing.
     """
     config = stored_config(folder, scene)
     check_scene(config.scene.path)
@@ -63,17 +58,15 @@ def run_shape(
         grid, after = Grid.of_header(stored.header["grid"]), stored.array("points.ids")
         count = stored.header["initial_points"]
     before = _points_before(dev, config, grid, count)
-    surface = _sampled(dev, mesh, grid, samples)
-    return _facts(grid, surface, samples) | {
+    surface, facts = _sampled(dev, mesh, grid, samples)
+    return facts | {
         "before": overlap(surface, grid, before),
         "after": overlap(surface, grid, after),
     }
 
 
 def _points_before(dev, config: Config, grid, count):
-    """Ids on a run's last grid of the `count` points that it began with; of a refined run, of what
-    they would be refined to without pruning.
-    """
+    """Ids on a run's last grid of the `count` points that it began with, refined as it was."""
     views = open_scene(dev, config, ("train",)).splits["train"]
     agreement = agreeing(dev, views, scene_box(config))
     grids = [grid]

@@ -21,18 +21,18 @@ def run(options: argparse.Namespace) -> None:
 
     found, harmful = list_devices(again=True), list_left_out()
     taken = [index for index, _, _ in by_speed(found)]
-    rows = [
-        {"index": i, **describe(device), "problem": problem, "default": [i] == taken[:1]}
-        for i, device, problem in found
-    ]
-    lines = [
-        f"{row['index']}  {row['name']}  [{row['platform']}]  "
-        f"{row['compute_units']} units, {row['memory_bytes'] / 2**30:.1f} GiB: "
-        f"{row['problem'] or 'works'}{', taken by default' if row['default'] else ''}"
-        for row in rows
-    ]
-    rows += [{"index": None, "name": name, "problem": problem} for name, problem in harmful]
-    lines += [f"left out  {name}: {problem}" for name, problem in harmful]
+    rows, lines = [], []
+    for index, device, problem in found:
+        row, is_default = describe(device), [index] == taken[:1]
+        rows.append({"index": index, **row, "problem": problem, "default": is_default})
+        lines.append(
+            f"{index}  {row['name']}  [{row['platform']}]  {row['compute_units']} units,"
+            f" {row['memory_bytes'] / 2**30:.1f} GiB:"
+            f" {problem or 'works'}{', taken by default' * is_default}"
+        )
+    for name, problem in harmful:
+        rows.append({"index": None, "name": name, "problem": problem})
+        lines.append(f"left out  {name}: {problem}")
     shared.tell(options.json, rows, lines)
     if not taken:
         raise UserError(f"no working OpenCL device: {mend()}")

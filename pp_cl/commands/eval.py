@@ -25,15 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.drivers import open_device
-    from pp_cl.evaluate import evaluate
-    from pp_cl.run import load_run
+    from pp_cl.evaluate import evaluate_run
+    from pp_cl.run import load
 
-    metrics = options.metrics
-    dev = open_device(options.device)
-    run = load_run(dev, options.run_folder, scene=options.scene)
-    result = evaluate(run, options.split, metrics, save_images=options.save_images, out=options.out)
-    folder = run.folder
+    run = load(options.run_folder, options.device, scene=options.scene)
+    metrics, folder = options.metrics, run.folder
+    result = evaluate_run(
+        run, options.split, metrics, save_images=options.save_images, out=options.out
+    )
     state = "" if result["finished"] else f", unfinished, step {result['step']}"
     own = f"{folder} ({len(result['per_image'])} views{state})"
     published = {} if result["published_differs"] else result["published"]
@@ -44,7 +43,12 @@ def run(options: argparse.Namespace) -> None:
         ranked.sort(key=lambda row: -row[1]["psnr"])
     shared.write_json_option(options.json, result)
     print(_table(result, ranked, len(own)))
-    print(_summary(result))
+    points, computed = result["points"], result["computed_fraction"]
+    share = f"{computed:.0%} of the network's work, " if computed < 1 else ""
+    print(
+        f"{points['final']} points ({points['initial']} at the start), {share}"
+        f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
+    )
     written = Path(options.out or folder.evaluation(options.split))
     print(
         f"wrote {written / 'metrics.json'} and {written / 'comparison.png'} (prediction"
@@ -68,13 +72,3 @@ def _cell(values, name):
     if name == "lpips" and OTHER_LPIPS in values:
         return f"{values[OTHER_LPIPS]:9.4f}*"
     return f"{values[name]:9.4f} " if name in values else " " * 10
-
-
-def _summary(result):
-    """Points, work and time."""
-    points, computed = result["points"], result["computed_fraction"]
-    share = f"{computed:.0%} of the network's work, " if computed < 1 else ""
-    return (
-        f"{points['final']} points ({points['initial']} at the start), {share}"
-        f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
-    )

@@ -16,7 +16,7 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import load_run, scene_is_there, stored_config
+from pp_cl.run import load, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.gaze import looked_at, up_of
@@ -31,10 +31,8 @@ Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
 
 
 def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
-    """What a run is, from its files alone; what they do not tell is None.
-
-    scene: where its scene is now, if it has moved. Raises UserError naming the file that is missing
-    or broken.
+    """What a run is, from its files alone; what they do not tell is None. scene: where its scene
+    is now. Raises UserError naming the file that is missing or broken.
     """
     config, rows, measured = stored_config(folder, scene), folder.rows(), folder.measured()
     last, network = rows[-1] if rows else {}, config.network
@@ -78,10 +76,8 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
 
 
 def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
-    """outline_sheet() of the points that a run has left, over renderings where its scene is
-    missing. Raises UserError as run_facts does, and for a scene that is broken.
-    """
-    run = load_run(dev, folder.path, scene=scene)
+    """outline_sheet() of the points that a run has left, over renderings without its scene."""
+    run = load(folder.path, dev, scene=scene)
     path = run.config.scene.path
     points = Hull(run.model.grid, run.model.cloud.ids.get(), capped=False)
     if scene_is_there(path):
@@ -112,12 +108,9 @@ def _image_sizes(image_files):
 def describe_scene(
     dev: Device, scene: str, preset_name: str, given: Iterable[Given] = ()
 ) -> tuple[Facts, list[View], Hull | None, list[Disagreement]]:
-    """(what a scene is, from its training views and the cameras of the others; those views; their
-    hull, None where the masks give none; the masks that the others contradict).
-
-    preset_name: whose number of points the hull gets, and whose size the images. given: settings,
-    as configure takes them. Raises UserError for a scene that is missing or broken; what prevents a
-    hull is a fact.
+    """(what a scene is with the settings of a preset and those given, its training views, their
+    hull, None where the masks give none, the masks that the others contradict). Raises UserError
+    for a scene that is missing or broken; what prevents a hull is a fact.
     """
     config = scene_config(scene, preset_name, given)
     path = config.scene.path
@@ -134,7 +127,10 @@ def describe_scene(
         problem = str(error)
     found = contradicting(views, hull, agreement) if hull else []
     ranges = np.array([view.depth_range for view in right if view.depth_range])
-    cameras, stored = ([getattr(v, name) for v in right] for name in ("camera", "stored_camera"))
+    cameras, stored, lenses = (
+        [getattr(view, name) for view in right]
+        for name in ("camera", "stored_camera", "file_camera")
+    )
     centre = looked_at(stored)
     facts = {
         "scene": path,
@@ -142,7 +138,11 @@ def describe_scene(
         "splits": {split: len(listed) for split, listed in frames.items()},
         "notes": list(opened.notes),
         "images": _image_sizes([frame for listed in frames.values() for frame in listed]),
-        **_lenses([view.file_camera for view in right]),
+        "focal_pixels": _range([focal for lens in lenses for focal in (lens.fx, lens.fy)]),
+        "field_of_view": {
+            "x": _angles((lens.width, lens.fx) for lens in lenses),
+            "y": _angles((lens.height, lens.fy) for lens in lenses),
+        },
         "masks": _masks(right)
         | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]}
         | ({"left_out": agreement.left_out, "forgiven": agreement.forgiven} if hull else {}),
@@ -174,25 +174,13 @@ def _range(values):
     return [float(min(values)), float(max(values))]
 
 
-def _lenses(cameras):
-    """Least and most of the cameras: focal length in pixels, angles of view in degrees."""
-
-    def angles(pairs):
-        return _range([math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in pairs])
-
-    return {
-        "focal_pixels": _range([focal for c in cameras for focal in (c.fx, c.fy)]),
-        "field_of_view": {
-            "x": angles((c.width, c.fx) for c in cameras),
-            "y": angles((c.height, c.fy) for c in cameras),
-        },
-    }
+def _angles(sides):
+    """Least and most degrees across (pixels, focal length)."""
+    return _range([math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in sides])
 
 
 def _masks(views):
-    """{"with_alpha": share of the views whose image has a transparent pixel, "object": mean share
-    of such an image that shows the object, None where there is none}.
-    """
+    """{"with_alpha": share of the views with a mask, "object": mean share that these hold}."""
     masks = [view.image[..., 3] for view in views if view.has_mask]
     shares = [float((mask > MASK_THRESHOLD).mean()) for mask in masks]
     return {

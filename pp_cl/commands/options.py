@@ -1,12 +1,11 @@
-"""Options that commands share, and the types by which argparse reads texts: a function of the text
-that raises argparse.ArgumentTypeError.
-"""
+"""Options that commands share, and argparse's types: functions of the text."""
 
 import argparse
 import json
 import os
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -45,7 +44,7 @@ def _read(convert, accepts, what):
                 return value
         except (ValueError, OverflowError):
             pass
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+        raise UserError(f"{quoted(text)}: write {what}")
 
     return read
 
@@ -60,12 +59,9 @@ def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
 
     def read(text):
         given = tuple(dict.fromkeys(word.strip() for word in text.split(",")))
-        for word in given:
-            if word not in known:
-                near = suggestion(word, known)
-                raise argparse.ArgumentTypeError(
-                    f"{quoted(word)}: {near}choose from {', '.join(known)}"
-                )
+        for word in (word for word in given if word not in known):
+            near = suggestion(word, known)
+            raise UserError(f"{quoted(word)}: {near}choose from {', '.join(known)}")
         return given
 
     return read
@@ -75,7 +71,7 @@ def _parts(text, separator, one, count, what):
     """So many values of another type, written as `what`."""
     parts = text.split(separator)
     if len(parts) != count:
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+        raise UserError(f"{quoted(text)}: write {what}")
     return [one(part) for part in parts]
 
 
@@ -90,7 +86,7 @@ def box(text: str) -> list[float]:
     what = "two corners, as -1,-1,-1,1,1,1"
     corners = _parts(text, ",", number(-1e6, 1e6), 6, what)
     if any(a == b for a, b in zip(corners[:3], corners[3:], strict=True)):
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+        raise UserError(f"{quoted(text)}: write {what}")
     return corners
 
 
@@ -107,19 +103,12 @@ def output_file(*suffixes: str) -> Callable[[str], str]:
     def read(text):
         path, folder = Path(text), os.path.dirname(os.path.abspath(text))
         if suffixes and path.suffix.lower() not in suffixes:
-            raise argparse.ArgumentTypeError(
-                f"{quoted(text)}: name a file that ends in {' or '.join(suffixes)}"
-            )
+            raise UserError(f"{quoted(text)}: name a file that ends in {' or '.join(suffixes)}")
         if os.path.exists(path) and not os.path.isfile(path):
-            raise argparse.ArgumentTypeError(f"{quoted(text)}: is no file; name one")
+            raise UserError(f"{quoted(text)}: is no file; name one")
         if not os.path.isdir(folder):
-            raise argparse.ArgumentTypeError(
-                f"{quoted(text)}: there is no folder {folder}; make it first"
-            )
-        try:
-            check_target(path)
-        except UserError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
+            raise UserError(f"{quoted(text)}: there is no folder {folder}; make it first")
+        check_target(path)
         return text
 
     return read
@@ -137,18 +126,20 @@ def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
 
 
 def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> None:
-    """Add --json, for write_json_option and tell: the name of a file, or sys.stdout, which then
-    has nothing but the JSON: cli.main() sends what is printed meanwhile to stderr. known: words of
-    the command, which are no files.
+    """Add --json: a file, or sys.stdout, which then has nothing but the JSON: cli.main() sends what
+    is printed meanwhile to stderr. known: words of the command, which are no files.
     """
 
     def target(text):
         if text == "-":
             return sys.stdout
-        is_of_command = text in known or os.path.isdir(text)
-        # output_file() refuses pipes, that reading would wait for
-        if is_of_command or _holds_else_than_json(output_file()(text)):
-            raise argparse.ArgumentTypeError(
+        is_taken = text in known or os.path.isdir(text)
+        if not is_taken:
+            output_file()(text)  # it refuses pipes, that reading would wait for
+            with suppress(OSError), open(text, "rb") as file:
+                is_taken = file.read(1) not in (b"", b"{", b"[")  # it would be lost
+        if is_taken:
+            raise UserError(
                 f"{quoted(text)}: no JSON may be written there; name another FILE, or write what"
                 " the command works on before --json"
             )
@@ -162,15 +153,6 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
         metavar="FILE",
         help="write the result to FILE as JSON; without FILE (or -) print it in place of the text",
     )
-
-
-def _holds_else_than_json(name):
-    """Whether a file of this name would be lost if JSON took its place."""
-    try:
-        with open(name, "rb") as file:
-            return file.read(1) not in (b"", b"{", b"[")
-    except OSError:
-        return False
 
 
 def write_json_option(target: str | TextIO | None, value: Any) -> None:
@@ -207,7 +189,7 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
 
     def names(text):
         if os.path.exists(text):
-            raise argparse.ArgumentTypeError(f"{quoted(text)}: write it before --metrics")
+            raise UserError(f"{quoted(text)}: write it before --metrics")
         return words(METRICS)(text)
 
     parser.add_argument(
@@ -252,5 +234,5 @@ def add_set(parser: argparse.ArgumentParser, text: str) -> None:
 def _setting(text):
     key, equals, value = text.partition("=")
     if not equals:
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: write section.key=value")
+        raise UserError(f"{quoted(text)}: write section.key=value")
     return key.strip(), value.strip(), "--set"

@@ -16,9 +16,7 @@ GIB = 2**30
 
 class TrainingProgress:
     """Rate, time left, PSNR, points and device memory of a training: to be entered while it runs,
-    and called after each of its steps with the step and its row of the log. Its rate begins once
-    kernels are built, whose time says nothing of the steps to come. stream: sys.stderr if not
-    given.
+    and called after each step with its row of the log. The rate begins once kernels are built.
     """
 
     def __init__(self, training: Training, stream: TextIO | None = None) -> None:

@@ -23,9 +23,7 @@ _in_haste.set()
 
 @contextmanager
 def interrupting() -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM raise KeyboardInterrupt(number) while the block runs; a list of those that
-    came. In another thread than the main one nothing changes.
-    """
+    """Ctrl-C and SIGTERM raise KeyboardInterrupt(number) in the block; a list of what came."""
     caught: list[int] = []
 
     def interrupt(number: int, _frame: FrameType | None) -> None:
@@ -39,8 +37,7 @@ def interrupting() -> Iterator[list[int]]:
 @contextmanager
 def first_signal(*, in_haste: bool = False) -> Iterator[list[int]]:
     """A list that is empty until Ctrl-C or SIGTERM comes, and then holds its number. A second one
-    does what it did before. in_haste: the process ends PATIENCE seconds later in any case, else as
-    long after the block. To be entered in the main thread.
+    does what it did before. in_haste: the process ends PATIENCE seconds later, not so long after.
     """
     caught: list[int] = []
 
@@ -72,12 +69,12 @@ def deferred() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
-    """Gives a function that makes signals do again what they did before the block."""
-    before = {number: signal.getsignal(number) for number in STOPPING}
+    """Gives what makes signals do again what they did before; in other threads nothing changes."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.getsignal(number) for number in STOPPING}
     # nohup, and & in a script, leave signals ignored; None is a handler that is not Python's
     before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
-    if threading.current_thread() is not threading.main_thread():
-        before = {}
 
     def restore() -> None:
         for number, handler in before.items():
@@ -92,9 +89,8 @@ def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Cal
 
 
 def watch() -> None:
-    """From now on a signal that is handled ends this process PATIENCE seconds later. Handlers run
-    between two steps of Python's alone, and not while a driver's compiler or a thread that is
-    waited for takes its time; what is on the disk is whole at any moment.
+    """From now on a signal that is handled ends this process PATIENCE seconds later: handlers do
+    not run while a driver's compiler or a thread that is waited for takes its time.
     """
     try:
         reader, writer = socket.socketpair()

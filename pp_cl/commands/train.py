@@ -48,6 +48,7 @@ def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.config import run_config
     from pp_cl.drivers import device_line, open_device
+    from pp_cl.engine.training.schedule import refine_steps
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.session.memory import memory_line
     from pp_cl.session.training import is_finished, open_training, stored_state
@@ -80,10 +81,18 @@ def run(options: argparse.Namespace) -> None:
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))
-    if training.trainer.begun:
-        print(_extended_line(training))
-    if training.hull and (told := _left_out_line(config.train)):
-        print(told)
+    if begun := training.trainer.begun:
+        print(
+            f"extends a finished training of {begun} steps; {config.train.iterations} from the"
+            " start would differ, as all schedules end at the last step and the optimiser's"
+            " moments start again"
+        )
+    wanted = sum(0 < share < 1 for share in config.train.refine_at)
+    if training.hull and (made := len(refine_steps(config.train))) < wanted:
+        print(
+            f"refinements: {made} of the {wanted} of train.refine_at, since in"
+            f" {config.train.iterations} iterations nothing is pruned between them"
+        )
     print(memory_line(training.memory_plan), flush=True)
     seconds = _run(training, options)
     print(
@@ -103,49 +112,25 @@ def _first_line(training):
     if hull is None:
         return f"resuming at step {trainer.step} with {points} points"
     spacing = spacing_pixels(trainer.model.grid, [view.camera for view in trainer.views])
-    asked = training.config.points.count
-    capped = (
-        f"\npoints: only {points} of the {asked} asked for, since a finer grid would have more than"
-        f" {CELL_CAP} cells"
-    )
-    finer = "".join(
-        f", later {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
-    )
-    return (
+    times = range(1, trainer.refinements_to_come + 1)
+    finer = "".join(f", later {spacing / 2**n:.2f}" for n in times)
+    line = (
         f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
-        f" the object ({hull.seconds:.1f} s){capped if hull.capped else ''}"
+        f" the object ({hull.seconds:.1f} s)"
     )
-
-
-def _extended_line(training):
-    """A line of text: how an extended training differs from one that was as long from its start."""
-    return (
-        f"extends a finished training of {training.trainer.begun} steps;"
-        f" {training.config.train.iterations} from the start would differ, as all schedules end at"
-        " the last step and the optimiser's moments start again"
-    )
-
-
-def _left_out_line(train):
-    """A line of text if some refinements of train.refine_at are left out, else an empty one."""
-    from pp_cl.engine.training.schedule import refine_steps
-
-    wanted, made = sum(0 < share < 1 for share in train.refine_at), len(refine_steps(train))
-    if made < wanted:
-        return (
-            f"refinements: {made} of the {wanted} of train.refine_at, since in {train.iterations}"
-            " iterations nothing is pruned between them"
+    if hull.capped:
+        line += (
+            f"\npoints: only {points} of the {training.config.points.count} asked for, since a"
+            f" finer grid would have more than {CELL_CAP} cells"
         )
-    return ""
+    return line
 
 
 def _images_line(training, chosen):
     """A line of text: the size of the images. chosen: whether the preset chose the downscale."""
     views = training.trainer.views
-    view = views[0]
-    stored, used = (
-        _sizes(cameras) for cameras in ([v.file_camera for v in views], [v.camera for v in views])
-    )
+    view, stored = views[0], _sizes([view.file_camera for view in views])
+    used = _sizes([view.camera for view in views])
     if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
@@ -159,8 +144,8 @@ def _sizes(cameras):
 
 
 def _run(training, options):
-    """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM: at once in
-    the first step, which builds kernels, else at the end of the step.
+    """Seconds of the training. Raises Stopped after Ctrl-C or SIGTERM: at once in the first step,
+    which builds kernels, else at the end of the step.
     """
     from pp_cl.commands.progress import TrainingProgress
     from pp_cl.commands.signals import first_signal

@@ -1,6 +1,4 @@
-"""Reads and writes files: checkpoints, images, videos, the folder of a run; written atomically and
-checked when read.
-"""
+"""Reads and writes files: checkpoints, images, the folder of a run."""
 
 import lazy_loader
 

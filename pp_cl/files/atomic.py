@@ -32,10 +32,8 @@ MANIFEST = ".pp-cl-files.jsonl"
 
 @contextmanager
 def atomic_file(path: Path | str, *, noted: bool = True) -> Iterator[BinaryIO]:
-    """A binary file object whose content appears under `path` only when the block ends well.
-
-    noted: in the manifest of the folder that the program fills, if it is one. Raises UserError
-    naming the file when the disk is full or may not be written; nothing half-written stays behind.
+    """A binary file object whose content appears under `path` only when the block ends well; noted:
+    in the manifest of the folder. Raises UserError naming a file that cannot be written.
     """
     with _renamed(Path(path), noted=noted) as temporary, open(temporary, "wb") as file:
         yield file
@@ -45,11 +43,7 @@ def atomic_file(path: Path | str, *, noted: bool = True) -> Iterator[BinaryIO]:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path of the same suffix for a library to write to, whose file appears under
-    `path` only when the block ends well.
-
-    Raises UserError naming the file when the library cannot write it.
-    """
+    """The same as a temporary path of the same suffix, for a library to write to."""
     kinds = OSError, RuntimeError  # the latter of libraries in C++
     with _renamed(path, path.suffix) as temporary, told(path, kinds):
         yield temporary
@@ -57,10 +51,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that appears as `folder` only when the block ends well.
-
-    Raises UserError if that holds something, or cannot be written; one of a file in the temporary
-    folder names the place that it would have had.
+    """A temporary folder that appears as `folder` only when the block ends well. Raises UserError
+    if that holds something or cannot be written, with the final place of a file in it.
     """
     folder = folder.resolve()
     check_new_folder(folder)
@@ -76,9 +68,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def _renamed(path, suffix="", *, noted=True):
-    """A temporary path; what is there when the block ends well gets the name `path`, else it is
-    removed.
-    """
+    """A temporary path, of which what is there gets the name `path` when the block ends well."""
     temporary = _temporary(path, suffix)
     try:
         with told(path):
@@ -148,9 +138,7 @@ def mend(error: Exception) -> str:
 def told(
     path: Path | str, kinds: tuple[type[Exception], ...] = (OSError,), then: str = ""
 ) -> Iterator[None]:
-    """An exception of these kinds in the block becomes a UserError that names the file and the
-    remedy. then: what follows in it.
-    """
+    """An exception of these kinds becomes a UserError with the file and the mend, and `then`."""
     try:
         yield
     except kinds as error:
@@ -189,8 +177,8 @@ def check_file(path: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Raise UserError where nothing can be made under a path, or no folder above it: tried with a
-    temporary file in the first folder above that there is.
+    """Raise UserError where nothing can be made under a path: tried with a temporary file in the
+    first folder above that there is.
     """
     tried = Path(os.path.abspath(path))
     try:
@@ -208,12 +196,9 @@ def check_target(path: Path) -> None:
 def own(
     folder: Path, files: Iterable[Path] = (), mend: str = "move it away", *, alone: bool = False
 ) -> None:
-    """Make a folder, where it is missing, one that the program fills, and remove what processes
-    that were killed have left unfinished in it.
-
-    files: will be written in it. alone: nothing of others may be there before. Raises UserError,
-    with nothing changed, where the folder cannot be written or holds other files, and as
-    check_ours does for `files`.
+    """Make a folder one that the program fills, and remove what killed processes left unfinished
+    in it. files: will be written there. alone: nothing of others may be there before. Raises
+    UserError, with nothing changed, as that says, and as check_ours does for `files`.
     """
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is not a folder; choose another --out")
@@ -243,10 +228,7 @@ def ours(paths: Iterable[Path]) -> list[Path]:
 
 
 def check_ours(paths: Iterable[Path], mend: str = "move it away") -> None:
-    """Raise UserError naming the first file that is there and not ours(): it would be lost.
-
-    mend: what to do about it.
-    """
+    """Raise UserError naming the first file that is there and not ours(): it would be lost."""
     there = [path for path in paths if os.path.lexists(path)]
     if others := set(there) - set(ours(there)):
         first = min(others)
@@ -264,9 +246,7 @@ def remove_ours(paths: Iterable[Path]) -> None:
 
 
 def _home(path):
-    """The folder nearest above a path that the program fills, None where there is none, or a folder
-    in between is not finished, of which all is noted at its end.
-    """
+    """The folder nearest above that the program fills; None without one, and in unfinished ones."""
     for folder in Path(os.path.abspath(path)).parents:
         if is_owned(folder):
             return folder
@@ -276,9 +256,7 @@ def _home(path):
 
 
 def _note(file, path):
-    """Add a file, or all in a folder, that is about to become `path`, to the manifest nearest above
-    that, if there is one.
-    """
+    """Add a file, or all in a folder, that is about to become `path`, to the nearest manifest."""
     if home := _home(path):
         inside = sorted(file.rglob("*")) if file.is_dir() else [file]
         lines = [_line(home, path / one.relative_to(file), one) for one in inside if one.is_file()]
@@ -292,18 +270,21 @@ def _note(file, path):
 
 def _line(home, path, file):
     """The line of a manifest for what stands in `file` and is, or will be, called `path`."""
+    relative = Path(os.path.abspath(path)).relative_to(home)
+    return json.dumps([relative.as_posix(), sha256_of(file).hexdigest()]).encode()
+
+
+def sha256_of(file: Path) -> Any:
+    """The digest object of a file, which is read in pieces."""
+    digest = hashlib.sha256()
     with open(file, "rb") as opened:
-        digest = hashlib.sha256()
         while part := opened.read(2**20):
             digest.update(part)
-    relative = Path(os.path.abspath(path)).relative_to(home)
-    return json.dumps([relative.as_posix(), digest.hexdigest()]).encode()
+    return digest
 
 
 def remove_leftovers(folder: Path | str) -> None:
-    """Delete temporary files and folders that killed processes left in the folder and below it, not
-    those of processes that live.
-    """
+    """Delete temporary files and folders that killed processes left in the folder and below it."""
     for leftover in list(Path(folder).rglob(".*.pp-cl.tmp*")):
         named = TEMPORARY.fullmatch(leftover.name)
         if not named or _lives(int(named[1])):

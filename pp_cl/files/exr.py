@@ -35,12 +35,9 @@ def exr_size(path: Path | str) -> tuple[int, int]:
 
 
 def read_exr_rgba(path: Path | str) -> np.ndarray:
-    """(H, W, 4) uint8 straight sRGB of an image's display window.
-
-    Linear light between 0 and 1 becomes sRGB, what is brighter is cut off; no alpha means 255, and
-    outside of the data window nothing is there: alpha 0. Raises UserError naming a file that is
-    missing or broken, has several parts, no colours, or more pixels than are read, or holds NaN or
-    infinite pixels; of broken ones the library prints lines of its own.
+    """(H, W, 4) uint8 straight sRGB of an image's display window: linear light above 1 is cut off,
+    no alpha means 255, and outside of the data window alpha is 0. Raises UserError naming a file
+    that is missing or broken, has several parts, no colours, too many pixels, NaN or infinite ones.
     """
     header = _header(path)
     first_shown, (width, height) = _window(path, header, "displayWindow")
@@ -48,10 +45,10 @@ def read_exr_rgba(path: Path | str) -> np.ndarray:
     names = _wanted(path, header, columns * min(rows, CHUNK_ROWS))
     try:
         with closing(OpenEXR.InputFile(str(path))) as file:
-            read = [np.frombuffer(one, np.float32) for one in file.channels(names, FLOAT)]
+            found = file.channels(names, FLOAT)
+            planes = [np.frombuffer(one, np.float32).reshape(rows, columns) for one in found]
     except Exception as error:  # the library's exceptions have no common class
         raise refusal(path, error, "OpenEXR") from error
-    planes = [plane.reshape(rows, columns) for plane in read]
     broken = ~np.logical_and.reduce([np.isfinite(plane) for plane in planes])
     if broken.any():
         raise UserError(
@@ -69,9 +66,7 @@ def read_exr_rgba(path: Path | str) -> np.ndarray:
 
 
 def _straight(light):
-    """(N, 4) uint8 straight sRGB of linear, premultiplied light: gray or RGB, with or without alpha
-    behind it.
-    """
+    """(N, 4) uint8 straight sRGB of linear, premultiplied gray or RGB, maybe alpha behind it."""
     count = light.shape[1]
     colours, alpha = (light, 1) if count % 2 else (light[:, :-1], np.clip(light[:, -1:], 0, 1))
     rgba = np.empty((len(light), 4), np.float32)
@@ -96,9 +91,7 @@ def _header(path):
 
 
 def _window(path, header, name):
-    """(x and y of the first pixel, (width, height)) of a window in the header. Raises UserError
-    for one that no image has.
-    """
+    """(x and y of the first pixel, (width, height)) of a window in the header. Raises UserError."""
     first, last = (np.array(corner, int) for corner in header[name])
     width, height = map(int, last - first + 1)
     if width < 1 or height < 1 or width * height > MOST_PIXELS:
@@ -110,9 +103,7 @@ def _window(path, header, name):
 
 
 def _wanted(path, header, chunk):
-    """The names of R, G and B, or of Y, and of A where it is there. chunk: pixels that are packed
-    together, but for tiles. Raises UserError.
-    """
+    """The names of R, G and B, or of Y, and of A. chunk: pixels that are packed together."""
     channels = {channel.name: channel for channel in header["channels"]}
     layers = {name[: name.rfind(".") + 1] for name in channels}  # with the point behind their name
     found = [

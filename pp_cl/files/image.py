@@ -36,12 +36,9 @@ PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
 def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarray:
-    """(H, W, 4) uint8 straight sRGB and alpha of an image file; gray and palette colours are
-    expanded, 16 bits a channel become 8, other colour spaces sRGB, no alpha means 255; OpenEXR as
-    read_exr_rgba has it.
-
-    size: (width, height) that it is to have: where it lies on its side, it is turned as its EXIF
-    says. Raises Unusable naming a file that is missing, truncated, no image, larger than
+    """(H, W, 4) uint8 straight sRGB and alpha of an image file, whatever its kind; no alpha means
+    255. size: (width, height) that it is to have: where it lies on its side, it is turned as its
+    EXIF says. Raises Unusable naming a file that is missing, truncated, no image, larger than
     MOST_PIXELS, or of another kind of numbers.
     """
     with _opened(path) as image:
@@ -52,17 +49,15 @@ def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarr
 
 
 def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
-    """The image, opened from a file, in one of EIGHT_BIT_MODES, in sRGB, which may be itself.
-    Raises Unusable.
-    """
-    if image.mode.startswith("I"):  # 16 bits of gray
+    """The image, opened from a file, in one of EIGHT_BIT_MODES, in sRGB. Raises Unusable."""
+    is_deep_gray = image.mode.startswith("I")
+    if is_deep_gray or is_deep_png(path):
+        _tell(path, "images of 16 bits a channel are read as 8")
+    if is_deep_gray:
         levels = np.array(image)
         if levels.min() < 0 or levels.max() > 65535:
             raise Unusable(f"{path}: holds more than 16 bits; write 8", "numbers of another kind")
-        _tell(path, "images of 16 bits a channel are read as 8")
         return Image.fromarray(((levels.astype(np.uint32) + 128) // 257).astype(np.uint8))
-    if is_deep_png(path):
-        _tell(path, "images of 16 bits a channel are read as 8")
     if image.mode not in (*EIGHT_BIT_MODES, *CONVERTED):
         raise Unusable(
             f"{path}: not 8 or 16 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit"
@@ -93,20 +88,16 @@ def is_transparent(path: Path | str) -> bool:
 
 
 def read_mask(path: Path | str) -> np.ndarray:
-    """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels, as
-    a cut-out, else its gray, of which colour that JPEG or a camera's program left in noise and rims
-    is no part. Raises UserError as read_rgba does, and for one with areas of colour.
+    """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels,
+    else its gray. Raises UserError as read_rgba does, and for one with areas of colour.
     """
-    with _opened(path) as image:
-        return _mask_of(path, in_srgb(path, image))
-
-
-def _mask_of(path, image):
+    with _opened(path) as opened:
+        image = in_srgb(path, opened).copy()
     if image.mode != "L":
         rgba = image.convert("RGBA")
-        alpha = rgba.getchannel("A")
-        if alpha.getextrema()[0] < 255:
-            return np.array(alpha)
+        alpha = np.array(rgba.getchannel("A"))
+        if alpha.min() < 255:
+            return alpha
         image = rgba.convert("RGB")
         sample = image.resize((COLOUR_SIDE, COLOUR_SIDE), Image.Resampling.NEAREST)
         cells = np.array(sample).reshape(128, 4, 128, 4, 3).mean((1, 3))
@@ -114,21 +105,21 @@ def _mask_of(path, image):
         if len(shown) and (np.ptp(shown, axis=1) > COLOURLESS).mean() > COLOURED:
             raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
         image = image.convert("L")
-    if image.getextrema()[1] == 1:  # a JPEG may hold noise of that size
+    gray = np.array(image)
+    if gray.max() == 1:  # a JPEG may hold noise of that size
         if Path(path).suffix.lower() in LOSSY:
             raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
         _tell(path, "masks of 0 and 1 are read as 0 and 255")
-        return np.array(image) * np.uint8(255)
-    return np.array(image)
+        return gray * np.uint8(255)
+    return gray
 
 
 def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> tuple[int, int]:
     """(width, height) from the header of an image file; as its EXIF turns it where only so it has
-    the shape of the size that is stated for it: the program that stated it saw it upright. Raises
-    UserError as read_rgba does.
+    the shape of the stated size. Raises UserError as read_rgba does.
     """
-    if _is_exr(path):
-        return _exr(exr_size, path)
+    if size := _exr(exr_size, path):
+        return size
     with _opened(path, checked=False) as image:
         size = image.size
         if stated and not same_shape(size, stated) and same_shape(size[::-1], stated):
@@ -142,12 +133,10 @@ def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return abs(one[0] * other[1] - one[1] * other[0]) <= max(other)
 
 
-def _is_exr(path):
-    return Path(path).suffix.lower() == ".exr"
-
-
 def _exr(read, path):
-    """What read() gives of an OpenEXR file. Raises Unusable where it refuses it."""
+    """What read() gives of an OpenEXR file, None of another. Raises Unusable."""
+    if Path(path).suffix.lower() != ".exr":
+        return None
     try:
         return read(path)
     except UserError as error:
@@ -156,11 +145,11 @@ def _exr(read, path):
 
 @contextmanager
 def _opened(path, checked=True):
-    """The image file, opened; what goes wrong with it inside the block becomes a UserError.
-    checked: by the checksums of a PNG, at which its decoder does not look.
+    """The image file, opened; what goes wrong with it in the block becomes Unusable. checked: by
+    the checksums of a PNG, at which its decoder does not look.
     """
-    if _is_exr(path):
-        yield Image.fromarray(_exr(read_exr_rgba, path))
+    if (light := _exr(read_exr_rgba, path)) is not None:
+        yield Image.fromarray(light)
         return
     try:
         with opened_regular(path) as file:
@@ -200,9 +189,7 @@ def to_8bit(image: np.ndarray) -> np.ndarray:
 
 def write_png(path: Path | str, image: np.ndarray) -> None:
     """Write a uint8 or float [0, 1] image of shape (H, W), (H, W, 3) or (H, W, 4), atomically.
-
-    Raises UserError naming the file when the disk is full or may not be written, ValueError for
-    NaN.
+    Raises UserError naming a file that cannot be written, ValueError for NaN.
     """
     image = np.asarray(image)
     encoded = io.BytesIO()
@@ -212,9 +199,7 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def image_paths(names: list[str]) -> list[PurePosixPath]:
-    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
-    those that all of them share go.
-    """
+    """Relative paths of PNG files for views of these names, without the folders that all share."""
     paths = [PurePosixPath(name) for name in names]
     shared = os.path.commonpath([path.parent for path in paths])
     paths = [path.relative_to(shared) for path in paths]

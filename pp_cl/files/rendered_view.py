@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +18,10 @@ WHITE = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A view as a model shows it, over white. Float32 arrays of H rows and W columns.
-
-    colour: (H, W, 3), sRGB in [0, 1], over white. alpha: (H, W) in [0, 1], the share that the
-    object covers. depth: (H, W), along the camera's axis in world units, mean by blend weight;
-    median_depth: the same where half of the weight is reached; both infinite where alpha is 0.
-    features: (H, W, 16), what the network made the colours of, or None.
+    """A view as a model shows it: float32 arrays. colour: (H, W, 3), sRGB in [0, 1], over white.
+    alpha: (H, W) in [0, 1]. depth, median_depth: (H, W), along the camera's axis in world units, of
+    the mean blend weight and where half of it is reached; infinite where alpha is 0. features: (H,
+    W, 16), what the network made the colours of, or None.
     """
 
     colour: np.ndarray
@@ -33,9 +31,7 @@ class RenderedView:
     features: np.ndarray | None = None
 
     def over(self, background: tuple[float, float, float] | None) -> np.ndarray:
-        """(H, W, 3) float32 in [0, 1]: the object over a colour, sRGB in [0, 1]; where nothing is,
-        exactly that colour. Over white it is `colour`, as the network made it; over None rgba().
-        """
+        """(H, W, 3) float32 in [0, 1]: the object over an sRGB colour, over None rgba()."""
         if background is None:
             return self.rgba()
         if tuple(background) == WHITE:
@@ -53,8 +49,7 @@ class RenderedView:
 
     def channels(self) -> dict[str, np.ndarray]:
         """{channel: (H, W) float32} for OpenEXR: R, G, B, in linear light and multiplied by alpha,
-        A; Z, the median depth, and mean.Z, both infinite where nothing is; feature.00 to feature.15
-        where the rendering has them.
+        A; Z, the median depth; mean.Z; feature.00 to feature.15 where the rendering has them.
         """
         rgba = self.rgba()
         light = srgb_to_linear(rgba[..., :3]) * rgba[..., 3:]
@@ -77,14 +72,12 @@ class RenderedView:
 
 
 def mean_rendered_view(views: Iterable[RenderedView]) -> RenderedView:
-    """The mean of several samples of one view, each of which is forgotten before the next is taken;
-    depths and features are those of the first.
-    """
+    """The mean of several samples of one view; depths and features are those of the first."""
     taken = iter(views)
     first, n = next(taken), 1
     colour, alpha = first.colour, first.alpha
     for sample in taken:
         colour, alpha, n = colour + sample.colour, alpha + sample.alpha, n + 1
-        del sample
+        del sample  # before the next is taken
     colour, alpha = ((total / np.float64(n)).astype(np.float32) for total in (colour, alpha))
-    return RenderedView(colour, alpha, first.depth, first.median_depth, first.features)
+    return replace(first, colour=colour, alpha=alpha)

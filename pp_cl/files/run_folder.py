@@ -48,8 +48,8 @@ class RunFolder:
         return self.evaluation(split) / "metrics.json"
 
     def measured(self) -> dict[str, Any] | None:
-        """{"mean": {metric: value}, "step", "finished", "points" that were left, "device"} of the
-        evaluation of the test split, None where there is none. Raises UserError for a broken one.
+        """{"mean": {metric: value}, "step", "finished", "points", "device"} of the evaluation of
+        the test split, None where there is none. Raises UserError for a broken one.
         """
         file = self.metrics("test")
         if not file.exists():
@@ -82,9 +82,7 @@ class RunFolder:
     @contextmanager
     def owned(self) -> Iterator[None]:
         """While the block runs, no other process trains into the folder, which is made where it is
-        missing. The system ends the ownership of a process that was killed.
-
-        Raises UserError naming the process that owns the folder.
+        missing. Raises UserError naming the process that owns the folder.
         """
         self.path.mkdir(parents=True, exist_ok=True)
         owner, lock = self.path / ".pp-cl.owner", FileLock(self.path / ".pp-cl.lock", timeout=0)
@@ -107,24 +105,20 @@ class RunFolder:
                 owner.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
             yield
         finally:
-            # the end of the process ends its ownership in any case
             with suppress(OSError):
                 owner.unlink(missing_ok=True)
-            with suppress(OSError):
-                lock.release()
+            lock.release()
 
     def check_sheets(self, step: int) -> None:
-        """Raise UserError for an image that training from this step on would replace, or create()
-        remove, and that no training has written as it is now.
+        """Raise UserError for an image that training from this step on would lose, and that no
+        training has written as it is now.
         """
         begun = "" if step == 0 else f"step_{step:06d}.png"
         previews = [one for one in self.previews.glob("step_*.png") if one.name > begun]
         check_ours([self.path / MASKS_SHEET] * (step == 0) + previews)
 
     def create(self, config_json: str) -> None:
-        """Make the folders, remove what a killed process left unfinished, and images that belong
-        to no checkpoint; write config.json, which makes the folder one of a run, before the rest.
-        """
+        """Make the folders, remove images that belong to no checkpoint, write config.json."""
         own(self.path)
         if not self.checkpoint.exists():
             remove_ours([self.path / MASKS_SHEET, *self.previews.glob("step_*.png")])
@@ -136,7 +130,7 @@ class RunFolder:
         write_text(self.config, config_json + "\n")
 
     def rows(self) -> list[dict[str, Any]]:
-        """The rows of the log, up to the first that is broken."""
+        """The rows of the log, up to the first that is broken. Raises UserError for a long one."""
         return _rows(self.log)
 
     def open_log(self, step: int) -> "Log":
@@ -172,9 +166,8 @@ class Log:
 
 
 def read_row(line: bytes | str) -> dict[str, Any] | None:
-    """The row of a log in a line of it: numbers are finite, "step" and "seconds" are there, from 0
-    on, "psnr" and "loss" are numbers where they are there. None where a kill or a fault left
-    something else.
+    """The row of a log in a line of it, with "step" and "seconds", from 0 on, and numbers that are
+    finite; None where a kill or a fault left something else.
     """
     try:
         row = strict_json(line) if len(line) <= MOST_LINE else {}
@@ -187,9 +180,7 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
 
 
 def _is_loggable(value, levels=MOST_LEVELS):
-    """Whether a value of JSON may be written again: no number in it is huge, infinite included, and
-    it is not nested deeply.
-    """
+    """Whether a value of JSON may be written again: no number is huge, and few lists are nested."""
     if isinstance(value, (list, dict)):
         inside = value.values() if isinstance(value, dict) else value
         return levels > 0 and all(_is_loggable(part, levels - 1) for part in inside)
@@ -197,9 +188,8 @@ def _is_loggable(value, levels=MOST_LEVELS):
 
 
 def _rows(path, step=math.inf):
-    """The rows of a log up to `step`, or to one that says finished where a step is given. The first
-    that is broken, and all after it, are left out with a warning; of a log that may be growing its
-    last line without one. Raises UserError for a log that is too long.
+    """The rows of a log up to `step`, or to one that says finished where a step is given, or to one
+    that is broken, with a warning, unless the log may be growing. Raises UserError for a long log.
     """
     size = path.stat().st_size if path.is_file() else 0
     if size > MOST_LOG:

@@ -10,9 +10,8 @@ BESIDES = ("step", "seconds")  # numbers of a row of the log that are no curves
 
 @contextmanager
 def curves(folder: Path, step: int) -> Iterator[Callable[[int, dict[str, Any] | None], None]]:
-    """What writes the row of a step, if there is one, into a folder that TensorBoard reads.
-
-    step: from which on rows will be written, anew where an interrupted training wrote them before.
+    """What writes the row of a step, if there is one, into a folder that TensorBoard reads. step:
+    from which on rows are written, anew where an interrupted training wrote them before.
     """
     from tensorboardX import SummaryWriter
 
@@ -26,9 +25,7 @@ def curves(folder: Path, step: int) -> Iterator[Callable[[int, dict[str, Any] | 
 
 
 def scalars(row: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """(name, number) of each curve in a row of the log: of {"rates": {"sh": (0.5, 0.1)}} rates/sh/0
-    and rates/sh/1.
-    """
+    """(name, number) of each curve in a row of the log, such as rates/sh/0 of {"rates": {...}}."""
     for name, value in row.items():
         if isinstance(value, (tuple, list)):
             value = dict(enumerate(value))

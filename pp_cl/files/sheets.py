@@ -19,8 +19,7 @@ def contact_sheet(
     images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
 ) -> np.ndarray:
     """(H, W, 3) uint8 image of uint8 images, (H, W, 3) or (H, W, 4), row by row under their
-    captions, each in a cell as large as the largest; what is transparent, or beside a smaller
-    image, shows white. There are no more columns than images.
+    captions, each over white in a cell as large as the largest.
     """
     columns = min(columns, len(images))
     rows = -(-len(images) // columns)
@@ -43,16 +42,11 @@ def write_comparison(
     path: Path, predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]
 ) -> None:
     """Write a PNG file of float (H, W, 3) images in [0, 1]: a row of prediction, truth and error
-    for each view, whose sizes may differ.
-
-    The error is the absolute difference, mean of the channels, ERROR_SCALE times; white is none, as
-    around the object.
+    for each view, the absolute difference, ERROR_SCALE times, dark on white.
     """
-    pairs = zip(predictions, truths, strict=True)
-    images = [to_8bit(image) for p, t in pairs for image in (p, t, _error(p, t))]
+    images: list[np.ndarray] = []
+    for prediction, truth in zip(predictions, truths, strict=True):
+        error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
+        shown = np.repeat(1 - ERROR_SCALE * error, 3, axis=2)
+        images += map(to_8bit, (prediction, truth, shown))
     write_png(path, contact_sheet(images, CAPTIONS * len(predictions), len(CAPTIONS)))
-
-
-def _error(prediction, truth):
-    error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
-    return np.repeat(1 - ERROR_SCALE * error, 3, axis=2)

@@ -24,9 +24,7 @@ MOST_PIXELS = 2 * 89_478_485  # of an image; Pillow refuses more. The largest se
 
 @contextmanager
 def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
-    """The opened file. Raises OSError where there is none, or where a folder is in its place, or a
-    pipe or a device, which may never end.
-    """
+    """The opened file. Raises OSError for none, a folder, and pipes and devices, without an end."""
     # Windows has no pipes with names in folders, but translates line ends unless told not to
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     descriptor = os.open(path, os.O_RDONLY | flags)
@@ -39,8 +37,8 @@ def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The zip file, until the block ends. Raises OSError as opened_regular, ValueError for a
-    directory of more than MOST_DIRECTORY bytes, and what zipfile raises.
+    """The zip file, until the block ends. Raises OSError as opened_regular, ValueError for a large
+    directory, and what zipfile raises.
     """
     with opened_regular(path) as file:
         # what zipfile itself finds at the file's end says how much it will read at once
@@ -53,7 +51,7 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
 
 def read_regular(path: Path | str, most: int, encoding: str = "utf-8") -> str:
     """The text of a file of at most so many bytes; UTF-16 is known by its byte order mark. Raises
-    OSError as opened_regular, ValueError for a larger one and for what is no such text.
+    OSError as opened_regular, ValueError for a larger one and other bytes.
     """
     with opened_regular(path) as file:
         content = file.read(most + 1)
@@ -84,9 +82,7 @@ def _refuse_constant(name):
 def refusal(
     path: Path | str, error: Exception, kind: str, mend: str = "copy it again"
 ) -> UserError:
-    """The UserError about a file that could not be read as `kind`: by the system's word, which has
-    another mend than a content that is broken.
-    """
+    """The UserError about a file that could not be read as `kind`, or for the system not at all."""
     if isinstance(error, FileNotFoundError):
         return UserError(f"{path}: no such file; copy it there")
     # the content names a place that no file has

@@ -18,16 +18,23 @@ def compare(
     metrics: tuple[str, ...] = ("psnr", "ssim"),
     dev: Device | None = None,
 ) -> dict[str, Any]:
-    """Metrics of two images, or of two folders that hold images of the same names.
-
-    metrics: names out of psnr, ssim, lpips; dev: only lpips needs one. Transparent images are
-    composited over white. Returns {"mean": {metric: number}, "per_image": [{"name", metric: number,
-    ...}]}. Raises UserError naming a file that is missing, unreadable, an image of a format that is
-    not read, without partner or of another size than its partner.
+    """Metrics of two images over white, or of two folders that hold images of the same names:
+    {"mean": {metric: number}, "per_image": [{"name", metric: number, ...}]}. metrics: out of psnr,
+    ssim, lpips, which needs dev. Raises UserError naming a file that is missing, unreadable,
+    without partner or of another size than its partner.
     """
-    pairs = _pairs(Path(prediction), Path(truth))
-    measure = Metrics(dev, metrics)
-    rows = [{"name": a.name, **_measure(measure, a, b)} for a, b in pairs]
+    rows, measure = [], Metrics(dev, metrics)
+    for one, other in _pairs(Path(prediction), Path(truth)):
+        a, b = read_over_white(one), read_over_white(other)
+        if a.shape != b.shape:
+            raise UserError(
+                f"{one}: {a.shape[1]}x{a.shape[0]} pixels, {other} has"
+                f" {b.shape[1]}x{b.shape[0]}; sizes must agree"
+            )
+        try:
+            rows.append({"name": one.name, **measure(a, b)})
+        except UserError as error:
+            raise UserError(f"{one}: {error}") from None
     return {"mean": mean(rows), "per_image": rows}
 
 
@@ -61,23 +68,8 @@ def _image_names(folder):
     return {path.name for path in paths if path.suffix.lower() in ENDINGS}
 
 
-def _measure(measure, prediction, truth):
-    a, b = read_over_white(prediction), read_over_white(truth)
-    if a.shape != b.shape:
-        raise UserError(
-            f"{prediction}: {a.shape[1]}x{a.shape[0]} pixels, {truth} has"
-            f" {b.shape[1]}x{b.shape[0]}; sizes must agree"
-        )
-    try:
-        return measure(a, b)
-    except UserError as error:
-        raise UserError(f"{prediction}: {error}") from None
-
-
 def read_over_white(path: Path | str) -> np.ndarray:
-    """Float64 (H, W, 3) image in [0, 1] of a file, composited over white. Raises UserError naming
-    the file.
-    """
+    """Float64 (H, W, 3) image in [0, 1] of a file, over white. Raises UserError naming the file."""
     rgba = read_rgba(path) / 255.0
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + (1 - alpha)

@@ -1,6 +1,4 @@
-"""LPIPS v0.1 with VGG16 (Zhang et al. 2018): a perceptual distance, run on the convolutions of the
-renderer.
-"""
+"""LPIPS v0.1 with VGG16 (Zhang et al. 2018), run on the convolutions of the renderer."""
 
 import math
 from collections.abc import Iterator
@@ -32,10 +30,7 @@ def lpips_program(dev: Device) -> Program:
 
 
 class Lpips:
-    """The network, prepared for images of one size at a time, and the distance of image pairs.
-
-    weights: as load_weights() returns them, which is the default (and may raise UserError).
-    """
+    """The network, prepared for images of one size at a time. weights: of load_weights()."""
 
     def __init__(self, dev: Device, weights: dict[str, np.ndarray] | None = None):
         weights = load_weights() if weights is None else weights
@@ -52,10 +47,8 @@ class Lpips:
         self._blocks: list[tuple[list[Conv], Any]] = []
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> float:
-        """LPIPS of two (H, W, 3) images in [0, 1].
-
-        Raises UserError for images of less than LEAST_SIZE pixels a side, ValueError for different
-        shapes.
+        """LPIPS of two (H, W, 3) images in [0, 1]. Raises UserError for images of less than
+        LEAST_SIZE pixels a side, ValueError for different shapes.
         """
         if a.shape != b.shape:
             raise ValueError(f"a {a.shape}, b {b.shape}")
@@ -97,17 +90,14 @@ class Lpips:
             yield x
 
     def _place(self, name, shape):
-        """Memory for a map: an image's features have one of their own, the other maps take turns in
-        two, which all images share: nothing is read there once a block is done. New memory for each
-        map took a quarter of the time.
+        """Memory for a map: an image's features have their own, the other maps take turns in two,
+        where nothing is read once a block is done. New memory took a quarter of the time.
         """
         n = math.prod(shape)
         return self.dev.scratch(("lpips", name), n)[:n].reshape(shape)
 
     def _compare(self, block, a, b):
-        """(H, W) distances of the features a and b (H, W, C) of a block; LPIPS is the sum of their
-        means.
-        """
+        """(H, W) distances of the features a and b (H, W, C) of a block."""
         height, width, channels = a.shape
         n, distance = height * width, self._place("distance", (height, width))
         self.program.launch(

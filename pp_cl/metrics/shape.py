@@ -31,9 +31,7 @@ class Mesh:
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """The triangles of a file that trimesh reads (PLY, OBJ, STL, OFF, GLB ...), those of several
-    objects together. Raises UserError naming the file.
-    """
+    """The triangles of a file that trimesh reads, of all its objects. Raises UserError."""
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a triangle mesh")
@@ -57,11 +55,9 @@ def read_mesh(path: Path | str) -> Mesh:
 
 @dataclass(frozen=True)
 class Surface:
-    """The vertices of a grid that are nearest to some point of a mesh.
-
-    grid: around the mesh and the grid asked for, of the same voxel size and in step with it. bits:
-    (ny nz, words) uint32, the set: bit b of word w in a row is vertex 32 w + b. count: of its
-    vertices.
+    """The vertices of a grid that are nearest to some point of a mesh. grid: around the mesh and
+    the grid asked for, in step with it. bits: (ny nz, words) uint32: bit b of word w in a row is
+    vertex 32 w + b. count: of the vertices.
     """
 
     grid: Grid
@@ -79,9 +75,8 @@ class Surface:
 
 
 def overlap(surface: Surface, grid: Grid, ids: np.ndarray) -> dict[str, float]:
-    """Of the points with these ids (N,), N > 0, on the grid that the surface was sampled for:
-    points: how many; iou: of them and the surface's vertices, intersection over union; recall:
-    share of the surface's that are among the points; precision: share of the points that are on it.
+    """{"points", "iou", "recall", "precision"} of the points with ids (N,), N > 0, on the grid that
+    the surface was sampled for, against the surface's vertices.
     """
     shared, points = int(surface.holds(grid, ids).sum()), len(ids)
     return {
@@ -100,10 +95,8 @@ def sample_surface(
     *,
     advance: Callable[[int], object] = lambda samples: None,
 ) -> Surface:
-    """The Surface of a mesh for a grid, by 1 to SAMPLES samples spread evenly over the mesh's area.
-
-    advance(samples) is called with the number of new samples from time to time. Raises UserError
-    for a mesh without area or too large for the grid.
+    """The Surface of a mesh for a grid, by 1 to SAMPLES samples spread evenly over the mesh's area,
+    of whose numbers advance() is told. Raises UserError for a mesh without area or too large.
     """
     around = _grid_around(mesh, grid)
     area_end, corners = _triangles(mesh, around)
@@ -137,9 +130,7 @@ def sample_surface(
 
 
 def _grid_around(mesh, grid):
-    """The grid in step with another that has a vertex nearest to every point of the mesh, and all
-    of the other's. Raises UserError.
-    """
+    """The grid in step with another that holds the mesh and all of the other. Raises UserError."""
     origin = np.asarray(grid.origin)
     low = np.floor((mesh.vertices.min(0) - origin) / grid.voxel_size)
     high = np.ceil((mesh.vertices.max(0) - origin) / grid.voxel_size)

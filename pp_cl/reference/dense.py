@@ -19,11 +19,6 @@ def camera_space(camera: Any, positions: np.ndarray) -> np.ndarray:
     return (np.asarray(positions, np.float64) - camera.eye) @ camera.pose[:, :3]
 
 
-def pixel_width(camera: Any, t: np.ndarray) -> np.ndarray:
-    """World width of a pixel at range t."""
-    return t / min(camera.fx, camera.fy)
-
-
 def drawn(
     camera: Any,
     positions: np.ndarray,
@@ -51,9 +46,7 @@ def rays(camera: Any) -> np.ndarray:
 def surface_depth(
     camera: Any, geometry: Arrays, radius: np.ndarray | float, kind: str
 ) -> np.ndarray:
-    """(N, HW): where a pixel's ray meets the point, along the camera's axis; of a soft point the
-    front of its ball, by the falloff. geometry, radius (N,) and kind: as geometry() has them.
-    """
+    """(N, HW) along the camera's axis, where a ray meets a point; a soft one's ball, by falloff."""
     ranges, d = geometry["depth"], np.maximum(geometry["falloff"], 0)
     if kind == "soft":
         radius = np.broadcast_to(np.asarray(radius, np.float64), len(ranges))
@@ -71,11 +64,8 @@ def geometry(
     depth_range: tuple[float, float] = DEPTH_RANGE,
 ) -> Arrays:
     """Dict of (N, HW) arrays: fragment, falloff, depth, z = normalised depth, and margin = distance
-    of the test of coverage from its border, in pixels.
-
-    radius: (N,) world units. covariance: (N, 3, 3) of Gaussians, world units squared; None: round
-    ones. Points that are left out cover nothing. Pulsar's box, part of the sphere's rule, is
-    included.
+    of the test of coverage from its border, in pixels. radius: (N,). covariance: (N, 3, 3) of
+    Gaussians; None: round ones.
     """
     radius = np.broadcast_to(np.asarray(radius, np.float64), (len(positions),))
     c, r = camera_space(camera, positions), rays(camera)
@@ -83,7 +73,7 @@ def geometry(
     c = np.where(ok[:, None], c, [0.0, 0.0, 1.0])
     t = np.linalg.norm(c, axis=1)[:, None]
     round_ones = radius[:, None, None] ** 2 * np.eye(3)
-    radius, width = radius[:, None], pixel_width(camera, t)
+    radius, width = radius[:, None], t / min(camera.fx, camera.fy)  # of a pixel at range t
     least = LEAST_RADIUS * width
     if kind == "gaussian":
         away, inverse, peak = screen_gaussians(
@@ -126,9 +116,7 @@ def geometry(
 def gaussians(
     camera: Any, vertices: np.ndarray, voxel_size: float, offset: np.ndarray, radius: float
 ) -> Arrays:
-    """geometry() of Gaussians in the cells of a grid. vertices: (N, 3) world. offset: (N, 9) or
-    more, as cl/cloud.h has it. radius: of one without offsets, world units.
-    """
+    """geometry() of Gaussians at vertices (N, 3) of a grid; offset: (N, 9), as in cl/cloud.h."""
     lower = np.zeros((len(offset), 3, 3))
     lower[:, range(3), range(3)] = radius * np.exp(offset[:, 3:6])
     lower[:, [1, 2, 2], [0, 0, 1]] = radius * offset[:, 6:9]
@@ -140,9 +128,8 @@ def gaussians(
 def screen_gaussians(
     camera: Any, c: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((N, HW, 2) from the centres of Gaussians to those of the pixels, (N, 2, 2) inverse of their
-    covariances on the screen, (N,) falloff in the centre). c: (N, 3) in camera axes. covariance:
-    (N, 3, 3) in world axes.
+    """((N, HW, 2) from centres of Gaussians to pixels', (N, 2, 2) inverse covariances on the
+    screen, (N,) falloff in the centre). c: (N, 3) in camera axes. covariance: in world axes.
     """
     (x, y, z), focal = c.T, (camera.fx, camera.fy)
     jacobian = np.zeros((len(c), 2, 3))
@@ -161,9 +148,7 @@ def screen_gaussians(
 
 
 def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """(N, HW) bool: the pixel lies in the sphere's box [floor(min), ceil(max)] of Pulsar; unbounded
-    at the eye's plane.
-    """
+    """(N, HW) bool: the pixel lies in Pulsar's box of the sphere, unbounded at the eye's plane."""
     y, x = np.mgrid[: camera.height, : camera.width]
     inside = np.ones((len(c), x.size), bool)
     for u, focal, centre, pixel in (
@@ -181,15 +166,9 @@ def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:
 
 
 def order(geometry_: Arrays) -> np.ndarray:
-    """(N, HW) int: each fragment's place in its pixel by (depth, index), from 0; other numbers are
-    meaningless.
-    """
+    """(N, HW) int: each fragment's place in its pixel by (depth, index), from 0."""
     depth = np.where(geometry_["fragment"], geometry_["depth"], np.inf)
-    ranks = np.empty(depth.shape, np.int64)
-    np.put_along_axis(
-        ranks, np.argsort(depth, axis=0, kind="stable"), np.arange(len(depth))[:, None], axis=0
-    )
-    return ranks
+    return np.argsort(np.argsort(depth, axis=0, kind="stable"), axis=0)
 
 
 def blend(geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.0) -> Arrays:
@@ -243,9 +222,8 @@ def features(blend_: Arrays, point_features: np.ndarray) -> np.ndarray:
 
 
 def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
-    """Dict of front-to-back compositing: alpha (N, HW); weight (N, HW) b; through (N, HW) T in
-    front of a fragment; background (HW,) what is left; fragment (N, HW) used: those where T >=
-    least.
+    """Dict of front-to-back compositing, (N, HW) each: alpha; weight b; through, T in front;
+    fragment, those where T >= least; and background (HW,), what is left.
     """
     fragment, ranks = geometry_["fragment"], order(geometry_)
     least_alpha, most_alpha = geometry_["limits"]
@@ -301,8 +279,8 @@ def gradients(
     max_tracked: int = 0,
     distortion_weight: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the tracked() fragments.
-    distortion_weight: of the pixels' distortion loss, which is added; of alpha() alone.
+    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the tracked() fragments, and of the
+    distortion loss times its weight, of alpha() alone.
     """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
@@ -324,9 +302,7 @@ def tracked(geometry_: Arrays, blend_: Arrays, max_tracked: int) -> np.ndarray:
 
 
 def _alpha_derivative(blend_, own, background, ranks):
-    """(N, HW) dL/dalpha of the fragments that are used. own: G times a point's features.
-    background: (HW,), G times those behind all fragments.
-    """
+    """(N, HW) dL/dalpha. own, background: G times a point's features, and what is behind all."""
     derivative = np.zeros_like(own)
     for q in np.flatnonzero(blend_["fragment"].any(axis=0)):
         points = np.flatnonzero(blend_["fragment"][:, q])

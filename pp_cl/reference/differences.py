@@ -11,9 +11,7 @@ def numeric_gradient(
     step: float,
     indices: Iterable[int] | None = None,
 ) -> np.ndarray:
-    """Central differences of a scalar function of a float64 array, at flat `indices` (all by
-    default): (len(indices),).
-    """
+    """(len(indices),) central differences of a function of an array, at flat indices (all)."""
     values = np.array(values, np.float64)
     indices = range(values.size) if indices is None else indices
     gradient = []

@@ -10,11 +10,6 @@ BLOCKS = (2, 2, 3, 3, 3)
 WIDTHS = (16, 16, 32, 32, 48)  # channels of the blocks of a network small enough for numpy
 
 
-def scaled_input(image: np.ndarray) -> np.ndarray:
-    """Network input of an image in [0, 1], (..., 3)."""
-    return (2 * image - 1 - np.array([-0.030, -0.088, -0.188])) / np.array([0.458, 0.448, 0.450])
-
-
 def maxpool2(x: np.ndarray) -> np.ndarray:
     """Largest value of each 2x2 cell; an odd last row or column is dropped."""
     height, width, channels = x.shape[0] // 2, x.shape[1] // 2, x.shape[2]
@@ -30,7 +25,8 @@ def pixel_distance(a: np.ndarray, b: np.ndarray, head: np.ndarray) -> np.ndarray
 
 def _features(image, weights):
     """The output of each block of an image in [0, 1]."""
-    x, layer, outputs = scaled_input(image), 0, []
+    x = (2 * image - 1 - np.array([-0.030, -0.088, -0.188])) / np.array([0.458, 0.448, 0.450])
+    layer, outputs = 0, []
     for block, convolutions in enumerate(BLOCKS):
         x = maxpool2(x) if block else x
         for _ in range(convolutions):
@@ -41,9 +37,7 @@ def _features(image, weights):
 
 
 def lpips(a: np.ndarray, b: np.ndarray, weights: Weights) -> float:
-    """Distance of two (H, W, 3) images in [0, 1]; weights as pp_cl.lpips_weights.load_weights()
-    names them.
-    """
+    """Distance of two (H, W, 3) images in [0, 1]; weights as load_weights() names them."""
     pairs = zip(_features(a, weights), _features(b, weights), strict=True)
     return sum(
         pixel_distance(x, y, weights[f"head{block}"]).mean() for block, (x, y) in enumerate(pairs)

@@ -7,9 +7,7 @@ import numpy as np
 
 
 def convolution(x: np.ndarray, weight: np.ndarray, bias: np.ndarray | float = 0.0) -> np.ndarray:
-    """(H, W, CO) float64 convolution of x (H, W, CI) by weight (CO, CI, K, K), stride 1, zero
-    padding K // 2.
-    """
+    """(H, W, CO) convolution of x (H, W, CI) by weight (CO, CI, K, K), padded by zeros."""
     out = np.zeros((x.shape[0] * x.shape[1], len(weight)))
     for ky, kx, seen in _taps(x, weight.shape[2]):
         out += seen @ weight[:, :, ky, kx].T.astype(np.float64, order="C")
@@ -22,9 +20,7 @@ def flipped(weight: np.ndarray) -> np.ndarray:
 
 
 def convolution_backward_weights(x: np.ndarray, grad_out: np.ndarray, k: int) -> np.ndarray:
-    """(CO, CI, K, K) float64 gradient of the weights; x: (H, W, CI), grad_out: (H, W, CO), or some
-    channels of either.
-    """
+    """(CO, CI, K, K) gradient of the weights, of x (H, W, CI) and grad_out (H, W, CO)."""
     columns = grad_out.reshape(-1, grad_out.shape[2]).astype(np.float64).T
     gradient = np.empty((len(columns), x.shape[2], k, k))
     for ky, kx, seen in _taps(x, k):
@@ -79,10 +75,8 @@ def upsample_backward(grad_out: np.ndarray) -> np.ndarray:
 
 
 def network(layers: list, parameters: dict, x: np.ndarray) -> dict[str, np.ndarray]:
-    """{layer: its float64 output} of a network; "image" is the image, "x" the input (H, W, C).
-
-    layers: pp_cl.engine.network.layers.Layer in the order of the forward pass. parameters:
-    {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
+    """{layer: its output} of a network; "image" is the image, "x" the input (H, W, C). layers: of
+    unet_layers(). parameters: {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
     """
     outputs = {"x": np.asarray(x, np.float64)}
     for layer in layers:
@@ -95,10 +89,8 @@ def network_gradients(
     layers: list, parameters: dict, outputs: dict, active: dict, *, grad_image: np.ndarray
 ) -> dict[str, np.ndarray]:
     """{"x" or parameter: its gradient}, given the outputs of network() and dL/dimage (H, W, 3).
-
-    active: {layer: where its ReLU lets the gradient pass}. Near 0 two ways of rounding disagree
-    about that, and one such place weighs more than the rounding of all others: pass those of the
-    network that is to be judged.
+    active: {layer: where its ReLU lets the gradient pass}, of the network that is to be judged:
+    near 0 one place of another rounding weighs more than the rounding of all others.
     """
     gradients: dict[str, Any] = {}  # of parameters
     grads: dict[str, Any] = defaultdict(float)  # of outputs, summed over their uses
@@ -128,9 +120,7 @@ def _forward(layer, source, parameters):
 
 
 def _backward(layer, source, grad_out, parameters):
-    """(gradient of the inputs' concatenation, {parameter: its gradient}), given that of the output
-    before its ReLU.
-    """
+    """(gradient of the joined inputs, {parameter: its gradient}), of that before the ReLU."""
     if layer.kind == "gate":
         return gate_backward(source, grad_out), {}
     if layer.kind != "conv":
@@ -166,5 +156,4 @@ def _bilinear(n):
 
 
 def _along_both(rows, columns, x):
-    """Apply a matrix to the rows and one to the columns of x (H, W, C)."""
     return np.einsum("Yy,Xx,yxc->YXc", rows, columns, x, optimize=True)

@@ -27,11 +27,9 @@ class Adam:
 
 
 class RmsProp:
-    """The step of cl/training/rmsprop.cl, written out for all points in every step.
-
-    values: {"sh": (N, count, 16), "offset": (N, 4), of Gaussians (N, 16), "opacity": (N, 9)}.
-    directions: (N, 3), from the eye, of length 1. most: of an offset; most_sh: of coefficients
-    above degree 0. v: {"sh": (N, 16), "offset", "opacity": (N,)}.
+    """The step of cl/training/rmsprop.cl, for all points in every step. values: {"sh": (N, count,
+    16), "offset": (N, 4 or 16), "opacity": (N, 9)}. directions: (N, 3) from the eye. most, most_sh:
+    of an offset, and of coefficients above degree 0.
     """
 
     def __init__(
@@ -50,8 +48,7 @@ class RmsProp:
         self, t: int, gradients: dict[str, np.ndarray], rates: dict, eps: dict[str, float]
     ) -> None:
         """Step t with gradients "sh", (N, 16) of the features, "offset" and "opacity"; those
-        between it and the last were 0. rates: {"sh": of the basis functions, "offset", "opacity",
-        "lobe"}.
+        between it and the last were 0. rates: {"sh", "offset", "opacity", "lobe"}.
         """
         moves = {}
         for name, values in gradients.items():
@@ -77,17 +74,15 @@ class RmsProp:
 
 
 def neighbours(vertices: np.ndarray) -> list[list[int | None]]:
-    """Per vertex (i, j, k) of (N, 3) the indices of its neighbours -x, +x, -y, +y, -z, +z, None
-    where there is none.
-    """
+    """The indices of each vertex's neighbours -x, +x, -y, +y, -z, +z; None where there is none."""
     index = {tuple(map(int, vertex)): n for n, vertex in enumerate(vertices)}
     offsets = [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)]
     return [[index.get((x + a, y + b, z + c)) for a, b, c in offsets] for x, y, z in index]
 
 
 def smoothed(values: np.ndarray, vertices: np.ndarray, amount: float) -> np.ndarray:
-    """Array (N, ...) moved by `amount` towards the mean of the neighbours on the vertices (N, 3):
-    first the points whose grid indices have an even sum, then the others.
+    """Array (N, ...) moved by `amount` towards the mean of the grid neighbours: first the points
+    whose indices have an even sum, then the others.
     """
     new = np.array(values, np.float64)
     around, colours = neighbours(vertices), vertices.sum(1) % 2

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import BarycentricInterpolator
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, maximum_filter
 
 CENTRE = np.array([0, 0, 0.15])  # of the globe
 MERIDIAN = np.array([0.819152, 0.573576, 0])
@@ -18,12 +17,8 @@ ECLIPTIC = np.cos(np.pi / 3) * MERIDIAN + np.sin(np.pi / 3) * WHEEL_V
 
 
 def dilated_mask(alpha: np.ndarray, threshold: int, margin: int) -> np.ndarray:
-    """(H, W) bool: some pixel at most `margin` rows and columns away has an alpha above the
-    threshold.
-    """
-    side = 2 * margin + 1
-    padded = np.pad(alpha > threshold, margin)
-    return np.asarray(sliding_window_view(padded, (side, side)).any((2, 3)))
+    """(H, W) bool: a pixel within `margin` rows and columns has an alpha above the threshold."""
+    return maximum_filter(alpha > threshold, 2 * margin + 1, mode="constant")
 
 
 def in_hull(
@@ -35,10 +30,8 @@ def in_hull(
     forgiven: int,
     doubts: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((N,) bool in the hull: seen by `least` views and rejected by no larger share of them than
-    `forgiven` of all, (N,) pixels to the nearest pixel border of any view that has the position
-    before it). With doubts, a view that does not see it takes one away from those that do, if its
-    nearest pixel is beside its mask.
+    """((N,) bool in the hull, as scene.hull.Carver has it, (N,) pixels to the nearest pixel border
+    of any view that has the position before it).
     """
     seen, rejecting = np.zeros((2, len(positions)), int)
     border = np.full(len(positions), np.inf)
@@ -74,9 +67,8 @@ def in_hull(
 
 
 def undistorted(image: np.ndarray, camera: Any, lens: Any, factor: int = 1) -> np.ndarray:
-    """(H // factor, W // factor, 4) float64, of 255 levels: an image (H, W, 4) uint8, read by
-    cubic splines where the lens puts the pixels of a pinhole camera, on premultiplied colour, then
-    reduced by area.
+    """(H // factor, W // factor, 4), of 255 levels: an image (H, W, 4) uint8, read by cubic splines
+    where the lens puts the pixels of a pinhole camera, premultiplied, then reduced by area.
     """
     height, width = (side // factor for side in image.shape[:2])
     x = (np.arange(factor * width) + 0.5 - camera.cx) / camera.fx
@@ -97,9 +89,7 @@ def undistorted(image: np.ndarray, camera: Any, lens: Any, factor: int = 1) -> n
 def target_forward(
     image: np.ndarray, downscale: int, left: int, top: int, *, width: int, height: int
 ) -> np.ndarray:
-    """(height, width, 3): means over white of the downscale x downscale blocks, from (left, top)
-    on, of an (H, W, 4) uint8 image.
-    """
+    """(height, width, 3): means over white of the blocks of an (H, W, 4) uint8 image."""
     colour, alpha = image[..., :3] / 255.0, image[..., 3:] / 255.0
     over_white = colour * alpha + (1 - alpha)
     target = np.ones((height, width, 3))
@@ -118,9 +108,8 @@ def target_forward(
 def target_between(
     image: np.ndarray, left: float, top: float, *, width: int, height: int
 ) -> np.ndarray:
-    """(height, width, 4): colour over white and alpha of an (H, W, 4) uint8 image at pixels from
-    the place (left, top) on, by the polynomial through the five nearest pixels each way; white and
-    0 where the nearest is outside of the image.
+    """(height, width, 4): colour over white and alpha of a uint8 image, by the polynomial
+    through the five nearest pixels each way; white and 0 where the nearest is outside.
     """
     alpha = image[..., 3:] / 255.0
     planes = np.concatenate([image[..., :3] / 255.0 * alpha + 1 - alpha, alpha], axis=2)

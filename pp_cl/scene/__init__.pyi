@@ -21,7 +21,6 @@ from .load import scene_box as scene_box
 from .load import scene_format as scene_format
 from .load import scene_frames as scene_frames
 from .load import scene_splits as scene_splits
-from .masks import MaskRule as MaskRule
 from .masks import cut_out as cut_out
 from .masks import named_mask as named_mask
 from .masks import read_mask_of_size as read_mask_of_size

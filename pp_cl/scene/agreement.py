@@ -18,8 +18,8 @@ AGREEING = 0.75  # of the other views that see a place, whose masks hold it
 
 
 class Disagreement(NamedTuple):
-    """A view whose mask rejects what the others agree on. share: of the places that they agree on,
-    which it alone rejects; those are the vertices `ids` (M,) of a coarse grid.
+    """A view whose mask alone rejects a share of the places that the others agree on, which are the
+    vertices `ids` (M,) of a coarse grid.
     """
 
     view: View
@@ -29,9 +29,8 @@ class Disagreement(NamedTuple):
 
 
 def disagreements(views: Sequence[View], box: np.ndarray) -> list[Disagreement]:
-    """The views whose masks disagree with the others, the worst first.
-
-    box: (2, 3), around the hull; its double is searched, since a wrong mask has carved it.
+    """The views whose masks disagree with the others, the worst first. box: (2, 3), around the
+    hull; its double is searched, since a wrong mask has carved it.
     """
     if not any(view.has_mask for view in views):
         return []
@@ -49,10 +48,7 @@ def disagreements(views: Sequence[View], box: np.ndarray) -> list[Disagreement]:
 
 
 def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
-    """One line on why the masks leave no point: which views contradict most others.
-
-    It counts the masks that hold each of about 32^3 positions in a (2, 3) box.
-    """
+    """One line on why the masks leave no point in a (2, 3) box: which contradict most others."""
     _, on_mask, beside = mask_votes(views, box)
     agreeing = on_mask.sum(0).max()
     objections = beside[:, on_mask.sum(0) == agreeing].mean(1)
@@ -72,7 +68,7 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
 
 def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray, np.ndarray]:
     """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its lattice() fall onto
-    each view's mask, and which into its image beside the mask), neither where it is ignored.
+    each view's mask, and which into its image beside it).
     """
     grid = Grid.centred_in(box, smallest_voxel_size(box, PROBED_CELLS))
     vertices = grid.lattice()

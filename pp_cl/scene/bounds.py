@@ -20,7 +20,7 @@ SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog
 
 def reach_of(views: Sequence[View]) -> float:
     """Longest side of the box of the cameras' eyes, world units. Raises UserError naming views
-    where they make no scene: all are in one place, one is much too far away, or all are too close.
+    where all are in one place, one is much too far away, or all are too close.
     """
     eyes = np.stack([view.camera.eye for view in views])
     reach, all_views = float(np.ptp(eyes, axis=0).max()), _all_of(views)
@@ -52,13 +52,10 @@ def _all_of(views):
 
 
 def bounding_box(views: Sequence[View]) -> np.ndarray:
-    """(2, 3) box around the intersection of one pyramid per view, the one through the rectangle
-    around its mask, by linear programs.
-
-    A side where the mask reaches the image border does not bound the object, unless nothing else
-    does; then the object is taken to end CROPPED_MARGIN image sizes outside. Where no view has a
-    mask, images end at their borders. Raises UserError when the pyramids do not meet, do not end or
-    meet in a point, and as reach_of does.
+    """(2, 3) box around the intersection of the views' pyramids, each through the rectangle around
+    its mask, by linear programs. A side where the mask reaches the image border does not bound the
+    object, unless nothing else does: then it ends CROPPED_MARGIN image sizes outside. Raises
+    UserError when the pyramids do not meet, do not end or meet in a point, and as reach_of does.
     """
     from scipy.optimize import linprog  # takes long to import
 
@@ -83,8 +80,8 @@ def bounding_box(views: Sequence[View]) -> np.ndarray:
 
 
 def looking_elsewhere(views: Sequence[View]) -> list[View]:
-    """The views whose pyramids miss the place that is the least outside of all pyramids together:
-    none where all meet. As a sum, that is where most of them meet, however far off the others are.
+    """The views whose pyramids miss the place that is the least outside of all, as a sum: that is
+    where most of them meet, however far off the others are.
     """
     from scipy.optimize import linprog  # takes long to import
 
@@ -105,10 +102,8 @@ def looking_elsewhere(views: Sequence[View]) -> list[View]:
 
 
 def _silhouette_planes(view, cropped_margin):
-    """(P, 4) normals n and offsets o: n.x >= o holds for all x that the rectangle around the
-    dilated mask lets pass.
-
-    Sides where it reaches the image border: left out, or cropped_margin image sizes further out.
+    """(P, 4) normals n and offsets o: n.x >= o holds for all x in the rectangle around the mask;
+    sides at the image border are left out, or cropped_margin image sizes further out.
     """
     camera, mask = view.stored_camera, view.hull_alpha > MASK_THRESHOLD
     normals = []

@@ -24,11 +24,8 @@ OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
 def demo_views(dev: Device, split: str, most: int | None = None, size: int = SIZE) -> list[View]:
-    """The 64 training or 16 test views of size x size pixels, rendered on the device; they state no
-    depth range. most: of them, spread evenly; None: all.
-
-    The training views spread evenly from a little below the horizon to the pole, the test views
-    circle the object.
+    """The 64 training or 16 test views of size x size pixels, rendered on the device, or `most` of
+    them, spread evenly.
     """
     return [
         View(frame.name, frame.camera, render(dev, frame.camera))
@@ -51,9 +48,7 @@ def demo_frames(split: str, size: int = SIZE) -> list[ImageFile]:
 
 
 def render(dev: Device, camera: Camera) -> np.ndarray:
-    """(H, W, 4) uint8 straight RGBA image of the object; alpha is the share of 4x4 rays that hit
-    it.
-    """
+    """(H, W, 4) uint8 straight RGBA image of the object, by 4x4 rays a pixel."""
     image = dev.empty((camera.height, camera.width, 4), np.uint8)
     dev.program("scene/demo", LANES=lanes(dev)).launch(
         "render_demo",
@@ -68,10 +63,7 @@ def render(dev: Device, camera: Camera) -> np.ndarray:
 
 def demo_mesh(dev: Device, resolution: int = 256) -> tuple[np.ndarray, np.ndarray]:
     """((V, 3) float32 vertices, (F, 3) int32 faces, counter-clockwise from outside) of the object,
-    by marching cubes.
-
-    resolution: grid vertices along the box's longest side; the thinnest parts are 0.022 wide, the
-    box is 1.92 long.
+    by marching cubes. resolution: grid vertices along the box's longest side.
     """
     from skimage.measure import marching_cubes  # takes long to import
 
@@ -99,10 +91,7 @@ def distances(dev: Device, grid: Grid) -> np.ndarray:
 
 
 def _camera(azimuth, elevation, size):
-    """Camera at two angles in radians that looks at the origin, z up.
-
-    camera.look_at would give other last bits, and with them other images and checkpoints.
-    """
+    """Camera at two angles in radians that looks at the origin; look_at() has other last bits."""
     level = math.cos(elevation)
     forward = -np.array([math.cos(azimuth) * level, math.sin(azimuth) * level, math.sin(elevation)])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])

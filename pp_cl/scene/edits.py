@@ -7,18 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pp_cl.errors import UserError, quoted
-from pp_cl.files.atomic import write_json
-from pp_cl.scene.convention import AXES
+from pp_cl.errors import quoted
+from pp_cl.files.atomic import told, write_json
+from pp_cl.scene.gaze import AXES
 from pp_cl.scene.readers.common import checked_box, fail_at, read_json
 
 EDITS = "pp_cl.json"
 
 
 class Edits(NamedTuple):
-    """box: (2, 3) lower and upper corner in world units, None where the user has given none.
-    dropped: names of images, as a scene lists them. axes: how the matrices of its cameras are
-    to be read, out of AXES; None where the user has not said so.
+    """box: (2, 3) lower and upper corner in world units. dropped: names of images, as a scene lists
+    them. axes: how the matrices of its cameras are to be read, out of AXES.
     """
 
     box: np.ndarray | None = None
@@ -46,9 +45,7 @@ def read_edits(folder: Path) -> Edits:
 
 
 def write_edits(folder: Path, edits: Edits) -> None:
-    """Write the edits into a scene's folder; none at all remove the file. Raises UserError for a
-    box without volume, and where that cannot be done.
-    """
+    """Write the edits into a scene's folder; none at all remove the file. Raises UserError."""
     file, box = folder / EDITS, None
     if edits.box is not None:
         box = checked_box(np.array(edits.box).tolist(), fail_at(file, "box")).tolist()
@@ -57,7 +54,5 @@ def write_edits(folder: Path, edits: Edits) -> None:
     if facts:
         write_json(file, facts)
         return
-    try:
+    with told(file):
         file.unlink(missing_ok=True)
-    except OSError as error:
-        raise UserError(f"{file}: cannot be removed ({error.strerror})") from error

@@ -1,8 +1,5 @@
-"""What is found of what a scene's files name: the image of a name, the mask of an image; and what
-cannot be used is left out.
-"""
+"""What is found of what a scene's files name: the image of a name, the mask of an image."""
 
-import hashlib
 import os
 import posixpath
 import re
@@ -13,14 +10,13 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from pp_cl.errors import Unusable, UserError
+from pp_cl.files.atomic import sha256_of
 from pp_cl.files.image import ENDINGS
 
 # where programs put the images that a name may mean, in their order, beside images_2, images_4 ...
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
 MASK_FOLDERS = ("masks", "mask")
 IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says nothing
-PIECE = 2**20  # bytes of a file that are read at once
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Fail = Callable[[str], UserError]  # makes the error that names the file and the key
@@ -33,9 +29,7 @@ def usable(
     name: Callable[[Item], str],
     left_out: LeftOut,
 ) -> Iterator[Result]:
-    """What read() gives of the items, without those for which it raises UserError: these are added
-    to left_out by their name().
-    """
+    """What read() gives of the items; where it raises UserError, their name() goes to left_out."""
     for item in items:
         try:
             yield read(item)
@@ -43,18 +37,11 @@ def usable(
             left_out.append((name(item), error))
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def find_image(folder: Path, given: str, fail: Fail, kind: str = "image") -> str:
-    """Path relative to the scene's folder of the image that a file there calls `given`.
-
-    In this order: as it is written, also as Windows writes paths; then for each tail of the path,
-    the longest first, beside the file and in IMAGE_FOLDERS: what _alike() finds. Links that lie in
-    the folder are followed. kind: image, or mask, which is looked for in MASK_FOLDERS, never where
-    images are.
-
-    Raises fail(text) for a path that leaves the folder, Unusable with its text where no image is.
+    """Path relative to the scene's folder of the image that a file there calls `given`: as it is
+    written, or what is _alike() for the tails of the path, the longest first, beside the file and
+    in IMAGE_FOLDERS, for the kind mask in MASK_FOLDERS. Raises fail(text) for a path that leaves
+    the folder, Unusable with its text where no image is.
     """
     root = os.path.realpath(folder)
     try:
@@ -90,24 +77,14 @@ def pictures_of(files: Sequence[Path]) -> list[object]:
     sizes = [file.stat().st_size if file.is_file() else -1 for file in files]
     often = Counter(sizes)
     return [
-        _digest(file) if size >= 0 and often[size] > 1 else file
+        sha256_of(file).digest() if size >= 0 and often[size] > 1 else file
         for file, size in zip(files, sizes, strict=True)
     ]
 
 
-def _digest(file):
-    """The digest of a file."""
-    digest = hashlib.sha256()
-    with file.open("rb") as opened:
-        while piece := opened.read(PIECE):
-            digest.update(piece)
-    return digest.digest()
-
-
 def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:
-    """{place: name} of sorted names in a list of `count`, of which some are gone: their places are
-    the numbers in their names, counted from the first one's. None where these say nothing: it may
-    be all of the first, or of the last, that are gone.
+    """{place: name} of sorted names in a list of `count`, of which some are gone, by the numbers in
+    the names, counted from the first one's; None where these say nothing.
     """
     if len(names) == count:
         return dict(enumerate(names))
@@ -119,9 +96,7 @@ def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:
 
 
 def _inside(root, path):
-    """A path relative to the root, of what a link leads to if that is inside, too; None of an
-    absolute path outside.
-    """
+    """A path relative to the root, of what a link leads to if that is inside; None outside."""
     for one in (os.path.realpath(path), os.path.normpath(path)):
         if os.path.commonpath([root, one]) == root:
             return os.path.relpath(one, root).replace(os.sep, "/")
@@ -131,41 +106,30 @@ def _inside(root, path):
 def _image_folders(root):
     """IMAGE_FOLDERS that there are, in any case, and images_N, the largest images first."""
     entries = sorted(os.listdir(root))
-    reduced = {
-        entry: int(number)
-        for entry in entries
-        if (number := entry.removeprefix("images_")).isdecimal() and number != entry
-    }
+    reduced = [entry for entry in entries if re.fullmatch(r"images_\d+", entry)]
     inside = {entry.lower(): entry for entry in reversed(entries)}
     usual = (inside.get(place, place) for place in IMAGE_FOLDERS)
-    places = (*usual, *sorted(reduced, key=reduced.__getitem__))
+    places = (*usual, *sorted(reduced, key=lambda entry: int(entry[len("images_") :])))
     return [place for place in places if os.path.isdir(os.path.join(root, place))]
 
 
 def _alike(folder, name):
-    """The image in a folder that a name means: with another ending (those that may have alpha
-    first), without an ending that stands there twice, or, if it is the only one, in another case.
-    None where there is none.
+    """The image in a folder that a name means: with another ending, those that may have alpha
+    first, or, if it is the only one, in another case. None where there is none.
     """
     if not os.path.isdir(folder):
         return None
     bare = _bare(name)
     alike = _images(folder, os.stat(folder).st_mtime_ns).get(bare.lower(), [])
     exact = [one for one in alike if _bare(one) == bare]
-    if name in exact:
-        found = name
-    elif exact:
-        found = min(exact, key=lambda one: ENDINGS.index(os.path.splitext(one)[1].lower()))
-    else:
-        found = alike[0] if len(alike) == 1 else None
+    exact.sort(key=lambda one: (one != name, ENDINGS.index(os.path.splitext(one)[1].lower())))
+    found = next(iter(exact or alike * (len(alike) == 1)), None)
     return found if found and os.path.isfile(os.path.join(folder, found)) else None
 
 
 @lru_cache(maxsize=256)
 def _images(folder, time):
-    """{name without endings, in lower case: images in a folder}. time: of the folder's last change,
-    so that what is kept here stays true.
-    """
+    """{name without endings, in lower case: images in a folder}, last changed at that time."""
     found = {}
     for name in sorted(os.listdir(folder)):
         if name.lower().endswith(ENDINGS):
@@ -185,8 +149,8 @@ def _bare(name):
 
 def find_mask(folder: Path, image: str, *, by_number: bool = False) -> str | None:
     """Path in a folder of masks of the mask of an image, a path in the same tree: with .png added,
-    or its stem, maybe with _mask behind or mask_ before it, with the ending of any image. None
-    where there is none. by_number: else that with the same number, as DTU has it.
+    or its stem, maybe with _mask behind or mask_ before it, or, by_number, with its number as DTU
+    has it. None where there is none.
     """
     above, name = posixpath.split(image)
     if not os.path.isdir(folder / above):
@@ -203,10 +167,8 @@ def find_mask(folder: Path, image: str, *, by_number: bool = False) -> str | Non
 @lru_cache(maxsize=256)
 def _masks(folder, time):
     """{what an image may be called, or its number: its mask} in a folder last changed then."""
-    found = {}
     names = [name for names in _images(folder, time).values() for name in names]
-    for name in names:
-        found[os.path.splitext(name)[0]] = name
+    found = {os.path.splitext(name)[0]: name for name in names}
     for name in names:
         bare = _bare(name)
         for image in (bare, bare.removesuffix("_mask"), bare.removeprefix("mask_")):
@@ -219,12 +181,10 @@ def _masks(folder, time):
 def find_masks(
     folder: Path, images: Sequence[str], places: Sequence[str] = MASK_FOLDERS
 ) -> dict[str, str] | None:
-    """{image: its mask} of those that have one in the scene's folder of masks, both relative to the
-    scene's folder; None where there is no such folder. places: what it may be called.
-
-    A mask lies in the same tree, with or without the folder of images above it, and is named as
-    find_mask() has it; where names of images are there once only, it may also lie at the top of its
-    folder, or have the same number. Raises UserError where no image has one.
+    """{image: its mask} of those that have one in the scene's folder of masks, which is called as
+    one of the places; None without such a folder. A mask lies in the same tree, with or without the
+    folder of images above it; where names of images are there once only, also at the top of its
+    folder, or by its number. Raises UserError where no image has one.
     """
     place = folder_named(folder, places)
     if place is None:
@@ -263,7 +223,7 @@ def holds_images(folder: Path) -> bool:
 
 def image_folder(folder: Path, names: Sequence[str] = IMAGE_FOLDERS) -> str:
     """Where the images of a format lie that does not name them: the first of the names that is a
-    folder there, else images_N with the largest images; where none is, the first name.
+    folder there, else images_N with the largest images.
     """
     reduced = [place for place in _image_folders(folder) if place.lower() not in IMAGE_FOLDERS]
     return folder_named(folder, names) or next(iter(reduced), names[0])

@@ -3,7 +3,7 @@
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -45,10 +45,8 @@ CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size
 
 @dataclass(frozen=True)
 class Hull:
-    """Vertices inside the visual hull.
-
-    grid: the smallest Grid that holds them. ids: (N,) uint32, ascending. capped: there are fewer
-    points than asked for, because a finer grid would have more cells than the cap.
+    """Vertices inside the visual hull. grid: the smallest Grid that holds them. ids: (N,) uint32,
+    ascending. capped: there are fewer points than asked for, by the cap on the grid's cells.
     """
 
     grid: Grid
@@ -57,13 +55,11 @@ class Hull:
 
 
 class Carver:
-    """Masks and cameras of the stored images, on the device, to carve any grid with.
-
-    Masks are widened by a pixel, which keeps vertices that touch the silhouette, and by one of the
-    reduced image: by so much are poses and masks of images wrong. least: images that must see a
-    vertex. doubts: 1 where so few masks end within their image that an image takes one of these
-    away from what lies beside it, if the nearest pixel of its border is beside the mask: so images
-    that are cropped to the object bound it, and those that it leaves do not cut it off.
+    """Masks and cameras of the stored images, on the device, to carve any grid with. Masks are
+    widened by a pixel, which keeps vertices that touch the silhouette, and by one of the reduced
+    image, as poses and masks are wrong. least: images that must see a vertex. doubts: 1 where few
+    masks end within their image; then an image takes one away from what lies beside it, if the
+    nearest pixel of its border is beside the mask: so images cropped to the object bound it.
     """
 
     def __init__(self, dev: Device, views: Sequence[View]):
@@ -77,22 +73,21 @@ class Carver:
             table.append((camera.width, camera.height, words, start))
             start += words * camera.height
         self.masks = dev.empty((start,), np.uint32)
-        for view, (_, _, words, first) in zip(views, table, strict=True):
-            self._add_mask(view, words, first)
+        for view, (_, height, words, first) in zip(views, table, strict=True):
+            self._add_mask(view, height, words, first)
         self.view_masks = dev.upload(table, np.uint32)
         is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
         self.view_is_whole = dev.upload(is_whole, np.uint32)
         # else these bound the object, and close-ups must not take away what lies beside them
         self.doubts = int(sum(is_whole) < self.least)
 
-    def _add_mask(self, view, words, first):
+    def _add_mask(self, view, height, words, first):
         """Write the widened mask of a view from word `first` on."""
-        height, width = view.image.shape[:2]
         mask, other = (self.dev.empty((height * words,), np.uint32) for _ in range(2))
         self.program.launch(
             "pack_mask",
             (words, height),
-            width=width,
+            width=view.image.shape[1],
             height=height,
             words=words,
             threshold=MASK_THRESHOLD,
@@ -112,8 +107,8 @@ class Carver:
             mask, other = other, mask
 
     def carve(self, grid: Grid, forgiven: int = 0) -> np.ndarray:
-        """(nz, ny, nx) bool: the vertices of a grid that enough images see and no more masks than
-        `forgiven` reject, or the same share of those that see one.
+        """(nz, ny, nx) bool: the vertices of a grid that enough images see and no larger share of
+        their masks rejects than `forgiven` of all.
         """
         nx, ny, nz = grid.dims
         rows, words = ny * nz, -(-nx // 32)
@@ -150,61 +145,22 @@ def build_grid(
     forgiven: int = 0,
 ) -> Hull:
     """Hull with about `points` vertices: the rule that fits Table 4 of the PlenopticPoints
-    supplemental.
+    supplemental. box: (2, 3), which holds all vertices; None: what the masks allow, and where no
+    view has one what all cameras see. forgiven: as agreeing() has it.
 
-    views: of any sizes; their stored images and cameras are used. box: (2, 3), which holds all
-    vertices; None: what the masks allow, and where no view has one what all cameras see. A vertex
-    is inside if LEAST_SEEING images see it and it lies in the mask of each one that does, both as
-    Carver has it, but for `forgiven` of all views (agreeing()). The search starts from the box
-    that the masks allow and rescales the voxel size from the measured count, until the count is
-    `points` to 1.02 points. At CELL_CAP vertices of the grid, or after 8 rounds, the best carving
-    is taken: the smallest with enough points, else the largest. Raises UserError for an impossible
-    `points`, masks or poses that leave no vertex, cameras that make no scene.
+    The search starts from the box that the masks allow and rescales the voxel size from the
+    measured count, until that is `points` to 1.02 points. At CELL_CAP vertices of the grid, or
+    after 8 rounds, the smallest carving with enough points is taken, else the largest. Raises
+    UserError for an impossible `points`, masks or poses that leave no vertex, cameras that make no
+    scene.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     limit = None if box is None else box - corner
-    hull = _search(dev, near, points, _box(near, limit, forgiven), forgiven, limit)
-    return replace(hull, grid=hull.grid.moved(corner))
-
-
-def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -> np.ndarray:
-    """(N,) ascending ids of the vertices of a grid inside the hull, as build_grid() has it."""
-    corner = _corner(views, reach_of(views))
-    near = [view.moved(-corner) for view in views]
-    carver = Carver(dev, _farthest_point_order(near, grid.centre - corner))
-    return grid.ids_of(carver.carve(grid.moved(-corner), forgiven))
-
-
-def _box(views, given, forgiven):
-    """The box to search: the given one as far as the masks allow it, whole if there are none. Where
-    masks are forgiven, twice what they allow, as a wrong one bounds it too.
-    """
-    if given is not None and not any(view.has_mask for view in views):
-        return given
-    box = bounding_box(views)
-    if forgiven:
-        box = box.mean(0) + np.array([[-1], [1]]) * np.ptp(box, axis=0)
-    if given is None:
-        return box
-    shared = np.stack([np.maximum(box[0], given[0]), np.minimum(box[1], given[1])])
-    return shared if (shared[0] < shared[1]).all() else given
-
-
-def _corner(views, reach):
-    """(3,) world position near the cameras, from which a scene far from the origin is carved as one
-    at the origin is: views that are moved alike, by whole units of the corner, give the same hull.
-    """
-    eyes = np.stack([view.camera.eye for view in views])
-    unit = 2.0 ** (math.frexp(reach)[1] - CORNER_BITS)
-    return unit * np.floor(eyes.min(0) / unit)
-
-
-def _search(dev, views, points, box, forgiven, limit):
-    """The Hull of build_grid() in a box. limit: (2, 3) that it may not leave, or None."""
-    carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
+    box = _box(near, limit, forgiven)
+    carver = Carver(dev, _farthest_point_order(near, box.mean(0)))
 
     def carve(voxel_size):
         grid = Grid.centred_in(box, voxel_size).rounded()
@@ -213,7 +169,7 @@ def _search(dev, views, points, box, forgiven, limit):
     best = last = carve(smallest_voxel_size(box, min(COARSE_CELLS, CELL_CAP)))
     capped, rounds, count = False, 0, last.total
     if not count:
-        raise UserError(explain_empty_hull(views, box))
+        raise UserError(explain_empty_hull(near, box))
     while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
         if count:  # the next carving searches a voxel around
             box = last.grid.box + last.grid.voxel_size * np.array([[-1], [1]])
@@ -227,11 +183,40 @@ def _search(dev, views, points, box, forgiven, limit):
         last = carve(voxel_size)
         count, rounds = last.total, rounds + 1
         best = min(best, last, key=lambda c: (c.total < points, abs(c.total - points)))
-    return Hull(best.grid, best.grid.ids_of(best.inside), capped and best.total < points)
+    ids = best.grid.ids_of(best.inside)
+    return Hull(best.grid.moved(corner), ids, capped and best.total < points)
+
+
+def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -> np.ndarray:
+    """(N,) ascending ids of the vertices of a grid inside the hull, as build_grid() has it."""
+    corner = _corner(views, reach_of(views))
+    near = [view.moved(-corner) for view in views]
+    carver = Carver(dev, _farthest_point_order(near, grid.centre - corner))
+    return grid.ids_of(carver.carve(grid.moved(-corner), forgiven))
+
+
+def _box(views, given, forgiven):
+    """The given box as far as the masks allow it, or twice that, where some are forgiven."""
+    if given is not None and not any(view.has_mask for view in views):
+        return given
+    box = bounding_box(views)
+    if forgiven:
+        box = box.mean(0) + np.array([[-1], [1]]) * np.ptp(box, axis=0)
+    if given is None:
+        return box
+    shared = np.stack([np.maximum(box[0], given[0]), np.minimum(box[1], given[1])])
+    return shared if (shared[0] < shared[1]).all() else given
+
+
+def _corner(views, reach):
+    """(3,) world position near the cameras, in whole units: views moved alike give one hull."""
+    eyes = np.stack([view.camera.eye for view in views])
+    unit = 2.0 ** (math.frexp(reach)[1] - CORNER_BITS)
+    return unit * np.floor(eyes.min(0) / unit)
 
 
 class _Carving(NamedTuple):
-    """The smallest grid that holds all `total` vertices inside, which are True in (nz, ny, nx)."""
+    """The smallest grid that holds all `total` vertices inside (nz, ny, nx)."""
 
     grid: Grid
     inside: np.ndarray
@@ -239,11 +224,7 @@ class _Carving(NamedTuple):
 
 
 def _tight(grid, inside):
-    """The _Carving of the vertices inside, (nz, ny, nx) bool; of all of the grid if there are none.
-
-    Ids are left to the carving that is chosen in the end: to number those of the first takes longer
-    than to carve it.
-    """
+    """The _Carving of the vertices inside, (nz, ny, nx) bool; of the whole grid without any."""
     used = [np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 1), (0, 2), (1, 2))]
     if not len(used[0]):
         return _Carving(grid, inside, 0)
@@ -255,12 +236,9 @@ def _tight(grid, inside):
 
 
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
-    """(near, far) for all views, as Euclidean distances in world units (docs/scenes.md).
-
-    The hull lies between them for every view: near is the distance to the ball around it,
-    DEPTH_MARGIN times enlarged, but at least half the distance to its box and one voxel size. A
-    range stated by the dataset, for most views, is kept, but widened to the ball itself, since
-    points outside of it would be missing.
+    """(near, far) for all views, as Euclidean distances in world units (docs/scenes.md): around the
+    hull's ball, DEPTH_MARGIN times enlarged, near at least half the distance to its box and one
+    voxel size. A range that the dataset states for most views is widened to the ball itself.
     """
     stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
     stated = stated if 2 * len(stated) > len(views) else []
@@ -275,18 +253,14 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
 
 
 def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
-    """Voxel size in pixels of the cameras' images, at the middle of the grid, mean over the
-    cameras.
-    """
+    """Voxel size in pixels of the cameras' images, at the middle of the grid, in the mean."""
     distances = [np.linalg.norm(camera.eye - grid.centre) for camera in cameras]
     pixels = [c.fx * grid.voxel_size / d for c, d in zip(cameras, distances, strict=True)]
     return float(np.mean(pixels))
 
 
 def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: the pixels that the points with these ids (N,) cover, gaps between neighbours
-    closed.
-    """
+    """(H, W) bool: the pixels that points with ids (N,) cover, gaps between neighbours closed."""
     gap = math.ceil(spacing_pixels(grid, [camera])) + 1
     wide = camera.crop(-gap, -gap, camera.width + 2 * gap, camera.height + 2 * gap)
     column, row, is_shown = wide.pixels(grid.positions(ids))
@@ -306,13 +280,10 @@ class Agreement(NamedTuple):
 
 
 def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) -> Agreement:
-    """How far masks agree, by what share of each lies where their hull does not.
-
-    Views that look elsewhere are left out. The hull of masks that agree covers all of them. Where a
-    mask lies beside it by MOST_BESIDE and several times the usual share, it belongs to another
-    place or another camera, and is left out. Where all do a little, masks are wrong here and there:
-    then as many are forgiven as it takes.
-    box: as build_grid() takes it. Raises UserError as build_grid() does.
+    """How far masks agree, by what share of each lies where their hull does not. Views that look
+    elsewhere, or whose masks lie beside it by MOST_BESIDE and several times the usual share, are
+    left out. Where all do a little, as many are forgiven as it takes. Raises UserError as
+    build_grid() does.
     """
     if not any(one.has_mask for one in views):
         return Agreement(list(views), {}, 0)
@@ -341,17 +312,16 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
 
 
 def contradicting(views: Sequence[View], hull: Hull, agreement: Agreement) -> list[Disagreement]:
-    """disagreements() around a hull of views of which those of the agreement are left. Where no
-    mask need be forgiven, only those left out disagree: what one alone carves away, no other shows.
+    """disagreements() around a hull. Where no mask need be forgiven, of views left out alone: what
+    one alone carves away, no other shows.
     """
     found = disagreements(views, hull.grid.box)
     return [one for one in found if agreement.forgiven or one.view.name in agreement.left_out]
 
 
 def misplaced(grid: Grid, ids: np.ndarray, views: Sequence[View]) -> list[View]:
-    """The views with a mask on which a share of the points with these ids (N,) falls that is
-    several times smaller than usual, of those that their image shows: their cameras, or masks, are
-    of another place.
+    """The views on whose mask a share of the shown points with ids (N,) falls that is several times
+    smaller than usual: their cameras, or masks, are of another place.
     """
     places = grid.positions(ids[:: max(1, len(ids) // SAMPLED_POINTS)])
     masked, shares = [view for view in views if view.has_mask], []
@@ -364,9 +334,7 @@ def misplaced(grid: Grid, ids: np.ndarray, views: Sequence[View]) -> list[View]:
 
 
 def _shares_beside(dev, views, box, forgiven):
-    """(V,) the share of each view's mask that is further than a pixel of its image, reduced to
-    COMPARED_SIZE, from the silhouette of their hull.
-    """
+    """(V,) the share of each view's mask that is further than a pixel from their silhouette."""
     hull = build_grid(dev, views, min(COMPARED_POINTS, CELL_CAP), box, forgiven)
     shares = []
     for view in views:
@@ -379,9 +347,7 @@ def _shares_beside(dev, views, box, forgiven):
 
 
 def _farthest_point_order(views, centre):
-    """The views in farthest-point order of their directions from the centre: the first few already
-    see the object from all sides, so that carving soon rejects most vertices.
-    """
+    """The views in farthest-point order of their directions: the first few reject most vertices."""
     directions = np.stack([view.camera.eye - centre for view in views])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     order, nearest = [], np.full(len(views), np.inf)

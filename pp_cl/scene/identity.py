@@ -20,7 +20,7 @@ MOST_SIDE = 2**24  # what float32 holds as whole numbers
 
 def identity(views: Sequence[View]) -> dict[str, Any]:
     """{"pixels": {name: digest} of the views, None where the program makes them, "views": for
-    unpacked_views()}: what the header of a checkpoint holds of its training views.
+    unpacked_views()}, for a checkpoint's header.
     """
     made = any(view.digest is None for view in views)
     pixels = None if made else {view.name: view.digest for view in views}
@@ -35,9 +35,7 @@ def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None
 
 
 def unpacked_views(views: Any) -> list[ImageFile]:
-    """The training views that identity() has kept. Raises ValueError or TypeError for what it never
-    makes.
-    """
+    """The training views that identity() has kept. Raises ValueError or TypeError."""
     if not isinstance(views, list) or not views:
         raise ValueError("no list of views")
     return [_unpacked(*view) for view in views]
@@ -45,8 +43,8 @@ def unpacked_views(views: Any) -> list[ImageFile]:
 
 def _unpacked(name, stored):
     values = numbers(stored)
-    is_list = values is not None and values.ndim == 1
-    if type(name) is not str or not is_list or len(values) - (POSE + LENS) not in (0, RANGE):
+    shapes = (POSE + LENS,), (POSE + LENS + RANGE,)
+    if type(name) is not str or values is None or values.shape not in shapes:
         raise ValueError("a view without name or camera")
     fx, fy, cx, cy, width, height, *near_far = values[POSE:].tolist()
     pose = values[:POSE].reshape(3, 4)
@@ -62,10 +60,8 @@ def _unpacked(name, stored):
 def difference(
     header: dict[str, Any], listed: Sequence[ImageFile], views: Sequence[View] = ()
 ) -> str:
-    """How the training views of a checkpoint's header differ from those that a scene lists, in
-    words; "" where all of them are listed, with the same cameras. The scene may list more.
-
-    views: those whose pixels are compared, where the header has their digests.
+    """How the training views of a checkpoint's header differ from those that a scene lists; ""
+    where all are listed with the same cameras. views: of which the pixels are compared, too.
     """
     cameras = {one.name: packed_camera(one.camera) for one in listed}
     for name, packed in header["views"]:

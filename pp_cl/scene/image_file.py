@@ -1,6 +1,4 @@
-"""Images that a scene lists, how far reading reduces them, and reading one: its pixels, its mask,
-its lens's distortion removed.
-"""
+"""Images that a scene lists, and reading one: its pixels, its mask, without distortion."""
 
 import hashlib
 from collections.abc import Sequence
@@ -15,7 +13,8 @@ from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.errors import Unusable
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.lens import LensDistortion, undistort
-from pp_cl.scene.masks import OPAQUE, MaskRule, cut_out, read_mask_of_size
+from pp_cl.scene.masks import OPAQUE, cut_out, is_by_colour, read_mask_of_size
+from pp_cl.settings import SceneConfig
 
 # Of a scene's images in memory, as RGBA; more than this is reduced while it is read. A fixed
 # number, not what happens to be free: the same command gives the same bits on every machine.
@@ -26,13 +25,11 @@ DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image that a scene lists, before its pixels are read.
-
-    name: path of the image relative to the scene's folder. camera: of the stored image, freed of
-    distortion. depth_range: (near, far), Euclidean distances in world units, if the format states
-    one. mask: path of its mask relative to the scene's folder, white where the object is; None: the
-    image's own alpha. lens: of the image as it lies in the file. ignore: path of an image that is
-    white where this one says nothing; if ignores_black, it is black there.
+    """An image that a scene lists, before its pixels are read. name, mask: paths relative to the
+    scene's folder, no mask: the image's own alpha. camera: of the stored image, freed of
+    distortion. depth_range: (near, far), Euclidean distances in world units, if stated. lens: of
+    the image as it lies in the file. ignore: path of an image that is white, or black, where this
+    one says nothing.
     """
 
     name: str
@@ -45,9 +42,8 @@ class ImageFile:
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], downscale: int) -> int:
-    """How many times to reduce images of these (width, height), in pixels, while they are read,
-    where a training reduces them `downscale` times: the least divisor of it with which they take
-    MOST_IMAGE_BYTES at most, else all of it.
+    """How many times to reduce images of these (width, height) while they are read: the least
+    divisor of `downscale` with which they take MOST_IMAGE_BYTES at most, else all of it.
     """
     divisors = (f for f in range(1, downscale + 1) if downscale % f == 0)
     return next((f for f in divisors if image_bytes(sizes, f) <= MOST_IMAGE_BYTES), downscale)
@@ -60,7 +56,7 @@ def image_bytes(sizes: Sequence[tuple[int, int]], factor: int) -> int:
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:
     """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): means of blocks of factor x
-    factor pixels on premultiplied colour, rounded. Rows and columns that fill no block are cut off.
+    factor pixels on premultiplied colour, rounded.
     """
     if factor == 1:
         return image
@@ -79,12 +75,10 @@ def shrink(image: np.ndarray, factor: int) -> np.ndarray:
 
 
 def read_view(
-    folder: Path, image_file: ImageFile, rule: MaskRule, dev: Device | None, factor: int = 1
+    folder: Path, image_file: ImageFile, masks: SceneConfig, dev: Device | None, factor: int = 1
 ) -> View:
-    """The View of an image of the scene in a folder, with its mask, free of distortion and
-    reduced `factor` times. dev: removes distortion; None where there is none.
-
-    Raises Unusable where the image or a mask cannot be used.
+    """The View of an image of the scene in a folder, with its mask, reduced `factor` times. dev:
+    removes distortion. Raises Unusable where the image or a mask cannot be used.
     """
     camera = image_file.camera
 
@@ -101,12 +95,12 @@ def read_view(
     image = read_rgba(folder / image_file.name, size)
     if image_file.mask:
         image[..., 3] = read_mask_of_size(folder / image_file.mask, image.shape[1::-1])
-    elif rule.source in ("box", "none"):
+    elif masks.mask_from in ("box", "none"):
         image[..., 3] = OPAQUE
     digest = pixel_digest(image, image_file.lens, ignored)
     image = used(image)
-    if rule.is_by_colour:
-        image = cut_out(image, image_file.name, rule.tolerance)
+    if is_by_colour(masks):
+        image = cut_out(image, image_file.name, masks.mask_tolerance)
     if ignored is not None:
         image = np.where(ignored[..., None], np.uint8(0), image)
     if image[..., 3].max() <= MASK_THRESHOLD:
@@ -128,9 +122,7 @@ def read_view(
 def pixel_digest(
     image: np.ndarray, lens: LensDistortion = STRAIGHT, ignored: np.ndarray | None = None
 ) -> str:
-    """Hex digest of the pixels of a uint8 image, its mask among them, of the distortion that is
-    removed from it, and of which pixels are ignored.
-    """
+    """Hex digest of a uint8 image with its mask, its distortion, and which pixels are ignored."""
     digest = hashlib.sha256(np.ascontiguousarray(image).data)
     digest.update(repr(lens).encode() if lens else b"")
     digest.update(b"" if ignored is None else np.packbits(ignored).data)

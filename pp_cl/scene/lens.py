@@ -17,9 +17,7 @@ ROWS_PROBED = 9  # of a band, to find the rows of the image that it shows
 
 @dataclass(frozen=True)
 class LensDistortion:
-    """Coefficients of OpenCV's models: radial (k1, k2, k3, over k4, k5, k6) and tangential (p1, p2)
-    of a perspective lens, k1 to k4 of a fisheye.
-    """
+    """Coefficients of OpenCV's models: of a perspective lens, or k1 to k4 of a fisheye."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -53,9 +51,7 @@ class LensDistortion:
         )
 
     def folds(self, camera: Camera) -> bool:
-        """Whether the model turns back inside the camera's image, so that two directions meet in
-        one pixel: there its polynomials say nothing of the lens.
-        """
+        """Whether two directions meet in one pixel of the camera's image."""
         x = (np.linspace(0, camera.width, PROBED) - camera.cx) / camera.fx
         y = (np.linspace(0, camera.height, PROBED) - camera.cy) / camera.fy
         x, y = self.apply(*np.meshgrid(x, y))
@@ -70,10 +66,8 @@ def undistort(
     dev: Device, image: np.ndarray, camera: Camera, lens: LensDistortion, factor: int = 1
 ) -> np.ndarray:
     """(H // factor, W // factor, 4) uint8 straight RGBA that the camera would have taken without
-    distortion, reduced `factor` times: means of factor x factor samples, each by cubic spline on
+    distortion, of an image (H, W, 4): means of factor x factor samples, each by cubic spline on
     premultiplied colour; beyond the image's border its edge goes on.
-
-    image: (H, W, 4) uint8 straight RGBA, as the lens has it. camera: of H x W pixels.
     """
     width, height = camera.width // factor, camera.height // factor
     program, columns = dev.program("scene/lens"), camera.width + 2 * MARGIN
@@ -123,9 +117,8 @@ def undistort(
 
 
 def _source_rows(camera, lens, top, bottom):
-    """(first, last + 1) row of an image that the rows top to bottom of the camera without
-    distortion need, the RUN_UP on both sides included; both may lie outside of the image, by as
-    little as its edge takes to be constant.
+    """(first, last + 1) row that the rows top to bottom need, with the RUN_UP on both sides; maybe
+    outside of the image, by as little as its edge takes to be constant.
     """
     x = (np.arange(camera.width + 1) - camera.cx) / camera.fx
     y = (np.linspace(top, bottom, ROWS_PROBED) - camera.cy) / camera.fy

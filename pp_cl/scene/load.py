@@ -1,6 +1,4 @@
-"""Scenes: images of one object with cameras and masks, from a folder in any format that READERS
-knows, or made by the program.
-"""
+"""Scenes: images of one object with cameras and masks, from a folder or made by the program."""
 
 import math
 import mimetypes
@@ -10,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -22,7 +21,6 @@ from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, quoted
 from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.progress import track
 from pp_cl.scene import demo
-from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.found import (
     IGNORE_FOLDERS,
@@ -33,20 +31,21 @@ from pp_cl.scene.found import (
     pictures_of,
     usable,
 )
+from pp_cl.scene.gaze import STATED, other_axes, read_as
 from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
-from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, half_transparent, read_mask_of_size
+from pp_cl.scene.masks import AS_GIVEN, OPAQUE, half_transparent, is_by_colour, read_mask_of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import SPLITS, read_json
 from pp_cl.scene.silhouette import within_silhouettes
-from pp_cl.settings import Config
+from pp_cl.settings import Config, SceneConfig
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, splits(folder) names its splits, read_split(folder, split, left_out) gives a
-# list of ImageFile of one of them without reading pixels and adds the views that cannot be used to
-# left_out, and box(folder), which only some have, gives the box that the files state around the
+# holds such files, read_split(folder, split, left_out) gives a list of ImageFile of one of them
+# without reading pixels and adds the views that cannot be used to left_out. Only some have
+# splits(folder), the names of its splits, and box(folder), the box that the files state around the
 # object. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
@@ -89,11 +88,8 @@ class SplitFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Views of one object.
-
-    folder: None for a scene that the program makes itself. splits: views by split name ("train",
-    "val", "test"). notes: a line for each kind of thing that was done to use them, such as views
-    that were left out.
+    """Views of one object, by split ("train", "val", "test"). folder: None for a scene that the
+    program makes itself. notes: lines of what was done to use them, such as views left out.
     """
 
     name: str
@@ -110,51 +106,42 @@ def open_scene(
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
-    `demo` is rendered on the device.
-
-    most, listed: as load_scene() takes them.
+    `demo` is rendered on the device. most, listed: as load_scene() takes them.
     """
-    path, downscale, masks = config.scene.path, config.scene.downscale, mask_rule(config)
+    path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
         rendered = {split: demo.demo_views(dev, split, most) for split in splits}
         return Scene(DEMO, None, _reduced(rendered, downscale))
-    scene = load_scene(path, splits, most, masks, downscale=downscale, listed=listed, dev=dev)
+    scene = load_scene(
+        path, splits, most, config.scene, downscale=downscale, listed=listed, dev=dev
+    )
     views = scene.splits.get("train", [])
     masked = [view for view in views if view.has_mask]
-    shares = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked]
+    shares, told = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked], []
     if masked and np.median(shares) > INVERTED:
-        warnings.warn(
-            f"{path}: most masks hold the border of their image, as if they were inverted: they"
-            " must be white on the object and black around it",
-            stacklevel=2,
+        told.append(
+            "most masks hold the border of their image, as if they were inverted: they must be"
+            " white on the object and black around it"
         )
     alphas = [shrink(view.image, view.downscale)[..., 3] for view in evenly(masked, MEASURED)]
     if masked and (soft := np.mean([half_transparent(alpha) for alpha in alphas])) > SOFT:
-        warnings.warn(
-            f"{path}: {soft:.0%} of what the masks hold is half transparent, edges not counted:"
-            " where the object is opaque, sharp masks give a sharper model",
-            stacklevel=2,
+        told.append(
+            f"{soft:.0%} of what the masks hold is half transparent, edges not counted: where the"
+            " object is opaque, sharp masks give a sharper model"
         )
     if views and not masked and most is None and config.scene.mask_from != "box":
-        warnings.warn(
-            f"{path}: no image has a mask: points fill the box that all cameras see;"
-            " --mask-from color cuts out a uniform background, --masks FOLDER takes masks,"
-            " --mask-from box says that it is meant",
-            stacklevel=2,
+        told.append(
+            "no image has a mask: points fill the box that all cameras see; --mask-from color cuts"
+            " out a uniform background, --masks FOLDER takes masks, --mask-from box says that it is"
+            " meant"
         )
+    _tell(path, told)
     return scene
 
 
-def mask_rule(config: Config) -> MaskRule:
-    """How the masks of the run's scene are made."""
-    scene = config.scene
-    return MaskRule(scene.mask_from, scene.masks, scene.mask_tolerance, scene.ignore)
-
-
 def scene_box(config: Config) -> np.ndarray | None:
-    """(2, 3) lower and upper corner of the setting scene.box, else of what the user has edited,
-    else of what the scene's format states; None where there is none. Raises UserError for a box
-    without volume.
+    """(2, 3) lower and upper corner of the setting scene.box, else of the user's edits, else
+    of what the scene's format states, or None. Raises UserError for a box without volume.
     """
     corners, path = np.array(config.scene.box, np.float64).reshape(2, 3), config.scene.path
     if not corners.any():
@@ -169,15 +156,16 @@ def scene_box(config: Config) -> np.ndarray | None:
 
 
 def scene_format(path: str) -> str:
-    """The name of the reader of a scene; of `demo` the word itself. Raises UserError where there is
-    no scene.
-    """
+    """The name of the reader of a scene; of `demo` the word itself. Raises UserError."""
     return DEMO if path == DEMO else find_reader(path).__name__.rpartition(".")[2]
 
 
 def scene_splits(path: Path | str) -> list[str]:
     """The names of a scene's splits. Raises UserError where there is no scene."""
-    return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
+    if path == DEMO:
+        return list(demo.SPLITS)
+    reader = find_reader(path)
+    return reader.splits(Path(path)) if hasattr(reader, "splits") else SPLITS
 
 
 # Listing a split ----------------------------------------------------------------------------------
@@ -191,14 +179,13 @@ def scene_frames(path: str | Path, split: str = "train", *, edited: bool = True)
 
 
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> SplitFiles:
-    """The images of a split, without their pixels; edited: but for those that the user has
-    dropped. Raises UserError where there are none, where too few are left, and for cameras in other
-    axes than the format's.
+    """The images of a split; edited: but for those that the user has dropped. Raises UserError
+    where too few are left, and for cameras in other axes than the format's.
     """
     if path == DEMO:
         return SplitFiles(demo.demo_frames(split), [], [])
     folder, reader = Path(path), find_reader(path)
-    present = reader.splits(folder)
+    present = scene_splits(path)
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
     left_out: LeftOut = []
@@ -218,11 +205,8 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
         lacks = f"; {EDITS} drops some" if edited and edits.dropped else ""
         raise UserError(f"{folder}: split {split} has no images{lacks}; add some")
 
-    def checked(image_file):
-        check_lens(folder / image_file.name, image_file)
-        return image_file
-
-    image_files = list(usable(image_files, checked, lambda one: one.name, left_out))
+    check = partial(with_sound_lens, folder)
+    image_files = list(usable(image_files, check, lambda one: one.name, left_out))
     _check_left(image_files, left_out, LEAST_VIEWS if split == "train" else 1)
     image_files, done = _masked(folder, reader, image_files, split)
     image_files = _ignoring(folder, IGNORE_FOLDERS, image_files, split)
@@ -239,11 +223,11 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     return SplitFiles(image_files, left_out, done)
 
 
-def check_lens(file: Path, image_file: ImageFile) -> None:
-    """Raise Unusable naming the file of an image whose camera shows nothing in float32, or
-    whose distortion folds.
+def with_sound_lens(folder: Path, image_file: ImageFile) -> ImageFile:
+    """The same image of a folder. Raises Unusable where its camera shows nothing in float32, or its
+    distortion folds.
     """
-    camera = image_file.camera
+    file, camera = folder / image_file.name, image_file.camera
     for what, values, least in (
         ("focal lengths", (camera.fx, camera.fy), LEAST_FOCAL),
         ("a principal point", (camera.cx, camera.cy), -MOST_FOCAL),
@@ -260,21 +244,19 @@ def check_lens(file: Path, image_file: ImageFile) -> None:
             " the images with the program that found them",
             "distortion that folds",
         )
+    return image_file
 
 
 def _check_left(left, left_out, least):
-    """Raise the error of the first view that was left out where fewer than `least`, or less than
-    half, are left.
-    """
+    """Raise the first error of left_out where fewer than `least`, or less than half, are left."""
     if left_out and len(left) < max(least, len(left_out)):
         raise left_out[0][1]
 
 
 def _masked(folder, reader, image_files, split):
     """(The images, with the masks of a folder of masks where the format names none; what was
-    done). Images of a transforms.json have their own alpha, if they have one. Where masks are of
-    the object, what a transforms.json names besides says where images are of use, as nerfstudio
-    takes it.
+    done). Images of a transforms.json have their own alpha, if any, and where masks are of the
+    object, masks that it names say where images are of use, as nerfstudio takes it.
     """
     named, done = [one for one in image_files if one.mask], []
     if named:
@@ -286,8 +268,11 @@ def _masked(folder, reader, image_files, split):
             replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in image_files
         ]
     place = folder_named(folder, MASK_FOLDERS)
-    if place and reader is transforms and _are_cut_out(folder, image_files):
-        return image_files, done
+    for one in image_files if place and reader is transforms else ():
+        with suppress(Unusable):  # the first image that can be read tells of all
+            if is_transparent(folder / one.name):
+                return image_files, done
+            break
     masks = _masks_in(folder, image_files, split, MASK_FOLDERS)
     if masks and reader is transforms:
         what = f"masks are taken from {folder / place}, which no frame names"
@@ -295,18 +280,8 @@ def _masked(folder, reader, image_files, split):
     return [replace(one, mask=masks.get(one.name)) for one in image_files], done
 
 
-def _are_cut_out(folder, image_files):
-    """Whether the first image that can be read has transparent pixels."""
-    for one in image_files:
-        with suppress(Unusable):
-            return is_transparent(folder / one.name)
-    return False
-
-
 def _masks_in(folder, image_files, split, places):
-    """{name: its mask} of those that have one in one of the places in a folder. Raises
-    UserError where a place has none for any training image.
-    """
+    """find_masks(); {} for other splits than train where no image has one."""
     try:
         return find_masks(folder, [one.name for one in image_files], places) or {}
     except UserError:
@@ -315,10 +290,12 @@ def _masks_in(folder, image_files, split, places):
         return {}
 
 
+def _absolute(folder, masks):
+    return {name: str(folder.absolute() / mask) for name, mask in masks.items()}
+
+
 def _are_besides(folder, image_file):
-    """Whether an image has alpha of which the mask that its frame names is no part, or the scene
-    has a folder of masks in which that mask does not lie.
-    """
+    """Whether the mask that a frame names is none of the object, by alpha or a folder of masks."""
     place, image = folder_named(folder, MASK_FOLDERS), folder / image_file.name
     if place and not image_file.mask.startswith(f"{place}/"):
         return True
@@ -331,11 +308,8 @@ def _are_besides(folder, image_file):
 
 
 def _ignoring(folder, places, image_files, split):
-    """The images, with the masks of what says nothing that lie in one of the places in a
-    folder.
-    """
-    masks = _masks_in(folder, image_files, split, places)
-    files = {name: str(folder.absolute() / mask) for name, mask in masks.items()}
+    """The images, with the masks of what says nothing in one of the places in a folder."""
+    files = _absolute(folder, _masks_in(folder, image_files, split, places))
     return [
         replace(one, ignore=files[one.name], ignores_black=False) if one.name in files else one
         for one in image_files
@@ -344,20 +318,16 @@ def _ignoring(folder, places, image_files, split):
 
 def _lines(split, used, left_out, done):
     """One line for each kind of thing that was left out or done in a split."""
-    count = len(used) + len(left_out)
-    gone = _by_kind((name, getattr(error, "why", WRONG)) for name, error in left_out)
+    told: dict[str, list[str]] = {}
+    for name, error in left_out:
+        told.setdefault(f"views left out: {getattr(error, 'why', WRONG)}", []).append(name)
+    count, gone = len(used) + len(left_out), len(told)
+    for name, what in done:
+        told.setdefault(what, []).append(name)
     return [
-        f"{split}: {len(names)} of {count} views left out: {why} ({few_names(names)})"
-        for why, names in gone.items()
-    ] + [f"{split}: {what} ({few_names(names)})" for what, names in _by_kind(done).items()]
-
-
-def _by_kind(pairs):
-    """{kind: names} of pairs of a name and a kind."""
-    kinds: dict[str, list[str]] = {}
-    for name, kind in pairs:
-        kinds.setdefault(kind, []).append(name)
-    return kinds
+        f"{split}: {f'{len(names)} of {count} ' * (i < gone)}{what} ({few_names(names)})"
+        for i, (what, names) in enumerate(told.items())
+    ]
 
 
 def _tell(folder, lines):
@@ -370,13 +340,10 @@ def _tell(folder, lines):
 
 
 def measured_split(path: str) -> str:
-    """The split that tells how a training goes: val, else test. Raises UserError where the scene
-    has neither.
-    """
+    """The split that tells how a training goes: val, else test. Raises UserError without either."""
     present = scene_splits(path)
-    for split in ("val", "test"):
-        if split in present:
-            return split
+    if split := next((split for split in ("val", "test") if split in present), ""):
+        return split
     raise UserError(f"--eval-every: {path} has no split val or test; leave it out")
 
 
@@ -384,10 +351,9 @@ def find_reader(path: str | Path) -> ModuleType:
     """The module of READERS for a folder. Raises UserError where it holds no scene."""
     folder = Path(path)
     check_folder(folder)
-    reader = _reader_of(folder)
-    if reader is None:
-        raise UserError(f"{folder}: no scene in it{_found_instead(folder)}")
-    return reader
+    if reader := _reader_of(folder):
+        return reader
+    raise UserError(f"{folder}: no scene in it{_found_instead(folder)}")
 
 
 def check_folder(folder: Path) -> None:
@@ -399,15 +365,14 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
-    if not _is_readable(folder):
+    if not os.access(folder, os.R_OK | os.X_OK):
         raise UserError(f"{folder}: cannot be read; check its permissions")
 
 
-def _is_readable(folder):
-    return os.access(folder, os.R_OK | os.X_OK)
-
-
 def _reader_of(folder):
+    """The reader of a folder, None where it holds no scene or cannot be read."""
+    if not os.access(folder, os.R_OK | os.X_OK):
+        return None
     return next((reader for reader in READERS if reader.recognises(folder)), None)
 
 
@@ -415,7 +380,7 @@ def _found_instead(folder):
     """What is in a folder without a scene, and where one is, in words."""
     inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     for near in (*folder.absolute().parents[:2], *filter(Path.is_dir, inside[:NEARBY])):
-        if _is_readable(near) and (reader := _reader_of(near)):
+        if reader := _reader_of(near):
             return f"; {near} is one ({reader.FILES}); give that"
     for file in (path for path in inside if path.suffix.lower() == ".json"):
         with suppress(UserError):
@@ -438,40 +403,37 @@ def load_scene(
     path: str | Path,
     splits: Iterable[str] = ("train",),
     most: int | None = None,
-    masks: MaskRule = AS_GIVEN,
+    masks: SceneConfig = AS_GIVEN,
     *,
     dev: Device | None = None,
     downscale: int | None = None,
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
-    """Scene of the given splits from a folder; progress shows on stderr.
-
-    most: views to read of each split, spread evenly; None: all. dev: removes distortion, and finds
-    silhouettes for training views whose masks are missing, which are left out without it.
-    downscale: how many times its images are reduced, those of a large scene in part while they are
-    read; None: as they are stored. listed: what list_split() gave of some splits, so that their
-    files are not read again. Raises UserError naming the file, and the key where there is one, for
-    whatever is missing, broken or contradictory, and for distortion without a device.
+    """Scene of the given splits from a folder. most: views to read of each
+    split, spread evenly; None: all. dev: removes distortion, and finds silhouettes for training
+    views without masks, which are left out without it. downscale: how many times images are
+    reduced; None: as they are stored. listed: what list_split() gave of some splits. Raises
+    UserError naming the file, and the key, for whatever is missing, broken or contradictory, and
+    for distortion without a device.
     """
     folder, lines = Path(path), []
-    for option, given in (("--masks", masks.folder), ("--ignore", masks.ignore)):
+    for option, given in (("--masks", masks.masks), ("--ignore", masks.ignore)):
         if given and not os.path.isdir(given):
             raise UserError(f"{given}: no such folder; {option} takes one of masks")
-    chosen, left_out = {}, {}
-
-    def reducible(image_file):
-        if downscale:
-            check_downscale(image_file.name, image_file.camera, downscale)
-        return image_file
-
+    chosen: dict[str, list[ImageFile]] = {}
+    left_out: dict[str, LeftOut] = {}
     for split in splits:
         found = (listed or {}).get(split) or list_split(folder, split)
         lines += _lines(split, *found)
-        some = _by_rule(masks, evenly(found.image_files, most), split)
-        gone: LeftOut = []
-        chosen[split] = list(usable(some, reducible, lambda one: one.name, gone))
-        _check_left(chosen[split], gone, 1)
-        left_out[split] = gone
+        chosen[split], left_out[split] = [], []
+        for one in _by_rule(masks, evenly(found.image_files, most), split):
+            try:
+                if downscale:
+                    check_downscale(one.name, one.camera, downscale)
+                chosen[split].append(one)
+            except UserError as error:
+                left_out[split].append((one.name, error))
+        _check_left(chosen[split], left_out[split], 1)
     image_files = [one for some in chosen.values() for one in some]
     if dev is None and any(one.lens for one in image_files):
         raise UserError(f"{folder}: its images have distortion, which only a device removes")
@@ -481,13 +443,12 @@ def load_scene(
         for split, some in chosen.items()
     }
     has_masks = any(v.is_masked or v.has_mask for some in views.values() for v in some)
-    for split, some in views.items():
+    for split, gone in left_out.items():
         is_whole, done = split == "train" and most is None, []
         if has_masks:
-            dev_or_none = dev if is_whole else None
-            views[split], done = _all_masked(folder, some, dev_or_none, left_out[split])
-        _check_left(views[split], left_out[split], LEAST_VIEWS if is_whole else 1)
-        lines += _lines(split, views[split], left_out[split], done)
+            views[split], done = _all_masked(folder, views[split], dev if is_whole else None, gone)
+        _check_left(views[split], gone, LEAST_VIEWS if is_whole else 1)
+        lines += _lines(split, views[split], gone, done)
     _tell(folder, lines)
     views = _reduced(views, downscale // factor) if downscale else views
     return Scene(folder.resolve().name, folder, views, lines)
@@ -499,12 +460,10 @@ def _reduced(splits, downscale):
 
 def _by_rule(rule, image_files, split):
     """The images, with the masks of the rule's folders, and none where its masks are no files."""
-    if rule.folder:
-        own = Path(rule.folder).absolute()
-        masks = _masks_in(own, image_files, split, ["."])
-        files = {name: str(own / mask) for name, mask in masks.items()}
+    if rule.masks:
+        files = _absolute(Path(rule.masks), _masks_in(Path(rule.masks), image_files, split, ["."]))
         image_files = [replace(one, mask=files.get(one.name)) for one in image_files]
-    elif rule.source != "given":
+    elif rule.mask_from != "given":
         image_files = [replace(one, mask=None) for one in image_files]
     if rule.ignore:
         image_files = _ignoring(Path(rule.ignore), ["."], image_files, split)
@@ -520,18 +479,20 @@ def _read_views(folder, image_files, masks, dev, factor, left_out):
         except UserError as error:
             return error
 
+    views = []
     with ThreadPoolExecutor(reading_cost(image_files, masks, factor)[0]) as pool:
-        reads, count = pool.map(read, image_files), len(image_files)
-        found = list(track(reads, "reading images", "image", count))
-    for image_file, error in zip(image_files, found, strict=True):
-        if isinstance(error, UserError):
-            left_out.append((image_file.name, error))
-    return [view for view in found if isinstance(view, View)]
+        reads = track(pool.map(read, image_files), "reading images", "image", len(image_files))
+        for image_file, found in zip(image_files, reads, strict=True):
+            if isinstance(found, UserError):
+                left_out.append((image_file.name, found))
+            else:
+                views.append(found)
+    return views
 
 
 def _all_masked(folder, views, dev, left_out):
-    """(views that all have masks, what was done): those without one are used inside the hull of the
-    others' masks where there is a device and that hull can be had, and left out else.
+    """(views that all have masks, what was done): those without are used inside the hull of the
+    others' masks, on a device, and left out else.
     """
     bare = [view for view in views if not (view.is_masked or view.has_mask)]
     masked = [view for view in views if view.is_masked or view.has_mask]
@@ -547,13 +508,12 @@ def _all_masked(folder, views, dev, left_out):
 
 
 def reading_cost(
-    image_files: Sequence[ImageFile], masks: MaskRule = AS_GIVEN, factor: int = 1
+    image_files: Sequence[ImageFile], masks: SceneConfig = AS_GIVEN, factor: int = 1
 ) -> tuple[int, int]:
-    """(how many images are read side by side, bytes that this takes beside the images that
-    stay): as many as there are cores, but no more than READING_BYTES hold. factor: how many times
-    they are reduced meanwhile.
+    """(how many images are read side by side, bytes that this takes beside the images that stay):
+    as many as there are cores and READING_BYTES hold.
     """
-    per_pixel = DECODED + (CUT_OUT / factor**2 if masks.is_by_colour else 0)
+    per_pixel = DECODED + (CUT_OUT / factor**2 if is_by_colour(masks) else 0)
     pixels = max(one.camera.width * one.camera.height for one in image_files)
     most = math.ceil(per_pixel * pixels)
     workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(image_files)))

@@ -1,7 +1,6 @@
 """The mask of an image: from a file, from its alpha, from a uniform background, or none."""
 
 import warnings
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -15,6 +14,7 @@ from pp_cl.engine.views import MASK_THRESHOLD, border
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import read_mask, same_shape
 from pp_cl.scene.found import find_mask
+from pp_cl.settings import SceneConfig
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = 255
@@ -24,36 +24,16 @@ HALF = 16, 239  # alphas between which a pixel is half transparent
 EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
 
-@dataclass(frozen=True)
-class MaskRule:
-    """How a scene's masks are made: the settings scene.mask_from, scene.masks and
-    scene.mask_tolerance.
-
-    source: given, alpha, color, box or none. folder: of masks named like the images, before
-    everything else; "" for none. tolerance: of color, in CIELAB's units. ignore: folder of masks
-    of what says nothing, before those of the scene; "" for none.
-    """
-
-    source: str = "given"
-    folder: str = ""
-    tolerance: float = 10.0
-    ignore: str = ""
-
-    @property
-    def is_by_colour(self) -> bool:
-        """Whether cut_out() makes the masks, of the images as they are used: it takes long, and
-        large ones take no better masks.
-        """
-        return self.source == "color" and not self.folder
+AS_GIVEN = SceneConfig()  # the masks of the scene's format, else alpha
 
 
-AS_GIVEN = MaskRule()
+def is_by_colour(masks: SceneConfig) -> bool:
+    """Whether cut_out() makes the masks, of images as they are used, since it takes long."""
+    return masks.mask_from == "color" and not masks.masks
 
 
 def named_mask(folder: Path, *names: str) -> Path:
-    """The mask of an image in a folder, by one of the names of the image: a path or a name
-    alone. Raises UserError.
-    """
+    """The mask of an image in a folder, by one of its names, paths or not. Raises UserError."""
     for name in names:
         if found := find_mask(folder, name) or find_mask(folder, PurePosixPath(name).name):
             return folder / found
@@ -62,8 +42,8 @@ def named_mask(folder: Path, *names: str) -> Path:
 
 
 def read_mask_of_size(file: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) uint8 mask of a file, 255 where the object is, resized to an image of (width, height)
-    pixels, whose shape it must have but for rounding. Raises Unusable.
+    """(H, W) uint8 mask of a file, 255 where the object is, resized to an image of (width, height),
+    whose shape it must have. Raises Unusable.
     """
     try:
         mask = read_mask(file)
@@ -83,13 +63,10 @@ def read_mask_of_size(file: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = False) -> np.ndarray:
-    """(H, W, 4) uint8: the image without the uniform background that its border shows.
-
-    The background's colour is the median of the border; it is what reaches the border and is no
-    further than `tolerance` from it, a distance in CIELAB. Places of that colour which the object
-    encloses are opaque, since nothing tells a hole from a spot; with_holes: but for the smallest
-    they are holes. Pixels at the edge are a mixture of the background and of the nearest colour
-    within the object. Raises Unusable naming the image where its border is of several colours.
+    """(H, W, 4) uint8: the image without the uniform background that reaches its border, no further
+    than `tolerance` from the border's median in CIELAB. Places of that colour which the object
+    encloses are opaque; with_holes: but for the smallest they are holes. Pixels at the edge are a
+    mixture with the nearest colour within. Raises Unusable where the border has several colours.
     """
     colour = image[..., :3] / 255.0
     behind = np.median(border(colour), axis=0)
@@ -101,7 +78,13 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
             " background; give masks with --masks FOLDER, or a higher scene.mask_tolerance",
             "no uniform background",
         )
-    outside = _regions(distance < tolerance, with_holes)
+    places = distance < tolerance
+    regions = label(places, connectivity=1)
+    chosen = border(regions)
+    if with_holes:
+        large = np.flatnonzero(np.bincount(regions.ravel()) > HOLE * regions.size)
+        chosen = np.append(chosen, large)
+    outside = places & np.isin(regions, np.unique(chosen[chosen > 0]))
     within = distance_transform_edt(~outside) > EDGE
     alpha = np.where(outside, 0, np.clip(distance / tolerance - 1, 0, 1))
     alpha[within] = 1
@@ -118,20 +101,6 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
 
 
 def half_transparent(alpha: np.ndarray) -> float:
-    """The share of what a mask (H, W) uint8 holds that is half transparent, and so is all around
-    it, as edges of an object are not that are sharp, nor thin parts of it.
-    """
+    """The share of what a mask (H, W) uint8 holds that is half transparent with all around it."""
     within = erosion((alpha > HALF[0]) & (alpha < HALF[1]), np.ones((3, 3)))
     return float(within.sum() / max((alpha > MASK_THRESHOLD).sum(), 1))
-
-
-def _regions(places, with_holes):
-    """(H, W) bool: the connected regions of `places` that reach the image's border, or are large
-    enough for holes.
-    """
-    regions = label(places, connectivity=1)
-    chosen = border(regions)
-    if with_holes:
-        large = np.flatnonzero(np.bincount(regions.ravel()) > HOLE * regions.size)
-        chosen = np.append(chosen, large)
-    return places & np.isin(regions, np.unique(chosen[chosen > 0]))

@@ -1,6 +1,4 @@
-"""Contact sheets for checking a scene: the outline of the points drawn over images, and where masks
-disagree.
-"""
+"""Contact sheets for checking a scene: outlines of the points over images, and wrong masks."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,10 +34,8 @@ def outline_sheet(
     points: Hull | None,
     disagreeing: Sequence[Disagreement] = (),
 ) -> np.ndarray:
-    """uint8 (H, W, 3) contact sheet of up to 12 images over white, spread evenly over the
-    views, with the outlines of the mask and, over it, of the points drawn over them.
-
-    disagreeing: their views come first, tinted where they reject what the others agree on.
+    """uint8 (H, W, 3) contact sheet of up to 12 views over white, with the outlines of the mask and
+    of the points; those of `disagreeing` come first, tinted where they reject what others hold.
     """
     target, images = Target(dev), []
     tinted = {one.view.name: one for one in disagreeing[:SHOWN_VIEWS]}

@@ -1,6 +1,4 @@
-"""The sparse points that a scene brings along: COLMAP's model, or the .ply that transforms.json
-names.
-"""
+"""The sparse points that a scene brings along: COLMAP's, or the .ply that transforms.json names."""
 
 import os
 from itertools import islice
@@ -22,8 +20,8 @@ GREY = 150  # of points without colour
 
 
 def sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """((N, 3) float64 world positions, (N, 3) uint8 colours), none where the scene has none, or not
-    the file that it names. Raises UserError naming a file that is broken.
+    """((N, 3) float64 world positions, (N, 3) uint8 colours), maybe none. Raises UserError naming a
+    file that is broken.
     """
     shared = {}
     if (file := folder / transforms.SINGLE).is_file():
@@ -43,11 +41,7 @@ def sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         if matrix is None:
             raise fail_at(file, "applied_transform")("must be 3 rows of 4 numbers; correct it")
         points = points @ matrix[:, :3].T + matrix[:, 3]
-    return points, _bytes(table[:, 3:])
-
-
-def _bytes(colours):
-    return np.clip(colours, 0, 255).astype(np.uint8)
+    return points, np.clip(table[:, 3:], 0, 255).astype(np.uint8)
 
 
 def _read_ply(file):
@@ -64,4 +58,4 @@ def _read_ply(file):
         raise refusal(file, error, "points of a .ply") from None
     if not (np.abs(points) < MOST).all():
         raise UserError(f"{file}: holds NaN, Inf or a huge number; write it again")
-    return points, _bytes(colours)
+    return points, np.clip(colours, 0, 255).astype(np.uint8)

@@ -29,9 +29,8 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """name: "wing: what", unique. run(dev, rng) yields the checks; rng is seeded anew for each
-    case. variant: of the convolutions, where the case is one's own; other devices than those that
-    it is offered to leave it out.
+    """name: "wing: what", unique. run(dev, rng) yields the checks. variant: the only one of the
+    convolutions that the case is of; devices to which it is not offered leave the case out.
     """
 
     name: str
@@ -72,9 +71,7 @@ def finite(*arrays: np.ndarray) -> Check:
 
 
 def _largest(actual, expected, scale):
-    """The largest error over the scale at its place; infinite for what is not finite, and where
-    there may be no error.
-    """
+    """The largest error over the scale at its place; infinite for what is not finite."""
     actual, expected = np.asarray(actual, np.float64), np.asarray(expected, np.float64)
     _same_shape(actual, expected)
     with np.errstate(all="ignore"):

@@ -1,18 +1,16 @@
 """Cases of prefix sums and of rows that are moved: exact, as all of it is integers and copies."""
 
-from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
 
 from pp_cl.engine.device.buffers import compact_rows, gather_rows
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import LARGEST_GROUP
 from pp_cl.engine.device.scan import BLOCK, exclusive_scan, nonzero, read_total
-from pp_cl.selftest.case import SIZES, Case, Check, exact
+from pp_cl.selftest.case import SIZES, Case, exact
 
 
-def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _scan(dev, rng):
     """One block, its edges, and many; sums beyond 32 bits."""
     for n in (*SIZES, BLOCK, BLOCK + 1, 700 * BLOCK + 1):
         values = rng.integers(0, 9, n, dtype=np.uint32)
@@ -27,7 +25,7 @@ def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             yield exact(offsets.get(), np.minimum(np.arange(n + 1) * value, 2**32 - 1))
 
 
-def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _nonzero(dev, rng):
     for n, share in product((*SIZES, BLOCK + 1), (0.0, 0.3, 1.0)):
         flags = rng.integers(1, 256, n) * (rng.random(n) < share)
         indices = dev.empty((n,), np.uint32)
@@ -40,7 +38,7 @@ def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(places.get(), expected)
 
 
-def _compact(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _compact(dev, rng):
     """Every bit is kept, those of NaN among them."""
     for n in SIZES:
         source = rng.integers(0, 2**32, (n, 3, 16), dtype=np.uint32)

@@ -1,35 +1,13 @@
 """Cases of the layers: convolutions of every variant, pooling, upsampling, gate, tiles."""
 
-from collections.abc import Iterator
 from functools import cache, partial
 
 import numpy as np
 
 from pp_cl.bench.conv import Layer
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers import simple, tiles
 from pp_cl.engine.layers.choice import OFFERED, VARIANTS, blocking_of, can_run
-from pp_cl.engine.layers.simple import (
-    SHARE,
-    avgpool2_backward,
-    avgpool2_forward,
-    first_features_backward,
-    first_features_forward,
-    gate_backward,
-    gate_forward,
-    maxpool2_forward,
-    output_forward,
-    residual_backward,
-    upsample2_backward,
-    upsample2_forward,
-)
-from pp_cl.engine.layers.tiles import (
-    SIDE,
-    copy_list,
-    grid_shape,
-    tiles_copy,
-    tiles_covered,
-    tiles_find,
-)
 from pp_cl.engine.network.tile_plan import halve
 from pp_cl.reference import lpips, network
 from pp_cl.selftest.case import EPS, Case, Check, allowed, each, exact, relative
@@ -80,7 +58,7 @@ def _layers():
 
 
 @cache
-def _hard_layers() -> dict[str, Layer]:
+def _hard_layers():
     """3x3 convolutions whose inputs or weights are made to hurt float32 or Winograd."""
     rng = np.random.default_rng(7)
 
@@ -130,7 +108,7 @@ def within(actual: np.ndarray, expected: np.ndarray) -> Check:
     return allowed(actual, expected, np.broadcast_to(most, expected.shape))
 
 
-def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _convolution(variant, dev, rng):
     """All directions; awkward sizes, two sources, a masked gradient."""
     bound = BOUNDS[variant]
     layers = _layers() if can_run(variant, 1) else _layers()[: len(SHAPES)]
@@ -141,77 +119,81 @@ def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterato
             yield relative(actual, expected, max(bound, WEIGHTS_BOUND) if of_weights else bound)
 
 
-def _hard_convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _hard_convolution(variant, dev, rng):
     """Large means, weights over six decades, values of 6e4 and 1e-7, 512 channels, zeros."""
     for layer in _hard_layers().values():
         results = layer.computed(dev, variant, blocking_of(dev))
         yield from map(within, results, layer.expected)
 
 
-def _pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _pool(dev, rng):
     """Means of 2x2 pixels; the gradient is added, and masked where a ReLU was pooled."""
     for h, w, c in PLANES:
         x, other = np.maximum(_normal(rng, 2 * h, 2 * w, c), 0), _normal(rng, 2 * h, 2 * w, c)
         grad_out, out, device_x = _normal(rng, h, w, c), dev.empty((h, w, c)), dev.upload(x)
-        avgpool2_forward(dev, device_x, out)
+        simple.avgpool2_forward(dev, device_x, out)
         yield relative(out.get(), network.pool(x.astype(np.float64)), FOUR)
         added = other + network.pool_backward(grad_out.astype(np.float64))
         for mask, expected in ((device_x, added * (x > 0)), (None, added)):
             grad_x = dev.upload(other)
-            avgpool2_backward(dev, mask, dev.upload(grad_out), grad_x)
+            simple.avgpool2_backward(dev, mask, dev.upload(grad_out), grad_x)
             yield relative(grad_x.get(), expected, FOUR)
 
 
-def _max_pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _max_pool(dev, rng):
     """Cells of zeros and of equal values; odd borders drop."""
     for shape in ((2, 2, 16), (3, 5, 3), (31, 33, 17), (257, 2, 32)):
         x = np.maximum(rng.integers(-3, 3, shape), 0).astype(np.float32)
         out = dev.empty((shape[0] // 2, shape[1] // 2, shape[2]))
-        maxpool2_forward(dev, dev.upload(x), out)
+        simple.maxpool2_forward(dev, dev.upload(x), out)
         yield exact(out.get(), lpips.maxpool2(x))
 
 
-def _upsample(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _upsample(dev, rng):
     for h, w, c in PLANES:
         x, grad_out = _normal(rng, h, w, c), _normal(rng, 2 * h, 2 * w, c)
         out, grad_x = dev.empty(grad_out.shape), dev.empty(x.shape)
-        upsample2_forward(dev, dev.upload(x), out)
+        simple.upsample2_forward(dev, dev.upload(x), out)
         yield relative(out.get(), network.upsample(x.astype(np.float64)), FOUR)
-        upsample2_backward(dev, dev.upload(grad_out), grad_x)
+        simple.upsample2_backward(dev, dev.upload(grad_out), grad_x)
         # sums of up to 16 weighted values
         expected = network.upsample_backward(grad_out.astype(np.float64))
         yield relative(grad_x.get(), expected, 8 * EPS)
 
 
-def _output(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _output(dev, rng):
     """Colours of the network's output, with features added and without, and the gradients."""
     for width in (1, 31, 33, 257):
         features, output = rng.standard_normal((3, width, 16)), rng.standard_normal((3, width, 3))
         image, plain = dev.upload(output, np.float32), dev.upload(output, np.float32)
-        output_forward(dev, image, dev.upload(features, np.float32))
-        output_forward(dev, plain, None)
+        simple.output_forward(dev, image, dev.upload(features, np.float32))
+        simple.output_forward(dev, plain, None)
         yield relative(plain.get(), 0.5 + 0.5 * output, 2 * EPS)
-        yield relative(image.get(), 0.5 + 0.5 * output + SHARE * (features[..., :3] - 1), 2 * EPS)
+        yield relative(
+            image.get(), 0.5 + 0.5 * output + simple.SHARE * (features[..., :3] - 1), 2 * EPS
+        )
         grad_features = dev.upload(features, np.float32)
-        residual_backward(dev, dev.upload(output, np.float32), grad_features)
-        expected = np.concatenate([features[..., :3] + SHARE * output, features[..., 3:]], axis=2)
+        simple.residual_backward(dev, dev.upload(output, np.float32), grad_features)
+        expected = np.concatenate(
+            [features[..., :3] + simple.SHARE * output, features[..., 3:]], axis=2
+        )
         yield relative(grad_features.get(), expected, 2 * EPS)
 
 
-def _first_features(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _first_features(dev, rng):
     """Colours that are features, and the gradient."""
     for height, width in ((1, 1), (31, 33), (3, 257)):
         features, grad = _normal(rng, height, width, 16), _normal(rng, height, width, 3)
         image, grad_features = dev.empty(grad.shape), dev.empty(features.shape)
-        first_features_forward(dev, dev.upload(features), image)
+        simple.first_features_forward(dev, dev.upload(features), image)
         yield relative(image.get(), features[..., :3].astype(np.float64), EPS)
-        first_features_backward(dev, dev.upload(grad), grad_features)
+        simple.first_features_backward(dev, dev.upload(grad), grad_features)
         expected = np.zeros(features.shape)
         expected[..., :3] = grad
         yield relative(grad_features.get(), expected, EPS)
 
 
-def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _gate(dev, rng):
     """Sizes; features and gates from 1e-12 to 60, where expm1 would cancel and exp overflow."""
     for h, w, c in PLANES:
         x, grad_out = 3 * _normal(rng, h, w, 2 * c), _normal(rng, h, w, c)
@@ -233,40 +215,40 @@ def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(output, gradient of x) of a gate, from the device; x, grad_out: float32."""
     out, grad_x, device_x = dev.empty(grad_out.shape), dev.empty(x.shape), dev.upload(x)
-    gate_forward(dev, device_x, out)
-    gate_backward(dev, device_x, dev.upload(grad_out), grad_x)
+    simple.gate_forward(dev, device_x, out)
+    simple.gate_backward(dev, device_x, dev.upload(grad_out), grad_x)
     return out.get(), grad_x.get()
 
 
-def _tiles(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Which tiles hold something, which have fragments, copies of them; tiles cut off by the
-    border.
-    """
+def _tiles(dev, rng):
+    """Which tiles hold something, which have fragments, copies of them, also at the border."""
     for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
         odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))
         x = np.where(rng.random((h, w, c)) < 0.02, odd, 1).astype(np.float32)
-        yield exact(tiles_find(dev, dev.upload(x), 1.0).get(), halve((x != 1).any(2), 2))
+        yield exact(tiles.tiles_find(dev, dev.upload(x), 1.0).get(), halve((x != 1).any(2), 2))
         fragments = rng.integers(1, 5, (h, w)) * (rng.random((h, w)) < 0.02)
         offsets = dev.upload(np.concatenate([[0], np.cumsum(fragments)]), np.uint32)
-        yield exact(tiles_covered(dev, offsets, (h, w)).get(), halve(fragments > 0, 2))
+        yield exact(tiles.tiles_covered(dev, offsets, (h, w)).get(), halve(fragments > 0, 2))
         yield _copied_tiles(dev, rng, _normal(rng, h, w, c))
 
 
 def _copied_tiles(dev, rng, x):
     """Half of the tiles become copies of the first one of their shape."""
-    rows, columns = grid_shape(*x.shape[:2])
+    rows, columns = tiles.grid_shape(*x.shape[:2])
     y, z = np.mgrid[: x.shape[0], : x.shape[1]]
-    cut = (np.arange(rows) * SIDE + SIDE > len(x))[:, None] * 2
-    cut = cut + (np.arange(columns) * SIDE + SIDE > x.shape[1])
+    cut = (np.arange(rows) * tiles.SIDE + tiles.SIDE > len(x))[:, None] * 2
+    cut = cut + (np.arange(columns) * tiles.SIDE + tiles.SIDE > x.shape[1])
     _, first, kind = np.unique(cut, return_index=True, return_inverse=True)
     source = first[kind.reshape(cut.shape)]
     number = np.arange(rows * columns).reshape(cut.shape)
     chosen = (rng.random(cut.shape) < 0.5) & (source != number)
-    copies, array = copy_list(source, chosen), dev.upload(x)
+    copies, array = tiles.copy_list(source, chosen), dev.upload(x)
     behind = np.full((3, 2), 2**30, np.int32)  # not to be read
-    tiles_copy(dev, array, dev.upload(np.concatenate([copies, behind])), len(copies))
-    tile = np.where(chosen, source, number)[y // SIDE, z // SIDE]
-    expected = x[tile // columns * SIDE + y % SIDE, tile % columns * SIDE + z % SIDE]
+    tiles.tiles_copy(dev, array, dev.upload(np.concatenate([copies, behind])), len(copies))
+    tile = np.where(chosen, source, number)[y // tiles.SIDE, z // tiles.SIDE]
+    expected = x[
+        tile // columns * tiles.SIDE + y % tiles.SIDE, tile % columns * tiles.SIDE + z % tiles.SIDE
+    ]
     return exact(array.get(), expected)
 
 

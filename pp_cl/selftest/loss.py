@@ -1,22 +1,18 @@
 """Cases of the losses: L1 and SSIM, masks, exposure, and their sum."""
 
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.training.exposure import DECAY, PRIOR, Exposure
 from pp_cl.engine.training.loss import Loss, ignore_gradient, ignore_target
 from pp_cl.reference import loss as reference_loss
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
 ONE = np.uint8(1)
 FLAT = 3e-6  # variances of nothing: rounding of Var[d] over C2 = 0.03^2
 
 
-def _loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _loss(dev, rng):
     """L1 and SSIM; at sizes below a window L1 alone."""
     for size in ((11, 11), (12, 33), (33, 31), (40, 257), (1, 1), (1, 257), (10, 40)):
         prediction, target = images(rng, *size)
@@ -33,9 +29,7 @@ def images(rng: np.random.Generator, height: int, width: int) -> tuple[np.ndarra
 
 
 def _loss_checks(dev, prediction, target, weights, *bounds):
-    """weights: of 1 - SSIM, and beta. bounds: of the terms, and of the gradient where it is
-    another.
-    """
+    """weights: of 1 - SSIM, and beta. bounds: of the terms, maybe another of the gradient."""
     loss = Loss(dev, *weights)
     grad, _ = loss.forward_backward(dev.upload(prediction), dev.upload(target))
     terms, expected = reference_loss.loss(prediction, target, *weights)
@@ -50,7 +44,7 @@ def four_terms(loss: Loss) -> np.ndarray:
     return np.array([found["loss"], found["l1"], 1 - found["ssim"], mse])
 
 
-def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _hard_loss(dev, rng):
     """Flat images, equal ones, and variances far below the squares they are the difference of."""
     for levels in ((0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)):
         prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
@@ -61,20 +55,14 @@ def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         prediction = (target + noise[1]).astype(np.float32)
         # rounding of values of 1 in variances of 1e-6, as shares of C2
         yield from _loss_checks(dev, prediction, target, (1.0, 0.0), 1e-5, 3e-5)
-        yield from _equal_images(dev, target)
+        loss = Loss(dev, 0.2)  # of equal images
+        grad, _ = loss.forward_backward(dev.upload(target), dev.upload(target))
+        yield exact(four_terms(loss)[:3], np.zeros(3))
+        yield exact(grad.get(), np.zeros_like(target))
 
 
-def _equal_images(dev, image):
-    loss = Loss(dev, 0.2)
-    grad, _ = loss.forward_backward(dev.upload(image), dev.upload(image))
-    yield exact(four_terms(loss)[:3], np.zeros(3))
-    yield exact(grad.get(), np.zeros_like(image))
-
-
-def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """weight * mean (alpha - mask)^2 of a part of the image, where alpha is too low times the
-    shortfall's weight, beside no other error; nothing outside of it.
-    """
+def _mask_loss(dev, rng):
+    """Of a part of the image, where alpha is too low times the shortfall's; nothing outside."""
     weight, shortfall, width, left, top = 0.7, 0.3, 29, 3, 1
     for side in SIZES:
         size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
@@ -82,15 +70,9 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         ignored = rng.random(mask.shape) < 0.2
         loss = Loss(dev, 0.0, mask_weight=weight)
         rendered = dev.upload(transmittance.ravel(), np.float32)
-        grad: Any
-        _, grad = loss.forward_backward(
-            dev.zeros((*size, 3)),
-            dev.zeros((side, width, 3)),
-            left,
-            top,
-            alphas=(rendered, dev.upload(np.where(ignored, -1, mask), np.float32)),
-            shortfall=shortfall,
-        )
+        images = dev.zeros((*size, 3)), dev.zeros((side, width, 3))
+        alphas = rendered, dev.upload(np.where(ignored, -1, mask), np.float32)
+        _, grad = loss.forward_backward(*images, left, top, alphas=alphas, shortfall=shortfall)
         difference = np.where(ignored, 0, 1 - transmittance[inside] - mask)
         weighted = np.where(difference < 0, shortfall, 1) * difference
         found, mean = loss.read(1).get(), (weighted * difference).mean()
@@ -100,7 +82,7 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(grad.get().reshape(size), expected, 8 * EPS)
 
 
-def _ignored(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _ignored(dev, rng):
     """What a part of an image is compared with where pixels are ignored, and no gradient there."""
     for side in SIZES:
         prediction, target = images(rng, side + 3, 36)[0], images(rng, side, 29)[1]
@@ -119,7 +101,7 @@ def _ignored(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(grad.get(), expected)
 
 
-def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _sum_of_terms(dev, rng):
     """The loss is that of the image and what is added."""
     for n in SIZES:
         prediction, target = images(rng, 12, n)
@@ -134,10 +116,8 @@ def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield each([found["loss"], found["distortion"]], expected, LOSS)
 
 
-def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The gains of three views, of which one is seen twice and one never, and images that are
-    divided by them.
-    """
+def _exposure(dev, rng):
+    """The gains of three views, one seen twice and one never, and images divided by them."""
     known, left, top = np.zeros((3, 3, 3)), 3, 1
     exposure = Exposure(dev, 3, is_applied=True)
     for view, side in zip((0, 2, 0), (1, 33, 257), strict=True):

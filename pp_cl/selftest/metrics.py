@@ -1,42 +1,36 @@
 """Cases of the metrics: LPIPS, and points against a mesh."""
 
-from collections.abc import Iterator
-from typing import Any
+from itertools import product
 
 import numpy as np
 
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import group_ranges, row_parts
 from pp_cl.engine.grid import Grid
 from pp_cl.metrics.lpips import Lpips, lpips_program
 from pp_cl.metrics.shape import Mesh, sample_surface
 from pp_cl.reference import lpips
-from pp_cl.selftest.case import SIZES, Case, Check, each, exact, relative
+from pp_cl.selftest.case import SIZES, Case, each, exact, relative
 
 BOX = np.array([(x, y, z) for x in (-0.39, 0.39) for y in (-0.29, 0.29) for z in (-0.19, 0.19)])
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
 
-def _distance(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _distance(dev, rng):
     """Features whose lengths differ a millionfold; none; equal ones."""
-    for n in SIZES:
-        for channels in (16, 512):
-            features = np.maximum(rng.normal(size=(2, n, channels)), 0)
-            a, b = (features * 10 ** rng.uniform(-3, 3, (2, n, 1))).astype(np.float32)
-            a[0], a[-1] = 0, 0 if n == 1 else b[-1]
-            head = rng.uniform(0, 1, channels).astype(np.float32)
-            exact_a, exact_b, exact_head = (v.astype(np.float64) for v in (a, b, head))
-            distance = dev.empty((n,))
-            arrays: dict[str, Any] = {"a": dev.upload(a), "b": dev.upload(b), "n": n, "c": channels}
-            arrays["head"] = dev.upload(head)
-            program, ranges = lpips_program(dev), group_ranges(dev, n, row_parts(dev))
-            program.launch("lpips_distance", *ranges, distance=distance, **arrays)
-            # sums over 512 channels in 16 lanes: 32 roundings in a row, and those of a root
-            expected = lpips.pixel_distance(exact_a, exact_b, exact_head)
-            yield relative(distance.get(), expected, 2e-6)
+    for n, channels in product(SIZES, (16, 512)):
+        features = np.maximum(rng.normal(size=(2, n, channels)), 0)
+        a, b = (features * 10 ** rng.uniform(-3, 3, (2, n, 1))).astype(np.float32)
+        a[0], a[-1] = 0, 0 if n == 1 else b[-1]
+        head, distance = rng.uniform(0, 1, channels).astype(np.float32), dev.empty((n,))
+        program, ranges = lpips_program(dev), group_ranges(dev, n, row_parts(dev))
+        arrays = {"a": dev.upload(a), "b": dev.upload(b), "head": dev.upload(head)}
+        program.launch("lpips_distance", *ranges, n=n, c=channels, distance=distance, **arrays)
+        # sums over 512 channels in 16 lanes: 32 roundings in a row, and those of a root
+        expected = lpips.pixel_distance(*(array.astype(np.float64) for array in (a, b, head)))
+        yield relative(distance.get(), expected, 2e-6)
 
 
-def _lpips(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _lpips(dev, rng):
     """A network of VGG16's shape with few channels: thirteen convolutions, each within 3e-6."""
     weights = lpips.random_weights(rng)
     for size in ((16, 16), (17, 33)):
@@ -45,7 +39,7 @@ def _lpips(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield each(Lpips(dev, weights).distance(a, b), lpips.lpips(a, b, weights), 1e-5)
 
 
-def _box(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _box(dev, rng):
     """Sides at 0.39, 0.29 and 0.19 are nearest to the layers at 0.35, 0.25 and 0.15."""
     faces = np.array([t for a, b, c, d in QUADS for t in ((a, b, c), (a, c, d))])
     grid = Grid((-0.45, -0.35, -0.25), 0.1, (10, 8, 6))

@@ -1,8 +1,5 @@
-"""Cases of what changes parameters: Adam, RMSprop of the points, moving averages, smoothing, the
-opacities of split points.
-"""
+"""Cases of what changes parameters: Adam, RMSprop, moving averages, smoothing, splits."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,7 +17,7 @@ from pp_cl.engine.training.schedule import Rates
 from pp_cl.engine.training.smooth import Smoother
 from pp_cl.engine.training.state import PointState, split_opacity
 from pp_cl.reference import dense, optim
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import some_ids, some_opacities
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
@@ -32,9 +29,8 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 
 class Cloud:
-    """n points on the grid, with random offsets, opacities and coefficients up to a degree, and
-    their float64 twin. width: of an offset. positions: (N, 3) in the world. start, learned(): of
-    "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
+    """n random points on the grid, and their float64 twin. width: of an offset. start, learned():
+    of "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
     """
 
     def __init__(
@@ -75,9 +71,7 @@ class Cloud:
         *,
         rates: Rates = RATES,
     ) -> None:
-        """One step, or that of another number. grads: as gradients() has them; those of `visible`
-        count.
-        """
+        """One step, or that of another number. grads: of gradients(), used of the visible."""
         self.steps = step or self.steps + 1
         rows = {name: self.dev.upload(g[visible], np.float32) for name, g in grads.items()}
         rmsprop_update(
@@ -97,9 +91,8 @@ class Cloud:
         seen = np.isin(np.arange(self.n), visible)
         grads = {name: np.where(seen, g.T, 0).T for name, g in grads.items()}
         grads["offset"] = grads["offset"] * (rates.offset > 0)
-        self.twin.step(
-            self.steps, grads, vars(rates) | {"sh": np.repeat(rates.sh, (1, 3, 5))}, EPSILONS
-        )
+        by_basis = vars(rates) | {"sh": np.repeat(rates.sh, (1, 3, 5))}
+        self.twin.step(self.steps, grads, by_basis, EPSILONS)
 
     def learned(self) -> dict[str, np.ndarray]:
         """float32 on the host."""
@@ -122,9 +115,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
 
 
 def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int = 4) -> Gradients:
-    """{"sh": (n, 16) of the features, "offset": (n, width), "opacity": (n,)} float32; every third
-    point's are 0.
-    """
+    """{"sh": (n, 16), "offset": (n, width), "opacity": (n,)}; every third point's are 0."""
     grads = {}
     for name, shape in (("sh", (n, 16)), ("offset", (n, width)), ("opacity", (n,))):
         grads[name] = (scale * rng.standard_normal(shape)).astype(np.float32)
@@ -132,14 +123,13 @@ def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int 
     return grads
 
 
-def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _adam(dev, rng):
     """Parameters and moments after twenty steps; the first step is the rate."""
     for n in SIZES:
         grads = 1e-3 * rng.standard_normal((20, n))
         for eps in (1e-8, 1e-15):
-            twin, parameter, state = adam_steps(
-                dev, rng.standard_normal(n), grads, rate=0.01, eps=eps
-            )
+            start = rng.standard_normal(n)
+            twin, parameter, state = adam_steps(dev, start, grads, rate=0.01, eps=eps)
             # the parameter is rounded in each step, by half EPS of its size; rarely the same way
             yield relative(parameter, twin.parameter, 3e-7)
             yield each(state["m"].get(), twin.m, 8 * EPS, floor=1e-3)
@@ -152,9 +142,7 @@ def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def adam_steps(
     dev: Device, start: np.ndarray, grads: np.ndarray, **options: Any
 ) -> tuple[optim.Adam, np.ndarray, dict[str, Array]]:
-    """(float64 twin, parameter, moments) after a step with each gradient. options: of
-    adam_update().
-    """
+    """(float64 twin, parameter, moments) after a step with each gradient."""
     parameter = dev.upload(start, np.float32)
     twin, state = optim.Adam(parameter.get()), {kind: dev.zeros(parameter.shape) for kind in "mv"}
     for step, grad in enumerate(grads.astype(np.float32), 1):
@@ -163,7 +151,7 @@ def adam_steps(
     return twin, parameter.get(), state
 
 
-def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _adam_extremes(dev, rng):
     """Gradients of 1e-20 to 1e10, of which float32 cannot square all; and of 0."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         for eps in (1e-8, 1e-15):
@@ -177,10 +165,8 @@ def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield exact(state["v"].get(), np.zeros(33))
 
 
-def _rmsprop(degree: int, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Of harmonics by the direction from the eye; points without a gradient keep their values, and
-    their second moments decay.
-    """
+def _rmsprop(degree, dev, rng):
+    """Points without a gradient keep their values, and their second moments decay."""
     for n in SIZES:
         cloud = Cloud(dev, rng, n, degree)
         for _ in range(8):
@@ -203,10 +189,8 @@ def _rmsprop_checks(cloud):
         yield relative(moments[name], cloud.twin.v[name], 3e-6)  # a sum of squares
 
 
-def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Gradients of 1e-20 to 1e10, of which float32 cannot square all; of 0 and -0; NaN stays; a
-    gradient of one parameter alone moves it alone.
-    """
+def _rmsprop_extremes(dev, rng):
+    """Some squares leave float32; NaN stays; a gradient of one parameter alone moves it alone."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         cloud = Cloud(dev, rng, 31)
         for _ in range(10):
@@ -214,10 +198,8 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         for name, values in cloud.learned().items():
             yield relative(values, cloud.twin.values[name], 1e-6 if name == "sh" else 1e-5)
     cloud, grads = Cloud(dev, rng, 33), gradients(rng, 33, 0.0)
-    grads["sh"][1], grads["sh"][2, 5], grads["opacity"][4], grads["offset"][7, 1] = (
-        -0.0,
-        *[np.nan] * 3,
-    )
+    grads["sh"][1] = -0.0
+    grads["sh"][2, 5] = grads["opacity"][4] = grads["offset"][7, 1] = np.nan
     grads["opacity"][10], grads["offset"][13, 3] = 1e-4, -1e-4
     cloud.step(grads, np.arange(33))
     for name, values in cloud.learned().items():
@@ -226,10 +208,8 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield absolute(np.nan_to_num(values), np.nan_to_num(expected), 1e-6 * RATES.opacity)
 
 
-def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Huge gradients keep opacities and offsets in their bounds, those of Gaussians and their SH
-    above degree 0, too, at the values of float64.
-    """
+def _bounded(dev, rng):
+    """Huge gradients keep opacities, offsets and Gaussians' SH above degree 0 in their bounds."""
     for footprint in ("soft", "gaussian"):
         width = offset_width(footprint)
         cloud = Cloud(dev, rng, 257, width=width)
@@ -249,7 +229,7 @@ def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield absolute(sh, cloud.twin.values["sh"], 1e-5)
 
 
-def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _ema(dev, rng):
     for n in SIZES:
         old, new = rng.standard_normal((2, n)).astype(np.float32)
         ema = dev.upload(old)
@@ -258,7 +238,7 @@ def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(ema.get(), expected, 2 * EPS)
 
 
-def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _smooth(dev, rng):
     """Neighbours on the grid, and the step towards their mean."""
     grid = Grid((0, 0, 0), 1, (7, 17, 9))
     for n in SIZES:
@@ -275,7 +255,7 @@ def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             yield relative(sh.get(), expected, 4 * EPS)  # a mean of up to six
 
 
-def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _refine(dev, rng):
     """1 - sqrt(1 - o), which cancels for small opacities; what depends on the direction alike."""
     for n in SIZES:
         opacity = some_opacities(rng, n)

@@ -1,6 +1,4 @@
-"""Runs the rasteriser's stages on explicit points: what render.py does, with every intermediate at
-hand. The tests use it too.
-"""
+"""Runs the rasteriser's stages on explicit points, with every intermediate at hand."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,18 +23,9 @@ Gradients = dict[str, np.ndarray]
 
 
 def make_camera(width: int = 24, height: int = 20, focal: float = 30.0) -> Camera:
-    """A camera four units away from the origin, off the axes, with different focal lengths and an
-    odd principal point.
-    """
-    return Camera(
-        look_at([2.3, -2.6, 1.9], [0.0, 0.1, 0.0]),
-        focal,
-        focal * 1.1,
-        width * 0.45,
-        height * 0.55,
-        width,
-        height,
-    )
+    """A camera four units away, off the axes, with two focal lengths and an odd principal point."""
+    pose = look_at([2.3, -2.6, 1.9], [0.0, 0.1, 0.0])
+    return Camera(pose, focal, 1.1 * focal, 0.45 * width, 0.55 * height, width, height)
 
 
 def make_points(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -56,10 +45,7 @@ def some_opacities(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 class PairedPoints:
-    """Points projected and paired with the pixels of a camera; arrays are float64 or float32 numpy.
-
-    positions: (N, 3). radius: one number or (N,), world units. depth_range: (near, far).
-    """
+    """Points (N, 3) of radius, one or (N,), projected and paired with the pixels of a camera."""
 
     backward: BlendGradients  # of the last gradients()
 
@@ -74,27 +60,22 @@ class PairedPoints:
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
     ):
         exact = partial(dense.geometry, camera, positions, radius, kind, depth_range=depth_range)
-        self._begin(dev, camera, len(positions), exact, depth_range)
-        self._pair(
-            project_spheres(
-                dev,
-                self.buffers,
-                kind,
-                dev.upload(camera.packed(depth_range)),
-                dev.upload(positions, np.float32),
-                point_radius=dev.upload(np.broadcast_to(radius, self.n), np.float32),
-            )
+        buffers, n = Buffers(dev), len(positions)
+        projected = project_spheres(
+            dev,
+            buffers,
+            kind,
+            dev.upload(camera.packed(depth_range)),
+            dev.upload(positions, np.float32),
+            point_radius=dev.upload(np.broadcast_to(radius, n), np.float32),
         )
+        self._pair(dev, camera, n, exact, depth_range, buffers, projected)
 
-    def _begin(self, dev, camera, n, exact, depth_range):
-        self.dev, self.camera, self.n = dev, camera, n
+    def _pair(self, dev, camera, n, exact, depth_range, buffers, projected):
+        self.dev, self.camera, self.n, self.buffers = dev, camera, n, buffers
         self._exact, self.depth_range = exact, depth_range
-        self.shape = (camera.height, camera.width)
-        self.buffers = Buffers(dev)
-
-    def _pair(self, projected):
-        self.projected = projected
-        self.pairs = find_all_pairs(self.dev, self.buffers, projected, self.shape)
+        self.shape, self.projected = (camera.height, camera.width), projected
+        self.pairs = find_all_pairs(dev, buffers, projected, self.shape)
 
     @property
     def seen(self) -> np.ndarray:
@@ -115,8 +96,8 @@ class PairedPoints:
         return matrix
 
     def geometry(self) -> dict[str, np.ndarray]:
-        """dense.geometry with the device's fragments, and at these its falloff and depth: at the
-        rim of a footprint a falloff is rounding, and a softmax may make it half a pixel.
+        """dense.geometry with the device's fragments, falloff and depth: at the rim of a footprint
+        a falloff is rounding, and a softmax may make it half a pixel.
         """
         total, fragment = self.pairs.total, self.fragments()
         falloff = self.pairs.pair_point_falloff.get()[:total, 1].view(np.float32)
@@ -143,15 +124,9 @@ class PairedPoints:
     ) -> np.ndarray:
         """(H, W, 16) blended features. rule: of BLENDS. drops: max_tracked and early_stop."""
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
+        view = self.buffers, self.pairs, self.projected.camera_buffer
         self.weights = blend_weights(
-            self.dev,
-            self.buffers,
-            self.pairs,
-            self.projected.camera_buffer,
-            self.opacity,
-            blend=rule,
-            gamma=gamma,
-            **drops,
+            self.dev, *view, self.opacity, blend=rule, gamma=gamma, **drops
         )
         self.weights.read_visible(self.dev)
         visible = self.weights.visible.get()
@@ -164,21 +139,16 @@ class PairedPoints:
 
     def weight(self) -> np.ndarray:
         """(N, HW) the blend weights, 0 where a fragment was dropped."""
+        return self.weight_and_dropped()[0]
+
+    def weight_and_dropped(self) -> tuple[np.ndarray, np.ndarray]:
+        """((N, HW) blend weights, (N, HW) bool: the fragments behind an early stop)."""
         is_listed, _, weights = listed_fragments(self.pairs, self.weights)
-        by_pair = np.zeros(self.pairs.total, np.float32)
-        by_pair[self._listed()[is_listed]] = weights
-        return self.dense(by_pair)
-
-    def dropped(self) -> np.ndarray:
-        """(N, HW) bool: the fragments behind an early stop."""
-        is_listed, _, _ = listed_fragments(self.pairs, self.weights)
-        by_pair = np.empty(self.pairs.total, bool)
-        by_pair[self._listed()] = ~is_listed
-        return self.dense(by_pair, False)
-
-    def _listed(self):
-        """(P,) the pairs in the order of the keys."""
-        return self.pairs.pair_key.get()[: self.pairs.total] & np.uint64(0xFFFFFFFF)
+        ordered = self.pairs.pair_key.get()[: self.pairs.total] & np.uint64(0xFFFFFFFF)
+        weight, dropped = np.zeros(len(ordered), np.float32), np.empty(len(ordered), bool)
+        weight[ordered[is_listed]] = weights
+        dropped[ordered] = ~is_listed
+        return self.dense(weight), self.dense(dropped, False)
 
     def gradients(
         self,
@@ -187,17 +157,15 @@ class PairedPoints:
         distortion_weight: float = 0.0,
         voxel_size: float = 0.0,
     ) -> Gradients:
-        """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
-        sum(alpha * grad_alpha) and the pixels' distortion loss times its weight, after blend(); on
-        a grid of a voxel size also "offset", (N, 4).
+        """{"features": (N, 16), "opacity": (N,), on a grid of a voxel size "offset": (N, 4)} of
+        sum(features * grad_features), sum(alpha * grad_alpha) and the weighted distortion loss.
         """
         grad_features = np.reshape(grad_features, (*self.shape, 16))
+        view = self.projected, self.pairs, self.weights
         found = self.backward = blend_backward(
             self.dev,
             self.buffers,
-            self.projected,
-            self.pairs,
-            self.weights,
+            *view,
             opacity=self.opacity,
             visible_features=self.visible_features,
             features=self.features,
@@ -217,23 +185,16 @@ class PairedPoints:
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
-        gradients = self.gradients(grad_features)
+        gradients, view = self.gradients(grad_features), (self.projected, self.pairs, self.weights)
+        pair_gradient = self.backward.pair_gradient
         positions, radius = spheres_backward(
-            self.dev,
-            self.projected,
-            self.pairs,
-            self.weights,
-            self.backward.pair_gradient,
-            opacity=self.opacity,
-            gamma=self.gamma,
+            self.dev, *view, pair_gradient, opacity=self.opacity, gamma=self.gamma
         )
         return gradients | {"positions": positions.get(), "radius": radius.get()}
 
 
 class PairedGaussians(PairedPoints):
-    """Gaussians in the cells of a grid. ids: (N,). offset: (N, 16), cl/cloud.h. radius: of one
-    without offsets, world units.
-    """
+    """Gaussians in the cells of a grid. ids: (N,). offset: (N, 16), as in cl/cloud.h."""
 
     def __init__(
         self,
@@ -244,23 +205,20 @@ class PairedGaussians(PairedPoints):
         offset: np.ndarray,
         radius: float,
     ):
-        exact = partial(
-            dense.gaussians, camera, grid.positions(ids), grid.voxel_size, offset, radius
+        vertices, n, buffers = grid.positions(ids), len(ids), Buffers(dev)
+        exact = partial(dense.gaussians, camera, vertices, grid.voxel_size, offset, radius)
+        projected = project_grid(
+            dev,
+            buffers,
+            "gaussian",
+            dev.upload(camera.packed(dense.DEPTH_RANGE)),
+            dev.upload(grid.packed()),
+            point_id=dev.upload(ids, np.uint32),
+            cloud_offset=dev.upload(offset, np.float32),
+            opacity=dev.zeros((n, OPACITIES)),
+            radius=radius,
         )
-        self._begin(dev, camera, len(ids), exact, dense.DEPTH_RANGE)
-        self._pair(
-            project_grid(
-                dev,
-                self.buffers,
-                "gaussian",
-                dev.upload(camera.packed(self.depth_range)),
-                dev.upload(grid.packed()),
-                point_id=dev.upload(ids, np.uint32),
-                cloud_offset=dev.upload(offset, np.float32),
-                opacity=dev.zeros((len(ids), OPACITIES)),
-                radius=radius,
-            )
-        )
+        self._pair(dev, camera, n, exact, dense.DEPTH_RANGE, buffers, projected)
 
 
 NEAR, FAR = dense.DEPTH_RANGE
@@ -269,27 +227,21 @@ AXIS_RADIUS = 0.001  # of points on the axis, world units
 AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 
 
-def depth_at(z: ArrayLike) -> np.ndarray:
-    """Distance from the eye of normalised depth z."""
-    return FAR - np.asarray(z) * (FAR - NEAR)
-
-
 def blend_on_axis(
     dev: Device, z: Sequence[float] | np.ndarray, opacity: ArrayLike, gamma: float, **options: Any
 ) -> tuple[PairedPoints, np.ndarray]:
     """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
     in its own channel.
     """
-    positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
+    positions = np.zeros((len(z), 3))
+    positions[:, 2] = FAR - np.asarray(z) * (FAR - NEAR)
     scene = PairedPoints(dev, AXIS, positions, AXIS_RADIUS)
     scene.blend(np.asarray(opacity), gamma, np.eye(16)[np.arange(len(z)) % 16], **options)
     return scene, scene.weight()[:, 0]
 
 
 class Blended:
-    """A random scene blended by the kernels and in float64, both with the kernels' fragments,
-    falloff and depth.
-    """
+    """A random scene blended by the kernels and in float64, with the kernels' geometry()."""
 
     def __init__(
         self,
@@ -320,24 +272,12 @@ class Blended:
         self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
         self.blend = dense.blend_by_rule(rule, self.geometry, self.opacity, gamma, stop)
-        self.weight = self.scene.weight()
-        self.dropped = self.scene.dropped()
+        self.weight, self.dropped = self.scene.weight_and_dropped()
 
     def gradients(self, distortion_weight: float = 0.0) -> Gradients:
-        """The kernels' gradients of sum(features * grad) and the distortion loss times its
-        weight.
-        """
+        """The kernels' gradients of sum(features * grad) and the weighted distortion loss."""
         return self.scene.gradients(self.grad, distortion_weight=distortion_weight)
 
-    def reference_gradients(
-        self, max_tracked: int = 0, distortion_weight: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The same in float64: (features, opacity)."""
-        return dense.gradients(
-            self.geometry,
-            self.blend,
-            self.point_features,
-            self.grad,
-            max_tracked=max_tracked,
-            distortion_weight=distortion_weight,
-        )
+    def reference_gradients(self, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The same in float64: (features, opacity). options: of dense.gradients()."""
+        return dense.gradients(self.geometry, self.blend, self.point_features, self.grad, **options)

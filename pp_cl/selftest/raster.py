@@ -1,16 +1,13 @@
 """Cases of the rasteriser before and after the blend weights: project, pairs, shade, depth."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from pp_cl.engine.camera import look_at
 from pp_cl.engine.device.buffers import Buffers
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import shade_forward
 from pp_cl.engine.raster.depth import depth_forward
@@ -18,7 +15,7 @@ from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES, sh_blocks
 from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
 from pp_cl.engine.raster.weights import BLENDS, list_weights, record_weights
 from pp_cl.reference import dense
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import (
     AXIS,
     FAR,
@@ -39,9 +36,9 @@ RIM = 1e-3  # the depth of a sphere is steep at its rim
 SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
 
 
-def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Points in the cells of a grid; spheres of which the depth range culls some, by their front.
-    Where points are is known of those that cover a pixel, and all cover one that lie in the image.
+def _project(dev, rng):
+    """Points in the cells of a grid, and spheres, of which the depth range culls some. Those that
+    lie in the image cover a pixel, and the places of these are known.
     """
     camera, depth_range = make_camera(), (3.5, 4.8)
     for n in SIZES:
@@ -49,42 +46,27 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         ids[-1] = GRID.ids(np.array(GRID.dims) - 1)
         offset = rng.uniform(-0.5, 0.5, (n, 4)).astype(np.float32)
         positions = GRID.positions(ids) + GRID.voxel_size * offset[:, :3]
-        points = project_grid(
-            dev,
-            Buffers(dev),
-            "disc",
-            dev.upload(camera.packed(dense.DEPTH_RANGE)),
-            dev.upload(GRID.packed()),
-            point_id=dev.upload(ids, np.uint32),
-            cloud_offset=dev.upload(offset),
-            opacity=dev.zeros((n, OPACITIES)),
-            radius=0.01,
-        )
+        points = _projected(dev, "disc", camera, ids, offset, np.zeros((n, OPACITIES)), 0.01)
         place, covers = dense.camera_space(camera, positions), points.point_count.get() > 0
         yield exact(covers | ~_inside(camera, place), np.ones(n, bool))
         radius = 0.01 * np.exp(offset[covers, 3])
         yield relative(points.point_shape.get()[covers, 0], radius, PLACED)
         yield relative(points.point_camera.get()[covers, :3], place[covers], PLACED)
-        yield relative(
-            points.point_camera.get()[covers, 3], np.linalg.norm(place[covers], axis=1), PLACED
-        )
+        distance = np.linalg.norm(place[covers], axis=1)
+        yield relative(points.point_camera.get()[covers, 3], distance, PLACED)
 
         positions, radius = make_points(rng, n), rng.uniform(0.01, 0.3, n)
         spheres = PairedPoints(dev, camera, positions, radius, depth_range=depth_range)
         placed, covers = spheres.projected.point_camera.get(), np.isin(np.arange(n), spheres.seen)
-        place, drawn = (
-            dense.camera_space(camera, positions),
-            dense.drawn(camera, positions, radius, depth_range),
-        )
+        place = dense.camera_space(camera, positions)
+        drawn = dense.drawn(camera, positions, radius, depth_range)
         yield exact(covers[~drawn], np.zeros((~drawn).sum(), bool))
         yield exact(covers | ~(drawn & _inside(camera, place)), np.ones(n, bool))
         yield relative(placed[covers, :3], place[covers], PLACED)
 
 
-def _opacities(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Opacities in the direction from the eye: random ones; along the axes, where all harmonics
-    together take opacities to their bounds, beyond them and to little more or less than these.
-    """
+def _opacities(dev, rng):
+    """Random ones; along the axes, where harmonics take opacities to their bounds and beyond."""
     for n in SIZES:
         ids = some_ids(rng, GRID, n)
         yield from _check_opacities(dev, make_camera(), ids, some_opacities(rng, n))
@@ -99,21 +81,26 @@ def _opacities(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _check_opacities(dev, camera, ids, learned):
-    points = project_grid(
-        dev,
-        Buffers(dev),
-        "soft",
-        dev.upload(camera.packed(dense.DEPTH_RANGE)),
-        dev.upload(GRID.packed()),
-        point_id=dev.upload(ids, np.uint32),
-        cloud_offset=dev.zeros((len(ids), 4)),
-        opacity=dev.upload(learned),
-        radius=0.05,
-    )
+    points = _projected(dev, "soft", camera, ids, np.zeros((len(ids), 4)), learned, 0.05)
     covers = points.point_count.get() > 0
     expected = dense.opacities(GRID.positions(ids), camera.eye, learned)
     # eight products of about 1/2, by harmonics of a direction of four roundings
     yield absolute(points.point_opacity.get()[covers], expected[covers], 8 * EPS)
+
+
+def _projected(dev, footprint, camera, ids, offset, opacity, radius):
+    """The points of a grid by project_grid()."""
+    return project_grid(
+        dev,
+        Buffers(dev),
+        footprint,
+        dev.upload(camera.packed(dense.DEPTH_RANGE)),
+        dev.upload(GRID.packed()),
+        point_id=dev.upload(ids, np.uint32),
+        cloud_offset=dev.upload(offset, np.float32),
+        opacity=dev.upload(opacity, np.float32),
+        radius=radius,
+    )
 
 
 def _inside(camera, place):
@@ -124,10 +111,8 @@ def _inside(camera, place):
     return (z > 0) & inside
 
 
-def _left_out(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Points behind the eye, on its plane and at it, and positions that are NaN, infinite or too
-    large, reach nothing.
-    """
+def _left_out(dev, rng):
+    """Points behind the eye, on its plane, at it, NaN, infinite or too large reach nothing."""
     positions = [[0, 0, 3.0], [0.001, 0, 4.0], [0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9]]
     for bad in (np.nan, np.inf, -np.inf, 3e38, -3e38):
         positions += [[bad, 0, 3.0], [0, bad, 3.0], [0, 0, bad]]
@@ -143,7 +128,7 @@ def _left_out(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact([gradient[2:].any() for gradient in found.values()], [False] * len(found))
 
 
-def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _pairs(kind, dev, rng):
     """Which pixels a point covers, how close to its centre, at which depth, in which order."""
     camera = replace(make_camera(33, 31), fy=26.0)
     for n in SIZES:
@@ -173,7 +158,7 @@ def _check_pairs(scene, expected):
     yield exact(scene.seen, np.flatnonzero(fragments.any(axis=1)))
 
 
-def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _equal_depths(dev, rng):
     """Thousands of points at few depths in one pixel: a stable order."""
     camera = replace(AXIS, fx=30.0, fy=33.0)
     for n in (*SIZES, 10_000):
@@ -184,10 +169,8 @@ def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(pairs.pair_key.get()[: pairs.total] & 0xFFFFFFFF, order)
 
 
-def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Harmonics of all degrees; those of 16 bits give what the same numbers in 32 bits give, of
-    Gaussians at least 0. No row is written for points that are not listed.
-    """
+def _shade(dev, rng):
+    """Harmonics of all degrees, of Gaussians at least 0. No row but of listed points is written."""
     camera = make_camera()
     for n, degree in product(SIZES, SH_DEGREES):
         positions = make_points(rng, n)
@@ -216,7 +199,7 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(clamped[:-3], np.maximum(features[:-3], 0))
 
 
-def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _depth(rule, dev, rng):
     """Alpha, mean and median depth by the blend weights; nothing of opacities of 0."""
     for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
         blended = Blended(
@@ -241,13 +224,9 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _medians(blended, weight, z):
-    """Two (HW,) between which the medians lie: where shares just below and above one half are
-    reached. weight, z: (N, HW).
-    """
-    fragments, bounds = (
-        blended.geometry["fragment"] & ~blended.dropped,
-        np.zeros((2, len(weight.T))),
-    )
+    """Two (HW,) between which the medians lie: of shares just below and above one half."""
+    fragments = blended.geometry["fragment"] & ~blended.dropped
+    bounds = np.zeros((2, len(weight.T)))
     for q in np.flatnonzero(weight.any(axis=0)):
         order = np.argsort(blended.geometry["depth"][:, q], kind="stable")
         listed = order[fragments[order, q]]
@@ -262,12 +241,10 @@ def _depths(dev, scene):
     return [array.get().ravel() for array in arrays]
 
 
-def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The highest weight of each point, and how often it was seen, by the tracked fragments; the
-    same from the weights that the backward pass leaves.
-    """
-    options: dict[str, Any] = {"early_stop": 0.05, "max_tracked": 2}
-    blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
+def _record(rule, dev, rng):
+    """The highest weight of each point, and how often it was seen, by the tracked fragments."""
+    drops = {"early_stop": 0.05, "max_tracked": 2}
+    blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **drops)
     before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
     highest, scene = before.copy(), blended.scene
     listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)

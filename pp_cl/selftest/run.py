@@ -1,6 +1,4 @@
-"""Runs the cases of the selftest one by one; their results as a table and as JSON, with what a
-report of a fault needs: device, driver and versions.
-"""
+"""Runs the cases of the selftest one by one; their results as a table and as JSON."""
 
 import os
 import platform
@@ -35,10 +33,8 @@ CASES: tuple[Case, ...] = (
 
 @dataclass(frozen=True)
 class Row:
-    """What a case found.
-
-    error, bound: of the check that came closest to its bound, or exceeded it most; None where the
-    case ended with an exception. reason: of a failure that numbers do not say, one line, else "".
+    """error, bound: of the case's worst check; None where it ended with an exception. reason: of a
+    failure that numbers do not say, one line, else "".
     """
 
     case: str
@@ -50,17 +46,13 @@ class Row:
 
 
 def run_cases(dev: Device, cases: Iterable[Case]) -> Iterator[Row]:
-    """The row of each case, as soon as it is there; those of variants that are not offered to the
-    device are left out. An exception fails its case, whatever it is.
-    """
+    """The row of each case, but of variants that are not offered to the device."""
     variants = (None, *OFFERED[device_class(dev)])
-    for case in cases:
-        if case.variant in variants:
-            yield run_case(dev, case)
+    yield from (run_case(dev, case) for case in cases if case.variant in variants)
 
 
 def run_case(dev: Device, case: Case) -> Row:
-    """The row of one case."""
+    """The row of one case, which an exception fails."""
     start = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # what is not finite is a result here
@@ -102,9 +94,7 @@ def line(row: Row) -> str:
 
 
 def as_json(dev: Device, rows: Iterable[Row]) -> dict[str, Any]:
-    """{"setup", "passed", "seconds", "cases": [a Row's fields]}; errors that are not finite are
-    null, as JSON has no number for them.
-    """
+    """{"setup", "passed", "seconds", "cases": [a Row's fields]}; null for what is no number."""
     rows = [row if np.isfinite(row.error or 0) else replace(row, error=None) for row in rows]
     return {
         "setup": setup(dev),

@@ -1,28 +1,19 @@
 """Cases of a scene's preparation: hull, targets, the demo."""
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import MASK_THRESHOLD, View
-from pp_cl.reference.scene import (
-    dilated_mask,
-    distance,
-    in_hull,
-    target_between,
-    target_forward,
-    undistorted,
-)
+from pp_cl.reference import scene as twin
 from pp_cl.scene.demo import distances
 from pp_cl.scene.hull import Carver
 from pp_cl.scene.lens import LensDistortion, undistort
-from pp_cl.selftest.case import SIZES, Case, Check, absolute, exact
+from pp_cl.selftest.case import SIZES, Case, absolute, exact
 
 BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
 TARGET = 5e-7  # a few roundings of a float32 in [0, 1]
@@ -37,18 +28,15 @@ DEMO = 2e-6  # distances of up to 2, by some ten roundings
 
 
 def _views(rng, share):
-    """Views of three sizes, one of them close, with `share` of the pixels in the mask, at random,
-    with alphas at and beside the threshold.
-    """
+    """Views of three sizes, one of them close, with a random `share` of the pixels in the mask."""
     views = []
     for eye, (width, height) in (
         ((3.0, 1, 0.5), (64, 48)),
         ((-2.0, 2, 1), (31, 33)),
         ((0.3, -0.4, 0.2), (40, 257)),
     ):
-        camera = Camera.look_at(
-            eye, (0, 0, 0), (0.3, 0.2, 1), fx=1.5 * width, width=width, height=height
-        )
+        size = {"fx": 1.5 * width, "width": width, "height": height}
+        camera = Camera.look_at(eye, (0, 0, 0), (0.3, 0.2, 1), **size)
         inside = rng.random((height, width, 1)) < share
         if width == height - 2:
             inside[[0, -1]] = inside[:, [0, -1]] = False  # the object ends within the image
@@ -57,40 +45,31 @@ def _views(rng, share):
     return views
 
 
-def _masks(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _masks(dev, rng):
     """Widened by two pixels, of a reduced image by more, and packed to bits."""
     for view, downscale in itertools.product(_views(rng, 0.002), (1, 2, 35)):
         height, width = view.image.shape[:2]
         words = Carver(dev, [replace(view, downscale=downscale)]).masks.get().reshape(height, -1)
         bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")[:, :width]
-        yield exact(bits, dilated_mask(view.image[..., 3], MASK_THRESHOLD, 1 + downscale))
+        yield exact(bits, twin.dilated_mask(view.image[..., 3], MASK_THRESHOLD, 1 + downscale))
 
 
-def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _hull(dev, rng):
     """Which vertices enough images see and few enough masks reject, and their numbers."""
     views = _views(rng, 0.05)
     carver = Carver(dev, views)
     for nx, forgiven, carver.doubts in itertools.product(SIZES, (0, 1, 2), (0, 1)):
         voxel_size, ny, nz = 2 / nx, 7, 5
-        grid = Grid(
-            (-voxel_size * nx / 2, -voxel_size * ny / 2, -voxel_size * nz / 2 + 0.1),
-            voxel_size,
-            (nx, ny, nz),
-        )
+        origin = -voxel_size * np.array([nx, ny, nz]) / 2 + [0, 0, 0.1]
+        grid = Grid(tuple(origin), voxel_size, (nx, ny, nz))
         positions = grid.lattice()
-        expected, border = in_hull(
-            views,
-            positions,
-            MASK_THRESHOLD,
-            least=carver.least,
-            forgiven=forgiven,
-            doubts=bool(carver.doubts),
-        )
+        rule = {"least": carver.least, "forgiven": forgiven, "doubts": bool(carver.doubts)}
+        expected, border = twin.in_hull(views, positions, MASK_THRESHOLD, **rule)
         found = carver.carve(grid, forgiven).ravel()
         yield exact(found[border > BORDER], expected[border > BORDER])
 
 
-def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _target(dev, rng):
     """Means over white of blocks of pixels, some of which reach outside of the image."""
     image = rng.integers(0, 256, (83, 97, 4), np.uint8)
     image[..., 3] = rng.choice([0, 255, 7, 130], (83, 97), p=[0.33, 0.33, 0.17, 0.17])
@@ -100,15 +79,15 @@ def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for width, height in ((1, 5), (31, 5), (33, 5), (5, 31), (257, 5)):
         crop = {"width": width, "height": height}
         box = (1, 2, width, height)
-        expected = target_forward(image, 3, 3 + 2, 6 + 1, **crop)
+        expected = twin.target_forward(image, 3, 3 + 2, 6 + 1, **crop)
         colour, alpha = target.crop(view.reduced(3), box, (2, 1))
         yield absolute(colour.get(), expected, TARGET)
         # over white, the object's share is what a black object would hide
-        hidden = 1 - target_forward(black, 3, 3 + 2, 6 + 1, **crop)[..., 0]
+        hidden = 1 - twin.target_forward(black, 3, 3 + 2, 6 + 1, **crop)[..., 0]
         yield absolute(alpha.get(), hidden, TARGET)
 
 
-def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _target_between(dev, rng):
     """Shifted by parts of a pixel, also where the crop reaches outside of the image."""
     image = rng.integers(0, 256, (40, 97, 4), np.uint8)
     view = View("noise", Camera(np.eye(3, 4), 90.0, 95.0, 45.6, 20.2, 97, 40), image)
@@ -118,7 +97,9 @@ def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     ):
         for x0, y0 in ((1, 2), (-3, 33)):
             found = target.crop(view, (x0, y0, width, height), (across, down))
-            expected = target_between(image, x0 + across, y0 + down, width=width, height=height)
+            expected = twin.target_between(
+                image, x0 + across, y0 + down, width=width, height=height
+            )
             yield absolute(found[0].get(), expected[..., :3], TARGET)
             yield absolute(found[1].get(), expected[..., 3], TARGET)
     nothing = replace(view, image=image * np.array([1, 1, 1, 0], np.uint8))
@@ -127,10 +108,8 @@ def _target_between(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(found[0].get(), np.ones((33, 60, 3)))
 
 
-def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Noise without distortion, at its size and at a half and a third; a tall image takes several
-    bands.
-    """
+def _distortion(dev, rng):
+    """Noise, at its size and at a half and a third; a tall image takes several bands."""
     sizes = [(n, 31) for n in SIZES] + [(33, 257), (1030, 700)]
     for (width, height), lens in itertools.product(sizes, LENSES):
         camera = Camera(np.eye(3, 4), 0.9 * height, 0.8 * height, 0.53 * width, 14.2, width, height)
@@ -138,14 +117,14 @@ def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         image[..., 3] = rng.integers(128, 256, (height, width))
         for factor in range(1, 2 if width < 3 or height > 300 else 4):
             found = undistort(dev, image, camera, lens, factor)
-            yield absolute(found, undistorted(image, camera, lens, factor), ROUNDED)
+            yield absolute(found, twin.undistorted(image, camera, lens, factor), ROUNDED)
 
 
-def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+def _demo(dev, rng):
     for n in SIZES:
         for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
             grid = Grid(start, 1.6 / n, (n, 1, 1))
-            expected = distance(grid.lattice())
+            expected = twin.distance(grid.lattice())
             yield absolute(distances(dev, grid).ravel(), expected, DEMO)
 
 

@@ -1,6 +1,4 @@
-"""The number of steps of a training that is given minutes: planned again and again from the time
-that its steps take.
-"""
+"""How many steps a training has that is given minutes, by the time that its steps take."""
 
 import math
 import statistics
@@ -26,8 +24,8 @@ FEWEST, MOST = 10, 100  # last steps whose median time counts: first ones may bu
 
 
 class Budget:
-    """Sets train.iterations, so that the training takes train.minutes. pixels: of all its views.
-    may_stay_coarse: where its steps are too few to refine the grid, it is left as it is.
+    """Sets train.iterations so that the training takes train.minutes. pixels: of all its views.
+    may_stay_coarse: the grid is left as it is where the steps are too few to refine it.
     """
 
     def __init__(self, train: TrainConfig, pixels: int, may_stay_coarse: bool = False):
@@ -37,9 +35,7 @@ class Budget:
         self._last = self._next = 0.0  # seconds: of the last step, and at which to plan
 
     def plan(self, step: int, seconds: float) -> bool:
-        """Plan if that is due after a step, up to whose end so many seconds have passed since the
-        training was opened; whether it was.
-        """
+        """Plan if that is due after a step, up to whose end so many seconds have passed, or not."""
         train = self._train
         self._times.append(seconds - self._last)
         self._last = seconds
@@ -63,9 +59,8 @@ class Budget:
 
 
 def replan(train: TrainConfig, step: int, left: float, ending: float = 0.0) -> None:
-    """Set train.iterations of a training that has time for `left` more steps if it is not refined
-    further; and shares of train.refine_at, so that past refinements stay where they were. ending:
-    steps at last that its end takes as long as.
+    """Set train.iterations of a training that has time for `left` more steps without refinements,
+    and train.refine_at so that past ones stay where they were. ending: steps that its end is worth.
     """
     steps, shares = train.iterations, [share for share in train.refine_at if 0 < share < 1]
     is_late = step >= FIXED * steps

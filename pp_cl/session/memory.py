@@ -1,6 +1,5 @@
-"""The memory that a training takes, within 15 % of what it will allocate: the tables of the engine,
-for the numbers of points, fragments and pixels that are expected. A training that does not fit is
-refused before anything is allocated.
+"""The memory that a training takes, within 15 %: the engine's tables, for the numbers of points,
+fragments and pixels that are expected. What does not fit is refused before it is allocated.
 """
 
 import math
@@ -28,7 +27,7 @@ from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import target_table
 from pp_cl.errors import UserError
 from pp_cl.scene.image_file import ImageFile, image_bytes, shrink_factor
-from pp_cl.scene.load import DEMO, mask_rule, reading_cost
+from pp_cl.scene.load import DEMO, reading_cost
 from pp_cl.settings import Config
 
 MIB, GIB = 2**20, 2**30
@@ -41,8 +40,8 @@ SHOWN = 0.8
 
 
 class Need(NamedTuple):
-    """Bytes that a training takes: of the device at its peak, and then of how many points; of the
-    largest buffer; of the host beside the program itself, whose memory a CPU's buffers are in, too.
+    """Bytes that a training takes: of the device at its peak, with how many points; of the largest
+    buffer; of the host beside the program itself, a CPU's buffers included.
     """
 
     device: int
@@ -52,10 +51,8 @@ class Need(NamedTuple):
 
 
 class MemoryPlan:
-    """Checks that a training fits the available memory; made before the training allocates
-    anything. need: what it takes, by the last check.
-
-    image_files: of the training views.
+    """Checks that a training fits the available memory; made before it allocates anything. need:
+    what it takes, by the last check. image_files: of the training views.
     """
 
     def __init__(self, config: Config, net: UNet, image_files: Sequence[ImageFile]):
@@ -69,9 +66,7 @@ class MemoryPlan:
         factor = 1 if is_demo else shrink_factor(sizes, self._downscale)
         self._images = image_bytes(sizes, factor)
         self._image = image_bytes([(self._largest.width, self._largest.height)], factor)
-        self._reading_bytes = (
-            0 if is_demo else reading_cost(image_files, mask_rule(config), factor)[1]
-        )
+        self._reading_bytes = 0 if is_demo else reading_cost(image_files, config.scene, factor)[1]
         held = self.dev.bytes if self.dev.is_cpu else 0  # which `need` counts
         self._program = resident_bytes() - held + compiler_bytes(self.dev.info)
 
@@ -81,16 +76,16 @@ class MemoryPlan:
         return self._program + self.need.host
 
     def check_unseen(self) -> None:
-        """Raise UserError as check_points() does if even the least memory that the training can
-        take does not fit; called before the images are read and the hull is known.
+        """Raise UserError if even the least memory that the training can take does not fit; called
+        before the images are read and the hull is known.
         """
         self._check(self._need(self._points.count, 0.0, step=0))
 
     def check_points(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
     ) -> None:
-        """Raise UserError, naming the settings to change, where a training with these points of a
-        grid does not fit from a step on, or would refine the grid beyond what ids can number.
+        """Raise UserError where a training with these points of a grid does not fit from a step
+        on, or would refine the grid beyond what ids can number.
         """
         to_come = sum(step < at for at in refine_steps(self._train))
         last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
@@ -102,9 +97,7 @@ class MemoryPlan:
         self._check(self.need_of(grid, points, depth_range, step))
 
     def check_growth(self, model: Model, step: int) -> None:
-        """Check again if the step after `step` refines the grid or begins the EMA: only now it is
-        known how many points pruning has left.
-        """
+        """Check again, by what pruning has left, if the next step refines or begins the EMA."""
         points = model.cloud.count
         if step + 1 in [*refine_steps(self._train), averages_from(self._train)]:
             try:
@@ -117,9 +110,7 @@ class MemoryPlan:
     def need_of(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
     ) -> Need:
-        """What a training with these points of a grid takes from a step on, seen from the middle of
-        the depth range.
-        """
+        """What a training with these points of a grid takes from a step on."""
         middle = sum(depth_range) / 2
         # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
         # second order
@@ -128,9 +119,7 @@ class MemoryPlan:
         return self._need(points, radius * self._largest.fx / middle * math.sqrt(growth), step)
 
     def _need(self, points, radius, step):
-        """The Need from a step on. radius: of the footprints then, pixels of the largest image
-        as it is stored.
-        """
+        """The Need from a step on. radius: of the footprints then, pixels of the stored image."""
         stretches = [*expected_stretches(self._train, points, step)]
         found = []
         for stretch in stretches:
@@ -138,34 +127,21 @@ class MemoryPlan:
             halved = stretches[0].refinements - stretch.refinements
             width = radius / 2**halved if self._raster.footprint == "soft" else radius
             found.append(self._need_of_stretch(stretch, width / self._downscale))
-        peak = max(found, key=lambda need: need.device)
-        host = max(need.host for need in found)
-        host = 2 * PIECE_BYTES + host + self.dev.is_cpu * peak.device
-        return Need(
-            peak.device,
-            peak.points,
-            max(need.largest for need in found),
-            self._images + max(host, self._reading_bytes),
-        )
+        peak, largest = max(found), max(need.largest for need in found)
+        host = 2 * PIECE_BYTES + max(need.host for need in found) + self.dev.is_cpu * peak.device
+        host = self._images + max(host, self._reading_bytes)
+        return peak._replace(largest=largest, host=host)
 
     def _need_of_stretch(self, stretch, radius):
-        """The Need of some steps; of the host only what refining after them takes. radius: of the
-        footprints, pixels of an image.
-        """
+        """The Need of some steps; of the host what refining after them takes."""
         raster, train, n = self._raster, self._train, stretch.points
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
         pairs = grown(0, round(n * min(footprint_pixels(radius), math.prod(image))))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
         share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(image))
-        of_step = view_table(
-            raster,
-            n,
-            math.prod(crop),
-            round(share * pairs),
-            round(share * visible),
-            training=True,
-        )
+        of_crop = math.prod(crop), round(share * pairs), round(share * visible)
+        of_step = view_table(raster, n, *of_crop, training=True)
         of_preview = view_table(raster, n, math.prod(image), pairs, visible)
         of_pruning = view_table(raster, n, math.prod(image), pairs, 0, until="weights")
 
@@ -179,10 +155,7 @@ class MemoryPlan:
             loss_table(self.dev, crop, crop, train.ssim_weight),
             {"image": ((self._image,), np.uint8)},
         ]
-        taking_turns = [
-            [of_step, target_table(crop)],
-            [of_preview, target_table(image)],
-        ]
+        taking_turns = [[of_step, target_table(crop)], [of_preview, target_table(image)]]
         if stretch.refinements == 0 and train.prune_weight > 0:
             taking_turns.append([of_pruning])
         device = _bytes(held) + max(map(_bytes, taking_turns))
@@ -191,9 +164,7 @@ class MemoryPlan:
         return Need(device, n, largest, n * REFINING_BYTES if stretch.refinements else 0)
 
     def _padded_size(self, halvings, side):
-        """(height, width) of a crop of the largest image, in whole multiples of what the
-        network needs; side 0: of the whole image.
-        """
+        """(height, width) of a crop of the largest image, or of all, in the network's multiples."""
         camera = self._largest.downscaled(self._downscale << halvings)
         height, width = (min(side or size, size) for size in (camera.height, camera.width))
         return height + -height % UNet.multiple, width + -width % UNet.multiple
@@ -231,7 +202,7 @@ def _size(size):
 
 
 def memory_line(memory_plan: MemoryPlan) -> str:
-    """The memory that the last check found to be needed, in words."""
+    """The memory that the last check found to be needed."""
     need, dev = memory_plan.need, memory_plan.dev
     has, on_host = _size(dev.info["memory_bytes"]), f"{_size(need.host)} of the computer's"
     if dev.is_cpu:

@@ -1,6 +1,4 @@
-"""What a new training starts from: its network, its visual hull, and the size that its points are
-to be refined to.
-"""
+"""What a new training starts from: its network, its visual hull, its refinements."""
 
 import warnings
 from pathlib import Path
@@ -45,9 +43,8 @@ DEMO_NETWORK = Path(__file__).with_name("demo.npz")
 
 
 def begin_network(dev: Device, config: Config) -> UNet:
-    """The network that a training starts with: its parameters are those that network.start names,
-    those of the demo only where the scene is another and they fit; else random ones. Raises
-    UserError for a run whose network has another shape.
+    """The network that network.start names: the demo's only where the scene is another and it
+    fits, else a random one. Raises UserError for a run whose network has another shape.
     """
     net = UNet.of_settings(dev, config.network, seed=config.train.seed)
     settings, folder = config.network, RunFolder(config.network.start)
@@ -78,11 +75,8 @@ def _unlike(ours, theirs):
 def first_hull(
     dev: Device, config: Config, agreement: Agreement, coarsest: float = COARSEST
 ) -> tuple[Hull, tuple[float, float]]:
-    """(the hull that a training starts from, its train.refine_at).
-
-    Where train.refine_at is automatic, there are as many refinements as bring points
-    `coarsest` pixels of the images close, and the hull has the spacing from which these lead to
-    FINEST to `coarsest`.
+    """(the hull that a training starts from, its train.refine_at). Where that is automatic, there
+    are as many refinements as bring points FINEST to `coarsest` pixels of the images close.
     """
     points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
@@ -101,9 +95,7 @@ def first_hull(
 
 
 def automatic_radius(grid: Grid, views: list[View], refinements_to_come: int) -> float:
-    """raster.radius of a grid that will be refined so often: one pixel of the images, within
-    bounds. Refining halves the spacing, and doubles the images.
-    """
+    """raster.radius of a grid to be refined so often: one pixel of the images, within bounds."""
     spacing = spacing_pixels(grid, [view.camera for view in views]) / 2**refinements_to_come
     return round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
 
@@ -111,11 +103,10 @@ def automatic_radius(grid: Grid, views: list[View], refinements_to_come: int) ->
 def fitting_hull(
     dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
 ) -> tuple[Agreement, Hull, tuple[float, float]]:
-    """(which views' masks agree, first_hull() of them, its (near, far)); config.train.refine_at
-    becomes what it says, and an automatic raster.radius one pixel of the images. Where memory is
-    too small for points COARSEST pixels apart in the end, they are as close as it allows. Raises
-    UserError as MemoryPlan.check_points() does, and for an automatic radius of footprints that are
-    not soft.
+    """(which views' masks agree, first_hull() of them, its (near, far)); automatic settings in
+    config are chosen. Where memory is too small for points COARSEST pixels apart in the end, they
+    are as close as it allows. Raises UserError as MemoryPlan.check_points() does, and for an
+    automatic radius of footprints that are not soft.
     """
     is_automatic, train, coarsest = config.train.refine_at == UNSET, config.train, COARSEST
     raster, is_radius_automatic = config.raster, config.raster.radius == 0

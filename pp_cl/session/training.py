@@ -1,6 +1,4 @@
-"""Runs a training in the folder of a run: begun with a visual hull or resumed from a checkpoint,
-then Trainer's steps with log, previews and checkpoints.
-"""
+"""Runs a training in the folder of a run: begun or resumed, with log, previews and checkpoints."""
 
 import math
 import time
@@ -29,14 +27,9 @@ from pp_cl.files.sheets import write_comparison
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.presets import SHORT
 from pp_cl.progress import Progress
-from pp_cl.run import Run, load_run
+from pp_cl.run import Run, load
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.load import (
-    SplitFiles,
-    list_split,
-    measured_split,
-    open_scene,
-)
+from pp_cl.scene.load import list_split, measured_split, open_scene
 from pp_cl.session.budget import NEVER, Budget
 from pp_cl.session.memory import MemoryPlan
 from pp_cl.session.start import automatic_radius, begin_network, fitting_hull, sheet_of_masks
@@ -50,10 +43,8 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 
 class HullFacts(NamedTuple):
-    """What a new training says of its visual hull.
-
-    capped: it has fewer points than asked for, as the grid may not be finer. seconds: time that
-    carving took. sheet: of the masks that disagree with the others, None if all agree.
+    """Of the hull of a new training. capped: it has fewer points than asked for. seconds: carving
+    took. sheet: of the masks that disagree with the others, None if all agree.
     """
 
     capped: bool
@@ -63,12 +54,9 @@ class HullFacts(NamedTuple):
 
 @dataclass
 class Training:
-    """A training that is ready to begin or to go on.
-
-    info: what a checkpoint's header holds beside the model's. memory_plan: the available memory and
-    the plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
-    views on which train.eval_every measures PSNR. began: time.monotonic() when it was opened, from
-    which train.minutes count.
+    """A training that is ready to begin or to go on. info: what a checkpoint's header holds beside
+    the model's. hull: None if it resumes. measured: the views on which train.eval_every measures
+    PSNR. began: time.monotonic() when it was opened, from which train.minutes count.
     """
 
     folder: RunFolder
@@ -89,14 +77,11 @@ class Training:
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> float:
         """Train to the end with log, previews and checkpoints; returns the seconds of training,
-        those before an interruption included.
-
-        on_step(step, row) is called after each step, with its row of the log where it has one.
-        is_stopped() is asked after each step: if it is true, a checkpoint is written and the
-        training ends, to be resumed later. Raises UserError before anything is written if another
-        process trains into the folder; later, after writing a checkpoint, if a refinement or the
-        EMA needs more memory than there is; and if numbers are no longer finite, keeping the last
-        checkpoint.
+        those before an interruption included. on_step(step, row) is called after each step, with
+        its row of the log where it has one; if is_stopped() is true then, a checkpoint is written
+        and the training ends. Raises UserError if another process trains into the folder, if the
+        next step needs more memory than there is, and if numbers are no longer finite; the last
+        checkpoint is kept.
         """
         with self.folder.owned():
             self._check_unchanged()
@@ -174,9 +159,7 @@ class Training:
         return key in self.config.automatic
 
     def _after_step(self, log, terms, seconds):
-        """Write the log's row, the preview and the checkpoint that are due; return the row or None.
-        The checkpoint comes last: resuming from it does not make the others again.
-        """
+        """Write the log's row, which it returns, the preview and then the checkpoint, as due."""
         trainer, train = self.trainer, self.config.train
         step, last, row = trainer.step, trainer.step == train.iterations, None
         is_measured = train.eval_every and step % train.eval_every == 0
@@ -199,11 +182,11 @@ class Training:
 
     def _measure(self):
         """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
-        found = [
-            psnr(to_8bit(image), to_8bit(view.ignoring(self.trainer.target(view), image)))
-            for view in self.measured
-            for image in [self._rendered(view)]
-        ]
+        found = []
+        for view in self.measured:
+            image = self._rendered(view)
+            truth = view.ignoring(self.trainer.target(view), image)
+            found.append(psnr(to_8bit(image), to_8bit(truth)))
         return {"test_psnr": float(np.mean(found))}
 
     def _expect_save(self):
@@ -241,65 +224,58 @@ class Training:
 def open_training(
     dev: Device, folder: RunFolder, config: Config, stored: Stored | None
 ) -> Training:
-    """resume_training() from the folder's checkpoint `stored` where it has one, else
-    begin_training().
+    """The training in `folder` from its checkpoint `stored` on, a finished one extended with new
+    moments and without refinements; without one from its beginning, where the automatic settings in
+    config are chosen. Raises UserError for a broken scene or another one than the checkpoint's, too
+    little memory, and a folder that may not be written.
     """
-    if stored is None:
-        return begin_training(dev, folder, config)
-    return resume_training(dev, folder, config, stored)
-
-
-def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
-    """A training in `folder` from its beginning; the automatic settings in config (train.refine_at,
-    raster.radius) are chosen.
-
-    Raises UserError for a scene that is broken, for too little memory, for a folder that may not be
-    written, and for images in it that would be lost.
-    """
-    began = time.monotonic()
+    began, (header, arrays) = time.monotonic(), stored or ({"step": 0}, {})
     check_target(folder.config)
-    folder.check_sheets(0)
-    net = begin_network(dev, config)
+    folder.check_sheets(header["step"])
+    begun = header["step"] if header.get("finished") else header.get("extended_from", 0)
+    followed = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
+
+    net = UNet.of_settings(dev, config.network) if stored else begin_network(dev, config)
     split_files = list_split(config.scene.path)
-    memory_plan = MemoryPlan(config, net, split_files.image_files)
-    memory_plan.check_unseen()
-    views, info = _read_views(dev, config, split_files)
-
-    start = time.perf_counter()
-    with Progress("carving the visual hull"):
-        agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
-        seconds = time.perf_counter() - start
-        sheet = sheet_of_masks(dev, views, hull, agreement)
-
-    cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
-    model = Model(dev, hull.grid, depth_range, cloud, net=net)
-    trainer = Trainer(dev, config, model, agreement.views)
-    info["initial_points"] = model.cloud.count
-    if agreement.left_out:
-        info["left_out"] = list(agreement.left_out)
-    facts, measured = HullFacts(hull.capped, seconds, sheet), _measured_views(dev, config)
+    memory_plan = MemoryPlan(followed, net, split_files.image_files)
+    if stored:
+        grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
+        memory_plan.check_points(grid, points, header["depth_range"], header["step"])
+    else:
+        memory_plan.check_unseen()
+    scene = open_scene(dev, config, ("train",), listed={"train": split_files})
+    views, facts = scene.splits["train"], None
+    info = identity(views) | ({"notes": scene.notes} if scene.notes else {})
+    if stored:
+        _check_scene(folder, config, header, views)
+        model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+        left_out = header.get("left_out", [])
+        views = [view for view in views if view.name not in left_out]
+        info["initial_points"] = header["initial_points"]
+    else:
+        start = time.perf_counter()
+        with Progress("carving the visual hull"):
+            agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
+            seconds = time.perf_counter() - start
+            facts = HullFacts(hull.capped, seconds, sheet_of_masks(dev, views, hull, agreement))
+        cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
+        model = Model(dev, hull.grid, depth_range, cloud, net=net)
+        views, left_out = agreement.views, list(agreement.left_out)
+        info["initial_points"] = model.cloud.count
+    trainer = Trainer(dev, followed, model, views)
+    if stored:
+        trainer.restore(header["step"], arrays, begun)
+    info |= {"extended_from": begun} if begun else {}
+    info |= {"left_out": left_out} if left_out else {}
+    measured = []
+    if config.train.eval_every:
+        split = measured_split(config.scene.path)
+        measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
     return Training(folder, config, trainer, info, memory_plan, facts, measured, began)
 
 
-def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
-    """The training in `folder` from its checkpoint on.
-
-    A finished one is extended to config.train.iterations, with new moments and without refinements:
-    every schedule ends at the last step, so it is not what it would have been from its beginning.
-    Raises UserError as begin_training() does, and for a checkpoint of another scene.
-    """
-    began, (header, arrays) = time.monotonic(), stored
-    check_target(folder.config)
-    folder.check_sheets(header["step"])
-    begun = header["step"] if header["finished"] else header.get("extended_from", 0)
-    extended = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
-
-    net = UNet.of_settings(dev, config.network)
-    split_files = list_split(config.scene.path)
-    memory_plan = MemoryPlan(extended, net, split_files.image_files)
-    grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
-    memory_plan.check_points(grid, points, header["depth_range"], header["step"])
-    views, info = _read_views(dev, config, split_files)
+def _check_scene(folder, config, header, views):
+    """Raise UserError where a checkpoint's training views are not those of the scene."""
     mismatch = difference(header, list_split(config.scene.path, edited=False).image_files, views)
     if not mismatch and {view.name for view in views} != {name for name, _ in header["views"]}:
         mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
@@ -308,31 +284,6 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
             f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
             " use another --out"
         )
-
-    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
-    left_out = header.get("left_out", [])
-    trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])
-    trainer.restore(header["step"], arrays, begun)
-    info["initial_points"] = header["initial_points"]
-    info |= {"extended_from": begun} if begun else {}
-    info |= {"left_out": left_out} if left_out else {}
-    measured = _measured_views(dev, config)
-    return Training(folder, config, trainer, info, memory_plan, None, measured, began)
-
-
-def _read_views(dev: Device, config: Config, split_files: SplitFiles):
-    """(the training views, what a checkpoint's header holds of them)."""
-    scene = open_scene(dev, config, ("train",), listed={"train": split_files})
-    views = scene.splits["train"]
-    return views, identity(views) | ({"notes": scene.notes} if scene.notes else {})
-
-
-def _measured_views(dev, config):
-    """The views on which train.eval_every measures PSNR: of the split val, else test."""
-    if not config.train.eval_every:
-        return []
-    split = measured_split(config.scene.path)
-    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
 
 
 def train_scene(
@@ -347,12 +298,10 @@ def train_scene(
     **options: Any,
 ) -> Run:
     """Train a scene into the folder `out`, or go on with the run there; a finished one is left
-    alone, unless more iterations are asked for than it has.
-
-    scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
-    value}; options: the same by the names of the command's options, such as iterations.
-    on_step(step, row): called after each step, with its row of the log or None. is_stopped: asked
-    after each step; where it is true, training ends with a checkpoint. Raises UserError.
+    alone, unless more iterations are asked for than it has. scene: a folder, or the word demo.
+    device: as `pp-cl train --device`. settings: {"section.key": value}; options: the same by the
+    names of the command's options, such as iterations. on_step, is_stopped: as Training.run()
+    takes them. Raises UserError.
     """
     unknown = set(options) - set(SHORT)
     if unknown:
@@ -364,15 +313,15 @@ def train_scene(
     stored, dev = stored_state(folder, config), open_device(device)
     if not is_finished(stored, config):
         open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
-    return load_run(dev, out)
+    return load(out, dev)
 
 
 # ---- what is asked for, and what there is
 
 
 def stored_state(folder: RunFolder, config: Config) -> Stored | None:
-    """(header, arrays) of the folder's checkpoint, None where there is none. A finished run takes
-    note of where its scene is now. Raises UserError for a folder or checkpoint that does not fit.
+    """(header, arrays) of the folder's checkpoint, or None. A finished run takes note of where its
+    scene is now. Raises UserError for a folder or checkpoint that does not fit.
     """
     folder.check_usable()
     there = load_config(folder.config) if folder.config.exists() else config

@@ -14,13 +14,12 @@ from scipy.ndimage import binary_fill_holes
 from skimage.measure import label
 from skimage.segmentation import find_boundaries
 
-from pp_cl import track
+from pp_cl import Config, track
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, few_names, shown
 from pp_cl.files import atomic_folder, contact_sheet, read_mask, read_rgba, write_png
 from pp_cl.scene import (
     ImageFile,
-    MaskRule,
     cut_out,
     disagreements,
     named_mask,
@@ -242,7 +241,7 @@ def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.n
     size = max(1, round(scale * width)), max(1, round(scale * height))
     small = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     try:
-        mask = cut_out(small, name, MaskRule.tolerance, with_holes)[..., 3]
+        mask = cut_out(small, name, Config().scene.mask_tolerance, with_holes)[..., 3]
     except UserError:
         return None
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])

@@ -117,5 +117,5 @@ def run(options: argparse.Namespace) -> None:
 def _metres(text):
     try:
         return shared.number(1e-6, 1e6)(text)
-    except argparse.ArgumentTypeError as error:
+    except UserError as error:
         raise UserError(f"--length {error}, in metres") from None

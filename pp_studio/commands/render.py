@@ -31,10 +31,8 @@ def _colour(text):
         return text
     try:
         red, green, blue = map(shared.integer(0, 255), text.split(","))
-    except (ValueError, argparse.ArgumentTypeError):
-        raise argparse.ArgumentTypeError(
-            f"{text}: write white, black, transparent or R,G,B from 0 to 255"
-        ) from None
+    except (ValueError, UserError):
+        raise UserError(f"{text}: write white, black, transparent or R,G,B from 0 to 255") from None
     return red / 255, green / 255, blue / 255
 
 

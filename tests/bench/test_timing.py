@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pp_cl.bench import timing
-from pp_cl.bench.plots import figure_of, plot_time_and_error
+from pp_cl.bench.plots import plot_time_and_error
 from pp_cl.bench.timing import errors, interleave
 
 
@@ -38,9 +38,7 @@ ROWS = [
 
 def test_time_against_error(tmp_path):
     file = tmp_path / "a.svg"
-    figure = figure_of(str(file))
-    plot_time_and_error(figure, ROWS, str(file))
-    (axes,) = figure.axes
+    (axes,) = plot_time_and_error(ROWS, str(file)).axes
     assert {line.get_label(): line.get_xydata().tolist() for line in axes.lines} == {
         "unet direct forward": [[9.0, 1e-6], [2.0, 1e-9]],
         "unet winograd train": [[3.0, 1e-5]],

@@ -1,10 +1,9 @@
-import argparse
 import json
 import sys
 
 import numpy as np
 import pytest
-from support.refused import failure
+from support.refused import failure, refusing
 
 from pp_cl.cli import main
 from pp_cl.commands import options
@@ -26,7 +25,7 @@ REFUSED = [
 @pytest.mark.parametrize("read, texts", REFUSED)
 def test_what_an_option_cannot_be_is_refused(read, texts):
     for text in texts:
-        with pytest.raises(argparse.ArgumentTypeError):
+        with refusing():
             read(text)
 
 

@@ -19,7 +19,7 @@ from pp_cl.scene.load import (
     scene_frames,
     scene_splits,
 )
-from pp_cl.scene.masks import MaskRule
+from pp_cl.settings import SceneConfig
 from tools.scene_formats import nerfstudio
 
 
@@ -84,7 +84,7 @@ def test_as_many_images_are_read_at_once_as_memory_holds(
     monkeypatch.setattr("pp_cl.scene.load.os.cpu_count", lambda: 64)
     camera = Camera(np.eye(3, 4), 4000, 4000, 2000, 1500, 4000, 3000)
     phone = ImageFile("a.jpg", camera, lens=lens)
-    told = reading_cost([phone] * 300, MaskRule(source), factor)
+    told = reading_cost([phone] * 300, SceneConfig(mask_from=source), factor)
     bands = BAND_COPIES * BAND_BYTES if lens else 0
     assert told == (workers, workers * per_pixel * 12_000_000 + bands)
     small = ImageFile("b.jpg", camera.downscaled(10))

@@ -15,12 +15,13 @@ from pp_cl.drivers import open_device
 from pp_cl.engine.views import MASK_THRESHOLD
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import agreeing, build_grid
 from pp_cl.scene.load import load_scene, open_scene, scene_box
-from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.masks import cut_out
 from pp_cl.scene.readers.frame import frame_keys
+from pp_cl.settings import SceneConfig
 
 TOLERANCE = 10.0
 
@@ -100,7 +101,7 @@ def test_a_folder_of_masks(tmp_path, rng, named):
         file = masks / named.format(stem=f"train_{i}", name=f"train_{i}.png")
         Image.fromarray(mask).save(file, quality=100)
         expected[f"train_{i}.png"] = mask
-    views = load_scene(tmp_path / "scene", masks=MaskRule(folder=str(masks))).splits["train"]
+    views = load_scene(tmp_path / "scene", masks=SceneConfig(masks=str(masks))).splits["train"]
     for view in views:
         assert np.abs(view.image[..., 3].astype(int) - expected[view.name]).max() <= 8
         stored = read_rgba(tmp_path / "scene" / view.name)
@@ -118,7 +119,7 @@ def test_a_folder_of_masks_is_one_like_that_of_the_scene(tmp_path):
             write_png(file, ball_image(camera)[..., pixels])
         frames.append({"file_path": image, **frame_keys(camera)})
     (scene / "transforms_train.json").write_text(json.dumps({"frames": frames}))
-    rule = MaskRule(folder=str(masks))
+    rule = SceneConfig(masks=str(masks))
     views = load_scene(scene, masks=rule).splits["train"]
     assert len(views) == 10 and all(view.is_masked and view.has_mask for view in views)
 
@@ -128,7 +129,7 @@ def test_a_folder_of_masks_is_one_like_that_of_the_scene(tmp_path):
 )
 def test_alpha_is_taken_or_left(tmp_path, source, opaque):
     write_scene(tmp_path)
-    for view in load_scene(tmp_path, masks=MaskRule(source)).splits["train"]:
+    for view in load_scene(tmp_path, masks=SceneConfig(mask_from=source)).splits["train"]:
         assert (view.image[..., 3] == 255).all() == opaque
 
 
@@ -144,7 +145,7 @@ def opaque_ball(folder, background=(255, 255, 255)):
 def test_a_ball_on_white_has_the_hull_of_its_masks(dev, tmp_path):
     opaque_ball(tmp_path / "white")
     write_ball_scene(tmp_path / "masked", views=10, size=40)
-    cut = load_scene(tmp_path / "white", masks=MaskRule("color")).splits["train"]
+    cut = load_scene(tmp_path / "white", masks=SceneConfig(mask_from="color")).splits["train"]
     given = load_scene(tmp_path / "masked").splits["train"]
     for a, b in zip(cut, given, strict=True):
         masks = [view.image[..., 3] > MASK_THRESHOLD for view in (a, b)]
@@ -187,7 +188,7 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
     for i, camera in enumerate(ring_cameras(6, 40)):
         mask = ball_image(camera)[..., 3] if i != 2 else np.full((40, 40), 255, np.uint8)
         write_png(tmp_path / "masks" / f"r_{i}.png", mask)
-    rule = MaskRule(folder=str(tmp_path / "masks"))
+    rule = SceneConfig(masks=str(tmp_path / "masks"))
     views = load_scene(tmp_path / "ball", masks=rule).splits["train"]
     (tmp_path / "masks/r_2.png").rename(tmp_path / "masks/other.png")
     with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, as others have"):
@@ -233,4 +234,4 @@ def test_the_choice_is_kept_with_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir("/")
     stored = json.loads((tmp_path / "run" / "config.json").read_text())["scene"]
     assert stored["masks"] == str(tmp_path / "masks")
-    assert load_run(open_device(), tmp_path / "run").scene("train").splits["train"][3].has_mask
+    assert load(tmp_path / "run", open_device()).scene("train").splits["train"][3].has_mask

@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_studio.large import parts, render_large
 
 
 @pytest.fixture
 def run(runs, scene, tmp_path, dev):
-    return load_run(dev, runs.trained(tmp_path / "run", scene, train__iterations=40))
+    return load(device=dev, folder=runs.trained(tmp_path / "run", scene, train__iterations=40))
 
 
 def test_it_is_woven_of_images_at_the_scale_of_the_training(run):

@@ -1,6 +1,5 @@
 """Reader of single sequences of CO3D, versions 1 and 2: CATEGORY/SEQUENCE/ with images and masks,
-whose annotations lie in CATEGORY/. Those of the category are the only files read outside of the
-scene's folder.
+whose annotations lie in CATEGORY/, outside of the scene's folder.
 """
 
 import gzip
@@ -19,13 +18,7 @@ from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.found import LeftOut, find_image, usable
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.readers.common import (
-    MOST,
-    SPLITS,
-    hold_out,
-    progress,
-    read_json,
-)
+from pp_cl.scene.readers.common import MOST, SPLITS, hold_out, progress, read_json
 from pp_cl.scene.readers.frame import Frame, rigid
 
 FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
@@ -54,12 +47,8 @@ def splits(folder: Path) -> list[str]:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split, in the order of their frame numbers.
-
-    Version 1: frames that set_lists.json calls known are for training, unseen ones for testing.
-    Version 2: as the first of set_lists/*.json has it that names the sequence, those of many views
-    before others. Without a list test is every eighth. Frames whose mask is empty are left out.
-    Raises UserError naming the file and the frame.
+    """The images of a split, in the order of their frame numbers, as _set_list() has them; without
+    a list test is every eighth. Frames whose mask is empty are left out. Raises UserError.
     """
     folder = _whole(folder)
     file, listed = folder.parent / ANNOTATIONS, _set_list(folder)
@@ -69,7 +58,11 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
     ]
     if not frames:
         raise UserError(f"{file}: has no frame of the sequence {folder.name}; give another folder")
-    chosen = sorted((frame for frame in frames if _mass(frame) != 0), key=_number)
+    for frame in frames:
+        if frame.number("frame_number") is None:
+            raise frame.error("frame_number", "is missing; copy the annotations again")
+    chosen = [frame for frame in frames if not _is_empty(frame)]
+    chosen.sort(key=lambda frame: frame.get("frame_number"))
     if listed is None:
         chosen = hold_out(chosen, split)
     else:
@@ -85,9 +78,7 @@ def _whole(folder):
 
 @lru_cache(maxsize=1)
 def _annotations(file, sequence, _changed):
-    """[(index, annotation)] of a sequence's frames, of a file last changed then. Raises
-    UserError.
-    """
+    """[(index, annotation)] of a sequence's frames, of a file last changed then."""
     found, left = [], MOST_SUM
     try:
         with opened_regular(file) as packed, gzip.open(packed, "rt", encoding="utf-8") as opened:
@@ -105,9 +96,7 @@ def _annotations(file, sequence, _changed):
 
 
 def _objects(opened):
-    """(object, characters of it) of a JSON list of objects in a text file, one after the other.
-    Raises ValueError for anything else, or more than MOST_TEXT characters.
-    """
+    """(object, characters of it) of a JSON list of objects in a text file. Raises ValueError."""
     decode, text, at = json.JSONDecoder().raw_decode, opened.read(PIECE), 0
     left = MOST_TEXT - len(text)
     if not text.lstrip().startswith("["):
@@ -132,19 +121,12 @@ def _objects(opened):
             raise ValueError("ends too early")
 
 
-def _number(frame):
-    number = frame.number("frame_number")
-    if number is None:
-        raise frame.error("frame_number", "is missing; copy the annotations again")
-    return number
-
-
-def _mass(frame):
-    """Pixels in the mask of a frame; None where that is not said."""
+def _is_empty(frame):
+    """Whether a frame's mask is said to have no pixel."""
     mask = frame.get("mask")
     if not isinstance(mask, dict):
-        return None
-    return Frame(frame.file, {}, mask, frame.index, "mask of frame ").number("mass", above=-1)
+        return False
+    return Frame(frame.file, {}, mask, frame.index, "mask of frame ").number("mass", above=-1) == 0
 
 
 def _path(frame, key):
@@ -196,11 +178,10 @@ def _camera(frame, size):
     return Camera(pose, *(float(v) for v in (*focal, *centre)), *size)
 
 
-# --------------------------------------------------------------------------------------------------
-
-
 def _set_list(folder):
-    """{split: paths of images} of the sequence, each in one split only; None without a list."""
+    """{split: paths of images} of the sequence, each in one split only; None without a list.
+    Version 1 calls them known and unseen; in version 2 lists of many views go before others.
+    """
     category = folder.parent
     old = category / "set_lists.json"
     if old.is_file():
@@ -228,9 +209,7 @@ def _listed(file, sequence):
 
 
 def _disjoint(found):
-    """The splits with frames, without those of train in the others; None without training or test
-    frames.
-    """
+    """The splits with frames, each once; None without training or test frames."""
     train = found.get("train", set())
     others = {name: found.get(name, set()) - train for name in ("val", "test")}
     splits = {"train": train} | {name: paths for name, paths in others.items() if paths}

@@ -32,7 +32,6 @@ from pp_cl.scene.readers.common import (
     fitted,
     hold_out,
     progress,
-    two_splits,
 )
 
 FILES = "a sparse model of COLMAP beside images"
@@ -77,7 +76,7 @@ TRACK_BYTES = 8  # the ids of an image and of a point in it
 
 
 class Lens(NamedTuple):
-    """A camera of the model. parameters: as COLMAP orders them for this model."""
+    """A camera of the model, its parameters as COLMAP orders them."""
 
     model: str
     width: int
@@ -86,16 +85,11 @@ class Lens(NamedTuple):
 
 
 class Image(NamedTuple):
-    """An image of the model. pose: (7,) qw, qx, qy, qz, tx, ty, tz, world to camera, as the file
-    has it.
-    """
+    """An image of the model. pose: (7,) qw, qx, qy, qz, tx, ty, tz, world to camera."""
 
     name: str
     camera: int
     pose: Sequence[float]
-
-
-splits = two_splits
 
 
 def recognises(folder: Path) -> bool:
@@ -104,10 +98,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split: test is every eighth in the order of their names.
-
-    Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
-    Raises UserError naming the file, and the image.
+    """The images of a split: test is every eighth in the order of names. Cameras are scaled to
+    images that were reduced since. Raises UserError naming the file, and the image.
     """
     model = model_folder(folder) or folder
     if (count := len(_models(folder))) > 1:
@@ -131,9 +123,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Where a scene's model lies, of several that with most images, those first that have a folder
-    of images beside or above them; None where it has none.
-    """
+    """Where a scene's model lies, of several one with images beside it, and most, or None."""
     models = _models(folder)
     if len(models) < 2:
         return next(iter(models), None)
@@ -141,9 +131,7 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def _images_of(folder, model):
-    """The folder of images nearest to a model, up to the scene's folder: an undistorted model has
-    other images than the one that it was made of. None where there is none.
-    """
+    """The folder of images nearest to a model, up to the scene's folder; None without one."""
     places = [model, *model.parents]
     for place in places[: places.index(folder) + 1]:
         if found := folder_named(place, [IMAGES]):
@@ -204,8 +192,8 @@ def _image_file(folder, near, model, lenses, image):
 
 
 def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
-    """(cameras by id, or what is wrong with them, images) of the model in a folder; binary files go
-    before text. Raises UserError naming the file, and the line or the place in it.
+    """(cameras by id, or what is wrong with them, images) of a folder's model. Raises UserError
+    naming the file, and the line or the place in it.
     """
     suffix = _suffix(folder)
     lenses: dict[int, Lens | Unusable] = {}
@@ -241,13 +229,10 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
 
 
 def read_points(folder: Path) -> Iterator[Sequence[float]]:
-    """Each (x, y, z, red, green, blue) of the points3D in a model's folder, which may have none.
-    Raises UserError naming the file, and the line or the place in it.
-    """
-    for suffix in (".bin", ".txt"):
-        if (file := folder / f"points3D{suffix}").is_file():
-            yield from (point for _, point in _records(file, _binary_point, POINT, _text_point))
-            return
+    """Each (x, y, z, red, green, blue) of the points3D in a model's folder. Raises UserError."""
+    files = (folder / f"points3D{suffix}" for suffix in (".bin", ".txt"))
+    for file in [file for file in files if file.is_file()][:1]:
+        yield from (point for _, point in _records(file, _binary_point, POINT, _text_point))
 
 
 def _are_numbers(values):
@@ -257,15 +242,11 @@ def _are_numbers(values):
 
 def _records(file, take, form, parse):
     """(place in words, record) of each record of a file, which take(opened) reads of a binary one,
-    and parse(line, next line) of a text file, whose lines are of a form. Files are not held whole:
-    points make them large. Raises UserError.
+    and parse(line) of a text file, whose lines are of a form.
     """
     is_binary = file.suffix == ".bin"
     try:
-        if is_binary:
-            yield from _binary_entries(file, take)
-        else:
-            yield from _text_entries(file, form, parse)
+        yield from _binary_entries(file, take) if is_binary else _text_entries(file, form, parse)
     except (OSError, OverflowError, ValueError) as error:
         raise refusal(file, error, "COLMAP's" if is_binary else "text") from None
 

@@ -1,6 +1,4 @@
-"""What readers share: folders of images, numbers in files of JSON, of numpy and of text, and the
-splits of formats that know none.
-"""
+"""What readers share: splits, folders of images, numbers in files of JSON, numpy and text."""
 
 import json
 import math
@@ -41,14 +39,9 @@ Item = TypeVar("Item")
 # Splits -------------------------------------------------------------------------------------------
 
 
-def two_splits(folder: Path) -> list[str]:
-    """splits() of the readers of formats that know none: test is what hold_out() takes."""
-    return SPLITS
-
-
 def hold_out(items: Sequence[Item], split: str, files: Sequence[Path] = ()) -> list[Item]:
-    """The items of split train or test, of a format without splits: test is every eighth picture.
-    files: of the items' images, which are one picture where they are copies.
+    """The items of split train or test, which is every eighth picture. files: of the items' images,
+    which are one picture where they are copies.
     """
     pictures = pictures_of(files) if files else range(len(items))
     place = {picture: index for index, picture in enumerate(dict.fromkeys(pictures))}
@@ -69,8 +62,8 @@ def progress(items: Sequence[Item]) -> Iterable[Item]:
 
 
 def folder_images(folder: Path, name: str) -> list[str]:
-    """Paths relative to the scene's folder of the images in its folder `name`, sorted, hidden files
-    left out. Raises UserError where there are none.
+    """Sorted paths relative to the scene's folder of the images in its folder `name`. Raises
+    UserError where there are none.
     """
     found = [
         file.name
@@ -91,8 +84,8 @@ def in_order(
     read: Callable[[int, str], ImageFile],
 ) -> list[ImageFile]:
     """The images of a split whose cameras, called so in a file, stand there in the order of the
-    names of their images. Where images are gone, the numbers in the names of the others tell which.
-    read(index, image) gives an ImageFile. Raises UserError where nothing tells.
+    images' names, by the numbers in these where images are gone. read(index, image) gives an
+    ImageFile. Raises UserError where nothing tells which are gone.
     """
     places = numbered(images, len(cameras))
     if places is None:
@@ -117,8 +110,8 @@ def fail_at(*place: object) -> Fail:
 
 
 def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
-    """The camera of an image of `size`, which was reduced or enlarged after the camera was found,
-    and must have its shape but for rounding. Raises Unusable with the text of fail().
+    """The camera of an image of `size`, which must have its shape but for rounding. Raises Unusable
+    with the text of fail().
     """
     width, height = camera.width, camera.height
     if not same_shape(size, (width, height)):
@@ -132,9 +125,7 @@ def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
 
 
 def checked_box(corners: object, fail: Fail) -> np.ndarray:
-    """(2, 3) lower and upper corner of a box that a file states. Raises fail(text) for what is
-    none.
-    """
+    """(2, 3) lower and upper corner of a box that a file states. Raises fail(text)."""
     box = numbers(corners, (2, 3))
     if box is None or not (box[1] > box[0]).all():
         raise fail(
@@ -148,8 +139,8 @@ def checked_box(corners: object, fail: Fail) -> np.ndarray:
 
 
 def numbers(value: Any, shape: tuple[int, ...] | None = None) -> np.ndarray | None:
-    """float64 array of nested lists of numbers, or of an array; None for anything else, as words
-    and truth values. shape: the only one allowed, of numbers that are finite and not huge.
+    """float64 array of nested lists of numbers, or of an array; None for anything else. shape: the
+    only one allowed, of numbers that are finite and not huge.
     """
     try:
         leaves = np.array(value, object).ravel()
@@ -185,8 +176,8 @@ def read_npy(file: Path) -> np.ndarray:
 
 
 def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
-    """{name: array as float64} of the members of a .npz file whose names begin with `wanted`.
-    Raises UserError naming the file.
+    """{name: float64 array} of a .npz file's members whose names begin with `wanted`. Raises
+    UserError naming the file.
     """
     arrays, left = {}, MOST_ARRAYS
     try:
@@ -222,9 +213,7 @@ def _read_array(opened, most):
 
 
 def read_numbers(file: Path) -> list[list[float]]:
-    """The numbers of each line of a text file that has some. Raises UserError naming the file and
-    the line.
-    """
+    """The numbers of each line of a text file. Raises UserError naming the file and the line."""
     try:
         lines = read_regular(file, MOST_TEXT, "utf-8-sig").split("\n")
     except (OSError, ValueError) as error:

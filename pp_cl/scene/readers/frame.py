@@ -37,9 +37,7 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, z backward; OpenCV
 
 @dataclass
 class Frame:
-    """The keys of one frame; a key that the frame lacks is looked up in the whole file. listed:
-    the key of the list that it stands in.
-    """
+    """The keys of one frame in the list `listed`; those that it lacks are the file's own."""
 
     file: Path
     shared: dict
@@ -62,9 +60,7 @@ class Frame:
         return UserError(f"{self.file}: {'' if is_shared else here}{key}: {text}")
 
     def number(self, key: str, above: float = -math.inf, below: float = math.inf) -> float | None:
-        """Finite float strictly between two bounds, or None if absent. Raises Unusable for anything
-        else.
-        """
+        """Finite float strictly between two bounds, or None if absent. Raises Unusable."""
         value = self.get(key)
         if value is None:
             return None
@@ -111,8 +107,7 @@ def frame_keys(camera: Camera) -> dict[str, Any]:
 
 def pinhole(frame: Frame, width: int, height: int) -> Camera:
     """The camera of a frame in the format of NeRF-synthetic and nerfstudio whose image has this
-    many pixels; fy is fx where neither fl_y nor camera_angle_y says it. Raises UserError naming the
-    key that is missing or wrong.
+    many pixels. Raises UserError naming the key that is missing or wrong.
     """
     fx = _focal_length(frame, "fl_x", "camera_angle_x", width)
     if fx is None:
@@ -159,9 +154,8 @@ def lens_distortion(frame: Frame) -> LensDistortion:
 
 
 def rigid(value: Any, fail: Fail) -> np.ndarray:
-    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal, free of a scale
-    that is the same along all axes. Raises Unusable with the text of fail() where it holds no
-    rotation and place.
+    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal, without a scale
+    that all axes share. Raises Unusable with the text of fail().
     """
     matrix = numbers(value, (4, 4))
     if matrix is None:

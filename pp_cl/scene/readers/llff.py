@@ -9,14 +9,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.found import LeftOut, image_folder
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.readers.common import (
-    fail_at,
-    fitted,
-    folder_images,
-    in_order,
-    read_npy,
-    two_splits,
-)
+from pp_cl.scene.readers.common import fail_at, fitted, folder_images, in_order, read_npy
 from pp_cl.scene.readers.frame import rigid
 
 FILES = "poses_bounds.npy (LLFF)"
@@ -25,8 +18,6 @@ NUMBERS = 17  # 3x4 pose, (height, width, focal length) as its fifth column; nea
 # LLFF: down, right, backwards; OpenCV: right, down, forwards
 LLFF_FROM_CV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
-splits = two_splits
-
 
 def recognises(folder: Path) -> bool:
     """True if the folder has the file of poses."""
@@ -34,11 +25,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split, in the order of their names.
-
-    Where the images are smaller or larger than the poses say, the focal length is scaled. Near and
-    far bound all that was photographed, not the object, and are left out. Raises UserError naming
-    the file and the row.
+    """The images of a split, in the order of their names. Near and far bound all that was
+    photographed, and are left out. Raises UserError naming the file and the row.
     """
     file = folder / POSES
     rows = read_npy(file)

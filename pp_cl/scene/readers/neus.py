@@ -12,14 +12,12 @@ from pp_cl.engine.camera import Camera
 from pp_cl.files.image import image_size
 from pp_cl.scene.found import LeftOut, image_folder
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz, two_splits
+from pp_cl.scene.readers.common import fail_at, folder_images, in_order, read_npz
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 IMAGES = ("image", "images", "rgb")
 MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours
-
-splits = two_splits
 
 
 def recognises(folder: Path) -> bool:
@@ -28,11 +26,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split: test is every eighth in the order of the images' names.
-
-    The world is that of world_mat, in its own units. scale_mat, where it is there, moves the unit
-    sphere around the object, which gives the depth range. Raises UserError naming the file and the
-    member.
+    """The images of a split: test is every eighth in the order of the images' names. scale_mat,
+    where it is there, gives the depth range. Raises UserError naming the file and the member.
     """
     file = _file(folder)
     matrices, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
@@ -58,8 +53,8 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def box(folder: Path) -> np.ndarray | None:
-    """(2, 3) box around the sphere that holds the object, of the first camera: scale_mat makes it
-    of the unit sphere. None where the file has none. Raises UserError as read_split does.
+    """(2, 3) box around the sphere that holds the object, by the first scale_mat, or None. Raises
+    UserError as read_split does.
     """
     file = _file(folder)
     scales = read_npz(file, "scale_mat_")
@@ -96,9 +91,7 @@ def _camera(matrix, size, fail):
 
 
 def _sphere(matrix, fail):
-    """((3,) middle, radius) of the sphere that a matrix makes of the unit sphere. Raises
-    fail(text).
-    """
+    """((3,) middle, radius) of the sphere that a matrix makes of the unit sphere."""
     if matrix.shape != (4, 4):
         raise fail(f"has shape {matrix.shape}; must be 4x4 numbers")
     left = matrix[:3, :3]

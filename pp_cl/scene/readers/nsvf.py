@@ -1,6 +1,5 @@
 """Reader of scenes as NSVF has them: rgb/ with the split in front of the names, pose/, one
-intrinsics.txt, and near_and_far.txt where it is there. bbox.txt, the box of NSVF's voxels, is not
-read.
+intrinsics.txt, and near_and_far.txt where it is there.
 """
 
 from pathlib import Path
@@ -74,8 +73,8 @@ def _names(folder):
 
 
 def _lens(file):
-    """((fx, fy, cx, cy), the (width, height) they are meant for or None): a 4x4 or 3x3 matrix, or
-    `focal cx cy 0` in the first line and the height and width in the last.
+    """((fx, fy, cx, cy), the (width, height) they are meant for or None): of a 4x4 or 3x3 matrix,
+    or `focal cx cy 0` first and the height and width last.
     """
     rows, fail = read_numbers(file), fail_at(file)
     lengths, size = [len(row) for row in rows], None

@@ -1,6 +1,5 @@
 """Reader of scenes in the format of NeRF-synthetic, transforms_<split>.json, and of nerfstudio,
-transforms.json, with the keys of both: intrinsics and distortion per frame, masks, near and far;
-and a writer of the former.
+transforms.json, with the keys of both; and a writer of the former.
 """
 
 import math
@@ -33,16 +32,12 @@ NAMED = ("train", "val", "test")  # splits that transforms.json may list as <spl
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder holds a transforms.json or a transforms_<split>.json; the s may be
-    missing.
-    """
+    """True if the folder holds a transforms.json or a transforms_<split>.json."""
     return _single(folder) is not None or bool(_split_files(folder))
 
 
 def splits(folder: Path) -> list[str]:
-    """The names of the splits that the folder holds. Add-ons of Blender write the cameras of a test
-    without its images: these are none.
-    """
+    """The names of the splits that the folder holds, but for those whose images are all missing."""
     if files := _split_files(folder):
         return sorted(s for s, file in files.items() if s == "train" or _has_image(folder, file))
     listed = [split for split in NAMED if f"{split}_filenames" in _read(_single(folder))]
@@ -50,11 +45,8 @@ def splits(folder: Path) -> list[str]:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of transforms_<split>.json; or those of transforms.json that its
-    <split>_filenames names, and where it has no such lists every eighth for test, the others for
-    train.
-
-    Raises UserError naming the file and the key that is missing or wrong.
+    """The images of transforms_<split>.json, or those of transforms.json that its <split>_filenames
+    names, without such lists every eighth for test. Raises UserError naming the file and the key.
     """
     files = _split_files(folder)
     file = files[split] if files else _single(folder)
@@ -74,9 +66,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def box(folder: Path) -> np.ndarray | None:
-    """(2, 3) box around the object that a transforms.json states as its `aabb`, None where there is
-    none. Raises UserError naming the file.
-    """
+    """(2, 3) box around the object that a transforms.json states as its `aabb`, or None."""
     file = _single(folder)
     corners = None if _split_files(folder) else _read(file).get("aabb")
     return None if corners is None else checked_box(corners, fail_at(file, "aabb"))
@@ -89,9 +79,7 @@ def _single(folder):
 
 
 def _split_files(folder):
-    """{split: transforms_<split>.json} of a scene that has one for training, or no transforms.json:
-    else they are copies beside it.
-    """
+    """{split: transforms_<split>.json}, unless they are copies beside a transforms.json."""
     found = [file for file in sorted(folder.glob("transform*_*.json")) if file.is_file()]
     files = {file.stem.partition("_")[2]: file for file in found}
     return {} if _single(folder) and "train" not in files else files
@@ -109,9 +97,7 @@ def _read(file):
 
 
 def _has_image(folder, file):
-    """Whether one of the frames of a file has its image, or what is wrong with the file is to be
-    told when it is read.
-    """
+    """Whether one of the frames of a file has its image, or the file is to be refused when read."""
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
@@ -173,9 +159,8 @@ def _image_file(folder, frame):
 
 
 def write_scene(splits: dict[str, list[View]], folder: Path | str) -> None:
-    """Write the stored images of views as a scene of NeRF-synthetic; the folder appears when it is
-    complete. Every frame has nerfstudio's fl_x, fl_y, cx, cy, w, h, and near and far if the views
-    state them. Raises UserError if the folder exists and is not empty, or cannot be written.
+    """Write the stored images of views as a scene of NeRF-synthetic, with nerfstudio's keys, too.
+    Raises UserError if the folder exists and is not empty, or cannot be written.
     """
     with atomic_folder(Path(folder)) as unfinished:
         for split, views in splits.items():

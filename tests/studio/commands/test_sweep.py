@@ -16,9 +16,9 @@ from support.sweeps import jobs_of, pretend, words_of
 from pp_cl.cli import main
 from pp_cl.config import run_config
 from pp_cl.drivers import open_device
-from pp_cl.evaluate import evaluate
+from pp_cl.evaluate import evaluate_run
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_cl.session.training import open_training
 
 ROOT = Path(__file__).parents[3]
@@ -90,7 +90,7 @@ def worker_of(checkpoint):
 def undisturbed(dev, job):
     folder = RunFolder(job.folder)
     open_training(dev, folder, run_config(folder, job.scene, None, job.given), None).run()
-    return evaluate(load_run(dev, folder.path), "test", job.metrics)
+    return evaluate_run(load(folder.path, dev), "test", job.metrics)
 
 
 @pytest.mark.unix

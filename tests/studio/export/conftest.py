@@ -1,6 +1,6 @@
 import pytest
 
-from pp_cl.run import load_run
+from pp_cl.run import load
 
 
 @pytest.fixture(scope="session")
@@ -13,4 +13,4 @@ def run_folder(runs, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def run(session_device, run_folder):
-    return load_run(session_device, run_folder)
+    return load(run_folder, session_device)

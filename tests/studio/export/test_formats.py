@@ -6,7 +6,7 @@ import trimesh
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.transforms import write_scene
 from pp_studio.export import AXES, FORMATS
@@ -72,7 +72,7 @@ def test_they_read_back_as_a_scene(run, tmp_path):
 def test_a_scene_without_test_views_gives_training_views(run, run_folder, tmp_path):
     shutil.copytree(run.config.scene.path, tmp_path / "ball")
     (tmp_path / "ball" / "transforms_test.json").unlink()
-    moved = load_run(run.dev, run_folder, scene=str(tmp_path / "ball"))
+    moved = load(run_folder, run.dev, scene=str(tmp_path / "ball"))
     with pytest.warns(UserWarning, match="no test views are exported: .*test"):
         splits = renderings(moved)
     assert {split: len(views) for split, views in splits.items()} == {"train": 12}

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from support.refused import refusing
 
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_cl.scene.lens import LensDistortion
 from pp_studio.export.formats import export_run
 from pp_studio.export.length import metres_per_unit, set_length, surface_point
@@ -19,7 +19,7 @@ RADIUS = 0.8  # of the ball, scene units
 @pytest.fixture
 def mine(run, run_folder, tmp_path):
     shutil.copytree(run_folder, tmp_path / "run")
-    return load_run(run.dev, tmp_path / "run")
+    return load(tmp_path / "run", run.dev)
 
 
 def text_of(one, position):

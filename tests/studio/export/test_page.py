@@ -15,7 +15,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_studio.export import QUALITIES, QUICK
 from pp_studio.export.gaussians import (
     GAUSSIAN,
@@ -277,7 +277,7 @@ def test_the_runs_name_is_text(run_folder, session_device, tmp_path):
     folder = tmp_path / "<b> & </script>".replace("/", "")
     shutil.copytree(run_folder, folder)
     one = np.ones(1, GAUSSIAN)
-    text = page_text(load_run(session_device, folder), Gaussians(one, np.zeros(3), (1, 1), 0))
+    text = page_text(load(folder, session_device), Gaussians(one, np.zeros(3), (1, 1), 0))
     assert "<title>&lt;b&gt; &amp; &lt;script&gt;</title>" in text
 
 

@@ -7,7 +7,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_studio.export import result
 from pp_studio.export.result import begin_result, write_result
 
@@ -42,7 +42,7 @@ def trained(run_folder, session_device, tmp_path):
     folder = shutil.copytree(run_folder, tmp_path / "run")
     shutil.rmtree(folder / "eval", ignore_errors=True)
     os.utime(folder / "checkpoint.npz", ns=(10**18, 10**18))
-    return load_run(session_device, folder)
+    return load(folder, session_device)
 
 
 def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from support.scenes import ring_cameras
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_studio.view.drawing import (
     SHOWN,
     colour_scale,
@@ -20,7 +20,7 @@ CAMERA = ring_cameras(3, 48)[2]
 
 @pytest.fixture
 def run(dev, trained):
-    return load_run(dev, trained)
+    return load(trained, dev)
 
 
 @pytest.fixture

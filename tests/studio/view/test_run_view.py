@@ -13,7 +13,7 @@ from support.viewing import drawing, tab, wait
 from pp_cl.config import load_config
 from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import load_run
+from pp_cl.run import load
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.session.training import open_training
 from pp_studio.export.gaussians import fitted_gaussians
@@ -146,7 +146,7 @@ def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monke
 
 
 def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copied, monkeypatch):
-    table, *_ = fitted_gaussians(load_run(dev, copied))
+    table, *_ = fitted_gaussians(load(copied, dev))
     view = RunView(served[0], dev, RunFolder(copied))
     view.look()
     monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)

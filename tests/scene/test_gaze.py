@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pp_cl.engine.camera import Camera
-from pp_cl.scene.convention import other_axes
+from pp_cl.scene.gaze import other_axes
 
 COUNT = 24
 ORIGINS = ((0, 0, 0), (2, -3, 1), (30, 10, -20))
