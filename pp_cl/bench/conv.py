@@ -155,7 +155,8 @@ def layer_errors(layer: Layer, computed: list[np.ndarray], result: str) -> tuple
 def _direction_errors(layer, computed, direction):
     """The larger ones of layer_errors() of what a direction computes."""
     results = ["forward"] if direction == "forward" else ["weights", "input"]
-    return tuple(map(max, *(layer_errors(layer, computed, result) for result in results)))
+    pairs = [layer_errors(layer, computed, result) for result in results]
+    return tuple(max(each) for each in zip(*pairs, strict=True))
 
 
 def bench_conv(
