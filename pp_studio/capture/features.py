@@ -282,10 +282,8 @@ def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
     check the pairs anew, and return True.
 
     Images are aligned by shifts, turns and scales, so that the camera may be moved a little.
-    begun: a file that says so before anything is removed; where it exists, this was stopped, and
-    goes on. is_turntable: the object is known to turn.
+    begun: a file to be made before anything is removed. is_turntable: the object is known to turn.
     """
-    is_turntable = is_turntable or begun.exists()
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         images = db.read_all_images()
         sizes = {i.camera_id: np.array([i.width, i.height]) for i in db.read_all_cameras()}

@@ -250,8 +250,11 @@ class Capture:
         return {"line": f"{int(np.median(list(counts.values())))} in an image", "counts": counts}
 
     def _matches(self):
-        pairs = isolated(self.work, features.match, self.database)
         begun, turntable = self.work / "turns", self.options["turntable"]
+        if begun.exists():  # it was stopped then, and would take matches of the object for still
+            isolated(self.work, features.forget_matches, self.database)
+            begun.unlink()
+        pairs = isolated(self.work, features.match, self.database)
         turns = isolated(self.work, features.remove_still, self.database, begun, turntable)
         line = f"{pairs} pairs of images"
         if turns:

@@ -395,6 +395,10 @@ def test_an_object_that_turns(dev, tmp_path, wall):
     assert any((scene / "capture/inside").iterdir()) == bool(wall)
     assert found(scene, "matches")["turns"] and found(scene, "poses")["placed"] == 14
     assert off(scene, cameras(SIZE, "turntable")).position < 0.01
+    before = found(scene, "matches")["line"]
+    (scene / "capture/matches.json").unlink()  # as where it is stopped while matches are removed
+    assert capture(photographs, scene, "--masks", masks, *told) == (0, [])
+    assert found(scene, "matches")["line"] == before and found(scene, "poses")["placed"] == 14
 
 
 @pytest.mark.slow
