@@ -3,7 +3,7 @@
 QUICK, BEST = "quick", "best"
 # {quality of a splat: (steps that fit it, voxel sizes of the cells whose points begin as one, 0:
 # each alone)}
-QUALITIES = {QUICK: (1000, 1.5), BEST: (7000, 0.0)}
+QUALITIES = {QUICK: (1500, 1.25), BEST: (7000, 0.0)}
 SCENE, VIEWER = AXES = "scene", "viewer"
 SPLATS, POINTS = ("splat", "splat-spz", "splat-glb"), ("ply", "glb")
 # {format of coordinates: whose axes they have, unless others are asked for}
