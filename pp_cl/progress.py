@@ -14,7 +14,7 @@ from typing import Any, TextIO, TypeVar
 from tqdm import tqdm
 
 REDRAWN = 1.0  # seconds between two states of the bar
-LINES_APART = 30.0  # seconds between two lines, those of all stages
+LINES_APART = 25.0  # seconds between two lines of all stages, and some more between stages
 # tqdm's, with little beside what follows; it is cut off at the right border
 FORMAT = (
     "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"

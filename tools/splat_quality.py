@@ -51,6 +51,7 @@ def row(run: Run, steps: int, cell: float) -> dict:
 def plot(rows: list[dict], file: str) -> None:
     """PSNR over seconds, a line for each run and window."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()
@@ -64,6 +65,9 @@ def plot(rows: list[dict], file: str) -> None:
                 for each, x, y in zip(mine, seconds, quality, strict=True):
                     axes.annotate(f"{each['steps']}", (x, y), fontsize=8, va="bottom")
     axes.set(xscale="log", xlabel="seconds on two cores; labels: steps", ylabel="PSNR, dB")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
     axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(file, dpi=120)
