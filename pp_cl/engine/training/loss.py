@@ -131,10 +131,11 @@ class Loss:
         weight, further, (v, ph) = self.ssim_weight, self._further, self._rows
 
         def by_name(rows: np.ndarray) -> dict[str, float]:
-            parts = rows[:v], rows[v : v + ph], rows[v + ph :]
-            sums = [part.sum(0, dtype=np.float64) for part in parts]
-            dissimilarity, (smooth, l1, mse, mask) = sums[0][0], sums[1]
-            found = {"mask": mask, "distortion": sums[2][0]}
+            dissimilarity = rows[:v].sum(0, dtype=np.float64)[0]
+            smooth, l1, mse, mask = rows[v : v + ph].sum(0, dtype=np.float64)
+            found = {"mask": mask}
+            if "distortion" in further:  # else nothing has written its rows
+                found["distortion"] = rows[v + ph :].sum(0, dtype=np.float64)[0]
             more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
             total = smooth + weight * dissimilarity
             total += sum(more[name] * weight for name, (weight, _) in further.items())
