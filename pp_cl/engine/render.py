@@ -146,7 +146,7 @@ class Renderer:
         """Free the buffers; the next view makes them anew."""
         self.model.net.release()
         self._buffers = Buffers(self.dev)
-        self._launches = {name: Prepared(self.dev) for name in ("project", "pairs", "weights")}
+        self._launches = {name: Prepared(self.dev) for name in ("project", "pairs", "weights", "blend")}
 
     def forward(
         self,
@@ -210,7 +210,8 @@ class Renderer:
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
         with dev.stage("blend"):
-            blend_forward(dev, pairs, weights, b.visible_features, b.features)
+            blend = partial(blend_forward, dev)
+            self._launches["blend"].run(blend, pairs, weights, b.visible_features, b.features)
         result.visible_features, result.features = b.visible_features, b.features
         if until == "features":
             return result

@@ -167,7 +167,8 @@ class Trainer:
         if ignored is not None:
             ignore_target(self.dev, ignored, image, target, alpha, offset)
         alphas, transmittance = None, rendered.weights.transmittance  # None of a softmax
-        if transmittance is not None and self.loss.mask_weight > 0 and crop.view.has_mask:
+        has_mask = self.views[crop.view_index].has_mask  # known, of crop.view it is not
+        if transmittance is not None and self.loss.mask_weight > 0 and has_mask:
             alphas = transmittance, alpha
         grad_image, grad_alpha = self.loss.forward_backward(
             image, target, *offset, alphas=alphas, shortfall=self._rising(1.0)
