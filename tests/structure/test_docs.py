@@ -13,9 +13,7 @@ DOCUMENTS = [
 ]
 PATH = re.compile(r"`((?:pp_cl|pp_studio|cl|tests|tools|docs)/[\w./]+)`")
 CARD = re.compile(r"\b([ABHLV]\d{2,3}|[RG]TX|GeForce|Radeon|Instinct|MI\d{3})\b")
-FIGURE = re.compile(
-    r"\d (ms|s|seconds|minutes|hours|dB|times)\b|^\|.*\| *[\d.,]+ *\|", re.MULTILINE
-)
+FIGURE = re.compile(r"\d (ms|s|seconds|minutes|dB|times)\b|^\|.*\| *[\d.,]+ *\|", re.MULTILINE)
 PUBLISHED = "RTX 5090, by 3dgrut's README"
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
 
@@ -87,10 +85,10 @@ def test_named_settings_exist(path):
 
 
 def typed_figures(text: str) -> list[str]:
-    """Paragraphs, each with the table below it, that name a GPU and state a figure which no command
-    wrote.
+    """Paragraphs with the tables below them, and items of lists, that name a GPU and state a figure
+    which no command wrote.
     """
-    paragraphs = re.split(r"\n\n(?!\|)", BLOCK.sub("", text).replace(PUBLISHED, ""))
+    paragraphs = re.split(r"\n\n(?!\|)|\n(?=- )", BLOCK.sub("", text).replace(PUBLISHED, ""))
     return [one for one in paragraphs if CARD.search(one) and FIGURE.search(one)]
 
 
