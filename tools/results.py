@@ -102,7 +102,7 @@ QUALITY = [
     {"head": "preset, steps", "cell": "`{preset}`, {steps:,}"},
     {"head": "minutes", "cell": "{minutes:.2f}"},
     {"head": "PSNR", "cell": "{psnr:.2f}"},
-    {"head": "r_1 to r_13, others", "cell": "{psnr_highlights:.2f}, {psnr_others:.2f}"},
+    {"head": "PSNR: r_1 to r_13, others", "cell": "{psnr_highlights:.2f}, {psnr_others:.2f}"},
     {"head": "SSIM", "cell": "{ssim:.4f}"},
     {"head": "LPIPS", "cell": "{lpips:.4f}"},
     {"head": "points", "cell": "{points:,}"},
@@ -240,7 +240,7 @@ def stages(preset: str, store: Path) -> dict:
     """What tools/stages.py says of a preset's run. Raises UserError without one."""
     run = store / STEPS[preset]
     if not run.exists():
-        raise UserError(f"{run}: not found; the part {run.name} trains it")
+        raise UserError(f"the part {run.name} comes first")
     return read_found(store, *TOOL, "tools.stages", scene_of(LEGO), "--out", run)
 
 
