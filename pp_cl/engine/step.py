@@ -108,7 +108,11 @@ class Trainer:
             ignored = None if says_nothing is None else self._sent(says_nothing)
 
         rendered = self.renderer.forward(
-            crop.camera, self.gamma, training=True, gradient_tiles=find_gradient_tiles
+            crop.camera,
+            self.gamma,
+            training=True,
+            gradient_tiles=find_gradient_tiles,
+            times_seen=self.state.times_seen,
         )
         with self.dev.stage("loss"):
             if self.exposure:
@@ -124,9 +128,10 @@ class Trainer:
             grad_alpha=grad_alpha,
             distortion_weight=distortion_weight / all_depths,
             with_offsets=rates.offset > 0,
+            max_weight=self.state.max_weight,
         )
         if distortion_weight > 0:
-            self.loss.add_distortion(gradients.pixel_distortion, distortion_weight, 1 / all_depths)
+            self.loss.add_distortion(gradients.distortion, distortion_weight, 1 / all_depths)
 
         with self.dev.stage("update"):
             self.optimiser.update(
@@ -137,11 +142,6 @@ class Trainer:
                 visible=rendered.weights.visible_rows,
                 count=rendered.weights.total.get(),
                 sh_eps=train.sh_eps / target.size,
-            )
-        with self.dev.stage("max weights"):
-            state = self.state
-            self.renderer.record_weights(
-                rendered, state.max_weight, state.times_seen, gradients=gradients
             )
         self.step += 1
         self.check()

@@ -110,7 +110,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     towards = positions - camera.eye
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
-    absent = (dev.zeros((1,)),) * 5
+    absent = (dev.zeros((1,)),) * 6
     return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
