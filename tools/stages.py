@@ -82,7 +82,6 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
         seen.append(least_bytes(**counts(result), sh=sh) | {"products": products})
         return backward(result, grad_image, **options)
 
-    trainer.renderer.backward = watched
     for _ in range(UNTIMED):
         trainer.train_step()
     dev.finish()
@@ -90,7 +89,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     host = host_cost(trainer, TIMED)
     dev.finish()
     step = (time.perf_counter() - start) / TIMED
-    seen.clear()
+    trainer.renderer.backward = watched  # it reads counts back
     with dev.timed_stages() as seconds:
         for _ in range(TIMED):
             trainer.train_step()
