@@ -18,6 +18,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import Prepared
+from pp_cl.engine.layers.conv import GradientParts
 from pp_cl.engine.layers.tiles import tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
@@ -255,13 +256,15 @@ class Renderer:
             del pairs, weights  # else their arrays would stay beside the larger ones
             self._launches |= {name: Prepared(self.dev) for name in ("pairs", "weights")}
 
-    def backward(self, result: RenderResult, grad_image: Array, **options: Any) -> BlendGradients:
-        """What backward_features() returns, from dL/dimage of result.image. The gradients of the
-        network's parameters are left in model.net.gradients. options: of backward_features().
+    def backward(
+        self, result: RenderResult, grad_image: Array, **options: Any
+    ) -> tuple[BlendGradients, GradientParts | None]:
+        """(what backward_features() returns, the network's part of what UNet.backward() does), from
+        dL/dimage of result.image. options: of backward_features().
         """
         with self.dev.stage("network backward"):
-            grad_features = self.model.net.backward(grad_image)
-        return self.backward_features(result, grad_features, **options)
+            grad_features, parts = self.model.net.backward(grad_image)
+        return self.backward_features(result, grad_features, **options), parts
 
     def backward_features(
         self,

@@ -122,7 +122,7 @@ class Trainer:
         # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * self.model.grid.diagonal
         distortion_weight = self._rising(train.distortion_weight if self._composited else 0.0)
-        gradients = self.renderer.backward(
+        gradients, network_parts = self.renderer.backward(
             rendered,
             grad_image,
             grad_alpha=grad_alpha,
@@ -138,6 +138,7 @@ class Trainer:
                 self.step + 1 - self.begun,
                 rates,
                 gradients,
+                network_parts,
                 points=rendered.points,
                 visible=rendered.weights.visible_rows,
                 count=rendered.weights.total.get(),

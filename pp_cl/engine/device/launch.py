@@ -60,7 +60,7 @@ def launch_groups(
     groups: int,
     *,
     most: int = LARGEST_GROUP,
-    defines: dict[str, int] | None = None,
+    defines: dict[str, Any] | None = None,
     **arguments,
 ) -> None:
     """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times, each

@@ -5,6 +5,7 @@ weights of the fragments; and the gradients of the blend, gathered by visible po
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -142,7 +143,7 @@ def blend_backward(
     rows = len(visible_features), pairs.pixels, pairs.capacity
     b.require(blend_backward_table(*rows, weights.blend, points.footprint))
     clear_pairs(dev, pairs, weights, b.pair_gradient)
-    of_fragments = {
+    of_fragments: dict[str, Any] = {
         "hw": pairs.pixels,
         "tracked": weights.tracked,
         "pixel_offset": pairs.pixel_offset,
