@@ -1,6 +1,9 @@
 import gc
+import math
+import re
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from support.refused import failure
 from support.runs import arguments
@@ -57,6 +60,42 @@ def test_it_is_within_15_percent_of_what_a_training_takes(
     need = training.memory_plan.need
     assert need.points == training.trainer.model.cloud.count
     assert 0.85 < need.device / plain.peak_bytes < 1.15
+
+
+class Card(Device):
+    """Notes what kernels are launched in which groups."""
+
+    def __init__(self, device):
+        super().__init__(device)
+        self.launched = set()
+
+    def enqueue(self, launch):
+        self.launched.add((launch.kernel, launch.local))
+        super().enqueue(launch)
+
+
+def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch):
+    """In the form for GPUs, with what all of these have: --memory 0.1, 28 MiB of it at once,
+    groups of 256, local memory of 32 KiB. They are refined as with more memory.
+    """
+    monkeypatch.setenv("PP_FORM", "gpu")
+    monkeypatch.setenv("PP_MAX_ALLOCATION", "28")
+    card, folder = Card(dev.device), RunFolder(tmp_path / "run")
+    scene = write_ball_scene(tmp_path / "ball", size=128)
+    settings = {"points.count": 4000, "scene.downscale": 1, "train.memory_gib": 0.1}
+    settings |= {"train.iterations": 24, "train.prune_weight": 0}
+    config = run_config(folder, scene, "tiny", [(*one, "test") for one in settings.items()])
+    training = open_training(card, folder, config, None)
+    need, given_up = training.memory_plan.need, training.hull.given_up
+    assert "as close as memory allows" in given_up and "--memory 0.1: " in given_up
+    assert config.train.refine_at == (0.35, 1)
+    assert 0.85 < need.device / (0.1 * GIB) <= 1
+    training.run()
+    assert 0.85 < need.device / card.peak_bytes < 1.15
+    limit = cl.kernel_work_group_info.LOCAL_MEM_SIZE
+    local = [one._kernel.get_work_group_info(limit, card.device) for one, _ in card.launched]
+    assert max(math.prod(group) for _, group in card.launched) == 256
+    assert 0 < max(local) <= 32 * 1024
 
 
 def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
@@ -174,8 +213,28 @@ def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
         made.check_unseen()
 
 
+def test_what_does_not_fit_any_more_is_dropped_but_for_half(plain):
+    made, (points, step) = memory_plan(plain, train__refine_at="0.4,1"), (20_000, 3000)
+    plain.info["memory_bytes"] = made.need_of(GRID, points, (2, 6), step).device
+    assert made.points_that_fit(GRID, points - 1, (2, 6), step) == points - 1
+    assert made.points_that_fit(GRID, 3 * points // 2, (2, 6), step) == points
+    assert made.need.device == plain.info["memory_bytes"]
+    with pytest.raises(UserError, match="needs"):
+        made.points_that_fit(GRID, 3 * points, (2, 6), step)
+
+
+def test_what_the_next_steps_take_is_not_dropped(plain):
+    made = memory_plan(plain, train__refine_at="0.4,1")
+    plain.info["memory_bytes"] = made.need_of(GRID, 100_000, (2, 6), 7900).device
+    assert made.points_that_fit(GRID, 100_000, (2, 6), 7900) == 100_000
+    with pytest.raises(UserError, match="needs"):
+        made.points_that_fit(GRID, 101_000, (2, 6), 7900)
+
+
 @pytest.mark.slow
-def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, monkeypatch, capsys):
+def test_a_refinement_that_does_not_fit_has_less_to_refine_or_keeps_what_is_learned(
+    plain, tmp_path, monkeypatch, capsys
+):
     scene = write_ball_scene(tmp_path / "ball", size=64)
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
@@ -183,9 +242,14 @@ def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, m
     monkeypatch.setattr(f"{schedule}.LEFT_BY_PRUNING", 0.05)
     monkeypatch.setattr(f"{schedule}.prunings", lambda train, start, end: int(end > start + 1))
     monkeypatch.setattr("pp_cl.drivers.open_device", lambda choice: plain)
+    settings |= {"downscale": 1, "points__count": 5000}
     plain.info["memory_bytes"] = 30 * MIB
-    words = arguments(scene, tmp_path / "run", downscale=1, points__count=5000, **settings)
+    assert main(arguments(scene, tmp_path / "fewer", **settings)) == 0
+    dropped, count = map(int, re.search(r"19: .* (\d+) of (\d+)", capsys.readouterr().err).groups())
+    assert 0.1 < dropped / count < 0.5 and plain.peak_bytes > 0.85 * 30 * MIB
 
+    plain.info["memory_bytes"] = 20 * MIB
+    words = arguments(scene, tmp_path / "run", **settings)
     told = failure(*words)
     assert "step 19: to go on with " in told and told.endswith("in another --out")
     plain.info["memory_bytes"] = GIB
