@@ -10,7 +10,7 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import assign, preset, run_config
+from pp_cl.config import assign, load_config, preset, run_config
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import table_bytes
 from pp_cl.engine.device.device import Device
@@ -74,27 +74,27 @@ class Card(Device):
         super().enqueue(launch)
 
 
-def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch):
+def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsys):
     """In the form for GPUs, with what all of these have: --memory 0.1, 28 MiB of it at once,
     groups of 256, local memory of 32 KiB. They are refined as with more memory.
     """
     monkeypatch.setenv("PP_FORM", "gpu")
     monkeypatch.setenv("PP_MAX_ALLOCATION", "28")
     card, folder = Card(dev.device), RunFolder(tmp_path / "run")
+    monkeypatch.setattr("pp_cl.drivers.open_device", lambda choice: card)
     scene = write_ball_scene(tmp_path / "ball", size=128)
-    settings = {"points.count": 4000, "scene.downscale": 1, "train.memory_gib": 0.1}
-    settings |= {"train.iterations": 24, "train.prune_weight": 0}
-    config = run_config(folder, scene, "tiny", [(*one, "test") for one in settings.items()])
-    training = open_training(card, folder, config, None)
-    need, given_up = training.memory_plan.need, training.hull.given_up
-    assert "as close as memory allows" in given_up and "--memory 0.1: " in given_up
-    assert config.train.refine_at == (0.35, 1)
-    assert 0.85 < need.device / (0.1 * GIB) <= 1
-    training.run()
-    assert 0.85 < need.device / card.peak_bytes < 1.15
+    words = ["train", scene, "--out", str(folder), "--downscale", "1", "--points", "4000"]
+    words += ["--memory", "0.1", "--iterations", "24", "--set", "train.prune_weight=0"]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert re.search("points: as close as memory allows; .*--memory 0.1: the training needs", told)
+    assert load_config(folder.config).train.refine_at == (0.35, 1)
+    plan = float(re.search(r"memory: up to (\S+) MiB of --memory 0.1", told)[1]) * MIB
+    assert 0.85 < plan / (0.1 * GIB) < 1.001
+    assert 0.85 < plan / card.peak_bytes < 1.15
+    assert max(math.prod(group) for _, group in card.launched) == 256
     limit = cl.kernel_work_group_info.LOCAL_MEM_SIZE
     local = [one._kernel.get_work_group_info(limit, card.device) for one, _ in card.launched]
-    assert max(math.prod(group) for _, group in card.launched) == 256
     assert 0 < max(local) <= 32 * 1024
 
 
