@@ -5,7 +5,7 @@
 Each training is a process of its own, a few steps long: what is allocated does not change between
 prunings. Refinements come early, so that none is left out. The rows `phone` and `photos` train on
 300 and 60 photographs of 12 megapixels, which are made in a temporary folder (most of them links)
-and removed.
+and removed. With --memory on a CPU, the device's memory is in the host's peak, not in its plan.
 """
 
 import argparse
