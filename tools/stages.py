@@ -49,9 +49,8 @@ def least_bytes(n: int, visible: int, fragments: int, front: int, pixels: int, s
         "blend": front * 2 * WORD + visible * ROW + pixels * ROW,
         "backward": front * (2 + 2 + 1 + 2 + 1 + 2 + 2) * WORD
         + (2 * visible + 2 * pixels) * ROW
-        + visible * 5 * WORD,
+        + visible * 7 * WORD,
         "update": visible * (2 * sh + 3 * ROW + 2 * WORD + 5 * moved),
-        "max weights": front * 2 * WORD + visible * 4 * WORD,
     }
 
 

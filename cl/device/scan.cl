@@ -1,20 +1,6 @@
 // Exclusive prefix sums of uint32, and stream compaction: the indices of non-zero flags. A sum
 // above the largest uint is the largest uint.
-#include "group.h"
-
-#ifndef BLOCK
-#define BLOCK 2048  // values that GROUP work-items scan together
-#endif
-
-// The sum of the blocks before `block`, by GROUP work-items together.
-#define SUM_BEFORE(block, block_sum, shared, sum)                                                  \
-    uint sum;                                                                                      \
-    {                                                                                              \
-        ulong part = 0;                                                                            \
-        for (uint i = MEMBER; i < (block); i += GROUP)                                             \
-            part += (block_sum)[i];                                                                \
-        group_scan((uint)min(part, (ulong)UINT_MAX), shared, &sum);                                \
-    }
+#include "scan.h"
 
 // GROUP work-items per block of BLOCK values: read them, write their sum.
 kernel void scan_sums(
@@ -66,8 +52,8 @@ kernel void scan_offsets(
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    SUM_BEFORE(block, block_sum, shared, before_block)
-    ulong sum = before_block;
+    BLOCK_SUMS(sums, block, b, block_sum, shared)
+    ulong sum = sums.before;
     for (uint first = block * BLOCK; first < end; first += GROUP) {
         const uint i = first + MEMBER;
         uint total;
@@ -94,7 +80,8 @@ kernel void scan_nonzero(
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    SUM_BEFORE(block, block_sum, shared, listed)
+    BLOCK_SUMS(sums, block, b, block_sum, shared)
+    uint listed = sums.before;
     for (uint first = block * BLOCK; first < end; first += GROUP) {
         const uint i = first + MEMBER, is_listed = i < end && flags[i] != 0;
         uint total;

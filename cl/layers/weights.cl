@@ -1,6 +1,7 @@
 // Weights as kernels read them, if not as they are; the sums of the parts of their gradients. Each
 // for all convolutions at once, of which a table has rows.
 #include "lanes.h"
+#include "layers/parts.h"
 
 #ifndef WINOGRAD
 #define WINOGRAD 1  // 0: no weights are transformed, as on GPUs, where that would spill
@@ -8,15 +9,6 @@
 #if WINOGRAD
 #include "layers/winograd.h"
 #endif
-
-// The row of the table whose items are from its first number on. length: of a row.
-static inline global const int *
-row_of(global const int *table, const int length, const uint rows, const int item) {
-    global const int *row = table;
-    for (uint r = 1; r < rows && table[length * r] <= item; r++)
-        row += length;
-    return row;
-}
 
 // `scale` times the weights of `count` input channels from `first` on, at most 16, for a tap and the
 // output channel o; 0 beyond.
@@ -76,29 +68,17 @@ kernel void lay_out_weights(
 #endif
 }
 
-// One work-item per part of (weights, row of partial, 16 output channels): adds the parts in order;
-// writes LANES values of a gradient. Rows of `table`: first row of partial of all weights, rows of
-// one part and group of 16 output channels (K * K * ci + 1), such groups, parts, where the parts,
-// the gradient of the weights and that of the biases begin; 1 if the sums are halved.
+// One work-item per part of a row of parts.h: writes LANES values of a gradient.
 kernel void sum_parts(
     const uint n,  // rows of partial, of one part of all weights
     const uint rows,
-    global const int *table,        // (rows, 8)
-    global const float16 *partial,  // (...) as above
+    global const int *table,        // (rows, 8) parts.h
+    global const float16 *partial,  // (...) as there
     global float16 *grad_weights,   // (...)
     global float16 *grad_biases)    // (...)
 {
     const int item = get_global_id(0) / ROW_PARTS;
     if (item >= n) return;
-    global const int *of = row_of(table, 8, rows, item);
-    const int per_block = of[1], blocks = of[2], parts = of[3];
-    const int row = (item - of[0]) % per_block, block = (item - of[0]) / per_block;
-    floats sum = 0.0f;
-    for (int part = 0; part < parts; part++)
-        sum += load_part(partial, of[4] + ((size_t)part * blocks + block) * per_block + row);
-    if (of[7]) sum *= 0.5f;
-    if (row < per_block - 1)
-        store_part(sum, grad_weights, of[5] + block * (per_block - 1) + row);
-    else
-        store_part(sum, grad_biases, of[6] + block);
+    const Sum found = sum_of(table, rows, partial, item);
+    store_part(found.sum, found.is_bias ? grad_biases : grad_weights, found.at);
 }

@@ -24,12 +24,16 @@
 // A kernel of each blend writes (b, s dL/db) of the fragments by pair, where each point finds its
 // own; that of the softmax (b, s), and the point multiplies by dL/db.
 #include "common.h"
+#include "group.h"
 #include "lanes.h"
 #include "raster/footprint.h"
 #include "reduce.h"
 
 #ifndef MOVES
 #define MOVES 0  // 1: the points' offsets have gradients
+#endif
+#ifndef SPAN
+#define SPAN 64  // pixels whose distortion loss is one sum
 #endif
 #ifndef DL_DB
 #define DL_DB 0  // 1: pair_gradient lacks dL/db: softmax_gradient wrote it
@@ -99,14 +103,14 @@ kernel void softmax_gradient(
     pixel_blend[q] = dot16(grad_features[q], features[q]);
 }
 
-// One work-item per pixel: reads its fragments, farthest first, and their points' features, writes
-// what each of the `tracked` nearest ones adds to the gradients of its point, by alpha compositing,
-// with those of alpha and of the distortion loss; and that loss.
+// GROUP work-items per run of SPAN pixels: read the fragments of each, farthest first, and their
+// points' features, write what each of the `tracked` nearest ones adds to the gradients of its
+// point, by alpha compositing, with those of alpha and of the distortion loss; and that loss.
 kernel void alpha_gradient(
     const uint hw,       // pixels
     const uint tracked,  // fragments of a pixel that get gradients
     const int has_grad_alpha,
-    const float distortion_weight,           // 0: none, and pixel_distortion is not written
+    const float distortion_weight,           // 0: none, and `distortion` is not written
     global const uint *pixel_offset,         // (HW+1)
     global const ulong *pair_key,            // (P) depth << 32 | pair
     global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
@@ -117,68 +121,75 @@ kernel void alpha_gradient(
     global const float16 *grad_features,     // (H, W, 16) G
     global const float *grad_alpha,          // (HW) g, not read without has_grad_alpha
     global float2 *pair_gradient,            // (P, 2) b, s dL/db; cleared before
-    global float *pixel_distortion)          // (HW) without its weight
+    global float *distortion)                // ((HW+SPAN-1)/SPAN) of each run, without its weight
 {
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    const float16 G = grad_features[q];
-    const float g = has_grad_alpha ? grad_alpha[q] : 0.0f;
-    const uint begin = pixel_offset[q];
-    // depths count from here, so that sums of them keep their digits
-    const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
-    float2 front = 0.0f, behind = 0.0f;  // sums of b and b z of the fragments there
-    uint end = begin;
-    for (; end < pixel_offset[q + 1] && (uint)pixel_weight_point[end] != NONE; end++) {
-        READ_AHEAD(visible_features + point_slot[(uint)pixel_weight_point[end]]);
-        if (distortion_weight > 0.0f) {
-            const float z = upper_float(pair_key[end]) - nearest;
-            front += upper_float(pixel_weight_point[end]) * (float2)(1.0f, z);
-        }
-    }
-    float T = transmittance[q], distortion = 0.0f;
-    float B = dot16(G, (float16)(BACKGROUND));
-    for (uint i = end; i > begin;) {
-        ulong key[BATCH];
-        float weight[BATCH], derivative[BATCH], of_point[BATCH];
-        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
-            const uint at = i - begin > j ? i - 1 - j : begin;
-            const ulong weight_point = pixel_weight_point[at];
-            key[j] = pair_key[at];
-            weight[j] = upper_float(weight_point);
-            derivative[j] = pixel_derivative[at];
-            of_point[j] = dot16(G, visible_features[point_slot[(uint)weight_point]]);
-        }
-        GPU_UNROLLED_FOR (uint j = 0; j < BATCH && i > begin; j++) {
-            i--;
-            const float b = weight[j];
-            float own = of_point[j];
+    SHARED(float, shared, GROUP);
+    const uint last = min(hw, (GROUP_ID + 1) * SPAN);
+    if (GROUP_ID * SPAN >= hw) return;
+    float sum = 0.0f;
+    for (uint q = GROUP_ID * SPAN + MEMBER; q < last; q += GROUP) {
+        const float16 G = grad_features[q];
+        const float g = has_grad_alpha ? grad_alpha[q] : 0.0f;
+        const uint begin = pixel_offset[q];
+        // depths count from here, so that sums of them keep their digits
+        const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
+        float2 front = 0.0f, behind = 0.0f;  // sums of b and b z of the fragments there
+        uint end = begin;
+        for (; end < pixel_offset[q + 1] && (uint)pixel_weight_point[end] != NONE; end++) {
+            READ_AHEAD(visible_features + point_slot[(uint)pixel_weight_point[end]]);
             if (distortion_weight > 0.0f) {
-                const float z = upper_float(key[j]) - nearest;
-                front -= b * (float2)(1.0f, z);
-                const float distances = z * (front.x - behind.x) - (front.y - behind.y);
-                own += 2.0f * distortion_weight * distances;
-                distortion += b * distances;
-                behind += b * (float2)(1.0f, z);
+                const float z = upper_float(pair_key[end]) - nearest;
+                front += upper_float(pixel_weight_point[end]) * (float2)(1.0f, z);
             }
-            const float dL_db = own + g - B;
-            if (i - begin < tracked)
-                pair_gradient[(uint)key[j]] = (float2)(b, derivative[j] * dL_db);
-            if (b > 0.0f) {
-                T += b;  // in front of this fragment
-                B += b / T * dL_db;
+        }
+        float T = transmittance[q];
+        float B = dot16(G, (float16)(BACKGROUND));
+        for (uint i = end; i > begin;) {
+            ulong key[BATCH];
+            float weight[BATCH], derivative[BATCH], of_point[BATCH];
+            GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
+                const uint at = i - begin > j ? i - 1 - j : begin;
+                const ulong weight_point = pixel_weight_point[at];
+                key[j] = pair_key[at];
+                weight[j] = upper_float(weight_point);
+                derivative[j] = pixel_derivative[at];
+                of_point[j] = dot16(G, visible_features[point_slot[(uint)weight_point]]);
+            }
+            GPU_UNROLLED_FOR (uint j = 0; j < BATCH && i > begin; j++) {
+                i--;
+                const float b = weight[j];
+                float own = of_point[j];
+                if (distortion_weight > 0.0f) {
+                    const float z = upper_float(key[j]) - nearest;
+                    front -= b * (float2)(1.0f, z);
+                    const float distances = z * (front.x - behind.x) - (front.y - behind.y);
+                    own += 2.0f * distortion_weight * distances;
+                    sum += b * distances;
+                    behind += b * (float2)(1.0f, z);
+                }
+                const float dL_db = own + g - B;
+                if (i - begin < tracked)
+                    pair_gradient[(uint)key[j]] = (float2)(b, derivative[j] * dL_db);
+                if (b > 0.0f) {
+                    T += b;  // in front of this fragment
+                    B += b / T * dL_db;
+                }
             }
         }
     }
-    if (distortion_weight > 0.0f) pixel_distortion[q] = distortion;
+    sum = group_sum(sum, shared);
+    if (distortion_weight > 0.0f && MEMBER == 0) distortion[GROUP_ID] = sum;
 }
 
 // One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes
-// the gradients of its features and, the first one, of its opacity, s dL/db by pair with DL_DB, and
-// with MOVES the gradient of its offset, in edges of the grid and as cloud.h has it.
+// the gradients of its features and, the first one, of its opacity, s dL/db by pair with DL_DB, with
+// MOVES the gradient of its offset, in edges of the grid and as cloud.h has it, and the sum of its
+// blend weights if it is the highest so far.
 kernel void blend_backward(
     const uint s,                            // visible points
     const float voxel_size,                  // of the grid, world units
     const float radius,                      // of a point without offsets, world units
+    const int is_recorded,                   // 0: max_weight is not touched
     global const uint *visible,              // (?) their indices, S
     global const float *camera,              // (21) camera.h, read with MOVES, as the next five
     global const float4 *point_camera,       // (N, 4) x, y, z, distance
@@ -194,7 +205,8 @@ kernel void blend_backward(
     global const float16 *grad_features,     // (H, W, 16) G
     global float16 *grad_visible_features,   // (?, 16) alike
     global float *grad_opacity,              // (?) alike
-    global float *grad_offset)               // (?, OFFSETS) alike, with MOVES
+    global float *grad_offset,               // (?, OFFSETS) alike, with MOVES
+    global float *max_weight)                // (N) read and written
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
@@ -205,7 +217,7 @@ kernel void blend_backward(
 #endif
     const float16 feature = DL_DB ? visible_features[g] : 0.0f;
     floats dL_df = 0.0f;
-    float dL_do = 0.0f;
+    float dL_do = 0.0f, weight = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         float2 of_fragment = pair_gradient[pair];
         if (of_fragment.x == 0.0f && of_fragment.y == 0.0f) continue;  // mostly dropped
@@ -217,6 +229,7 @@ kernel void blend_backward(
         }
         dL_df += of_fragment.x * G;
         dL_do += of_fragment.y;
+        weight += of_fragment.x;
 #if MOVES
         const float d = as_float(pair_point_falloff[pair].y);  // 0 at the very rim
         if (ROW_PART == 0 && d > 0.0f && of_fragment.y != 0.0f)
@@ -228,6 +241,8 @@ kernel void blend_backward(
     store_part(dL_df, grad_visible_features, g);
     if (ROW_PART > 0) return;
     grad_opacity[g] = dL_do;
+    // fmax() would hide a NaN
+    if (is_recorded && (weight > max_weight[i] || isnan(weight))) max_weight[i] = weight;
 #if MOVES
     const Offsets offset = FORM > 1 ? OFFSETS_AT(cloud_offset, i) : (Offsets)(0.0f);
     OFFSETS_AT(grad_offset, g) = offset_end(&moved, &cam, voxel_size, radius, offset);

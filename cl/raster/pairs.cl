@@ -4,6 +4,7 @@
 // the list, in any order, instead of the pair.
 #include "common.h"
 #include "raster/footprint.h"
+#include "scan.h"
 
 #if LANES > 1
 #define BESIDE_DEPTH(pixel, pair) (pair)
@@ -50,50 +51,45 @@ ALWAYS_INLINE Footprints footprints_load(
     return f;
 }
 
-// One work-item per LANES points: finds their fragments again (project.cl counted them) and writes
-// them as pairs; does nothing where not all of them have room.
+// Finds the fragments of `count` points from `first` on again (project.cl counted them), and writes
+// them as pairs from `offset` on.
 //
 // A compiler that rounds otherwise here than in project.cl finds one fragment more or less of a
 // point in a million: one too many is left out, one that is missing becomes a pair without weight.
-kernel void pairs_fill(
-    const uint n,                       // points
-    const uint p,                       // capacity, in pairs
-    global const float *camera,         // (21) camera.h
-    global const float4 *point_camera,  // (N, 4) x, y, z, t
-    global const float *point_shape,    // (N, SHAPE) footprint.h
-    global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
-    global const uint *point_offset,    // (N+1) first pair of each point
-    global uint *pair_pixel,            // (P)
-    global uint2 *pair_point_falloff,   // (P, 2) point, bits of d in [0, 1]
-    global ulong *point_key,            // (P) depth << 32 | pair, on GPUs place, by point
-    global volatile uint *pixel_count)  // (?) (HW) accumulates on GPUs, else untouched
-{
-    const uint first = get_global_id(0) * LANES;
-    if (first >= n || point_offset[n] > p) return;
-    const uint count = min((uint)LANES, n - first);
-    if (point_offset[first] == point_offset[first + count]) return;
-    const Camera cam = camera_load(camera);
+ALWAYS_INLINE void fill(
+    const Camera *cam,
+    const uint first,
+    const uint count,
+    uint offset,
+    global const float4 *point_camera,
+    global const float *point_shape,
+    global const ushort4 *point_box,
+    global const uint *point_count,
+    global uint *pair_pixel,
+    global uint2 *pair_point_falloff,
+    global ulong *point_key,
+    global volatile uint *pixel_count) {
     const Footprints f = footprints_load(first, count, point_camera, point_shape, point_box);
-    const Rim rim = footprints_rim(&cam, &f);
+    const Rim rim = footprints_rim(cam, &f);
     // of each point: its next pair, where they end, the first pixel of its box
     uint next[LANES], end[LANES], corner[LANES];
     for (uint j = 0; j < count; j++) {
-        next[j] = point_offset[first + j];
-        end[j] = point_offset[first + j + 1];
-        corner[j] = f.box[1][j] * cam.width + f.box[0][j];
+        next[j] = offset;
+        offset = end[j] = offset + point_count[first + j];
+        corner[j] = f.box[1][j] * cam->width + f.box[0][j];
     }
     int row = 0, column = 0;
     while (row < f.rows) {
         // first a few pixels of all points, then what each point covers: its pairs lie together
         float falloff[CELLS][LANES], depth[CELLS][LANES];
-        uint offset[CELLS], fragments[LANES];
+        uint beside[CELLS], fragments[LANES];
         uints found = 0;
         for (uint k = 0; k < CELLS && row < f.rows; k++) {
             const Coverage c = footprints_test(&f, &rim, column, row);
             found |= select((uints)(0), (uints)(1u << k), c.covers);
             LANES_INTO(falloff[k], c.falloff);
             LANES_INTO(depth[k], c.depth);
-            offset[k] = row * cam.width + column;
+            beside[k] = row * cam->width + column;
             if (++column == f.columns) {
                 column = 0;
                 row++;
@@ -103,7 +99,7 @@ kernel void pairs_fill(
         for (uint j = 0; j < count; j++)
             for (uint left = fragments[j]; left && next[j] < end[j]; left &= left - 1) {
                 const uint k = 31 - clz(left & -left), pair = next[j]++;
-                const uint pixel = corner[j] + offset[k];
+                const uint pixel = corner[j] + beside[k];
                 pair_pixel[pair] = pixel;
                 pair_point_falloff[pair] = (uint2)(first + j, as_uint(falloff[k][j]));
                 point_key[pair] = upsample(as_uint(depth[k][j]), BESIDE_DEPTH(pixel, pair));
@@ -116,4 +112,52 @@ kernel void pairs_fill(
             pair_point_falloff[pair] = (uint2)(first + j, as_uint(0.0f));
             point_key[pair] = upsample(as_uint(depth), BESIDE_DEPTH(corner[j], pair));
         }
+}
+
+// GROUP work-items per block of BLOCK points: find where the pairs of each begin and, where all have
+// room, write them, and count the view for points that have any.
+kernel void pairs_fill(
+    const uint n,                       // points
+    const uint p,                       // capacity, in pairs
+    const int is_counted,               // 0: times_seen is not touched
+    global const float *camera,         // (21) camera.h
+    global const float4 *point_camera,  // (N, 4) x, y, z, t
+    global const float *point_shape,    // (N, SHAPE) footprint.h
+    global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
+    global const uint *point_count,     // (N) fragments
+    global const uint *block_sum,       // ((N+BLOCK-1)/BLOCK) of them
+    global uint *point_offset,          // (N+1) first pair of each point
+    global uint *pair_pixel,            // (P)
+    global uint2 *pair_point_falloff,   // (P, 2) point, bits of d in [0, 1]
+    global ulong *point_key,            // (P) depth << 32 | pair, on GPUs place, by point
+    global float *times_seen,           // (N) accumulates
+    global volatile uint *pixel_count)  // (?) (HW) accumulates on GPUs, else untouched
+{
+    SHARED(uint, shared, 2 * GROUP);
+    const uint begin = GROUP_ID * BLOCK, end = min(n, begin + BLOCK);
+    if (begin >= n) return;
+    BLOCK_SUMS(sums, GROUP_ID, (n + BLOCK - 1) / BLOCK, block_sum, shared)
+    const Camera cam = camera_load(camera);
+    uint behind = sums.before;  // where the pairs of the points so far end
+    for (uint run = begin; run < end; run += GROUP * LANES) {
+        const uint first = run + MEMBER * LANES,
+                   count = first < end ? min((uint)LANES, end - first) : 0;
+        uint fragments = 0, of_run;
+        for (uint j = 0; j < count; j++)
+            fragments = add_sat(fragments, point_count[first + j]);
+        const uint offset = add_sat(behind, group_scan(fragments, shared, &of_run));
+        behind = add_sat(behind, of_run);
+        uint next = offset;
+        for (uint j = 0; j < count; j++) {
+            point_offset[first + j] = next;
+            next = add_sat(next, point_count[first + j]);
+        }
+        if (fragments == 0 || sums.all > p) continue;
+        for (uint j = 0; is_counted && j < count; j++)
+            if (point_count[first + j] > 0) times_seen[first + j] += 1.0f;
+        fill(
+            &cam, first, count, offset, point_camera, point_shape, point_box, point_count,
+            pair_pixel, pair_point_falloff, point_key, pixel_count);
+    }
+    if (end == n && MEMBER == 0) point_offset[n] = behind;
 }

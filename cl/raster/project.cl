@@ -5,6 +5,7 @@
 #include "grid.h"
 #include "lanes.h"
 #include "cloud.h"
+#include "scan.h"
 #include "sh.h"
 #include "raster/footprint.h"
 
@@ -62,9 +63,9 @@ ALWAYS_INLINE ints count_fragments(const Camera *cam, const Footprints *f) {
 }
 
 // Projects `count` points and writes them from `first` on: positions in camera axes, shapes, boxes
-// and numbers of fragments; of points of which none covers a pixel, only these numbers, and it
-// returns false.
-ALWAYS_INLINE bool project_points(
+// and numbers of fragments, whose sum it returns; of points of which none covers a pixel, only these
+// numbers.
+ALWAYS_INLINE uint project_points(
     const Camera *cam,
     const floats x,
     const floats y,
@@ -81,8 +82,9 @@ ALWAYS_INLINE bool project_points(
     if (!project(cam, x, y, z, radius, form, &f)) {
         for (uint j = 0; j < count; j++)
             point_count[first + j] = 0;
-        return false;
+        return 0;
     }
+    uint sum = 0;
     float place[4][LANES], shape[SHAPE][LANES];
     int fragments[LANES];
     LANES_INTO(place[0], f.x);
@@ -99,8 +101,9 @@ ALWAYS_INLINE bool project_points(
             point_shape[SHAPE * i + k] = shape[k][j];
         point_box[i] = (ushort4)(f.box[0][j], f.box[1][j], f.box[2][j], f.box[3][j]);
         point_count[i] = fragments[j];
+        sum = add_sat(sum, (uint)fragments[j]);
     }
-    return true;
+    return sum;
 }
 
 // Whether all points of a brick miss the image, wherever they are in their cells. id: of one of
@@ -156,34 +159,28 @@ ALWAYS_INLINE void opacities_from_eye(
         point_opacity[first + j] = found[j];
 }
 
-// One work-item per LANES points: reads their grid indices, offsets and opacities, writes their
-// numbers of fragments and, if any is above 0, their camera-space positions and distances, shapes,
-// boxes and opacities from the eye.
-kernel void project_grid(
-    const uint n,                      // points
-    global const float *camera,        // (21) camera.h
-    global const float *grid,          // (8) grid.h
-    global const uint *point_id,       // (N)
-    const float radius,                // of a point without offsets, world units
-    global const float *cloud_offset,  // (N, OFFSETS) cloud.h
-    global const float *opacity,       // (N, OPACITIES) cloud.h
-    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
-    global float *point_shape,         // (N, SHAPE) footprint.h
-    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
-    global uint *point_count,   // (N)
-    global float *point_opacity)  // (N) from the eye
-{
-    const uint first = get_global_id(0) * LANES;
-    if (first >= n) return;
-    const uint count = min((uint)LANES, n - first);
-    const Camera cam = camera_load(camera);
+// Reads the grid indices, offsets and opacities of `count` points from `first` on, writes what
+// project_grid says of them and returns the sum of their fragments.
+ALWAYS_INLINE uint project_vertices(
+    const Camera *cam,
+    const uint first,
+    const uint count,
+    global const float *grid,
+    global const uint *point_id,
+    const float radius,
+    global const float *cloud_offset,
+    global const float *opacity,
+    global float4 *point_camera,
+    global float *point_shape,
+    global ushort4 *point_box,
+    global uint *point_count,
+    global float *point_opacity) {
     // most points of a crop lie beside it
     const uint one = point_id[first], other = point_id[first + count - 1];
-    if (LANES > 1 && (one ^ other) >> 3 * BRICK_BITS == 0 &&
-        brick_misses(&cam, grid, one, radius)) {
+    if (LANES > 1 && (one ^ other) >> 3 * BRICK_BITS == 0 && brick_misses(cam, grid, one, radius)) {
         for (uint j = 0; j < count; j++)
             point_count[first + j] = 0;
-        return;
+        return 0;
     }
     uint id[LANES];
     float offset[3 + FORM][LANES];
@@ -209,14 +206,50 @@ kernel void project_grid(
     const floats px = grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0]));
     const floats py = grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1]));
     const floats pz = grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2]));
-    if (project_points(
-            &cam, px, py, pz, LOGS == 1 ? form[0] : radius, form, first, count, point_camera,
-            point_shape, point_box, point_count))
+    const uint fragments = project_points(
+        cam, px, py, pz, LOGS == 1 ? form[0] : radius, form, first, count, point_camera,
+        point_shape, point_box, point_count);
+    if (fragments > 0)
         opacities_from_eye(
-            px - cam.eye.x, py - cam.eye.y, pz - cam.eye.z, first, count, opacity, point_opacity);
+            px - cam->eye.x, py - cam->eye.y, pz - cam->eye.z, first, count, opacity,
+            point_opacity);
+    return fragments;
 }
 
-// One work-item per LANES spheres: reads their positions and radii, writes the same as
+// GROUP work-items per block of BLOCK points: read their grid indices, offsets and opacities, write
+// their numbers of fragments and the sum of these and, of LANES points of which any has one, their
+// camera-space positions and distances, shapes, boxes and opacities from the eye.
+kernel void project_grid(
+    const uint n,                      // points
+    global const float *camera,        // (21) camera.h
+    global const float *grid,          // (8) grid.h
+    global const uint *point_id,       // (N)
+    const float radius,                // of a point without offsets, world units
+    global const float *cloud_offset,  // (N, OFFSETS) cloud.h
+    global const float *opacity,       // (N, OPACITIES) cloud.h
+    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
+    global float *point_shape,         // (N, SHAPE) footprint.h
+    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
+    global uint *point_count,   // (N)
+    global uint *block_sum,     // ((N+BLOCK-1)/BLOCK) of point_count
+    global float *point_opacity)  // (N) from the eye
+{
+    SHARED(uint, shared, 2 * GROUP);
+    const uint begin = GROUP_ID * BLOCK, end = min(n, begin + BLOCK);
+    if (begin >= n) return;
+    const Camera cam = camera_load(camera);
+    uint sum = 0, total;
+    for (uint first = begin + MEMBER * LANES; first < end; first += GROUP * LANES)
+        sum = add_sat(
+            sum,
+            project_vertices(
+                &cam, first, min((uint)LANES, end - first), grid, point_id, radius, cloud_offset,
+                opacity, point_camera, point_shape, point_box, point_count, point_opacity));
+    group_scan(sum, shared, &total);
+    if (MEMBER == 0) block_sum[GROUP_ID] = total;
+}
+
+// GROUP work-items per block of BLOCK spheres: read their positions and radii, write the same as
 // project_grid.
 kernel void project_spheres(
     const uint n,                      // spheres
@@ -226,25 +259,33 @@ kernel void project_spheres(
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled
     global float *point_shape,         // (N, SHAPE) footprint.h
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
-    global uint *point_count)   // (N)
+    global uint *point_count,   // (N)
+    global uint *block_sum)     // ((N+BLOCK-1)/BLOCK) of point_count
 {
-    const uint first = get_global_id(0) * LANES;
-    if (first >= n) return;
-    const uint count = min((uint)LANES, n - first);
+    SHARED(uint, shared, 2 * GROUP);
+    const uint begin = GROUP_ID * BLOCK, end = min(n, begin + BLOCK);
+    if (begin >= n) return;
     const Camera cam = camera_load(camera);
-    float x[LANES], y[LANES], z[LANES], radius[LANES];
-    for (uint j = 0; j < LANES; j++) {
-        const uint i = first + min(j, count - 1);
-        x[j] = positions[3 * i];
-        y[j] = positions[3 * i + 1];
-        z[j] = positions[3 * i + 2];
-        radius[j] = point_radius[i];
+    uint sum = 0, total;
+    for (uint first = begin + MEMBER * LANES; first < end; first += GROUP * LANES) {
+        const uint count = min((uint)LANES, end - first);
+        float x[LANES], y[LANES], z[LANES], radius[LANES];
+        for (uint j = 0; j < LANES; j++) {
+            const uint i = first + min(j, count - 1);
+            x[j] = positions[3 * i];
+            y[j] = positions[3 * i + 1];
+            z[j] = positions[3 * i + 2];
+            radius[j] = point_radius[i];
+        }
+        const floats radii = LANES_FROM(radius);
+        floats form[FORM];
+        GPU_UNROLLED_FOR (uint k = 0; k < FORM; k++)
+            form[k] = k < LOGS ? radii : 0.0f;
+        sum = add_sat(
+            sum, project_points(
+                     &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), radii, form, first, count,
+                     point_camera, point_shape, point_box, point_count));
     }
-    const floats radii = LANES_FROM(radius);
-    floats form[FORM];
-    GPU_UNROLLED_FOR (uint k = 0; k < FORM; k++)
-        form[k] = k < LOGS ? radii : 0.0f;
-    project_points(
-        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), radii, form, first, count, point_camera,
-        point_shape, point_box, point_count);
+    group_scan(sum, shared, &total);
+    if (MEMBER == 0) block_sum[GROUP_ID] = total;
 }

@@ -2,6 +2,7 @@
 // host) and exponential moving averages (EMA).
 #include "common.h"
 #include "lanes.h"
+#include "layers/parts.h"
 
 // 1 - beta; 1 - 0.999f would be off by 1e-5 of itself
 #ifndef DECAY1
@@ -11,27 +12,30 @@
 #define DECAY2 0.001f
 #endif
 
-// One work-item per LANES values: moves a parameter and its two moments one step.
+// One work-item per part of a row of parts.h, where the parts of the gradients are: moves LANES
+// parameters and their two moments one step.
 kernel void adam_update(
-    const uint n,              // values
-    const float rate,          // learning rate * sqrt(1 - beta2^t) / (1 - beta1^t)
-    const float eps,           // eps * sqrt(1 - beta2^t)
-    global const float *grad,  // (...) n values, as the next three
-    global float *parameter,   // (...)
-    global float *m,           // (...) first moment
-    global float *v)           // (...) second moment
+    const uint n,  // rows of partial, of one part of all weights
+    const uint rows,
+    const float rate,               // learning rate * sqrt(1 - beta2^t) / (1 - beta1^t)
+    const float eps,                // eps * sqrt(1 - beta2^t)
+    global const int *table,        // (rows, 8) parts.h
+    global const float16 *partial,  // (...) as there
+    global float16 *parameter,      // (...) of all weights and biases
+    global float16 *m,              // (...) first moment
+    global float16 *v)              // (...) second moment
 {
-    const size_t i = LANES * get_global_id(0);
-    if (i >= n) return;
-    const int count = min(n - (uint)i, (uint)LANES);
-    const floats g = load_lanes(grad + i, count);
-    floats m_new = load_lanes(m + i, count), v_new = load_lanes(v + i, count);
+    const int item = get_global_id(0) / ROW_PARTS;
+    if (item >= n) return;
+    const Sum found = sum_of(table, rows, partial, item);
+    const floats g = found.sum;
+    floats m_new = load_part(m, found.at), v_new = load_part(v, found.at);
     m_new += DECAY1 * (g - m_new);
     v_new += DECAY2 * (g * g - v_new);
-    store_lanes(m_new, m + i, count);
-    store_lanes(v_new, v + i, count);
-    const floats moved = load_lanes(parameter + i, count) - rate * m_new / (sqrt(v_new) + eps);
-    store_lanes(moved, parameter + i, count);
+    store_part(m_new, m, found.at);
+    store_part(v_new, v, found.at);
+    store_part(
+        load_part(parameter, found.at) - rate * m_new / (sqrt(v_new) + eps), parameter, found.at);
 }
 
 // One work-item per LANES values: moves an EMA towards a parameter.

@@ -201,24 +201,6 @@ kernel void loss_gradient(
     if (MEMBER == 0) terms[v + row] = sum;
 }
 
-// GROUP work-items per row of the prediction: sum what its pixels give to the distortion loss.
-kernel void loss_distortion(
-    const uint v,   // rows of windows
-    const uint ph,  // prediction
-    const uint pw,
-    global const float *pixel_distortion,  // (PH * PW)
-    global float4 *terms)                  // (?, 4) rows V + PH to V + 2 PH - 1: the sum; 0
-{
-    SHARED(float, shared, GROUP);
-    const uint y = GROUP_ID;
-    if (y >= ph) return;
-    float sum = 0.0f;
-    for (uint x = MEMBER; x < pw; x += GROUP)
-        sum += pixel_distortion[y * pw + x];
-    sum = group_sum(sum, shared);
-    if (MEMBER == 0) terms[v + ph + y] = (float4)(sum, 0.0f, 0.0f, 0.0f);
-}
-
 // One work-item per target pixel: where it is ignored, the target becomes what was rendered, of
 // which the loss is 0, and its alpha -1.
 kernel void ignore_target(

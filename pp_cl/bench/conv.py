@@ -17,6 +17,7 @@ from pp_cl.engine.layers.conv import (
     Blocking,
     Conv,
     ConvShape,
+    gradient_parts,
     pack_bias,
     pack_weights,
     sum_parts,
@@ -139,7 +140,7 @@ class UploadedLayer:
             conv, parts, grad_out, self.grad_parts, masks=masks, tiles=tiles, grad_tiles=tiles
         )
         grads = self.grad_weight, self.grad_bias
-        sum_parts(dev, [(conv, count)], self.table, conv.partial, *grads)
+        sum_parts(dev, gradient_parts([(conv, count)], self.table, conv.partial), *grads)
 
 
 def layer_errors(layer: Layer, computed: list[np.ndarray], result: str) -> tuple[float, float]:

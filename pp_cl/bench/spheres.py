@@ -6,9 +6,8 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs
-from pp_cl.engine.raster.project import ProjectedPoints, projection_program, projection_table
+from pp_cl.engine.raster.project import ProjectedPoints, launch_projection, projection_table
 from pp_cl.engine.raster.weights import BlendWeights
 
 
@@ -24,36 +23,31 @@ def project_spheres(
     """Project points anywhere. positions: (N, 3) float32, world. point_radius: (N,)."""
     n = len(positions)
     b.require(projection_table(n, footprint))
-    program = projection_program(dev, footprint)
-    program.launch(
-        "project_spheres",
-        -(-n // lanes(dev)),
-        n=n,
-        camera=camera_buffer,
-        positions=positions,
-        point_radius=point_radius,
-        point_camera=b.point_camera,
-        point_shape=b.point_shape,
-        point_box=b.point_box,
-        point_count=b.point_count,
-    )
+    arrays = {"camera": camera_buffer, "positions": positions, "point_radius": point_radius}
+    launch_projection(dev, b, "project_spheres", n, footprint, **arrays)
     return ProjectedPoints(
         footprint,
         camera_buffer,
         b.point_camera,
         b.point_box,
         b.point_count,
+        b.block_sum,
         b.point_shape,
         b.point_opacity,
     )
 
 
 def find_all_pairs(
-    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], capacity: int = 1
+    dev: Device,
+    b: Buffers,
+    points: ProjectedPoints,
+    size: tuple[int, int],
+    capacity: int = 1,
+    times_seen: Array | None = None,
 ) -> Pairs:
-    """The fragments in an image of size (height, width); `capacity` is tried first."""
+    """What find_pairs() returns with room for all; `capacity` is tried first."""
     while True:
-        pairs = find_pairs(dev, b, points, size, capacity)
+        pairs = find_pairs(dev, b, points, size, capacity, times_seen)
         pairs.read_count(dev)
         capacity = capacity_needed(pairs)
         if capacity == pairs.capacity:

@@ -69,7 +69,7 @@ def network_runner(net: UNet, x: Array, grad_image: Array | None = None) -> Call
     def run():
         net.forward(x, training=grad_image is not None)
         if grad_image is not None:
-            net.backward(grad_image)
+            net.sum_gradients(net.backward(grad_image)[1])
         net.dev.finish()
 
     return run
@@ -92,8 +92,8 @@ def network_errors(
     parameters = plain_parameters(net, net.parameters)
     image = net.forward(dev.upload(outputs["x"], np.float32)).get()
     active = {layer.name: net.output(layer.name).get() > 0 for layer in net.layers if layer.relu}
-    actual = {"x": net.backward(dev.upload(grad_image)).get()}
-    actual |= plain_parameters(net, net.gradients)
+    grad_x, parts = net.backward(dev.upload(grad_image))
+    actual = {"x": grad_x.get()} | plain_parameters(net, net.sum_gradients(parts))
     expected = reference.network_gradients(
         net.layers, parameters, outputs, active, grad_image=grad_image
     )

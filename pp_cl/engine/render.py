@@ -18,6 +18,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import Prepared
+from pp_cl.engine.layers.conv import GradientParts
 from pp_cl.engine.layers.tiles import tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
@@ -145,7 +146,7 @@ class Renderer:
         """Free the buffers; the next view makes them anew."""
         self.model.net.release()
         self._buffers = Buffers(self.dev)
-        self._launches = {name: Prepared(self.dev) for name in ("project", "pairs", "weights")}
+        self._launches = {name: Prepared(self.dev) for name in ("project", "pairs", "weights", "blend")}
 
     def forward(
         self,
@@ -157,6 +158,7 @@ class Renderer:
         depth_range: tuple[float, float] | None = None,
         training: bool = False,
         gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
+        times_seen: Array | None = None,
     ) -> RenderResult:
         """Render a camera, which is padded to multiples of net.multiple pixels.
 
@@ -165,7 +167,7 @@ class Renderer:
         the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
         softmax needs the model's.
         training: keep what backward() needs. gradient_tiles: returns that argument of
-        UNet.plan_tiles(); called after the wait for the device.
+        UNet.plan_tiles(); called after the wait for the device. times_seen: of find_pairs().
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         padded, left, top = camera.padded(net.multiple)
@@ -193,7 +195,7 @@ class Renderer:
                 radius=self.point_radius,
             )
         pairs, weights, tile_mask = self._pairs_and_weights(
-            points, size, gamma, early_stop, training
+            points, size, gamma, early_stop, training, times_seen
         )
         result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tile_mask)
         if until == "weights":
@@ -208,7 +210,8 @@ class Renderer:
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
         with dev.stage("blend"):
-            blend_forward(dev, pairs, weights, b.visible_features, b.features)
+            blend = partial(blend_forward, dev)
+            self._launches["blend"].run(blend, pairs, weights, b.visible_features, b.features)
         result.visible_features, result.features = b.visible_features, b.features
         if until == "features":
             return result
@@ -220,7 +223,7 @@ class Renderer:
             result.image = net.forward(b.features, training, plan)
         return result
 
-    def _pairs_and_weights(self, points, size, gamma, early_stop, training):
+    def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen):
         """(Pairs, BlendWeights, RenderResult.tile_mask). Both stages are enqueued before the number
         of pairs is known, and run again with more capacity if it was too small.
         """
@@ -229,7 +232,7 @@ class Renderer:
             with self.dev.stage("pairs"):
                 find = partial(find_pairs, self.dev, b)
                 capacity = self._capacity[by_pair]
-                pairs = self._launches["pairs"].run(find, points, size, capacity)
+                pairs = self._launches["pairs"].run(find, points, size, capacity, times_seen)
                 pairs.read_count(self.dev)
             with self.dev.stage("weights"):
                 weights = self._launches["weights"].run(
@@ -254,13 +257,15 @@ class Renderer:
             del pairs, weights  # else their arrays would stay beside the larger ones
             self._launches |= {name: Prepared(self.dev) for name in ("pairs", "weights")}
 
-    def backward(self, result: RenderResult, grad_image: Array, **options: Any) -> BlendGradients:
-        """What backward_features() returns, from dL/dimage of result.image. The gradients of the
-        network's parameters are left in model.net.gradients. options: of backward_features().
+    def backward(
+        self, result: RenderResult, grad_image: Array, **options: Any
+    ) -> tuple[BlendGradients, GradientParts | None]:
+        """(what backward_features() returns, the network's part of what UNet.backward() does), from
+        dL/dimage of result.image. options: of backward_features().
         """
         with self.dev.stage("network backward"):
-            grad_features = self.model.net.backward(grad_image)
-        return self.backward_features(result, grad_features, **options)
+            grad_features, parts = self.model.net.backward(grad_image)
+        return self.backward_features(result, grad_features, **options), parts
 
     def backward_features(
         self,
@@ -270,11 +275,12 @@ class Renderer:
         grad_alpha: Array | None = None,
         distortion_weight: float = 0.0,
         with_offsets: bool = False,
+        max_weight: Array | None = None,
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
         alpha compositing also from dL/dalpha (H * W,), and of the distortion loss of each pixel
         with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
-        points are composited by alpha, there are none of offsets.
+        points are composited by alpha, there are none of offsets. max_weight: of blend_backward().
 
         result: of the last forward(training=True). The gradients of the SH coefficients are those
         of the visible points' features times the basis functions in the view's direction; the
@@ -296,6 +302,7 @@ class Renderer:
                 grad_alpha=grad_alpha,
                 distortion_weight=distortion_weight,
                 voxel_size=self.model.grid.voxel_size if moves else 0.0,
+                max_weight=max_weight,
             )
 
     def blend(self, result: RenderResult, features: np.ndarray) -> np.ndarray:
@@ -328,17 +335,11 @@ class Renderer:
         times_seen: Array,
         *,
         least: float = 0.0,
-        gradients: BlendGradients | None = None,
     ) -> None:
-        """Update what pruning looks at by the last forward(), see raster/weights.py. gradients: of
-        its backward pass, if there was one.
-        """
-        dev, pairs, weights = self.dev, result.pairs, result.weights
-        if gradients:
-            listed = gradients.pair_gradient
-        else:
-            listed = list_weights(dev, self._buffers, pairs, weights)
-        record_weights(dev, pairs, weights, listed, max_weight, times_seen, least)
+        """Update what pruning looks at by the last forward(), see raster/weights.py."""
+        pairs, weights = result.pairs, result.weights
+        listed = list_weights(self.dev, self._buffers, pairs, weights)
+        record_weights(self.dev, pairs, weights, listed, max_weight, times_seen, least)
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of forward()."""

@@ -109,7 +109,11 @@ class Trainer:
             ignored = None if says_nothing is None else self._sent(says_nothing)
 
         rendered = self.renderer.forward(
-            crop.camera, self.gamma, training=True, gradient_tiles=find_gradient_tiles
+            crop.camera,
+            self.gamma,
+            training=True,
+            gradient_tiles=find_gradient_tiles,
+            times_seen=self.state.times_seen,
         )
         with self.dev.stage("loss"):
             if self.exposure:
@@ -119,30 +123,27 @@ class Trainer:
         # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * self.model.grid.diagonal
         distortion_weight = self._rising(train.distortion_weight if self._composited else 0.0)
-        gradients = self.renderer.backward(
+        gradients, network_parts = self.renderer.backward(
             rendered,
             grad_image,
             grad_alpha=grad_alpha,
             distortion_weight=distortion_weight / all_depths,
             with_offsets=rates.offset > 0,
+            max_weight=self.state.max_weight,
         )
         if distortion_weight > 0:
-            self.loss.add_distortion(gradients.pixel_distortion, distortion_weight, 1 / all_depths)
+            self.loss.add_distortion(gradients.distortion, distortion_weight, 1 / all_depths)
 
         with self.dev.stage("update"):
             self.optimiser.update(
                 self.step + 1 - self.begun,
                 rates,
                 gradients,
+                network_parts,
                 points=rendered.points,
                 visible=rendered.weights.visible_rows,
                 count=rendered.weights.total.get(),
                 sh_eps=train.sh_eps / target.size,
-            )
-        with self.dev.stage("max weights"):
-            state = self.state
-            self.renderer.record_weights(
-                rendered, state.max_weight, state.times_seen, gradients=gradients
             )
         self.step += 1
         self.check()
@@ -167,7 +168,8 @@ class Trainer:
         if ignored is not None:
             ignore_target(self.dev, ignored, image, target, alpha, offset)
         alphas, transmittance = None, rendered.weights.transmittance  # None of a softmax
-        if transmittance is not None and self.loss.mask_weight > 0 and crop.view.has_mask:
+        has_mask = self.views[crop.view_index].has_mask  # known, of crop.view it is not
+        if transmittance is not None and self.loss.mask_weight > 0 and has_mask:
             alphas = transmittance, alpha
         grad_image, grad_alpha = self.loss.forward_backward(
             image, target, *offset, alphas=alphas, shortfall=self._rising(1.0)

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from pp_cl.engine.grid import Grid
+from pp_cl.engine.raster.blend import SPAN
 from pp_cl.engine.raster.project import FOOTPRINTS
 from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.reference import dense
@@ -276,7 +277,8 @@ def _distortion(dev, rng):
         yield relative(gradients["opacity"], expected, GRADIENT)
         yield exact(gradients["features"], np.zeros((n, 16)))
         distortion = dense.distortion(blended.geometry, blended.blend)
-        yield relative(blended.scene.backward.pixel_distortion.get(), distortion, GRADIENT)
+        runs = np.add.reduceat(distortion, range(0, len(distortion), SPAN))
+        yield relative(blended.scene.backward.distortion.get(), runs, GRADIENT)
 
 
 def _of_both(what, function):

@@ -5,11 +5,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from pyopencl.array import Array
 
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
+from pp_cl.engine.layers.conv import GradientParts
 from pp_cl.engine.raster.points import SH_DEGREES, PointCloud, offset_width
 from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.engine.training.optim import POINT_EPS, adam_update, ema_update, rmsprop_update
@@ -110,7 +110,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     towards = positions - camera.eye
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
-    absent = (dev.zeros((1,)),) * 5
+    absent = (dev.zeros((1,)),) * 6
     return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
@@ -132,8 +132,8 @@ def _adam(dev, rng):
             twin, parameter, state = adam_steps(dev, start, grads, rate=0.01, eps=eps)
             # the parameter is rounded in each step, by half EPS of its size; rarely the same way
             yield relative(parameter, twin.parameter, 3e-7)
-            yield each(state["m"].get(), twin.m, 8 * EPS, floor=1e-3)
-            yield each(state["v"].get(), twin.v, 8 * EPS)
+            yield each(state["m"], twin.m, 8 * EPS, floor=1e-3)
+            yield each(state["v"], twin.v, 8 * EPS)
     _, parameter, _ = adam_steps(dev, np.zeros(257), np.full((1, 257), -3e-4), rate=0.5, eps=1e-15)
     # what 1 - beta2 in float32 would miss by 7e-6
     yield each(parameter, np.full(257, 0.5), 4e-7)
@@ -141,14 +141,23 @@ def _adam(dev, rng):
 
 def adam_steps(
     dev: Device, start: np.ndarray, grads: np.ndarray, **options: Any
-) -> tuple[optim.Adam, np.ndarray, dict[str, Array]]:
-    """(float64 twin, parameter, moments) after a step with each gradient."""
-    parameter = dev.upload(start, np.float32)
-    twin, state = optim.Adam(parameter.get()), {kind: dev.zeros(parameter.shape) for kind in "mv"}
+) -> tuple[optim.Adam, np.ndarray, dict[str, np.ndarray]]:
+    """(float64 twin, parameters, moments "m" and "v") after a step with each gradient, halved and
+    in two parts: of weights, and the last 16 of biases.
+    """
+    n, rows = grads.shape[1], -(-grads.shape[1] // 16)
+    whole = np.zeros((16 * rows,), np.float32)
+    whole[:n] = start
+    parameter, moments = dev.upload(whole), {kind: dev.zeros(whole.shape) for kind in "mv"}
+    twin, partial = optim.Adam(whole[:n].copy()), np.zeros((2, rows, 16), np.float32)
+    table = dev.upload([[0, rows, 1, 2, 0, 0, rows - 1, 1]], np.int32)
     for step, grad in enumerate(grads.astype(np.float32), 1):
-        adam_update(dev, parameter, dev.upload(grad), state, step=step, **options)
+        partial.reshape(2, -1)[:, :n] = 0.5 * grad, 1.5 * grad
+        parts = GradientParts(rows, table, dev.upload(partial.ravel()))
+        adam_update(dev, parameter, parts, moments, step=step, **options)
         twin.step(grad, **options)
-    return twin, parameter.get(), state
+    found = {kind: array.get()[:n] for kind, array in moments.items()}
+    return twin, parameter.get()[:n], found
 
 
 def _adam_extremes(dev, rng):
@@ -162,7 +171,7 @@ def _adam_extremes(dev, rng):
     start = rng.standard_normal(33).astype(np.float32)
     _, parameter, state = adam_steps(dev, start, np.zeros((3, 33)), rate=0.5, eps=1e-15)
     yield exact(parameter, start)
-    yield exact(state["v"].get(), np.zeros(33))
+    yield exact(state["v"], np.zeros(33))
 
 
 def _rmsprop(degree, dev, rng):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pyopencl.array import Array
 
 from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
 from pp_cl.engine.camera import Camera, look_at
@@ -75,7 +76,8 @@ class PairedPoints:
         self.dev, self.camera, self.n, self.buffers = dev, camera, n, buffers
         self._exact, self.depth_range = exact, depth_range
         self.shape, self.projected = (camera.height, camera.width), projected
-        self.pairs = find_all_pairs(dev, buffers, projected, self.shape)
+        self.times_seen = dev.zeros((n,))
+        self.pairs = find_all_pairs(dev, buffers, projected, self.shape, times_seen=self.times_seen)
 
     @property
     def seen(self) -> np.ndarray:
@@ -156,6 +158,7 @@ class PairedPoints:
         grad_alpha: np.ndarray | None = None,
         distortion_weight: float = 0.0,
         voxel_size: float = 0.0,
+        max_weight: Array | None = None,
     ) -> Gradients:
         """{"features": (N, 16), "opacity": (N,), on a grid of a voxel size "offset": (N, 4)} of
         sum(features * grad_features), sum(alpha * grad_alpha) and the weighted distortion loss.
@@ -173,6 +176,7 @@ class PairedPoints:
             grad_alpha=None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32),
             distortion_weight=distortion_weight,
             voxel_size=voxel_size,
+            max_weight=max_weight,
         )
         rows = {"features": found.visible_features, "opacity": found.opacity}
         if found.offset is not None:

@@ -156,6 +156,7 @@ def _check_pairs(scene, expected):
     inner = pixels[1:] == pixels[:-1]
     yield exact((keys[1:] > keys[:-1])[inner], np.ones(inner.sum(), bool))
     yield exact(scene.seen, np.flatnonzero(fragments.any(axis=1)))
+    yield exact(scene.times_seen.get(), fragments.any(axis=1).astype(np.float32))
 
 
 def _equal_depths(dev, rng):
@@ -242,7 +243,9 @@ def _depths(dev, scene):
 
 
 def _record(rule, dev, rng):
-    """The highest weight of each point, and how often it was seen, by the tracked fragments."""
+    """The highest weight of each point, also as the backward pass finds it, and how often it was
+    seen, by the tracked fragments.
+    """
     drops = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **drops)
     before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
@@ -258,10 +261,11 @@ def _record(rule, dev, rng):
     yield exact(seen.get(), weight > least)
     is_visible = np.isin(scene.pair_points(), scene.weights.visible.get())
     weights = listed.get()[: scene.pairs.total, 0][is_visible]
-    blended.gradients()
+    scene.gradients(blended.grad, max_weight=before)
     left = scene.backward.pair_gradient.get()[: scene.pairs.total, 0]
     yield exact(left[is_visible], weights)
-    yield relative(highest.get(), np.maximum(before.get(), weight), PLACED)
+    yield relative(highest.get(), np.maximum(2e-3 * np.arange(500), weight), PLACED)
+    yield exact(before.get(), highest.get())
 
 
 CASES = (

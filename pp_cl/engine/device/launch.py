@@ -59,19 +59,21 @@ def launch_groups(
     kernel: str,
     groups: int,
     *,
-    defines: dict[str, int] | None = None,
+    most: int = LARGEST_GROUP,
+    defines: dict[str, Any] | None = None,
     **arguments,
 ) -> None:
     """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times, each
     a work-group. A GPU's compiler may allow fewer of one kernel than the device runs of others.
 
-    defines: of the program, beside GROUP. arguments: by parameter name.
+    most: work-items of a group, a power of two. defines: of the program, to which GROUP is added.
+    arguments: by parameter name.
     """
-    items, defines = group_items(dev), defines or {}
-    program = dev.program(name, GROUP=items, **defines)
+    items, defines = min(most, group_items(dev)), defines or {}
+    program = dev.program(name, **defines | {"GROUP": items})
     while items > 1 and items > program.kernels[kernel].largest_group:
         items //= 2
-        program = dev.program(name, GROUP=items, **defines)
+        program = dev.program(name, **defines | {"GROUP": items})
     program.launch(kernel, groups * items, items, **arguments)
 
 

@@ -7,7 +7,7 @@ from pp_cl.engine.device.buffers import Pending, read_later
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import launch_groups
 
-BLOCK = 2048  # values that a work-item of a CPU, or a work-group of a GPU, scans
+BLOCK = 1024  # values that a work-item of a CPU, or a work-group of a GPU, scans
 
 
 def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
@@ -24,17 +24,18 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
 def _block_sums(dev, kernel, n, **arrays):
     """(blocks,) or longer: what the kernel finds in each block of n numbers."""
     # of a power of two: numbers of pairs differ from step to step
-    held = dev.scratch("scan", 1 << (_blocks(n) - 1).bit_length(), np.uint32)
+    held = dev.scratch("scan", 1 << (blocks_of(n) - 1).bit_length(), np.uint32)
     _launch(dev, kernel, n, block_sum=held, **arrays)
     return held
 
 
-def _blocks(n):
+def blocks_of(n: int) -> int:
+    """The blocks of n values."""
     return -(-n // BLOCK)
 
 
 def _launch(dev, kernel, n, **arguments):
-    blocks = _blocks(n)
+    blocks = blocks_of(n)
     launch_groups(
         dev, "device/scan", kernel, blocks, defines={"BLOCK": BLOCK}, n=n, b=blocks, **arguments
     )

@@ -147,7 +147,8 @@ def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> 
                 vectors = blocks * k**2 * co
                 n, first, places[1] = n + vectors, first + channels, places[1] + vectors
     if rows:
-        weights_program(dev).launch(
+        transforms = any(row[1] > 0 for row in rows)
+        weights_program(dev, transforms).launch(
             "lay_out_weights",
             n,
             VECTOR if dev.is_cpu else None,

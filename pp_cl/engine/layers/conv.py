@@ -8,7 +8,7 @@ choice.py says which one is taken.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
@@ -147,26 +147,32 @@ def mask_bits(masks: Sequence[bool]) -> int:
     return sum(1 << i for i, is_masked in enumerate(masks) if is_masked)
 
 
-def weights_program(dev: Device) -> Program:
-    """The kernels of layers/weights.cl."""
-    return dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=int(dev.is_cpu))
+def weights_program(dev: Device, transforms: bool = False) -> Program:
+    """The kernels of layers/weights.cl. transforms: whether Winograd's weights are laid out, which
+    on GPUs spills registers.
+    """
+    return dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=int(dev.is_cpu or transforms))
 
 
-def sum_parts(
-    dev: Device,
-    parts: Sequence[tuple[Conv, int]],
-    table: PackedArrays,
-    work: Array,
-    grad_weights: Array,
-    grad_biases: Array,
-) -> None:
-    """Overwrite the gradients of weights and biases by the sums, in order, of their parts, those of
-    all convolutions in one launch.
+class GradientParts(NamedTuple):
+    """Of the gradients of the weights and biases of several convolutions, as kernels take them
+    (cl/layers/parts.h). n: vectors of 16 of all gradients. table: (convolutions, 8) int32. partial:
+    (?,) float32, the parts.
+    """
 
-    parts: [(convolution, number of parts that backward() has left)]. table: for what the kernel
-    reads of them, until the next call with it. work: (?,) float32, in which Conv.partial lie;
-    grad_weights, grad_biases: (?,) float32, in which the gradients lie as Conv.weight and Conv.bias
-    do in their arrays.
+    n: int
+    table: Array
+    partial: Array
+
+
+def gradient_parts(
+    parts: Sequence[tuple[Conv, int]], table: PackedArrays, partial: Array
+) -> GradientParts:
+    """What backward() of convolutions has left in `partial`, (?,) float32, in which Conv.partial
+    lie.
+
+    parts: [(convolution, number of parts)]. table: for what kernels read of them, until the next
+    call with it.
     """
     rows, n = [], 0
     for conv, count in parts:
@@ -175,13 +181,22 @@ def sum_parts(
         rows.append((n, sums, blocks, count, *places, conv.is_halved))
         n += sums * blocks
     (sent,) = table.send([((len(rows), 8), np.int32)], [np.array(rows, np.int32)])
+    return GradientParts(n, sent, partial)
+
+
+def sum_parts(dev: Device, parts: GradientParts, grad_weights: Array, grad_biases: Array) -> None:
+    """Overwrite the gradients of weights and biases by the sums, in order, of their parts.
+
+    grad_weights, grad_biases: (?,) float32, in which the gradients lie as Conv.weight and Conv.bias
+    do in their arrays.
+    """
     weights_program(dev).launch(
         "sum_parts",
-        n * row_parts(dev),
-        n=n,
-        rows=len(rows),
-        table=sent,
-        partial=work,
+        parts.n * row_parts(dev),
+        n=parts.n,
+        rows=len(parts.table),
+        table=parts.table,
+        partial=parts.partial,
         grad_weights=grad_weights,
         grad_biases=grad_biases,
     )

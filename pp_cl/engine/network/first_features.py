@@ -18,7 +18,7 @@ class FirstFeatures:
     def __init__(self, dev: Device):
         self.dev = dev
         self.parameters: dict[str, Array] = {}
-        self.all_parameters, self.all_gradients = dev.zeros((1,)), dev.zeros((1,))
+        self.all_parameters = dev.zeros((1,))
         self._shape: tuple[int, ...] = ()  # of the features of the last forward()
 
     def split(self, whole: Array) -> dict[str, Array]:
@@ -52,8 +52,8 @@ class FirstFeatures:
         first_features_forward(self.dev, x, image)
         return image
 
-    def backward(self, grad_image: Array) -> Array:
-        """(H, W, C) float32 gradient of the features of the last forward()."""
+    def backward(self, grad_image: Array) -> tuple[Array, None]:
+        """((H, W, C) float32 gradient of the features of the last forward(), None)."""
         grad_features = self.dev.empty(self._shape)
         first_features_backward(self.dev, grad_image, grad_features)
-        return grad_features
+        return grad_features, None

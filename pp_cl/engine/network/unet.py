@@ -16,7 +16,9 @@ from pp_cl.engine.layers.conv import (
     DIRECTIONS,
     Conv,
     ConvShape,
+    GradientParts,
     first_float,
+    gradient_parts,
     pack_bias,
     pack_weights,
     sum_parts,
@@ -131,12 +133,11 @@ class UNet:
     widths: channels of the three levels. blocks: what a level computes, of settings.BLOCKS.
     residual: adds output.SHARE of the first three features to the image. variant: of the
     convolutions, as choose() takes it; blocking: of their kernels, as shipped for the device; both
-    may be replaced before the first pass. layers: in the order of the forward pass. parameters,
-    gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,),
-    ...} float32 on the device; all_parameters, all_gradients: the 1-D array that they lie in, with
-    zeros between them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for
-    Conv2d), output channels beyond CO at 0, with gradient 0. multiple: of which the sides of images
-    are, in pixels.
+    may be replaced before the first pass. layers: in the order of the forward pass. parameters:
+    {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
+    on the device; all_parameters: the 1-D array that they lie in, with zeros between them. Weights
+    and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output channels
+    beyond CO at 0, with gradient 0. multiple: of which the sides of images are, in pixels.
     """
 
     multiple = 4  # two poolings halve the height and the width
@@ -156,7 +157,7 @@ class UNet:
         self.layers = unet_layers(widths, blocks=blocks)
         self.variant, self.blocking = variant, blocking_of(dev)
         self.all_parameters, self.parameters = self._packed()
-        self.all_gradients, self.gradients = self._packed()
+        self._gradients: Any = None  # of sum_gradients(): (the whole, its parts by name)
         rng = np.random.default_rng(seed)
         for layer in convolutions(self.layers):
             shape = layer.weight_shape()
@@ -295,19 +296,27 @@ class UNet:
             plan.copy_tiles(self.dev, layer.name, out)
         output_forward(self.dev, out, x if self._residual else None)
 
-    def backward(self, grad_y: Array) -> Array:
-        """(H, W, 16) gradient of x in the last forward(x, training=True), given dL/dy (H, W, 3).
+    def backward(self, grad_y: Array) -> tuple[Array, GradientParts]:
+        """(gradient (H, W, 16) of x in the last forward(x, training=True), what the gradients of
+        all parameters are sums of, for sum_gradients() or an optimiser), given dL/dy (H, W, 3).
 
-        Overwrites the gradients of all parameters; parameters and x must be as they were in
-        forward. The result is in a buffer of the network. Raises RuntimeError without such a
-        forward.
+        Parameters and x must be as they were in forward. The results are in buffers of the network.
+        Raises RuntimeError without such a forward.
         """
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
         space, (plan, x), self._trained = self._workspaces[True], self._trained, None
         plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
-        space.launches["backward"].run(partial(self._backward, space), plan, x, grad_y)
-        return space.arrays[gradient_of("x")]
+        parts = space.launches["backward"].run(partial(self._backward, space), plan, x, grad_y)
+        return space.arrays[gradient_of("x")], parts
+
+    def sum_gradients(self, parts: GradientParts) -> dict[str, Array]:
+        """{name of a parameter: its gradient} by the parts of backward(), until the next call."""
+        if self._gradients is None:
+            self._gradients = self._packed()
+        whole, gradients = self._gradients
+        sum_parts(self.dev, parts, whole, whole)
+        return gradients
 
     def _backward(self, space, plan, x, grad_y):
         dev, arrays, convs = self.dev, space.arrays | {"x": x}, space.convs
@@ -347,8 +356,7 @@ class UNet:
         plan.copy_tiles(dev, gradient_of("x"), grad_x)
         if self._residual:
             residual_backward(dev, grad_y, grad_x)
-        all_gradients = self.all_gradients
-        sum_parts(dev, parts, space.part_table, space.work, all_gradients, all_gradients)
+        return gradient_parts(parts, space.part_table, space.work)
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its
@@ -379,7 +387,7 @@ class UNet:
         that their convolutions share, which grows with the device's compute units.
         """
         whole = self.all_parameters.shape, np.float32
-        table: Table = {"parameters": whole, "gradients": whole}
+        table: Table = {"parameters": whole}
         scratch = [0]
         for training, size in ((True, crop), (False, image)):
             convs, maps = self.convolutions(size, training), array_shapes(self.layers, size)

@@ -5,19 +5,21 @@ weights of the fragments; and the gradients of the blend, gathered by visible po
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes, row_parts
+from pp_cl.engine.device.launch import group_items, lanes, launch_groups, row_parts
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.points import four_blocks, offset_width, stored_degree
 from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
 from pp_cl.engine.raster.weights import BlendWeights, clear_pairs
 
 ON_GPU = 4  # lanes there: each work-item reads vectors
+SPAN = 64  # pixels whose distortion loss is one sum
 
 
 def shade_forward(
@@ -55,7 +57,7 @@ def blend_forward(
     dev: Device, pairs: Pairs, weights: BlendWeights, visible_features: Array, features: Array
 ) -> None:
     """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32."""
-    _program(dev).launch(
+    dev.program("raster/blend", **_defines(dev)).launch(
         "blend_forward",
         pairs.pixels * row_parts(dev, ON_GPU),
         hw=pairs.pixels,
@@ -75,7 +77,7 @@ def blend_backward_table(
     """
     return {
         "pair_gradient": ((pairs, 2), np.float32),
-        "pixel_distortion": ((pixels if blend == "alpha" else 1,), np.float32),
+        "distortion": ((-(-pixels // SPAN) if blend == "alpha" else 1,), np.float32),
         "pixel_blend": ((pixels if blend == "softmax" else 1,), np.float32),
         "grad_visible_features": ((visible, 16), np.float32),
         "grad_opacity": ((visible,), np.float32),
@@ -90,15 +92,15 @@ class BlendGradients:
 
     visible_features: (S, 16). opacity: (S,). offset: (S, 4) of soft points composited by alpha, (S,
     16) of Gaussians, through the falloff of their fragments; None if not asked for.
-    pixel_distortion: (HW,), undefined without its weight. pair_gradient: (P, 2), by pair of a
-    visible point the blend weight b and what the fragment adds to dL/dopacity, both 0 where it is
-    dropped or not tracked.
+    distortion: (ceil(HW/SPAN),) of so many pixels each, undefined without its weight.
+    pair_gradient: (P, 2), by pair of a visible point the blend weight b and what the fragment adds
+    to dL/dopacity, both 0 where it is dropped or not tracked.
     """
 
     visible_features: Array
     opacity: Array
     offset: Array | None
-    pixel_distortion: Array
+    distortion: Array
     pair_gradient: Array
 
 
@@ -116,6 +118,7 @@ def blend_backward(
     grad_alpha: Array | None = None,
     distortion_weight: float = 0.0,
     voxel_size: float = 0.0,
+    max_weight: Array | None = None,
 ) -> BlendGradients:
     """The gradients of the points weights.visible, after blend_weights() with derivatives.
 
@@ -123,7 +126,9 @@ def blend_backward(
     W, 16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times
     sum_ij b_i b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths
     (world units) of its fragments; no gradient of the depths is formed. voxel_size: of the grid
-    that offsets are counted in, world units; 0: no gradients of offsets. Raises ValueError for
+    that offsets are counted in, world units; 0: no gradients of offsets. max_weight: (N,)
+    float32, becomes for each point the highest sum over an image's pixels of its blend weights so
+    far. Raises ValueError for
     grad_alpha or a distortion loss of a softmax, which has no transmittance, and for offsets unless
     soft points are composited by alpha.
     """
@@ -138,7 +143,7 @@ def blend_backward(
     rows = len(visible_features), pairs.pixels, pairs.capacity
     b.require(blend_backward_table(*rows, weights.blend, points.footprint))
     clear_pairs(dev, pairs, weights, b.pair_gradient)
-    of_fragments = {
+    of_fragments: dict[str, Any] = {
         "hw": pairs.pixels,
         "tracked": weights.tracked,
         "pixel_offset": pairs.pixel_offset,
@@ -148,19 +153,25 @@ def blend_backward(
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    macros = footprint_macros(points.footprint)
-    program = _program(dev, DL_DB=int(not is_alpha), MOVES=int(moves), **macros)
+    defines = _defines(
+        dev, DL_DB=int(not is_alpha), MOVES=int(moves), **footprint_macros(points.footprint)
+    )
+    program = dev.program("raster/blend", **defines)
     if is_alpha:
-        program.launch(
+        launch_groups(
+            dev,
+            "raster/blend",
             "alpha_gradient",
-            pairs.pixels,
+            -(-pairs.pixels // SPAN),
+            most=SPAN,
+            defines=defines,
             has_grad_alpha=int(grad_alpha is not None),
             distortion_weight=distortion_weight,
             transmittance=weights.transmittance,
             point_slot=weights.point_slot,
             visible_features=visible_features,
             grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
-            pixel_distortion=b.pixel_distortion,
+            distortion=b.distortion,
             **of_fragments,
         )
     else:
@@ -177,6 +188,7 @@ def blend_backward(
         s=count,
         voxel_size=voxel_size,
         radius=points.radius,
+        is_recorded=max_weight is not None,
         visible=weights.visible_rows,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
@@ -193,15 +205,17 @@ def blend_backward(
         grad_visible_features=b.grad_visible_features,
         grad_opacity=b.grad_opacity,
         grad_offset=b.grad_offset,
+        max_weight=opacity if max_weight is None else max_weight,
     )
     return BlendGradients(
         b.grad_visible_features,
         b.grad_opacity,
         b.grad_offset if moves else None,
-        b.pixel_distortion,
+        b.distortion,
         b.pair_gradient,
     )
 
 
-def _program(dev, **defines):
-    return dev.program("raster/blend", LANES=lanes(dev, ON_GPU), **defines)
+def _defines(dev, **defines):
+    group = min(SPAN, group_items(dev))
+    return {"LANES": lanes(dev, ON_GPU), "SPAN": SPAN, "GROUP": group} | defines

@@ -12,8 +12,8 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table, grown
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes
-from pp_cl.engine.device.scan import exclusive_scan, read_total
+from pp_cl.engine.device.launch import lanes, launch_groups
+from pp_cl.engine.device.scan import BLOCK, blocks_of, exclusive_scan, read_total
 from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.errors import UserError
 
@@ -86,30 +86,43 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
 
 
 def find_pairs(
-    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], capacity: int = 1
+    dev: Device,
+    b: Buffers,
+    points: ProjectedPoints,
+    size: tuple[int, int],
+    capacity: int = 1,
+    times_seen: Array | None = None,
 ) -> Pairs:
     """The fragments in an image of size (height, width), if there are no more than `capacity`; does
     not wait for the device. Their number is known after read_count().
+
+    times_seen: (N,) float32, counts for each point the images in which it has a fragment.
     """
     n, pixels = len(points.point_box), size[0] * size[1]
     b.require(pairs_table(n, pixels, capacity))
-    exclusive_scan(dev, points.point_count, b.point_offset)
     if not dev.is_cpu:
         b.require({"pixel_count": ((pixels,), np.uint32)})
         dev.fill(b.pixel_count, 0)
-    dev.program("raster/pairs", LANES=lanes(dev), **footprint_macros(points.footprint)).launch(
+    launch_groups(
+        dev,
+        "raster/pairs",
         "pairs_fill",
-        -(-n // lanes(dev)),
+        blocks_of(n),
+        defines={"LANES": lanes(dev), "BLOCK": BLOCK, **footprint_macros(points.footprint)},
         n=n,
         p=capacity,
+        is_counted=times_seen is not None,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         point_shape=points.point_shape,
         point_box=points.point_box,
+        point_count=points.point_count,
+        block_sum=points.block_sum,
         point_offset=b.point_offset,
         pair_pixel=b.pair_pixel,
         pair_point_falloff=b.pair_point_falloff,
         point_key=b.pair_key if dev.is_cpu else b.pair_scratch,
+        times_seen=points.point_opacity if times_seen is None else times_seen,
         pixel_count=b.pixel_offset if dev.is_cpu else b.pixel_count,
     )
     if dev.is_cpu:

@@ -6,13 +6,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
-from pp_cl.engine.device.device import Device, Program
-from pp_cl.engine.device.launch import lanes
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes, launch_groups
+from pp_cl.engine.device.scan import BLOCK, blocks_of
 from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
 
 # numbered as in cl/raster/footprint.h; each has its header beside that
@@ -26,13 +28,13 @@ class ProjectedPoints:
     """N points in one view, valid until the next projection.
 
     footprint: one of FOOTPRINTS. camera_buffer: (21,) float32, cl/camera.h. point_count: (N,)
-    uint32, pixels that are covered. The others are undefined in a run of LANES points without
-    fragments. point_camera: (N, 4) float32, x, y, z in camera axes and the distance from the eye;
-    (0, 0, 0, -1) for a culled point. point_box: (N, 4) uint16, first x, first y, last x, last y of
-    the pixels that may be covered; last < first means none. point_shape: (N, 1) float32, the radius
-    in world units; of Gaussians (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h).
-    point_opacity: (N,) float32 in [0, 1], from the eye; of spheres undefined. cloud_offset, radius:
-    of project_grid().
+    uint32, pixels that are covered; block_sum: (ceil(N/BLOCK),) uint32, the sums of so many. The
+    others are undefined in a run of LANES points without fragments. point_camera: (N, 4) float32,
+    x, y, z in camera axes and the distance from the eye; (0, 0, 0, -1) for a culled point.
+    point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels that may be covered;
+    last < first means none. point_shape: (N, 1) float32, the radius in world units; of Gaussians
+    (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h). point_opacity: (N,) float32
+    in [0, 1], from the eye; of spheres undefined. cloud_offset, radius: of project_grid().
     """
 
     footprint: str
@@ -40,6 +42,7 @@ class ProjectedPoints:
     point_camera: Array
     point_box: Array
     point_count: Array
+    block_sum: Array
     point_shape: Array
     point_opacity: Array
     cloud_offset: Array | None = None
@@ -57,6 +60,7 @@ def projection_table(n: int, footprint: str = "soft") -> Table:
         "point_camera": ((n, 4), np.float32),
         "point_box": ((n, 4), np.uint16),
         "point_count": ((n,), np.uint32),
+        "block_sum": ((blocks_of(n),), np.uint32),
         "point_shape": ((n, footprint_macros(footprint)["SHAPE"]), np.float32),
         "point_opacity": ((n,), np.float32),
     }
@@ -71,10 +75,31 @@ def footprint_macros(footprint: str) -> dict[str, int]:
     }
 
 
-def projection_program(dev: Device, footprint: str) -> Program:
-    """The kernels that project points of one of FOOTPRINTS."""
-    macros = footprint_macros(footprint)
-    return dev.program("raster/project", LANES=lanes(dev), MOST_OFFSET=f"{MOST_OFFSET}f", **macros)
+def launch_projection(
+    dev: Device, b: Buffers, kernel: str, n: int, footprint: str, **arguments: Any
+) -> None:
+    """Launch a kernel that projects n points of one of FOOTPRINTS into the buffers b of
+    projection_table().
+    """
+    launch_groups(
+        dev,
+        "raster/project",
+        kernel,
+        blocks_of(n),
+        defines={
+            "LANES": lanes(dev),
+            "BLOCK": BLOCK,
+            "MOST_OFFSET": f"{MOST_OFFSET}f",
+            **footprint_macros(footprint),
+        },
+        n=n,
+        point_camera=b.point_camera,
+        point_shape=b.point_shape,
+        point_box=b.point_box,
+        point_count=b.point_count,
+        block_sum=b.block_sum,
+        **arguments,
+    )
 
 
 def project_grid(
@@ -97,21 +122,18 @@ def project_grid(
     """
     n = point_id.size
     b.require(projection_table(n, footprint))
-    program = projection_program(dev, footprint)
-    program.launch(
+    launch_projection(
+        dev,
+        b,
         "project_grid",
-        -(-n // lanes(dev)),
-        n=n,
+        n,
+        footprint,
         camera=camera_buffer,
         grid=grid_buffer,
         point_id=point_id,
         radius=radius,
         cloud_offset=cloud_offset,
         opacity=opacity,
-        point_camera=b.point_camera,
-        point_shape=b.point_shape,
-        point_box=b.point_box,
-        point_count=b.point_count,
         point_opacity=b.point_opacity,
     )
     return ProjectedPoints(
@@ -120,6 +142,7 @@ def project_grid(
         b.point_camera,
         b.point_box,
         b.point_count,
+        b.block_sum,
         b.point_shape,
         b.point_opacity,
         cloud_offset,

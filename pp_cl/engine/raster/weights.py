@@ -193,8 +193,7 @@ def record_weights(
 ) -> None:
     """Update what pruning looks at, both (N,) float32: max_weight, the highest sum over an image's
     pixels of a point's blend weights so far, and times_seen, how many images had a fragment of the
-    point, dropped or not, and such a sum of at least `least`. pair_gradient: of blend_backward() or
-    list_weights().
+    point, dropped or not, and such a sum of at least `least`. pair_gradient: of list_weights().
     """
     dev.program("raster/weights").launch(
         "record_weights",

@@ -29,7 +29,7 @@ def loss_table(
         "moments": ((window_rows, 4, blocks, values), np.float32),
         "derivatives": ((window_rows, 3, blocks, values), np.float32),
         "row_derivatives": ((window_rows, 3, blocks, values), np.float32),
-        "terms": ((window_rows + 2 * padded[0], 4), np.float32),
+        "terms": ((window_rows + padded[0], 4), np.float32),
         "grad_prediction": ((*padded, 3), np.float32),
         "grad_alpha": ((math.prod(padded),), np.float32),
     }
@@ -53,7 +53,8 @@ class Loss:
         self.beta = beta
         self.ssim_weight = ssim_weight
         self.mask_weight = mask_weight
-        self._rows = 0, 0  # of windows and of the prediction
+        self._window_rows = 0
+        self._distortion: Any = None  # the download of it
         self._further: dict[str, tuple[float, float]] = {}  # {further term: (weight, scale)}
         self._buffers = Buffers(dev)
 
@@ -111,31 +112,28 @@ class Loss:
             grad_alpha=b.grad_alpha,
             **shared,
         )
-        self._rows = window_rows, ph
+        self._window_rows, self._distortion = window_rows, None
         self._further = {"mask": (self.mask_weight, 1 / (height * width))} if alphas else {}
         return b.grad_prediction, b.grad_alpha if alphas else None
 
-    def add_distortion(self, pixel_distortion: Array, weight: float, scale: float = 1.0) -> None:
-        """Add weight times the distortion loss: scale * sum(pixel_distortion), (PH * PW,)
-        float32.
-        """
+    def add_distortion(self, distortion: Array, weight: float, scale: float = 1.0) -> None:
+        """Add weight times the distortion loss: scale * sum(distortion), (...,) float32."""
         self._further["distortion"] = weight, scale
-        (v, ph), pixels = self._rows, len(pixel_distortion)
-        arrays = {"pixel_distortion": pixel_distortion, "terms": self._buffers.terms}
-        self._launch("loss_distortion", ph, v=v, ph=ph, pw=pixels // ph, **arrays)
+        self._distortion = read_later(self.dev, distortion)
 
     def read(self, step: int) -> Pending[dict[str, float]]:
         """{"loss", "l1", "ssim", "psnr"} of the crop of a step, from 1 on, and the further terms.
         Asking for them raises Diverged if one is not finite.
         """
-        weight, further, (v, ph) = self.ssim_weight, self._further, self._rows
+        weight, further, v = self.ssim_weight, self._further, self._window_rows
+        distortion = self._distortion
 
         def by_name(rows: np.ndarray) -> dict[str, float]:
             dissimilarity = rows[:v].sum(0, dtype=np.float64)[0]
-            smooth, l1, mse, mask = rows[v : v + ph].sum(0, dtype=np.float64)
+            smooth, l1, mse, mask = rows[v:].sum(0, dtype=np.float64)
             found = {"mask": mask}
-            if "distortion" in further:  # else nothing has written its rows
-                found["distortion"] = rows[v + ph :].sum(0, dtype=np.float64)[0]
+            if distortion:
+                found["distortion"] = distortion.get().sum(dtype=np.float64)
             more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
             total = smooth + weight * dissimilarity
             total += sum(more[name] * weight for name, (weight, _) in further.items())

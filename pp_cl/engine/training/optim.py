@@ -15,6 +15,7 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import DeviceRows, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
+from pp_cl.engine.layers.conv import GradientParts
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import BlendGradients
 from pp_cl.engine.raster.points import PointCloud, four_blocks, stored_degree
@@ -57,14 +58,15 @@ class Optimiser:
         step: int,
         rates: Rates,
         gradients: BlendGradients,
+        network_parts: GradientParts | None,
         *,
         points: ProjectedPoints,
         visible: Array,
         count: int,
         sh_eps: float,
     ) -> None:
-        """One step by the gradients of the visible points, and by those of the network, which lie
-        in model.net.gradients.
+        """One step by the gradients of the visible points, and by those of the network, as they are
+        in parts; None: it has no parameters.
 
         step: from 1. points: as projected into the rendered view. visible: uint32, the visible
         ones, S = count of them. sh_eps: eps of the SH coefficients.
@@ -84,15 +86,16 @@ class Optimiser:
             state=self.state,
             sh_eps=sh_eps,
         )
-        adam_update(
-            self.dev,
-            net.all_parameters,
-            net.all_gradients,
-            self.moments,
-            step=step,
-            rate=rates.network,
-            eps=NETWORK_EPS,
-        )
+        if network_parts:
+            adam_update(
+                self.dev,
+                net.all_parameters,
+                network_parts,
+                self.moments,
+                step=step,
+                rate=rates.network,
+                eps=NETWORK_EPS,
+            )
 
     def update_ema(self, weight: float) -> None:
         """Update the EMA of points and network: average += weight * (parameter - average); the
@@ -156,28 +159,30 @@ class Optimiser:
 def adam_update(
     dev: Device,
     parameter: Array,
-    grad: Array,
+    parts: GradientParts,
     moments: dict[str, Array],
     *,
     step: int,
     rate: float,
     eps: float,
 ) -> None:
-    """One dense Adam step of `parameter`, in place.
+    """One Adam step of all weights and biases of which `parts` has gradients, in place.
 
-    parameter, grad, moments "m" and "v": float32 arrays of one shape, any; the moments start as
-    zeros. step: from 1 on. Raises ValueError when the shapes differ.
+    parameter, moments "m" and "v": float32 arrays of one shape, laid out as UNet.all_parameters;
+    the moments start as zeros. step: from 1 on. Raises ValueError when the shapes differ.
     """
-    _same_shape(parameter, grad, *moments.values())
+    _same_shape(parameter, *moments.values())
     # rate (m / c1) / (sqrt(v / c2) + eps) = (rate root / c1) m / (sqrt(v) + eps root)
     root = math.sqrt(1 - BETA2**step)
     dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2).launch(
         "adam_update",
-        -(-parameter.size // lanes(dev)),
-        n=parameter.size,
+        parts.n * row_parts(dev),
+        n=parts.n,
+        rows=len(parts.table),
         rate=rate * root / (1 - BETA1**step),
         eps=eps * root,
-        grad=grad,
+        table=parts.table,
+        partial=parts.partial,
         parameter=parameter,
         m=moments["m"],
         v=moments["v"],

@@ -60,7 +60,7 @@ def test_the_residual_connection_adds_to_the_network(dev, rng):
     for residual in (False, True):
         net = UNet(dev, (16, 16, 16), blocks="single", residual=residual)
         images.append(net.forward(dev.upload(x)).get())
-        grads.append(net.backward(dev.upload(grad_y)).get())
+        grads.append(net.backward(dev.upload(grad_y))[0].get())
     np.testing.assert_array_equal(images[1][0], images[0][0])
     np.testing.assert_allclose(images[1], images[0] + SHARE * (x[..., :3] - 1), atol=1e-6)
     grads[0][..., :3] += SHARE * grad_y

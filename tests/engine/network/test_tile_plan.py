@@ -67,7 +67,8 @@ def run(dev, net, x, grad_y, *, sparse):
     plan = net.plan_tiles(x.shape[:2], active_mask(x), other) if sparse else None
     x = dev.upload(x)
     y = net.forward(x, True, plan).get()
-    return [y, net.backward(dev.upload(grad_y)).get(), *[g.get() for g in net.gradients.values()]]
+    grad_x, parts = net.backward(dev.upload(grad_y))
+    return [y, grad_x.get(), *[g.get() for g in net.sum_gradients(parts).values()]]
 
 
 @pytest.mark.parametrize("name, variant, blocks", CASES)

@@ -7,6 +7,7 @@ import pytest
 from support.comparisons import relative_error
 from support.models import make_model
 
+from pp_cl.engine.layers.conv import GradientParts
 from pp_cl.engine.raster.points import SH_DEGREES
 from pp_cl.engine.training.optim import Optimiser, adam_update, ema_update
 from pp_cl.engine.training.state import PointState
@@ -19,7 +20,8 @@ pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
 def test_refuses_different_shapes(dev):
     a, b = dev.zeros((4, 3)), dev.zeros((3, 4))
     with pytest.raises(ValueError, match="one shape"):
-        adam_update(dev, a, b, {"m": a, "v": a}, step=1, rate=0.1, eps=1e-8)
+        parts = GradientParts(1, dev.zeros((1, 8), np.int32), a)
+        adam_update(dev, a, parts, {"m": a, "v": b}, step=1, rate=0.1, eps=1e-8)
     with pytest.raises(ValueError, match="one shape"):
         ema_update(dev, a, b, 0.5)
 
