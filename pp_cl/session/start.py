@@ -1,5 +1,6 @@
 """What a new training starts from: its network, its visual hull, its refinements."""
 
+import math
 import warnings
 from pathlib import Path
 
@@ -123,16 +124,18 @@ def fitting_hull(
     views, _, forgiven = agreement
     hull, train.refine_at = first_hull(dev, config, agreement)
     to_come, cameras = len(refine_steps(train)), [view.camera for view in views]
+    last = math.inf  # points of the try before
     while True:
         if is_radius_automatic:
             raster.radius = automatic_radius(hull.grid, views, to_come)
         found = hull.grid, len(hull.ids), depth_range(views, hull)
         fault = memory_plan.fault_of(*found)
-        fewer = memory_plan.coarser_points(*found) if fault and is_automatic else 0
+        can_be_fewer = is_automatic and len(hull.ids) < last
+        fewer = memory_plan.coarser_points(*found) if fault and can_be_fewer else 0
         if not (fault and fewer):
             memory_plan.check_points(*found)
             return agreement, hull, found[-1], given_up
-        spacing = spacing_pixels(hull.grid, cameras) / 2**to_come
+        last, spacing = len(hull.ids), spacing_pixels(hull.grid, cameras) / 2**to_come
         given_up = given_up or (
             f"points: as close as memory allows; {len(hull.ids)} at first, {spacing:.2f} pixels"
             f" apart in the end, would be too many ({fault[0]})"
