@@ -43,6 +43,8 @@ SHOWN = 0.8
 # The least share of its points with which a training goes on where memory is too small for all of
 # them: about as many as pruning leaves at most beyond LEFT_BY_PRUNING, in two refinements.
 LEAST_KEPT = 0.5
+# The share of all memory that is filled where that decides the points: plans err by a few percent.
+FILLED = 0.9
 
 
 class Need(NamedTuple):
@@ -107,10 +109,11 @@ class MemoryPlan:
         drops the others before it takes more memory. Raises UserError as check_points() does where
         that is less than LEAST_KEPT of them, or not even the next steps fit.
         """
-        most = _most(points, lambda n: not self.fault_of(grid, n, depth_range, step))
-        begins = not self._fault(self.need_of(grid, points, depth_range, step, stretches=1))
-        goes_on = begins and most >= LEAST_KEPT * points
-        self.check_points(grid, most if goes_on else points, depth_range, step)
+        most, start = points, self.need_of(grid, points, depth_range, step, stretches=1)
+        if not self._fault(start) and self.fault_of(grid, points, depth_range, step):
+            kept = _most(points, lambda n: self.fault_of(grid, n, depth_range, step, FILLED))
+            most = kept if kept >= LEAST_KEPT * points else points
+        self.check_points(grid, most, depth_range, step)
         return most
 
     def coarser_points(self, grid: Grid, points: int, depth_range: tuple[float, float]) -> int:
@@ -118,19 +121,24 @@ class MemoryPlan:
         coarser grid; 0 where none do.
         """
 
-        def fits(count):
+        def fault(count):
             times = (points / count) ** (1 / 3)
             dims = tuple(max(1, round(n / times)) for n in grid.dims)
             coarser = replace(grid, voxel_size=times * grid.voxel_size, dims=dims)
-            return not self.fault_of(coarser, count, depth_range)
+            return self.fault_of(coarser, count, depth_range, share=FILLED)
 
-        return _most(points, fits)
+        return _most(points, fault)
 
     def fault_of(
-        self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
+        self,
+        grid: Grid,
+        points: int,
+        depth_range: tuple[float, float],
+        step: int = 0,
+        share: float = 1.0,
     ) -> tuple[str, str] | None:
-        """Why a training with these points of a grid does not fit from a step on, and what to do;
-        None where it fits.
+        """Why a training with these points of a grid does not fit into a share of the memory from
+        a step on, and what to do; None where it fits.
         """
         to_come = sum(step < at for at in refine_steps(self._train))
         last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
@@ -139,7 +147,7 @@ class MemoryPlan:
                 f"refined {to_come} times, the grid has more than {MOST_IDS} vertices",
                 "refine less often (train.refine_at), or lower --points",
             )
-        return self._fault(self.need_of(grid, points, depth_range, step))
+        return self._fault(self.need_of(grid, points, depth_range, step), share)
 
     def grows_after(self, step: int) -> bool:
         """Whether the next step takes more memory: it refines or begins the EMA."""
@@ -215,7 +223,7 @@ class MemoryPlan:
         height, width = (min(side or size, size) for size in (camera.height, camera.width))
         return height + -height % UNet.multiple, width + -width % UNet.multiple
 
-    def _fault(self, need):
+    def _fault(self, need, share=1.0):
         info, name = self.dev.info, self.dev.name
         lower, available = "lower --points or train.crop, or raise --downscale", available_bytes()
         free = math.inf if available is None else max(0, available - self._program)
@@ -223,13 +231,13 @@ class MemoryPlan:
             most = _size(info["max_allocation_bytes"])
             why = f"a buffer of {_size(need.largest)} is more than the {most} that {name} allocates"
             why += " at once"
-        elif need.device > info["memory_bytes"]:
+        elif need.device > share * info["memory_bytes"]:
             has = _size(info["memory_bytes"])
             why = f"the training needs {_size(need.device)}, {name} has {has}"
-        elif need.host > free:
+        elif need.host > share * free:
             why = f"the training needs {_size(need.host)} of the host's memory, {_size(free)} are"
             why += " free"
-        elif self.budget and need.device > self.budget * GIB:
+        elif self.budget and need.device > share * self.budget * GIB:
             why = f"--memory {self.budget:g}: the training needs {_size(need.device)}"
             lower = f"give --memory {math.ceil(need.device / GIB * 100) / 100:g}, {lower}"
         else:
@@ -237,9 +245,9 @@ class MemoryPlan:
         return why, f"{lower}, or choose another device (`pp-cl devices`)"
 
 
-def _most(points, fits):
-    """The largest n up to `points` for which fits(n), as for all smaller ones; 0: there is none."""
-    return bisect_right(range(1, points + 1), False, key=lambda n: not fits(n))
+def _most(points, fault):
+    """The largest n up to `points` without a fault(n), as smaller ones are; 0: there is none."""
+    return bisect_right(range(1, points + 1), False, key=lambda n: fault(n) is not None)
 
 
 def _bytes(tables):
