@@ -94,7 +94,7 @@ site: $(MADE) ## build README.md and docs/ as a site in build/site; fails on a d
 
 results: $(READY) ## measure what README.md and docs/ state, and write it there: hours, with the scenes of PP_DATA
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[cpu,plot,torch,capture]'
-	@PP_DEVICE="$${PP_DEVICE:-Intel(R) OpenCL}" $(BIN)/python -m tools.results $(ARGS)
+	@$(if $(findstring --kind,$(ARGS)),,PP_DEVICE="$${PP_DEVICE:-Intel(R) OpenCL}") $(BIN)/python -m tools.results $(ARGS)
 	@$(BIN)/python -m tools.docs_tables
 
 readme: $(READY) ## type README.md's commands in an empty folder, on each driver that is here, and write their lines there: minutes

@@ -2,8 +2,8 @@
 
     python tools/compare_torch.py --widths 128,256,512 --size 256 --json FILE
 
-PyTorch (development extra `torch`) runs the same operations in the same order, in channels_last, on
-the CPU.
+PyTorch (development extra `torch`) runs the same operations in the same order, in channels_last: on
+the CPU, or beside a GPU of ours by CUDA, in float32 without TF32.
 """
 
 import argparse
@@ -25,17 +25,17 @@ PAUSE = 0.03
 
 
 class TorchNetwork:
-    """PyTorch's twin of a UNet, with the same parameters, in float32 channels_last or in
-    float64.
+    """PyTorch's twin of a UNet, with the same parameters, in channels_last, of a dtype and on a
+    device of PyTorch.
     """
 
-    def __init__(self, torch, net, dtype):
-        self.torch, self.dtype, self.layers = torch, dtype, net.layers
+    def __init__(self, torch, net, dtype, place):
+        self.torch, self.dtype, self.place, self.layers = torch, dtype, place, net.layers
         plain = bench.plain_parameters(net, net.parameters)
         self.parameters = {name: self._tensor(values) for name, values in plain.items()}
 
     def _tensor(self, values):
-        tensor = self.torch.from_numpy(np.array(values)).to(self.dtype)
+        tensor = self.torch.from_numpy(np.array(values)).to(self.place, self.dtype)
         if tensor.ndim == 4:
             tensor = tensor.contiguous(memory_format=self.torch.channels_last)
         return tensor.requires_grad_()
@@ -67,34 +67,47 @@ class TorchNetwork:
         return 0.5 + 0.5 * outputs["out"]
 
     def forward(self, x):
-        """The image without what a backward pass needs."""
+        """The image without what a backward pass needs, once it is made."""
         with self.torch.inference_mode():
-            return self.image(x)
+            image = self.image(x)
+        self.finish()
+        return image
 
     def train(self, x, grad_image):
-        """{"x" or parameter: its gradient}."""
-        names = ["x", *self.parameters]
-        gradients = self.torch.autograd.grad(
-            self.image(x), [x, *self.parameters.values()], grad_image
-        )
-        return dict(zip(names, gradients, strict=True))
+        """Make the image and all gradients, and wait."""
+        self.torch.autograd.grad(self.image(x), [x, *self.parameters.values()], grad_image)
+        self.finish()
+
+    def finish(self):
+        """Wait for the device."""
+        if self.place == "cuda":
+            self.torch.cuda.synchronize()
 
 
 def compare(torch, dev, widths, size, *, variant, rounds):
     """{"rel_l2": ours against float64, "forward": {"ours_ms", "torch_ms", "ratio"}, "train": the
     same, forward and backward to the input and the weights}: medians, ratio = torch_ms / ours_ms.
+    Raises UserError beside a GPU of ours that PyTorch does not see.
     """
+    place, how = "cpu", f"oneDNN, {torch.get_num_threads()} threads"
+    if not dev.is_cpu:
+        if not torch.cuda.is_available():
+            raise UserError(f"PyTorch {torch.__version__} sees no GPU: install it with CUDA")
+        place, how = "cuda", "cuDNN's fastest, without TF32"
+        torch.backends.cudnn.conv.fp32_precision = "ieee"
+        torch.backends.cudnn.benchmark = True
     rng = np.random.default_rng(0)
     values = np.maximum(rng.normal(size=(size, size, bench.CHANNELS_IN)), 0).astype(np.float32)
     grads = rng.normal(size=(size, size, bench.CHANNELS_OUT)).astype(np.float32)
     net = bench.make_network(dev, widths, variant)
     x, grad_image = dev.upload(values), dev.upload(grads)
-    twin, exact = (TorchNetwork(torch, net, kind) for kind in (torch.float32, torch.float64))
+    twin = TorchNetwork(torch, net, torch.float32, place)
+    exact = TorchNetwork(torch, net, torch.float64, "cpu")
     torch_x, torch_grad = twin.input(values), twin.input(grads).detach()
     expected = exact.forward(exact.input(values)).numpy()[0].transpose(1, 2, 0)
     images = {
         "rel_l2": net.forward(x, training=False).get(),
-        "torch_rel_l2": twin.forward(torch_x).numpy()[0].transpose(1, 2, 0),
+        "torch_rel_l2": twin.forward(torch_x).cpu().numpy()[0].transpose(1, 2, 0),
     }
     times = interleave(
         {
@@ -110,8 +123,7 @@ def compare(torch, dev, widths, size, *, variant, rounds):
         "device": dev.name,
         "platform": dev.info["platform"],
         "variant": variant,
-        "torch": torch.__version__,
-        "threads": torch.get_num_threads(),
+        "torch": f"PyTorch {torch.__version__} ({how})",
         "widths": list(widths),
         "size": size,
         "runs": rounds,

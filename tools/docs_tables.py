@@ -5,8 +5,8 @@
 A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end table -->` of a
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
 parsers of pp_cl/commands/), `api` (of the public names), `trained` and `evaluated` (what the
-commands of README.md print, of docs/results/readme.json), or that of another file
-docs/results/NAME.json (NAME may be KIND/TABLE), which holds
+commands of README.md print, of docs/results/readme.json), `kinds` (all that lie in a folder of
+docs/results/), or that of another file docs/results/NAME.json (NAME may be KIND/TABLE), which holds
 
     commit, date, machine, how    of what code it is, where and how it was measured
     decides    digest of what decides a training in that code (tools/provenance.py)
@@ -92,6 +92,16 @@ def readme(results: dict) -> dict[str, str]:
         "trained": f"    {first['trained']}",
         "evaluated": "\n".join([*lines, "", f"{about} {sentence(results)}"]),
     }
+
+
+def kinds(tables: dict[str, str]) -> str:
+    """The tables of each kind under its name, first that of its trainings."""
+    lines: list[str] = []
+    for kind in sorted({name.partition("/")[0] for name in tables if "/" in name}):
+        own = sorted(name for name in tables if name.startswith(f"{kind}/"))
+        own.sort(key=lambda name: not name.endswith("/trainings"))
+        lines += [f"### {kind}", *(tables[name] for name in own)]
+    return "\n\n".join(lines)
 
 
 def settings() -> str:
@@ -239,6 +249,7 @@ def read_tables(folder: Path) -> dict[str, str]:
     results = read_results(folder)
     measured = readme(results.pop("readme")) if "readme" in results else {}
     measured |= {name: table(contents) for name, contents in results.items()}
+    measured["kinds"] = kinds(measured)
     return measured | {"settings": settings(), "commands": commands(), "api": api()}
 
 

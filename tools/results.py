@@ -5,9 +5,10 @@ runs/results/, so that the same command goes on where it was stopped; for other 
 measured anew. Then docs/results/ and the plots are written; `make docs` puts them into the pages.
 Scenes are looked for in PP_DATA (../shared/data). It takes hours in which nothing else should run.
 
-`--kind NAME` measures for another processor or driver (PP_DEVICE) than README's. What it finds is
-kept in runs/results-NAME/, and the tables of those parts that were measured go to
-docs/results/NAME/, for the marker `table: NAME/trainings`.
+`--kind NAME` measures for another processor, driver (PP_DEVICE) or GPU than README's. What it finds
+is kept in runs/results-NAME/, and the tables of those parts that were measured go to
+docs/results/NAME/, for the marker `table: kinds`. `--minutes N`, on a GPU that is lent for a while,
+measures the parts of WORTH for which there is time, and names those that it left out.
 """
 
 import argparse
@@ -18,11 +19,13 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, TypeAlias
 
 from pp_cl.drivers import open_device
@@ -42,6 +45,7 @@ WIDTHS = {16: "AVX-512", 8: "AVX2", 4: "vectors of 128 bits"}  # floats in a vec
 
 LEGO, ALL_VIEWS = "nerf_synthetic/lego", "nerf_synthetic/lego_all"
 HEAD = "ethiopian_head"
+HIGHLIGHTS = {f"test/r_{i}.png" for i in range(1, 14)}  # lego's views with a highlight
 TOOL = (sys.executable, "-m")
 PP_CL = (*TOOL, "pp_cl")
 OPENSPLAT = [(3.6, 24.2), (14.0, 29.9)]  # minutes on one core, PSNR; its CPU build, 15b7e80
@@ -96,8 +100,9 @@ QUALITY = [
     {"head": "scene", "cell": "{name}"},
     {"head": "size", "cell": "{size}"},
     {"head": "preset, steps", "cell": "`{preset}`, {steps:,}"},
-    {"head": "minutes", "cell": "{minutes:.1f}"},
+    {"head": "minutes", "cell": "{minutes:.2f}"},
     {"head": "PSNR", "cell": "{psnr:.2f}"},
+    {"head": "PSNR: r_1 to r_13, others", "cell": "{psnr_highlights:.2f}, {psnr_others:.2f}"},
     {"head": "SSIM", "cell": "{ssim:.4f}"},
     {"head": "LPIPS", "cell": "{lpips:.4f}"},
     {"head": "points", "cell": "{points:,}"},
@@ -105,6 +110,9 @@ QUALITY = [
 ]
 # by preset, the training whose last steps are timed
 STEPS = {"tiny": "lego_8000", "full": "lego_15000"}
+# parts that --minutes measures, the most telling first: minutes that each takes at most on an H200
+WORTH = {"demo_1500": 1.0, "lego_8000": 1.5, "lego_15000": 3.0}
+WORTH |= {"rasteriser": 1.0, "pytorch": 1.0, "stages_tiny": 0.5, "stages_full": 1.0}
 RASTERISER = [
     {"head": "scene", "cell": "{scene}"},
     {"head": "points", "cell": "{points:,}"},
@@ -118,15 +126,15 @@ PYTORCH = [
     {"head": "widths", "cell": "{widths}"},
     {"head": "side", "cell": "{size}"},
     {"head": "variant", "cell": "`{variant}`"},
-    {"head": "forward, ms", "cell": "{forward_ours_ms:.1f}, {forward_torch_ms:.1f}"},
+    {"head": "forward, ms", "cell": "{forward_ours_ms:.2f}, {forward_torch_ms:.2f}"},
     {"head": "ratio", "cell": "{forward_ratio:.2f}"},
-    {"head": "with backward, ms", "cell": "{train_ours_ms:.1f}, {train_torch_ms:.1f}"},
+    {"head": "with backward, ms", "cell": "{train_ours_ms:.2f}, {train_torch_ms:.2f}"},
     {"head": "ratio", "cell": "{train_ratio:.2f}"},
     {"head": "relative L2 error", "cell": "{rel_l2:.1e}, {torch_rel_l2:.1e}"},
 ]
 STAGES = [
     {"head": "stage", "cell": "{stage}"},
-    *({"head": f"{preset}, ms", "cell": f"{{ms_{preset}:.1f}}"} for preset in STEPS),
+    *({"head": f"{preset}, ms", "cell": f"{{ms_{preset}:.2f}}"} for preset in STEPS),
 ]
 MEMORY = [
     {"head": "training", "cell": "{name}"},
@@ -180,6 +188,13 @@ def train(training: Training, store: Path) -> dict:
     words = ["--scene", scene_of(training.test)] if training.test else []
     found = read_found(store, *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
     about = read_found(store, *PP_CL, "info", run)
+    psnr = {row["name"]: row["psnr"] for row in found["per_image"]}
+    means = found["mean"]
+    if training.test == ALL_VIEWS:
+        means |= {
+            "psnr_highlights": fmean(psnr[name] for name in HIGHLIGHTS),
+            "psnr_others": fmean(psnr[name] for name in psnr.keys() - HIGHLIGHTS),
+        }
     (size,) = about["views"]["images"]
     width, height = (int(side) // about["downscale"] for side in size.split("x"))
     return {
@@ -187,9 +202,9 @@ def train(training: Training, store: Path) -> dict:
         "size": f"{width}x{height}",
         "preset": training.preset,
         "steps": about["iterations"],
-        "views": len(found["per_image"]),
+        "views": len(psnr),
         "minutes": round(about["seconds"] / 60, 2),
-        **{name: round(value, 4) for name, value in found["mean"].items()},
+        **{name: round(value, 4) for name, value in means.items()},
         "points": about["points"]["left"],
         "frame_ms": round(found["seconds_per_frame"] * 1e3, 1),
         "computed": round(found["computed_fraction"], 2),
@@ -221,15 +236,17 @@ def pytorch(store: Path) -> list[dict]:
     return rows
 
 
-def stages(store: Path) -> dict[str, dict]:
-    """{preset: what tools/stages.py says}."""
-    words = {name: (scene_of(LEGO), "--out", store / run) for name, run in STEPS.items()}
-    return {name: read_found(store, *TOOL, "tools.stages", *w) for name, w in words.items()}
+def stages(preset: str, store: Path) -> dict:
+    """What tools/stages.py says of a preset's run. Raises UserError without one."""
+    run = store / STEPS[preset]
+    if not run.exists():
+        raise UserError(f"the part {run.name} comes first")
+    return read_found(store, *TOOL, "tools.stages", scene_of(LEGO), "--out", run)
 
 
-def by_preset(found: dict) -> list[dict]:
+def by_preset(found: dict[str, dict]) -> list[dict]:
     """Rows of STAGES."""
-    rows = {}
+    rows: dict[str, dict] = {}
     for preset, steps in found.items():
         for row in steps["stages"]:
             rows.setdefault(row["stage"], {"stage": row["stage"]})[f"ms_{preset}"] = row["ms"]
@@ -262,7 +279,7 @@ PARTS: dict[str, Callable[[Path], Found]] = {
     "demo": demo,
     "rasteriser": rasteriser,
     "pytorch": pytorch,
-    "stages": stages,
+    **{f"stages_{preset}": partial(stages, preset) for preset in STEPS},
     "memory": memory,
 }
 
@@ -304,14 +321,16 @@ def origin() -> dict[str, str]:
         raise UserError("pp_cl/ or cl/ differ from the last commit: commit first")
     dev = open_device()
     # PoCL's name is longer than the processor's: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
-    name = processor() if dev.is_cpu else dev.name
+    name = processor().replace("(R)", "")
     driver = f"{dev.info['platform']} {dev.info['driver']}"
     vectors = WIDTHS.get(dev.queue.device.native_vector_width_float)
-    what = ", ".join(filter(None, (name.replace("(R)", ""), vectors)))
+    if dev.is_cpu and vectors:
+        name += f", {vectors}"
+    gpu = "" if dev.is_cpu else f"{dev.name} beside "
     return {
         "commit": git("log", "-1", "--format=%h", "--", *CODE),
         "date": date.today().isoformat(),
-        "machine": f"{os.cpu_count()} cores ({what}), {driver}",
+        "machine": f"{gpu}{os.cpu_count()} cores ({name}), {driver}",
         "decides": digest(),
     }
 
@@ -331,6 +350,24 @@ def measure(store: Path, name: str) -> Found:
     if not file.exists():
         write_json(file, PARTS[name](store))
     return json.loads(file.read_text("utf-8"))
+
+
+def measure_within(store: Path, minutes: float) -> list[str]:
+    """Measure the parts of WORTH for which there is time, on a device as slow as its parts so far;
+    what was left out, and why.
+    """
+    start, expected, left_out = time.monotonic(), 0.0, []
+    for name, needed in WORTH.items():
+        used = (time.monotonic() - start) / 60
+        if used + needed * (max(1, used / expected) if expected else 1) > minutes:
+            left_out.append(f"{name} (too little time)")
+            continue
+        try:
+            measure(store, name)
+            expected += needed
+        except UserError as error:
+            left_out.append(f"{name} ({error})")
+    return left_out
 
 
 def trained(found: dict[str, Found]) -> list[dict]:
@@ -362,17 +399,19 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     quality = "means over the held-out views; minutes of training alone"
     blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
     rows = found | {"trainings": trained(found)}
-    steps = ""
-    if "stages" in found:
-        rows["stages"] = by_preset(found["stages"])
-        steps = "; ".join(
-            f"{preset}: {run['points']:,} points, {run['size']} pixels"
-            for preset, run in found["stages"].items()
-        )
+    runs = {preset: found[f"stages_{preset}"] for preset in STEPS if f"stages_{preset}" in found}
+    rows["stages"] = by_preset(runs)
+    steps = "; ".join(
+        f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['launches']} launches"
+        for preset, run in runs.items()
+    )
+    beside = "ours, PyTorch's, theirs over ours; medians of interleaved runs"
+    if "pytorch" in found:
+        beside += f", {found['pytorch'][0]['torch']}"
     parts = {
         "trainings": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
-        "pytorch": ("ours, PyTorch's, theirs over ours; medians of interleaved runs", PYTORCH),
+        "pytorch": (beside, PYTORCH),
         "stages": (f"medians of a step on lego ({steps})", STAGES),
         "memory": ("the most memory that a few steps take", MEMORY),
         "demo": ("runs of the demo", DEMO),
@@ -438,13 +477,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
     parser.add_argument("--kind", default="", metavar="NAME")
+    parser.add_argument("--minutes", type=float, metavar="N")
     options = parser.parse_args()
     store = ROOT / "runs" / "-".join(filter(None, ("results", options.kind)))
     try:
         about = origin()
         begin(store, about["commit"])
-        for name in options.only:
-            measure(store, name)
+        if options.minutes:
+            left_out = measure_within(store, options.minutes)
+            print("left out:", "; ".join(left_out) or "nothing")
+        else:
+            for name in options.only:
+                measure(store, name)
         found = {name: measure(store, name) for name in PARTS if (store / f"{name}.json").exists()}
     except UserError as error:
         print(f"results: {error}", file=sys.stderr)

@@ -1,5 +1,5 @@
 """Time of a training's steps by stage, beside the time that its bytes and multiplications need; and
-what the host takes for a step.
+of a step that does not wait for its stages, and of the host in it.
 
     python -m tools.stages SCENE --out RUN [--preset P] [--json FILE]
 
@@ -13,6 +13,7 @@ import argparse
 import json
 import statistics
 import sys
+import time
 from pathlib import Path
 
 from pp_cl.bench.timing import interleave
@@ -63,7 +64,7 @@ def counts(result) -> dict:
 
 
 def measure(scene: str, out: Path, preset: str | None) -> dict:
-    """{"points", "pixels", "copy_gbs", "gflops", "host_ms", "launches", "stages": rows of {"stage",
+    """{"points", "size", "copy_gbs", "gflops", "launches": of a step, "stages": rows of {"stage",
     "ms", "least_ms"}}, medians of the timed steps. Raises UserError as `pp-cl train`.
     """
     folder, steps, given = RunFolder(out), UNTIMED + 2 * TIMED, []
@@ -81,11 +82,14 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
         seen.append(least_bytes(**counts(result), sh=sh) | {"products": products})
         return backward(result, grad_image, **options)
 
-    trainer.renderer.backward = watched
     for _ in range(UNTIMED):
         trainer.train_step()
+    dev.finish()
+    start = time.perf_counter()
     host = host_cost(trainer, TIMED)
-    seen.clear()
+    dev.finish()
+    step = (time.perf_counter() - start) / TIMED
+    trainer.renderer.backward = watched  # it reads counts back
     with dev.timed_stages() as seconds:
         for _ in range(TIMED):
             trainer.train_step()
@@ -103,13 +107,15 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
         for name, taken in seconds.items()
         if len(taken) >= TIMED  # what every step does; pairs anew where there was too little room
     ]
+    unsplit = {"step without waits": 1e3 * step, "host's time in it": host["host_ms"]}
+    rows += [{"stage": name, "ms": ms} for name, ms in unsplit.items()]
     padded, _, _ = trainer.crops.draw(0).camera.padded(UNet.multiple)
     return {
         "points": cloud.count,
         "size": f"{padded.width}x{padded.height}",
         "copy_gbs": copied * 1e-6,
         "gflops": computed * 1e-6,
-        **host,
+        "launches": host["launches"],
         "stages": rows,
     }
 
@@ -127,8 +133,8 @@ def main() -> int:
     except UserError as error:
         print(f"stages: {error}", file=sys.stderr)
         return 2
-    print("{points:,} points, {size}: {copy_gbs:.1f} GB/s, {gflops:.0f} GFLOP/s".format_map(found))
-    print("host: {host_ms:.2f} ms a step, {launches} launches".format_map(found))
+    print("{points:,} points, {size}, {launches} launches".format_map(found))
+    print("{copy_gbs:.1f} GB/s, {gflops:.0f} GFLOP/s".format_map(found))
     for row in found["stages"]:
         least = f"{row['least_ms']:8.2f}" if "least_ms" in row else ""
         print(f"{row['stage']:18} {row['ms']:8.2f} {least}")

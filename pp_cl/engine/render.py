@@ -146,7 +146,8 @@ class Renderer:
         """Free the buffers; the next view makes them anew."""
         self.model.net.release()
         self._buffers = Buffers(self.dev)
-        self._launches = {name: Prepared(self.dev) for name in ("project", "pairs", "weights", "blend")}
+        stages = "project", "pairs", "weights", "blend"
+        self._launches = {name: Prepared(self.dev) for name in stages}
 
     def forward(
         self,

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from pp_cl.settings import Config, every_setting
+from tools.docs_tables import BLOCK
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
@@ -11,6 +12,9 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 PATH = re.compile(r"`((?:pp_cl|pp_studio|cl|tests|tools|docs)/[\w./]+)`")
+CARD = re.compile(r"\b([ABHLV]\d{2,3}|[RG]TX|GeForce|Radeon|Instinct|MI\d{3})\b")
+FIGURE = re.compile(r"\d (ms|s|seconds|minutes|dB|times)\b|^\|.*\| *[\d.,]+ *\|", re.MULTILINE)
+PUBLISHED = "RTX 5090, by 3dgrut's README"
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
 
 
@@ -78,3 +82,30 @@ def test_named_settings_exist(path):
     words = re.findall(rf"\b({'|'.join(known)})\.(\w+)\b(?!\.)", path.read_text("utf-8"))
     files = {"py", "cl", "md", "json", "h"}
     assert not [w for w in words if w[1] not in known[w[0]] and w[1] not in files]
+
+
+def typed_figures(text: str) -> list[str]:
+    """Paragraphs with the tables below them, and items of lists, that name a GPU and state a figure
+    which no command wrote.
+    """
+    paragraphs = re.split(r"\n\n(?!\|)|\n(?=- )", BLOCK.sub("", text).replace(PUBLISHED, ""))
+    return [one for one in paragraphs if CARD.search(one) and FIGURE.search(one)]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.stem)
+def test_no_figure_of_a_gpu_is_typed(path):
+    assert not typed_figures(path.read_text("utf-8"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "NVIDIA's H100 and H200 have run it (`full` in 92 seconds).",
+        "Small trainings wait for the H200's host, 4 to 5 ms a step.",
+        "On an NVIDIA H100 it is 3 times as fast.",
+        "One NVIDIA H200, at commit 15af55e9.\n\n| scene | PSNR |\n|---|---|\n| demo | 37.51 |",
+    ],
+)
+def test_typed_figures_of_a_gpu_are_found(text):
+    written = "Of the card:\n\n<!-- table: kinds -->\nH200, 92 s\n\n<!-- end table -->"
+    assert typed_figures(f"## GPUs\n\n{written}\n\n{text}\n\n{written}") == [text]

@@ -62,8 +62,20 @@ def test_documents_are_up_to_date(path):
 
 
 def test_all_results_are_shown_once():
+    """Those of kinds by the one table of all kinds."""
     text = "".join(path.read_text("utf-8") for path in TOOL.documents(ROOT))
-    assert sorted(re.findall(r"(?m)^<!-- table: (\S+) -->$", text)) == sorted(TABLES)
+    shown = re.findall(r"(?m)^<!-- table: ([^\s/]+) -->$", text)
+    assert sorted(shown) == sorted(name for name in TABLES if "/" not in name)
+
+
+def test_tables_of_kinds(tmp_path):
+    for name in ("h200/stages", "h200/trainings", "avx2/trainings", "trainings"):
+        file = tmp_path / f"{name}.json"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(json.dumps(RESULTS | {"measured": name}))
+    lines = TOOL.read_tables(tmp_path)["kinds"].splitlines()
+    found = [line.partition(".")[0] for line in lines if line.startswith(("#", "A", "H"))]
+    assert found == ["### avx2", "Avx2/trainings", "### h200", "H200/trainings", "H200/stages"]
 
 
 def test_settings_and_commands_are_complete():

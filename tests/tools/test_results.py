@@ -1,9 +1,10 @@
+from pp_cl.errors import UserError
 from tools import docs_tables
 from tools import results as TOOL
 
 ROW = {"name": "lego", "size": "200x200", "preset": "tiny", "steps": 300, "views": 200}
 ROW |= {"minutes": 0.5, "psnr": 28.1234, "ssim": 0.95, "lpips": 0.05, "points": 90000}
-ROW |= {"frame_ms": 14.0, "computed": 1.0}
+ROW |= {"psnr_highlights": 25.6, "psnr_others": 28.3, "frame_ms": 14.0, "computed": 1.0}
 RASTER = {
     "scene": "grid",
     "points": 250336,
@@ -14,16 +15,18 @@ RASTER = {
 }
 RASTER |= {"ms": 15.8, "max_err": 8e-8}
 TORCH = {"widths": "32,64,128", "size": 200, "variant": "auto", "rel_l2": 4e-7}
-TORCH |= {"torch_rel_l2": 4e-7}
+TORCH |= {"torch_rel_l2": 4e-7, "torch": "PyTorch 2.13.0 (oneDNN, 2 threads)"}
 for key in ("forward", "train"):
     TORCH |= {f"{key}_ours_ms": 13.1, f"{key}_torch_ms": 18.6, f"{key}_ratio": 1.4}
-STEP = {"points": 92812, "size": "128x128", "stages": [{"stage": "shade", "ms": 6.2}]}
+STEP = {"points": 92812, "size": "128x128", "launches": 45}
+STEP |= {"stages": [{"stage": "shade", "ms": 6.2}]}
 MEMORY = {"name": "tiny", "points": 253464, "device_plan": 7e2, "device": 7e2}
 MEMORY |= {"host_plan": 1e3, "host": 1e3}
 FOUND = dict.fromkeys(TOOL.PARTS, ROW)
 FOUND |= {"demo": [{"what": "mesh", "result": "0.76"}]}
 FOUND |= {"rasteriser": [RASTER], "memory": [MEMORY]}
-FOUND |= {"pytorch": [TORCH], "stages": dict.fromkeys(TOOL.STEPS, STEP)}
+FOUND |= {"pytorch": [TORCH]}
+FOUND |= {f"stages_{preset}": STEP for preset in TOOL.STEPS}
 
 
 def test_tables_and_plots(tmp_path):
@@ -34,3 +37,42 @@ def test_tables_and_plots(tmp_path):
         assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
     TOOL.draw(TOOL.trained(FOUND), TOOL.timed(FOUND), tmp_path)
     assert len({*tmp_path.glob("*.png")}) == 4
+
+
+def test_lego_has_its_highlights_apart(tmp_path, monkeypatch):
+    views = [{"name": f"test/r_{i}.png", "psnr": 20.0 if 1 <= i <= 13 else 30.0} for i in range(20)]
+    found = {"per_image": views, "mean": {"psnr": 23.5, "ssim": 0.9}, "seconds_per_frame": 0.1}
+    found |= {"computed_fraction": 1.0, "views": {"images": ["800x800"]}, "downscale": 4}
+    found |= {"iterations": 300, "seconds": 7, "points": {"left": 9}}
+    monkeypatch.setattr(TOOL, "run_program", lambda *words: None)
+    monkeypatch.setattr(TOOL, "read_found", lambda *words: found)
+    monkeypatch.setattr(TOOL, "scene_of", lambda name: name)
+    trainings = (TOOL.TRAININGS[0], *TOOL.lego("tiny", 4, 300))
+    rows = {one.name: TOOL.train(one, tmp_path) for one in trainings}
+    cell = next(column["cell"] for column in TOOL.QUALITY if "r_13" in column["head"])
+    assert docs_tables.cell(cell, rows["lego"]) == "20.00, 30.00"
+    assert docs_tables.cell(cell, rows["demo"]) == ""
+
+
+def test_what_fits_into_the_minutes_is_measured(tmp_path, monkeypatch):
+    """A device that takes twice as long as an H200, where PyTorch is missing."""
+    now = [0.0]
+
+    def part(name):
+        def measured(store):
+            if name == "pytorch":
+                raise UserError("install PyTorch")
+            now[0] += 60 * 2 * TOOL.WORTH[name]
+            return [{"name": name}]
+
+        return measured
+
+    monkeypatch.setattr(TOOL, "PARTS", {name: part(name) for name in TOOL.WORTH})
+    monkeypatch.setattr(TOOL.time, "monotonic", lambda: now[0])
+    left_out = TOOL.measure_within(tmp_path, 9)
+    assert now[0] / 60 == 8
+    assert left_out == [
+        "lego_15000 (too little time)",
+        "pytorch (install PyTorch)",
+        "stages_full (too little time)",
+    ]

@@ -19,8 +19,8 @@ pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
 
 def test_refuses_different_shapes(dev):
     a, b = dev.zeros((4, 3)), dev.zeros((3, 4))
+    parts = GradientParts(1, dev.zeros((1, 8), np.int32), a)
     with pytest.raises(ValueError, match="one shape"):
-        parts = GradientParts(1, dev.zeros((1, 8), np.int32), a)
         adam_update(dev, a, parts, {"m": a, "v": b}, step=1, rate=0.1, eps=1e-8)
     with pytest.raises(ValueError, match="one shape"):
         ema_update(dev, a, b, 0.5)
