@@ -1,10 +1,11 @@
 """Compare the memory that trainings are said to need with the peaks of device and host.
 
-    python tools/memory_peaks.py [--scene FOLDER] [--only NAME ...] [--json FILE]
+    python tools/memory_peaks.py [--scene FOLDER] [--only NAME ...] [--memory GIB] [--json FILE]
 
 Each training is a process of its own, a few steps long: what is allocated does not change between
-prunings. Refinements come early, so that none is left out. The row `phone` trains on 300
-photographs of 12 megapixels, which are made in a temporary folder (most of them links) and removed.
+prunings. Refinements come early, so that none is left out. The rows `phone` and `photos` train on
+300 and 60 photographs of 12 megapixels, which are made in a temporary folder (most of them links)
+and removed. With --memory on a CPU, the device's memory is in the host's peak, not in its plan.
 """
 
 import argparse
@@ -28,7 +29,8 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.session.training import open_training
 
 MIB = 2**20
-PHONE, PHONES, SHRUNK = (4000, 3000), 300, 4  # pixels, photographs, times the drawing is enlarged
+PHONE, SHRUNK = (4000, 3000), 4  # pixels, times the drawing is enlarged
+PHOTOGRAPHS = {"phone": 300, "photos": 60}  # of trainings
 EARLY = {"train.iterations": 70, "train.eval_every": 0}  # they are smoothed once
 # what is trained: preset, settings
 TRAININGS = {
@@ -39,10 +41,11 @@ TRAININGS = {
     "paper": ("paper", {"points.count": 1_500_000, "scene.downscale": 4, "train.iterations": 4}),
     "paper in full": ("paper", {"train.iterations": 3}),  # 12 GiB on lego
     "phone": ("tiny", {"scene.downscale": 8}),
+    "photos": ("full", {"train.memory_gib": 4, "train.prune_weight": 0}),
 }
 
 
-def write_phone_scene(folder: Path, count: int = PHONES) -> str:
+def write_phone_scene(folder: Path, count: int) -> str:
     """A scene of `count` photographs of 12 megapixels of a ball with a mask; all cameras look at
     its centre from one distance and see the same circle, so that a few files do.
     """
@@ -67,10 +70,11 @@ def write_phone_scene(folder: Path, count: int = PHONES) -> str:
     return str(folder)
 
 
-def peaks(name: str, scene: str) -> dict:
+def peaks(name: str, scene: str, memory: float = 0.0) -> dict:
     """The row of one training, in MiB; for a process that does nothing else."""
     preset, settings = TRAININGS[name]
-    given = [(*item, "--only") for item in (EARLY | settings).items()]
+    settings = EARLY | settings | ({"train.memory_gib": memory} if memory else {})
+    given = [(*item, "--only") for item in settings.items()]
     with tempfile.TemporaryDirectory() as temporary:
         folder = RunFolder(Path(temporary) / "run")
         config = run_config(folder, scene, preset, given)
@@ -88,22 +92,26 @@ def peaks(name: str, scene: str) -> dict:
         "host": host / MIB,
         "device_ratio": need.device / dev.peak_bytes,
         "host_ratio": host_need / host,
+        "given_up": training.hull.given_up if training.hull else "",
     }
 
 
-def measured(name: str, scene: str) -> dict:
-    """peaks() in a process of its own."""
-    command = [sys.executable, __file__, "--child", name, "--scene", scene]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+def measured(name: str, scene: str, memory: float) -> dict:
+    """peaks() in a process of its own; with `memory` in the form for GPUs."""
+    command = [sys.executable, __file__, "--child", name, "--scene", scene, "--memory", f"{memory}"]
+    card = {"PP_FORM": "gpu", "PP_MAX_ALLOCATION": f"{256 * memory}"} if memory else {}
+    done = subprocess.run(
+        command, check=True, stdout=subprocess.PIPE, text=True, env=os.environ | card
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def row(name: str, scene: str) -> dict:
+def row(name: str, scene: str, memory: float) -> dict:
     """The row of a training by its name."""
-    if name != "phone":
-        return measured(name, scene)
+    if name not in PHOTOGRAPHS:
+        return measured(name, scene, memory)
     with tempfile.TemporaryDirectory() as folder:
-        return measured(name, write_phone_scene(Path(folder)))
+        return measured(name, write_phone_scene(Path(folder), PHOTOGRAPHS[name]), memory)
 
 
 def main() -> None:
@@ -111,13 +119,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", default="demo", help="folder of a scene (demo)")
     parser.add_argument("--only", nargs="+", choices=TRAININGS, default=list(TRAININGS))
+    parser.add_argument(
+        "--memory",
+        type=float,
+        default=0.0,
+        metavar="GIB",
+        help="as on a GPU of so much memory, of which it allocates a quarter at once",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there too")
     parser.add_argument("--child", choices=TRAININGS, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps(peaks(options.child, options.scene)))
+        print(json.dumps(peaks(options.child, options.scene, options.memory)))
         return
-    rows = [row(name, options.scene) for name in options.only]
+    rows = [row(name, options.scene, options.memory) for name in options.only]
     print(json.dumps(rows, indent=1))
     if options.json:
         write_json(options.json, rows)

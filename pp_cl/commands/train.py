@@ -118,6 +118,8 @@ def _first_line(training):
         f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
         f" the object ({hull.seconds:.1f} s)"
     )
+    if hull.given_up:
+        line += f"\n{hull.given_up}"
     if hull.capped:
         line += (
             f"\npoints: only {points} of the {training.config.points.count} asked for, since a"

@@ -16,6 +16,7 @@ from pp_cl.engine.training.exposure import Exposure, decided_at
 from pp_cl.engine.training.loss import Loss, ignore_gradient, ignore_target
 from pp_cl.engine.training.optim import Optimiser
 from pp_cl.engine.training.prune import (
+    most_visible,
     points_of_large_parts,
     points_that_views_show,
     points_to_keep,
@@ -231,6 +232,10 @@ class Trainer:
         """Drop the points that were in enough images and had too low a blend weight or opacity."""
         opacity, train = self.model.cloud.opacity, self.config.train
         self._keep(points_to_keep(self.dev, self.state, opacity, train))
+
+    def keep_most_visible(self, count: int) -> None:
+        """Drop all points but the `count` that images show most."""
+        self._keep(most_visible(self.dev, self.state, self.model.cloud.opacity, count))
 
     def _keep(self, rows):
         """Drop all points but `rows`, with their training state."""

@@ -3,8 +3,11 @@ fragments and pixels that are expected. What does not fit is refused before it i
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import reduce
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +16,7 @@ from pp_cl.engine.device.buffers import PIECE_BYTES, grown, table_bytes
 from pp_cl.engine.device.device import compiler_bytes
 from pp_cl.engine.device.host import available_bytes, resident_bytes
 from pp_cl.engine.grid import MOST_IDS, Grid
-from pp_cl.engine.model import REFINING_BYTES, Model
+from pp_cl.engine.model import REFINING_BYTES
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud, sh_blocks
 from pp_cl.engine.raster.project import footprint_pixels
@@ -37,6 +40,11 @@ CROP_SHARE = 4
 # The share of the points that an image shows at first, when they are fog; all where no fragments
 # are dropped.
 SHOWN = 0.8
+# The least share of its points with which a training goes on where memory is too small for all of
+# them: about as many as pruning leaves at most beyond LEFT_BY_PRUNING, in two refinements.
+LEAST_KEPT = 0.5
+# The share of all memory that is filled where that decides the points: plans err by a few percent.
+FILLED = 0.9
 
 
 class Need(NamedTuple):
@@ -52,13 +60,14 @@ class Need(NamedTuple):
 
 class MemoryPlan:
     """Checks that a training fits the available memory; made before it allocates anything. need:
-    what it takes, by the last check. image_files: of the training views.
+    what it takes, by the last check; budget: --memory, GiB. image_files: of the training views.
     """
 
     def __init__(self, config: Config, net: UNet, image_files: Sequence[ImageFile]):
         self.dev, self._net = net.dev, net
         self.need: Need
         self._raster, self._train, self._points = config.raster, config.train, config.points
+        self.budget = config.train.memory_gib
         self._downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
         cameras = [one.camera for one in image_files]
         self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
@@ -79,7 +88,9 @@ class MemoryPlan:
         """Raise UserError if even the least memory that the training can take does not fit; called
         before the images are read and the hull is known.
         """
-        self._check(self._need(self._points.count, 0.0, step=0))
+        self.need = self._need(self._points.count, 0.0, step=0)
+        if fault := self._fault(self.need):
+            raise UserError(": ".join(fault))
 
     def check_points(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
@@ -87,44 +98,87 @@ class MemoryPlan:
         """Raise UserError where a training with these points of a grid does not fit from a step
         on, or would refine the grid beyond what ids can number.
         """
+        self.need = self.need_of(grid, points, depth_range, step)
+        if fault := self.fault_of(grid, points, depth_range, step):
+            raise UserError(": ".join(fault))
+
+    def points_that_fit(
+        self, grid: Grid, points: int, depth_range: tuple[float, float], step: int
+    ) -> int:
+        """The most of these points of a grid with which a training fits from a step on, if it
+        drops the others before it takes more memory. Raises UserError as check_points() does where
+        that is less than LEAST_KEPT of them, or not even the next steps fit.
+        """
+        most, start = points, self.need_of(grid, points, depth_range, step, stretches=1)
+        if not self._fault(start) and self.fault_of(grid, points, depth_range, step):
+            kept = _most(points, lambda n: self.fault_of(grid, n, depth_range, step, FILLED))
+            most = kept if kept >= LEAST_KEPT * points else points
+        self.check_points(grid, most, depth_range, step)
+        return most
+
+    def coarser_points(self, grid: Grid, points: int, depth_range: tuple[float, float]) -> int:
+        """The most points, up to these of a grid, with which a training fits that begins with a
+        coarser grid; 0 where none do.
+        """
+
+        def fault(count):
+            times = (points / count) ** (1 / 3)
+            dims = tuple(max(1, round(n / times)) for n in grid.dims)
+            coarser = replace(grid, voxel_size=times * grid.voxel_size, dims=dims)
+            return self.fault_of(coarser, count, depth_range, share=FILLED)
+
+        return _most(points, fault)
+
+    def fault_of(
+        self,
+        grid: Grid,
+        points: int,
+        depth_range: tuple[float, float],
+        step: int = 0,
+        share: float = 1.0,
+    ) -> tuple[str, str] | None:
+        """Why a training with these points of a grid does not fit into a share of the memory from
+        a step on, and what to do; None where it fits.
+        """
         to_come = sum(step < at for at in refine_steps(self._train))
         last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
         if last.id_count > MOST_IDS:
-            raise UserError(
-                f"refined {to_come} times, the grid has more than {MOST_IDS} vertices:"
-                " refine less often (train.refine_at), or lower --points"
+            return (
+                f"refined {to_come} times, the grid has more than {MOST_IDS} vertices",
+                "refine less often (train.refine_at), or lower --points",
             )
-        self._check(self.need_of(grid, points, depth_range, step))
+        return self._fault(self.need_of(grid, points, depth_range, step), share)
 
-    def check_growth(self, model: Model, step: int) -> None:
-        """Check again, by what pruning has left, if the next step refines or begins the EMA."""
-        points = model.cloud.count
-        if step + 1 in [*refine_steps(self._train), averages_from(self._train)]:
-            try:
-                self.check_points(model.grid, points, model.depth_range, step)
-            except UserError as error:
-                raise UserError(
-                    f"step {step}: to go on with {points} points, {error}, in another --out"
-                ) from None
+    def grows_after(self, step: int) -> bool:
+        """Whether the next step takes more memory: it refines or begins the EMA."""
+        return step + 1 in [*refine_steps(self._train), averages_from(self._train)]
 
     def need_of(
-        self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
+        self,
+        grid: Grid,
+        points: int,
+        depth_range: tuple[float, float],
+        step: int = 0,
+        stretches: int | None = None,
     ) -> Need:
-        """What a training with these points of a grid takes from a step on."""
+        """What a training with these points of a grid takes from a step on. stretches: between
+        refinements and the beginning of the EMA, to which to look ahead; None: all.
+        """
         middle = sum(depth_range) / 2
         # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
         # second order
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
         radius = point_radius(self._raster, grid.voxel_size, depth_range)
-        return self._need(points, radius * self._largest.fx / middle * math.sqrt(growth), step)
+        radius *= self._largest.fx / middle * math.sqrt(growth)
+        return self._need(points, radius, step, stretches)
 
-    def _need(self, points, radius, step):
+    def _need(self, points, radius, step, stretches=None):
         """The Need from a step on. radius: of the footprints then, pixels of the stored image."""
-        stretches = [*expected_stretches(self._train, points, step)]
+        ahead = [*islice(expected_stretches(self._train, points, step), stretches)]
         found = []
-        for stretch in stretches:
+        for stretch in ahead:
             # soft points are as wide as points are apart, which refining halves
-            halved = stretches[0].refinements - stretch.refinements
+            halved = ahead[0].refinements - stretch.refinements
             width = radius / 2**halved if self._raster.footprint == "soft" else radius
             found.append(self._need_of_stretch(stretch, width / self._downscale))
         peak, largest = max(found), max(need.largest for need in found)
@@ -169,27 +223,31 @@ class MemoryPlan:
         height, width = (min(side or size, size) for size in (camera.height, camera.width))
         return height + -height % UNet.multiple, width + -width % UNet.multiple
 
-    def _check(self, need):
-        info, name, self.need = self.dev.info, self.dev.name, need
+    def _fault(self, need, share=1.0):
+        info, name = self.dev.info, self.dev.name
         lower, available = "lower --points or train.crop, or raise --downscale", available_bytes()
         free = math.inf if available is None else max(0, available - self._program)
-        budget = self._train.memory_gib
         if need.largest > info["max_allocation_bytes"]:
             most = _size(info["max_allocation_bytes"])
             why = f"a buffer of {_size(need.largest)} is more than the {most} that {name} allocates"
             why += " at once"
-        elif need.device > info["memory_bytes"]:
+        elif need.device > share * info["memory_bytes"]:
             has = _size(info["memory_bytes"])
             why = f"the training needs {_size(need.device)}, {name} has {has}"
-        elif need.host > free:
+        elif need.host > share * free:
             why = f"the training needs {_size(need.host)} of the host's memory, {_size(free)} are"
             why += " free"
-        elif budget and need.device > budget * GIB:
-            why = f"--memory {budget:g}: the training needs {_size(need.device)}"
+        elif self.budget and need.device > share * self.budget * GIB:
+            why = f"--memory {self.budget:g}: the training needs {_size(need.device)}"
             lower = f"give --memory {math.ceil(need.device / GIB * 100) / 100:g}, {lower}"
         else:
-            return
-        raise UserError(f"{why}: {lower}, or choose another device (`pp-cl devices`)")
+            return None
+        return why, f"{lower}, or choose another device (`pp-cl devices`)"
+
+
+def _most(points, fault):
+    """The largest n up to `points` without a fault(n), as smaller ones are; 0: there is none."""
+    return bisect_right(range(1, points + 1), False, key=lambda n: fault(n) is not None)
 
 
 def _bytes(tables):
@@ -203,9 +261,10 @@ def _size(size):
 
 def memory_line(memory_plan: MemoryPlan) -> str:
     """The memory that the last check found to be needed."""
-    need, dev = memory_plan.need, memory_plan.dev
+    need, dev, budget = memory_plan.need, memory_plan.dev, memory_plan.budget
     has, on_host = _size(dev.info["memory_bytes"]), f"{_size(need.host)} of the computer's"
     if dev.is_cpu:
         return f"memory: up to {on_host} {has}, with {need.points} points"
-    on_device = f"{_size(need.device)} of the {has} of {dev.name}"
+    of = f"--memory {budget:g}" if budget else f"the {has} of {dev.name}"
+    on_device = f"{_size(need.device)} of {of}"
     return f"memory: up to {on_device}, with {need.points} points, and {on_host}"

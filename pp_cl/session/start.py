@@ -1,5 +1,6 @@
 """What a new training starts from: its network, its visual hull, its refinements."""
 
+import math
 import warnings
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from pp_cl.engine.views import View
 from pp_cl.errors import UserError, few_names
 from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
 from pp_cl.scene.hull import (
+    TOLERANCE,
     Agreement,
     Hull,
     agreeing,
@@ -36,7 +38,6 @@ FINEST, COARSEST = 1.25, 1.5
 # raster.radius where it is automatic, in point spacings: one pixel within these bounds; less is no
 # better where points lie farther apart
 LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
-COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1.7 times less points
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
 # what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
 DEMO_NETWORK = Path(__file__).with_name("demo.npz")
@@ -73,10 +74,10 @@ def _unlike(ours, theirs):
 
 
 def first_hull(
-    dev: Device, config: Config, agreement: Agreement, coarsest: float = COARSEST
+    dev: Device, config: Config, agreement: Agreement
 ) -> tuple[Hull, tuple[float, float]]:
     """(the hull that a training starts from, its train.refine_at). Where that is automatic, there
-    are as many refinements as bring points FINEST to `coarsest` pixels of the images close.
+    are as many refinements as bring points FINEST to COARSEST pixels of the images close.
     """
     points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
@@ -87,8 +88,8 @@ def first_hull(
     spacing = spacing_pixels(hull.grid, cameras)
     smallest = min(min(camera.width, camera.height) for camera in cameras)
     possible = [n for n in range(1, len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
-    times = sum(spacing > coarsest * 2 ** (n - 1) for n in possible)
-    first = min(max(spacing, 2**times * FINEST), 2**times * coarsest)
+    times = sum(spacing > COARSEST * 2 ** (n - 1) for n in possible)
+    first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)
     if times and first != spacing:
         hull = build_grid(dev, views, round(points * (spacing / first) ** 3), box, forgiven)
     return hull, REFINE_AT[times]
@@ -102,13 +103,14 @@ def automatic_radius(grid: Grid, views: list[View], refinements_to_come: int) ->
 
 def fitting_hull(
     dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
-) -> tuple[Agreement, Hull, tuple[float, float]]:
-    """(which views' masks agree, first_hull() of them, its (near, far)); automatic settings in
-    config are chosen. Where memory is too small for points COARSEST pixels apart in the end, they
-    are as close as it allows. Raises UserError as MemoryPlan.check_points() does, and for an
-    automatic radius of footprints that are not soft.
+) -> tuple[Agreement, Hull, tuple[float, float], str]:
+    """(which views' masks agree, first_hull() of them, its (near, far), what it gives up);
+    automatic settings in config are chosen. Where memory is too small and the refinements are
+    automatic, there are as many of these, and the points as close as memory allows. Raises
+    UserError as MemoryPlan.check_points() does, and for an automatic radius of footprints that are
+    not soft.
     """
-    is_automatic, train, coarsest = config.train.refine_at == UNSET, config.train, COARSEST
+    is_automatic, train, given_up = config.train.refine_at == UNSET, config.train, ""
     raster, is_radius_automatic = config.raster, config.raster.radius == 0
     config.automatic = [
         key for key, one in zip(AUTOMATIC, (is_automatic, is_radius_automatic), strict=True) if one
@@ -119,19 +121,26 @@ def fitting_hull(
             " cannot be; give it in world units at a depth range of 4 (0.0015 in the paper)"
         )
     agreement = agreeing(dev, views, scene_box(config))
+    views, _, forgiven = agreement
+    hull, train.refine_at = first_hull(dev, config, agreement)
+    to_come, cameras = len(refine_steps(train)), [view.camera for view in views]
+    last = math.inf  # points of the try before
     while True:
-        hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
         if is_radius_automatic:
-            to_come = len(refine_steps(train))
-            raster.radius = automatic_radius(hull.grid, agreement.views, to_come)
-        near_far = depth_range(agreement.views, hull)
-        try:
-            memory_plan.check_points(hull.grid, len(hull.ids), near_far)
-            return agreement, hull, near_far
-        except UserError:
-            if not is_automatic or train.refine_at == NEVER:
-                raise
-        train.refine_at, coarsest = UNSET, COARSER * coarsest
+            raster.radius = automatic_radius(hull.grid, views, to_come)
+        found = hull.grid, len(hull.ids), depth_range(views, hull)
+        fault = memory_plan.fault_of(*found)
+        can_be_fewer = is_automatic and len(hull.ids) < last
+        fewer = memory_plan.coarser_points(*found) if fault and can_be_fewer else 0
+        if not (fault and fewer):
+            memory_plan.check_points(*found)
+            return agreement, hull, found[-1], given_up
+        last, spacing = len(hull.ids), spacing_pixels(hull.grid, cameras) / 2**to_come
+        given_up = given_up or (
+            f"points: as close as memory allows; {len(hull.ids)} at first, {spacing:.2f} pixels"
+            f" apart in the end, would be too many ({fault[0]})"
+        )
+        hull = build_grid(dev, views, max(1, int(fewer / TOLERANCE)), scene_box(config), forgiven)
 
 
 def sheet_of_masks(

@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,11 +45,13 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 class HullFacts(NamedTuple):
     """Of the hull of a new training. capped: it has fewer points than asked for. seconds: carving
-    took. sheet: of the masks that disagree with the others, None if all agree.
+    took. given_up: for lack of memory, in a line; "": nothing. sheet: of the masks that disagree
+    with the others, None if all agree.
     """
 
     capped: bool
     seconds: float
+    given_up: str
     sheet: np.ndarray | None
 
 
@@ -119,11 +122,8 @@ class Training:
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < train.iterations:
-                try:
-                    self.memory_plan.check_growth(trainer.model, trainer.step)
-                except UserError:  # the next step would not fit the memory
-                    self._save(finished=False)
-                    raise
+                if self.memory_plan.grows_after(trainer.step):
+                    self._fit_memory()
                 start = time.perf_counter()
                 terms = trainer.train_step()
                 took = time.perf_counter() - start
@@ -154,6 +154,25 @@ class Training:
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
             self._save(finished=True)
         return seconds
+
+    def _fit_memory(self):
+        """Drop points where memory is too small for all of them from the next step on."""
+        trainer, model = self.trainer, self.trainer.model
+        count, step = model.cloud.count, trainer.step
+        try:
+            most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, step)
+        except UserError as error:
+            self._save(finished=False)
+            raise UserError(
+                f"step {step}: to go on with {count} points, {error}, in another --out"
+            ) from None
+        if most < count:
+            warnings.warn(
+                f"step {step}: for lack of memory, {count - most} of {count} points are dropped,"
+                " those that images show least",
+                stacklevel=2,
+            )
+            trainer.keep_most_visible(most)
 
     def _is_automatic(self, key):
         return key in self.config.automatic
@@ -240,7 +259,7 @@ def open_training(
     memory_plan = MemoryPlan(followed, net, split_files.image_files)
     if stored:
         grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
-        memory_plan.check_points(grid, points, header["depth_range"], header["step"])
+        memory_plan.points_that_fit(grid, points, header["depth_range"], header["step"])
     else:
         memory_plan.check_unseen()
     scene = open_scene(dev, config, ("train",), listed={"train": split_files})
@@ -255,9 +274,10 @@ def open_training(
     else:
         start = time.perf_counter()
         with Progress("carving the visual hull"):
-            agreement, hull, depth_range = fitting_hull(dev, config, views, memory_plan)
+            agreement, hull, depth_range, given_up = fitting_hull(dev, config, views, memory_plan)
             seconds = time.perf_counter() - start
-            facts = HullFacts(hull.capped, seconds, sheet_of_masks(dev, views, hull, agreement))
+            sheet = sheet_of_masks(dev, views, hull, agreement)
+            facts = HullFacts(hull.capped, seconds, given_up, sheet)
         cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
         model = Model(dev, hull.grid, depth_range, cloud, net=net)
         views, left_out = agreement.views, list(agreement.left_out)

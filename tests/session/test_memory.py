@@ -1,13 +1,16 @@
 import gc
+import math
+import re
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from support.refused import failure
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import assign, preset, run_config
+from pp_cl.config import assign, load_config, preset, run_config
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import table_bytes
 from pp_cl.engine.device.device import Device
@@ -17,7 +20,7 @@ from pp_cl.engine.network.unet import UNet
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.session.memory import GIB, MIB, MemoryPlan
+from pp_cl.session.memory import FILLED, GIB, MIB, MemoryPlan
 from pp_cl.session.training import open_training
 
 GRID = Grid((0, 0, 0), 0.02, (64, 64, 64))
@@ -57,6 +60,42 @@ def test_it_is_within_15_percent_of_what_a_training_takes(
     need = training.memory_plan.need
     assert need.points == training.trainer.model.cloud.count
     assert 0.85 < need.device / plain.peak_bytes < 1.15
+
+
+class Card(Device):
+    """Notes what kernels are launched in which groups."""
+
+    def __init__(self, device):
+        super().__init__(device)
+        self.launched = set()
+
+    def enqueue(self, launch):
+        self.launched.add((launch.kernel, launch.local))
+        super().enqueue(launch)
+
+
+def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsys):
+    """In the form for GPUs, with what all of these have: --memory 0.1, 28 MiB of it at once,
+    groups of 256, local memory of 32 KiB. They are refined as with more memory.
+    """
+    monkeypatch.setenv("PP_FORM", "gpu")
+    monkeypatch.setenv("PP_MAX_ALLOCATION", "28")
+    card, folder = Card(dev.device), RunFolder(tmp_path / "run")
+    monkeypatch.setattr("pp_cl.drivers.open_device", lambda choice: card)
+    scene = write_ball_scene(tmp_path / "ball", size=128)
+    words = ["train", scene, "--out", str(folder), "--downscale", "1", "--points", "4000"]
+    words += ["--memory", "0.1", "--iterations", "24", "--set", "train.prune_weight=0"]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert re.search("points: as close as memory allows; .*--memory 0.1: the training needs", told)
+    assert load_config(folder.config).train.refine_at == (0.35, 1)
+    plan = float(re.search(r"memory: up to (\S+) MiB of --memory 0.1", told)[1]) * MIB
+    assert FILLED - 0.05 < plan / (0.1 * GIB) < FILLED + 0.001
+    assert 0.85 < plan / card.peak_bytes < 1.15
+    assert max(math.prod(group) for _, group in card.launched) == 256
+    limit = cl.kernel_work_group_info.LOCAL_MEM_SIZE
+    local = [one._kernel.get_work_group_info(limit, card.device) for one, _ in card.launched]
+    assert 0 < max(local) <= 32 * 1024
 
 
 def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
@@ -174,8 +213,28 @@ def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
         made.check_unseen()
 
 
+def test_what_does_not_fit_any_more_is_dropped_but_for_half(plain):
+    made, (points, step) = memory_plan(plain, train__refine_at="0.4,1"), (20_000, 3000)
+    plain.info["memory_bytes"] = made.need_of(GRID, points, (2, 6), step).device
+    assert made.points_that_fit(GRID, points, (2, 6), step) == points
+    assert made.points_that_fit(GRID, 3 * points // 2, (2, 6), step) > 3 * points // 4
+    assert made.need.device == pytest.approx(FILLED * plain.info["memory_bytes"], rel=1e-3)
+    with pytest.raises(UserError, match="needs"):
+        made.points_that_fit(GRID, 3 * points, (2, 6), step)
+
+
+def test_what_the_next_steps_take_is_not_dropped(plain):
+    made = memory_plan(plain, train__refine_at="0.4,1")
+    plain.info["memory_bytes"] = made.need_of(GRID, 100_000, (2, 6), 7900).device
+    assert made.points_that_fit(GRID, 100_000, (2, 6), 7900) == 100_000
+    with pytest.raises(UserError, match="needs"):
+        made.points_that_fit(GRID, 101_000, (2, 6), 7900)
+
+
 @pytest.mark.slow
-def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, monkeypatch, capsys):
+def test_a_refinement_that_does_not_fit_has_less_to_refine_or_keeps_what_is_learned(
+    plain, tmp_path, monkeypatch, capsys
+):
     scene = write_ball_scene(tmp_path / "ball", size=64)
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
@@ -183,9 +242,14 @@ def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, m
     monkeypatch.setattr(f"{schedule}.LEFT_BY_PRUNING", 0.05)
     monkeypatch.setattr(f"{schedule}.prunings", lambda train, start, end: int(end > start + 1))
     monkeypatch.setattr("pp_cl.drivers.open_device", lambda choice: plain)
+    settings |= {"downscale": 1, "points__count": 5000}
     plain.info["memory_bytes"] = 30 * MIB
-    words = arguments(scene, tmp_path / "run", downscale=1, points__count=5000, **settings)
+    assert main(arguments(scene, tmp_path / "fewer", **settings)) == 0
+    dropped, count = map(int, re.search(r"19: .* (\d+) of (\d+)", capsys.readouterr().err).groups())
+    assert 0.1 < dropped / count < 0.5 and plain.peak_bytes > (FILLED - 0.15) * 30 * MIB
 
+    plain.info["memory_bytes"] = 20 * MIB
+    words = arguments(scene, tmp_path / "run", **settings)
     told = failure(*words)
     assert "step 19: to go on with " in told and told.endswith("in another --out")
     plain.info["memory_bytes"] = GIB

@@ -28,16 +28,29 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainC
     The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
     Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
-    weight, seen = dev.download(state.max_weight), dev.download(state.times_seen)
-    opacities = dev.download(opacity)[:, 0]
-    broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
-    if broken:
-        raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
+    weight, opacities = _weights_and_opacities(dev, state, opacity)
+    seen = dev.download(state.times_seen)
     judged = seen >= schedule.PRUNE_LOOKS
     passes = (weight >= train.prune_weight) & (opacities >= LEAST_OPACITY)
     dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
     dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
     return _listed(dev, ~judged | passes, weight)
+
+
+def most_visible(dev: Device, state: PointState, opacity: Array, count: int) -> Array:
+    """(count,) uint32, ascending: the points of the highest blend weights since they were last
+    judged; of equal ones the most opaque. Raises Diverged as points_to_keep() does.
+    """
+    weight, opacities = _weights_and_opacities(dev, state, opacity)
+    return dev.upload(np.sort(np.lexsort((-opacities, -weight))[:count]), np.uint32)
+
+
+def _weights_and_opacities(dev, state, opacity):
+    weight, opacities = dev.download(state.max_weight), dev.download(opacity)[:, 0]
+    broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
+    if broken:
+        raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
+    return weight, opacities
 
 
 def final_points_to_keep(
