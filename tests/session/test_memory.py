@@ -109,7 +109,7 @@ def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
     return MemoryPlan(config, net, [ImageFile(f"{i}.png", camera) for i in range(images)])
 
 
-def test_each_compute_unit_has_memory_of_its_own(dev, plain, monkeypatch):
+def test_each_compute_unit_has_memory_of_its_own(dev, cpu_form, plain, monkeypatch):
     """Where convolutions transform their tiles; as on a server with 128 cores."""
     planned, shared, taken = [], [], []
     for units in (2, 256):
