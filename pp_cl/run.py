@@ -19,7 +19,7 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.depth import depth_forward
 from pp_cl.engine.render import Renderer
-from pp_cl.engine.training.schedule import gamma_at
+from pp_cl.engine.training.schedule import gamma_at, supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError, few_names
 from pp_cl.files.image import to_8bit
@@ -50,14 +50,18 @@ class Run:
     def renderer(self) -> Renderer:
         """Renders the model, whose parameters must not change any more."""
         self.model.net.freeze()
-        return Renderer(self.dev, self.model, self.config.raster)
+        supersampling = supersampling_at(self._last_step, self.config.train)
+        return Renderer(self.dev, self.model, self.config.raster, supersampling)
+
+    @property
+    def _last_step(self):
+        # the settings of a finished run that is extended say where it goes, not where it is
+        return self.config.train.iterations if self.header["finished"] else self.header["step"]
 
     @property
     def gamma(self) -> float:
         """Depth sharpness of the blend at the run's last step."""
-        # the settings of a finished run that is extended say where it goes, not where it is
-        steps = self.config.train.iterations
-        return gamma_at(steps if self.header["finished"] else self.header["step"], steps)
+        return gamma_at(self._last_step, self.config.train.iterations)
 
     def scene(self, split: str) -> Scene:
         """The run's scene with one split, without views that training has left out or that show
@@ -164,15 +168,36 @@ class Run:
             result = self.renderer.forward(camera.shifted(dx, dy), self.gamma, **options)
             with self.dev.stage("depth"):
                 found = depth_forward(
-                    self.dev, result.points, result.pairs, result.weights, result.size
+                    self.dev, result.points, result.pairs, result.weights, result.drawn_size
                 )
-            arrays = (*found, result.features) if features else found
-            layers = [result.cropped(self.dev.download(array)) for array in arrays]
+            drawn = [self.dev.download(array) for array in found]
+            layers = [result.cropped(array) for array in self._averaged(result, *drawn)]
+            if features:
+                layers.append(result.cropped(self.dev.download(result.features)))
             return RenderedView(result.clamped(), *layers)
 
         rendered = mean_rendered_view(sample(dx, dy) for dy in shifts for dx in shifts)
         self.checked(rendered.colour)
         return rendered
+
+    def _averaged(self, result, alpha, depth, median):
+        """Of the image's pixels: the mean of the drawn ones' alpha, and of those of their depths
+        that lie within a voxel of the nearest.
+        """
+        (height, width), k = result.size, result.supersampling
+        if k == 1:
+            return alpha, depth, median
+        alpha, *depths = (
+            array.reshape(height, k, width, k).swapaxes(1, 2).reshape(height, width, k * k)
+            for array in (alpha, depth, median)
+        )
+        reach = [one.min(2, keepdims=True) + self.model.grid.voxel_size for one in depths]
+        near = [one <= most for one, most in zip(depths, reach, strict=True)]
+        means = (
+            np.where(is_near, one, 0).sum(2) / is_near.sum(2, dtype=np.float32)
+            for one, is_near in zip(depths, near, strict=True)
+        )
+        return alpha.mean(2), *means
 
     @property
     def nearest(self) -> float:

@@ -131,6 +131,13 @@ class TrainConfig:
     crop: int = setting(
         128, "side in pixels of the square crop of a step (0: whole images)", 0, 2**14
     )
+    supersampled: float = setting(
+        0.0,
+        "share of the steps, the last ones, in which features are drawn in images twice as large,"
+        " whose means the network sees; they take twice as long, as do renderings from then on",
+        0,
+        1,
+    )
     pixel_jitter: bool = setting(
         True,
         "shift the image by a random part of a pixel each step: where it is reduced, by whole"

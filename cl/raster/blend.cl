@@ -189,7 +189,7 @@ kernel void blend_backward(
     const uint s,                            // visible points
     const float voxel_size,                  // of the grid, world units
     const float radius,                      // of a point without offsets, world units
-    const int is_recorded,                   // 0: max_weight is not touched
+    const float pixel,                       // its share of one, 0: max_weight is not touched
     global const uint *visible,              // (?) their indices, S
     global const float *camera,              // (21) camera.h, read with MOVES, as the next five
     global const float4 *point_camera,       // (N, 4) x, y, z, distance
@@ -242,7 +242,8 @@ kernel void blend_backward(
     if (ROW_PART > 0) return;
     grad_opacity[g] = dL_do;
     // fmax() would hide a NaN
-    if (is_recorded && (weight > max_weight[i] || isnan(weight))) max_weight[i] = weight;
+    weight *= pixel;
+    if (pixel > 0.0f && (weight > max_weight[i] || isnan(weight))) max_weight[i] = weight;
 #if MOVES
     const Offsets offset = FORM > 1 ? OFFSETS_AT(cloud_offset, i) : (Offsets)(0.0f);
     OFFSETS_AT(grad_offset, g) = offset_end(&moved, &cam, voxel_size, radius, offset);

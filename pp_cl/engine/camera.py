@@ -118,6 +118,18 @@ class Camera:
             height=self.height // factor,
         )
 
+    def enlarged(self, factor: int) -> "Camera":
+        """The camera of the image that has factor x factor pixels for each pixel of this one's."""
+        return replace(
+            self,
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=self.cx * factor,
+            cy=self.cy * factor,
+            width=self.width * factor,
+            height=self.height * factor,
+        )
+
     def resized(self, width: int, height: int) -> "Camera":
         """The camera whose image has this many pixels and shows as much across its width."""
         scale = width / self.width

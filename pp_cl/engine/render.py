@@ -6,6 +6,7 @@ project -> pairs -> blend weights -> shade the visible points -> blend their fea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,7 +20,8 @@ from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import Prepared
 from pp_cl.engine.layers.conv import GradientParts
-from pp_cl.engine.layers.tiles import tiles_covered
+from pp_cl.engine.layers.simple import avgpool2_backward, avgpool2_forward
+from pp_cl.engine.layers.tiles import grid_shape, tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
     BlendGradients,
@@ -65,10 +67,11 @@ def view_table(
     *,
     until: Literal["weights", "image"] = "image",
     training: bool = False,
+    supersampling: int = 1,
 ) -> Table:
-    """The buffers of Renderer for a view of n points with so many pixels, fragments and visible
-    points. until, training: of forward(); with record_weights() if it ends at the weights, with
-    backward() in a training.
+    """The buffers of Renderer for a view of n points with so many drawn pixels, fragments and
+    visible points. until, training: of forward(); with record_weights() if it ends at the weights,
+    with backward() in a training. supersampling: of RenderResult.
     """
     table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs)
     table |= weights_table(n, pixels, pairs if training else 1)
@@ -78,7 +81,18 @@ def view_table(
     table["visible_features"] = (visible, 16), np.float32
     if training:
         table |= blend_backward_table(visible, pixels, pairs, settings.blend, settings.footprint)
+    if supersampling > 1:
+        table |= _means_table(pixels // supersampling**2)
+        table |= _drawn_gradients_table(pixels if training else 0)
     return table
+
+
+def _means_table(pixels):
+    return {"mean_features": ((pixels, 16), np.float32), "mean_rest": ((pixels,), np.float32)}
+
+
+def _drawn_gradients_table(pixels):
+    return {"grad_features": ((pixels, 16), np.float32), "grad_alpha": ((pixels,), np.float32)}
 
 
 @dataclass
@@ -87,12 +101,15 @@ class RenderResult:
     the next view.
 
     camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
-    offset: (left, top) of the view in it. points: the N points as the padded camera sees them.
-    tile_mask: (rows, columns) bool, the 4x4 tiles of the padded image that have fragments; None
-    where the network computes all. visible_features: float32, one row of 16 for each point of
-    weights.visible, then room for more. features: (H, W, 16) float32, blended from them. image: (H,
-    W, 3) float32, unclamped. computed_fraction: share of the network's multiplications that was
-    done; the others would have seen only background.
+    offset: (left, top) of the view in it. supersampling: pixels that points are drawn in for one of
+    the image, each way; pairs and weights are of these. points: the N points as the camera of the
+    drawn pixels sees them. tile_mask: (rows, columns) bool, the 4x4 tiles of drawn pixels that have
+    fragments; None where the network computes all. visible_features: float32, one row of 16 for
+    each point of weights.visible, then room for more. drawn_features: float32, blended from them,
+    16 of each drawn pixel. features: (H, W, 16) float32, their means; transmittance: (H * W,)
+    float32, the means of that of weights, None as there. image: (H, W, 3) float32, unclamped.
+    computed_fraction: share of the network's multiplications that was done; the others would have
+    seen only background.
     """
 
     dev: Device
@@ -103,15 +120,25 @@ class RenderResult:
     pairs: Pairs
     weights: BlendWeights
     tile_mask: Pending[np.ndarray] | None
+    supersampling: int = 1
     visible_features: Array = field(init=False)
+    drawn_features: Array = field(init=False)
     features: Array = field(init=False)
+    transmittance: Array | None = None
     image: Array = field(init=False)
     computed_fraction: float = 1.0
 
+    @property
+    def drawn_size(self) -> tuple[int, int]:
+        """(height, width) of the pixels that points are drawn in."""
+        height, width = self.size
+        return self.supersampling * height, self.supersampling * width
+
     def fragments(self) -> np.ndarray:
-        """(height, width) int64: the points that cover each pixel, without the padding."""
+        """(height, width) int64: the fragments of each pixel, without the padding."""
         counts = np.diff(self.pairs.pixel_offset.get().astype(np.int64))
-        return self.cropped(counts.reshape(self.size))
+        (height, width), k = self.size, self.supersampling
+        return self.cropped(counts.reshape(height, k, width, k).sum((1, 3)))
 
     def clamped(self) -> np.ndarray:
         """(height, width, 3) float32 image without the padding, clamped to [0, 1]."""
@@ -124,9 +151,11 @@ class RenderResult:
 
 
 class Renderer:
-    """Renders a model. Its buffers are reused from view to view."""
+    """Renders a model. Its buffers are reused from view to view. supersampling: of images, as
+    RenderResult has it, 1 or 2.
+    """
 
-    def __init__(self, dev: Device, model: Model, settings: RasterConfig):
+    def __init__(self, dev: Device, model: Model, settings: RasterConfig, supersampling: int = 1):
         self.dev = dev
         self.model = model
         self.settings = settings
@@ -135,6 +164,7 @@ class Renderer:
         # the views.
         self._by_pair = False
         self._capacity, self._visible_capacity = [1, 1], [1, 1]
+        self.supersampling = supersampling
         self.release()
 
     @property
@@ -163,7 +193,8 @@ class Renderer:
     ) -> RenderResult:
         """Render a camera, which is padded to multiples of net.multiple pixels.
 
-        until: the last stage wanted: blend weights, blended features or the network's image.
+        until: the last stage wanted: blend weights, blended features or the network's image, which
+        alone is supersampled.
         gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
         the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
         softmax needs the model's.
@@ -172,8 +203,8 @@ class Renderer:
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         padded, left, top = camera.padded(net.multiple)
-        size = (padded.height, padded.width)
-        if max(size) > MOST_SIDE:
+        size, k = (padded.height, padded.width), self.supersampling if until == "image" else 1
+        if k * max(size) > MOST_SIDE:
             raise UserError(
                 f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
                 " are rendered; render parts of it"
@@ -183,8 +214,11 @@ class Renderer:
             self._by_pair = by_pair
             self.release()
         b = self._buffers
-        b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
-        dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
+        drawn = padded.enlarged(k)
+        drawn_size = drawn.height, drawn.width
+        b.require({"camera_buffer": ((21,), np.float32)})
+        b.require({"features": ((*drawn_size, 16), np.float32)})
+        dev.send(b.camera_buffer, self.model.packed(drawn, depth_range))
         with dev.stage("project"):
             points = self._launches["project"].run(
                 partial(project_grid, dev, b, self.settings.footprint),
@@ -196,9 +230,10 @@ class Renderer:
                 radius=self.point_radius,
             )
         pairs, weights, tile_mask = self._pairs_and_weights(
-            points, size, gamma, early_stop, training, times_seen
+            points, drawn_size, gamma, early_stop, training, times_seen
         )
-        result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tile_mask)
+        view = camera, (left, top), size
+        result = RenderResult(dev, *view, points, pairs, weights, tile_mask, k)
         if until == "weights":
             return result
         with dev.stage("shade"):
@@ -213,16 +248,46 @@ class Renderer:
         with dev.stage("blend"):
             blend = partial(blend_forward, dev)
             self._launches["blend"].run(blend, pairs, weights, b.visible_features, b.features)
-        result.visible_features, result.features = b.visible_features, b.features
+            result.visible_features, result.drawn_features = b.visible_features, b.features
+            self._average(result)
         if until == "features":
             return result
         with dev.stage("network"):
             plan: Any = None
             if net.is_planned(size):
-                plan = net.plan_tiles(size, tile_mask.get(), gradient_tiles())
+                (rows, columns), covered = grid_shape(*size), tile_mask.get()
+                covered = covered.reshape(rows, k, columns, k).any((1, 3))
+                plan = net.plan_tiles(size, covered, gradient_tiles())
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
-            result.image = net.forward(b.features, training, plan)
+            result.image = net.forward(result.features, training, plan)
         return result
+
+    def _average(self, result):
+        """Set what of a result is the mean of drawn pixels."""
+        b, rest = self._buffers, result.weights.transmittance
+        result.features, result.transmittance = result.drawn_features, rest
+        if result.supersampling == 1:
+            return
+        (height, width), pixels = result.size, math.prod(result.size)
+        b.require(_means_table(pixels))
+        result.features = b.mean_features.reshape(height, width, 16)
+        avgpool2_forward(self.dev, result.drawn_features, result.features)
+        if rest is not None:
+            result.transmittance = b.mean_rest
+            means = b.mean_rest.reshape(height, width, 1)
+            avgpool2_forward(self.dev, rest.reshape(*result.drawn_size, 1), means)
+
+    def _of_drawn(self, result, name, grad):
+        """The gradient (H, W, C) of means of drawn pixels, given to these, in a buffer."""
+        if result.supersampling == 1 or grad is None:
+            return grad
+        self._buffers.require(_drawn_gradients_table(math.prod(result.drawn_size)))
+        height, width = result.size
+        channels = grad.size // (height * width)
+        drawn = getattr(self._buffers, name).reshape(*result.drawn_size, channels)
+        self.dev.fill(drawn, 0)
+        avgpool2_backward(self.dev, None, grad.reshape(height, width, channels), drawn)
+        return drawn
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen):
         """(Pairs, BlendWeights, RenderResult.tile_mask). Both stages are enqueued before the number
@@ -279,9 +344,10 @@ class Renderer:
         max_weight: Array | None = None,
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
-        alpha compositing also from dL/dalpha (H * W,), and of the distortion loss of each pixel
-        with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
-        points are composited by alpha, there are none of offsets. max_weight: of blend_backward().
+        alpha compositing also from dL/dalpha (H * W,), and of the distortion loss of each drawn
+        pixel with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless
+        soft points are composited by alpha, there are none of offsets. max_weight: of
+        blend_backward().
 
         result: of the last forward(training=True). The gradients of the SH coefficients are those
         of the visible points' features times the basis functions in the view's direction; the
@@ -290,6 +356,8 @@ class Renderer:
         settings = self.settings
         moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
         with self.dev.stage("backward"):
+            grad_features = self._of_drawn(result, "grad_features", grad_features)
+            grad_alpha = self._of_drawn(result, "grad_alpha", grad_alpha)
             return blend_backward(
                 self.dev,
                 self._buffers,
@@ -298,12 +366,13 @@ class Renderer:
                 result.weights,
                 opacity=result.points.point_opacity,
                 visible_features=result.visible_features,
-                features=result.features,
+                features=result.drawn_features,
                 grad_features=grad_features,
-                grad_alpha=grad_alpha,
+                grad_alpha=None if grad_alpha is None else grad_alpha.reshape(-1),
                 distortion_weight=distortion_weight,
                 voxel_size=self.model.grid.voxel_size if moves else 0.0,
                 max_weight=max_weight,
+                pixel=1 / result.supersampling**2,
             )
 
     def blend(self, result: RenderResult, features: np.ndarray) -> np.ndarray:

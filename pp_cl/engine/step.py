@@ -29,6 +29,7 @@ from pp_cl.engine.training.schedule import (
     gamma_at,
     refine_steps,
     rising_weight,
+    supersampling_at,
 )
 from pp_cl.engine.training.smooth import Smoother
 from pp_cl.engine.training.state import PointState, split_opacity
@@ -108,6 +109,7 @@ class Trainer:
             find_gradient_tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
             ignored = None if says_nothing is None else self._sent(says_nothing)
 
+        self.renderer.supersampling = supersampling_at(self.step, train)
         rendered = self.renderer.forward(
             crop.camera,
             self.gamma,
@@ -121,7 +123,7 @@ class Trainer:
                 self.exposure.fit(crop.view_index, rendered.image, image, alpha, offset)
             grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
         # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
-        all_depths = alpha.size * self.model.grid.diagonal
+        all_depths = alpha.size * rendered.supersampling**2 * self.model.grid.diagonal
         distortion_weight = self._rising(train.distortion_weight if self._composited else 0.0)
         gradients, network_parts = self.renderer.backward(
             rendered,
@@ -167,7 +169,7 @@ class Trainer:
         image, offset = rendered.image, rendered.offset
         if ignored is not None:
             ignore_target(self.dev, ignored, image, target, alpha, offset)
-        alphas, transmittance = None, rendered.weights.transmittance  # None of a softmax
+        alphas, transmittance = None, rendered.transmittance  # None of a softmax
         has_mask = self.views[crop.view_index].has_mask  # known, of crop.view it is not
         if transmittance is not None and self.loss.mask_weight > 0 and has_mask:
             alphas = transmittance, alpha

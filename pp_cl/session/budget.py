@@ -4,7 +4,7 @@ import math
 import statistics
 from collections import deque
 
-from pp_cl.engine.training.schedule import refine_steps
+from pp_cl.engine.training.schedule import refine_steps, supersampling_at
 from pp_cl.settings import TrainConfig
 
 NEVER = (1.0, 1.0)  # train.refine_at of a grid that is not refined
@@ -12,6 +12,7 @@ PLANS = 50  # in the minutes given
 FIXED = 0.8  # share of the steps after which their number rises no more: soon the averages begin
 FOG = 0.35  # of the first step's time, which later ones save: a third of the steps clears it
 DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
+SUPERSAMPLED = 2.0  # times that a step takes longer once it is supersampled
 # Steps of a training, for each of its refinements, below which it is better without any: in the
 # time of 250 steps of `small`, lego has 27.4 dB with its refinement and 29.8 without, in that of
 # 800 steps 31.5 and 32.3.
@@ -39,7 +40,8 @@ class Budget:
         train = self._train
         self._times.append(seconds - self._last)
         self._last = seconds
-        if step in refine_steps(train):
+        changes = supersampling_at(step, train) != supersampling_at(step - 1, train)
+        if changes or step in refine_steps(train):
             self._times.clear()
         if len(self._times) < FEWEST or seconds < self._next:
             return False
@@ -60,21 +62,29 @@ class Budget:
 
 def replan(train: TrainConfig, step: int, left: float, ending: float = 0.0) -> None:
     """Set train.iterations of a training that has time for `left` more steps without refinements,
-    and train.refine_at so that past ones stay where they were. ending: steps that its end is worth.
+    and train.refine_at and supersampled so that what is past stays where it was. ending: steps that
+    its end is worth.
     """
     steps, shares = train.iterations, [share for share in train.refine_at if 0 < share < 1]
     is_late = step >= FIXED * steps
     past = {share: at for share in shares if (at := max(1, round(share * steps))) <= step}
     to_come = [at / steps for at in refine_steps(train) if at > step]
-    all_as_one, start = 0.0, 0.0
-    for level, end in enumerate([*to_come, 1.0]):
-        all_as_one += (end - start) * DEARER**level
-        start = end
+    dearer = [(share, DEARER) for share in to_come]
+    begun, begins = supersampling_at(step, train) > 1, 1 - train.supersampled
+    if not begun:
+        dearer.append((begins, SUPERSAMPLED))
+    all_as_one, start, cost = 0.0, 0.0, 1.0
+    for end, times in [*sorted(dearer), (1.0, 1.0)]:
+        all_as_one += (end - start) * cost
+        start, cost = end, cost * times
     # is not jumped over
     soonest = min([1.0 if is_late else FIXED, *(share for share in shares if share not in past)])
+    soonest = soonest if begun else min(soonest, begins)
     left -= ending * DEARER ** len(to_come)
     planned = max(round((step + left) / all_as_one), math.ceil((step + 1) / soonest))
     if is_late and planned > steps:  # else averages would begin anew
         return
     train.iterations = planned
     train.refine_at = tuple(past[s] / planned if s in past else s for s in train.refine_at)
+    if begun:
+        train.supersampled = 1 - begins * steps / planned

@@ -191,12 +191,14 @@ class MemoryPlan:
         raster, train, n = self._raster, self._train, stretch.points
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
-        pairs = grown(0, round(n * min(footprint_pixels(radius), math.prod(image))))
+        k = 2 if train.supersampled > 0 else 1
+        drawn = k**2 * math.prod(image)
+        pairs = grown(0, round(n * min(footprint_pixels(k * radius), drawn)))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
         share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(image))
-        of_crop = math.prod(crop), round(share * pairs), round(share * visible)
-        of_step = view_table(raster, n, *of_crop, training=True)
-        of_preview = view_table(raster, n, math.prod(image), pairs, visible)
+        of_crop = k**2 * math.prod(crop), round(share * pairs), round(share * visible)
+        of_step = view_table(raster, n, *of_crop, training=True, supersampling=k)
+        of_preview = view_table(raster, n, drawn, pairs, visible, supersampling=k)
         of_pruning = view_table(raster, n, math.prod(image), pairs, 0, until="weights")
 
         held = [

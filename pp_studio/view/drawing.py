@@ -104,7 +104,8 @@ def most_opaque(run: Run, share: float) -> Run:
     cloud = model.cloud.rows(run.dev, run.dev.upload(keep))
     thinned = Model(run.dev, model.grid, model.depth_range, cloud, net=model.net)
     found = replace(run, model=thinned)
-    found.renderer = Renderer(run.dev, thinned, run.config.raster)  # the network is frozen already
+    # the network is frozen already
+    found.renderer = Renderer(run.dev, thinned, run.config.raster, run.renderer.supersampling)
     found.ball = run.ball
     return found
 

@@ -1,3 +1,4 @@
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +18,12 @@ from pp_cl.settings import RasterConfig
 GAMMA = 0.03
 
 
-def chained(model, settings, camera):
+def chained(model, settings, camera, k=1):
     """Float64 (image, function from its gradient to those of the points' features, of their
-    opacities and of the network) of the padded camera.
+    opacities and of the network) of the padded camera, of k x k drawn pixels each.
     """
     padded, _, _ = camera.padded(4)
+    shape, padded = (padded.height, padded.width), padded.enlarged(k)
     positions = GRID.positions(model.cloud.ids.get())
     opacity = oracle_raster.opacities(positions, padded.eye, model.cloud.opacity.get())
     sh = np.concatenate([array.get() for array in model.cloud.sh], 1)
@@ -33,14 +35,14 @@ def chained(model, settings, camera):
     point_features = oracle_raster.shade(positions, padded.eye, sh)
     features = oracle_raster.features(blend, point_features)
     parameters = plain_parameters(model.net, model.net.parameters)
-    shape = (padded.height, padded.width)
     layers = model.net.layers
-    outputs = network(layers, parameters, features.reshape(*shape, 16))
+    features = features.reshape(shape[0], k, shape[1], k, 16).mean((1, 3))
+    outputs = network(layers, parameters, features)
     active = {name: values > 0 for name, values in outputs.items()}
 
     def backward(grad_image):
         grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_image)
-        grad_features = grad_net.pop("x").reshape(-1, 16)
+        grad_features = (grad_net.pop("x") / k**2).repeat(k, 0).repeat(k, 1).reshape(-1, 16)
         of_points = oracle_raster.gradients(
             geometry, blend, point_features, grad_features, max_tracked=settings.max_tracked
         )
@@ -61,14 +63,14 @@ SETTINGS = {
 
 @pytest.mark.parametrize("blend", BLENDS)
 @pytest.mark.parametrize("early_stop", [0.0, 0.001])
-@pytest.mark.parametrize("name", SETTINGS)
-def test_image_and_gradients(dev, rng, name, early_stop, blend):
+@pytest.mark.parametrize("name, k", [*((name, 1) for name in SETTINGS), ("soft", 2)])
+def test_image_and_gradients(dev, rng, name, k, early_stop, blend):
     settings = RasterConfig(blend=blend, early_stop=early_stop, **SETTINGS[name])
     model, camera = make_model(dev, rng), ring_cameras(1, 30)[0].crop(3, 4, 22, 17)
-    renderer = Renderer(dev, model, settings)
+    renderer = Renderer(dev, model, settings, supersampling=k)
     result = renderer.forward(camera, GAMMA, training=True)
     image = result.image.get()
-    expected, backward = chained(model, settings, camera)
+    expected, backward = chained(model, settings, camera, k)
     assert image.shape == (20, 24, 3) and relative_error(image, expected) < 1e-5
 
     grad = rng.normal(size=image.shape).astype(np.float32)
@@ -83,6 +85,26 @@ def test_image_and_gradients(dev, rng, name, early_stop, blend):
     assert relative_error(opacity[: len(visible)], want_opacity[visible]) < 5e-5
     for key, value in plain_parameters(model.net, model.net.sum_gradients(parts)).items():
         assert relative_error(value, want_net[key]) < 5e-5, key
+
+
+def test_alpha_is_the_mean_of_drawn_pixels(dev, rng):
+    model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
+    renderer = Renderer(dev, model, RasterConfig(radius=0.85), supersampling=2)
+    result = renderer.forward(camera, GAMMA, training=True)
+    drawn = result.weights.transmittance.get().reshape(32, 2, 32, 2)
+    np.testing.assert_allclose(result.transmittance.get(), drawn.mean((1, 3)).ravel(), atol=1e-6)
+    assert result.fragments().sum() == result.pairs.total
+
+    grad = rng.normal(size=(32, 32)).astype(np.float32)
+    zeros = dev.zeros((32, 32, 16))
+    found = renderer.backward_features(result, zeros, grad_alpha=dev.upload(grad.ravel()))
+    found = found.opacity.get()[: result.weights.visible.size]
+    given = dev.upload((grad / 4).repeat(2, 0).repeat(2, 1).ravel())
+    alone, zeros = copy(result), dev.zeros((64, 64, 16))
+    alone.size, alone.supersampling = (64, 64), 1
+    expected = renderer.backward_features(alone, zeros, grad_alpha=given).opacity.get()
+    assert np.abs(found).max() > 0
+    np.testing.assert_array_equal(found, expected[: len(found)])
 
 
 def test_padding_does_not_move_the_image(dev, rng):

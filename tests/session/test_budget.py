@@ -8,7 +8,7 @@ from support.runs import SETTINGS, set_words, spoken
 
 from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
-from pp_cl.engine.training.schedule import refine_steps
+from pp_cl.engine.training.schedule import refine_steps, supersampling_at
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session.budget import NEVER, Budget
 from pp_cl.settings import TrainConfig
@@ -16,14 +16,17 @@ from pp_cl.settings import TrainConfig
 SMALL = {key: value for key, value in SETTINGS.items() if key != "train.iterations"}
 
 
-def simulated(minutes, refine_at, seconds_of, built=0.0):
+def simulated(minutes, refine_at, seconds_of, built=0.0, supersampled=0.0):
     """(seconds, its TrainConfig, steps of its refinements) of a training whose step lasts
     seconds_of(share of the steps done, refinements done), after kernels were built.
     """
-    train = TrainConfig(iterations=8000, minutes=minutes, refine_at=refine_at)
+    train = TrainConfig(
+        iterations=8000, minutes=minutes, refine_at=refine_at, supersampled=supersampled
+    )
     budget, step, total, refined = Budget(train, 48 * 200**2), 0, 0.0, []
     while step < train.iterations:
         took = seconds_of(step / train.iterations, len(refined)) + built * (step == 0)
+        took *= supersampling_at(step, train)
         step, total = step + 1, total + took
         refined += [step] if step in refine_steps(train) else []
         budget.plan(step, total)
@@ -31,17 +34,19 @@ def simulated(minutes, refine_at, seconds_of, built=0.0):
     return total + 18 * seconds_of(1.0, len(refined)), train, refined
 
 
-@pytest.mark.parametrize("minutes", [1, 5, 60])
+@pytest.mark.parametrize("minutes, supersampled", [(1, 0), (1, 0.3), (5, 0), (60, 0), (60, 0.3)])
 @pytest.mark.parametrize("refine_at", [(1.0, 1.0), (0.35, 1.0), (0.33, 0.67)])
 @pytest.mark.parametrize("dearer", [1.7, 2.3, 3.0])
-def test_the_promise_is_kept_as_fog_clears_and_grids_are_refined(minutes, refine_at, dearer):
+def test_the_promise_is_kept_as_fog_clears_and_grids_are_refined(
+    minutes, supersampled, refine_at, dearer
+):
     rng = np.random.default_rng(1)
 
     def seconds_of(share, level):  # fog makes the first steps dear; others share the machine
         busy = 2.0 if 0.5 < share < 0.6 else 1.0
         return 0.05 * dearer**level * (1 + np.exp(-9 * share)) * busy * rng.uniform(0.5, 1.5)
 
-    total, train, refined = simulated(minutes, refine_at, seconds_of, built=10.0)
+    total, train, refined = simulated(minutes, refine_at, seconds_of, 10.0, supersampled)
     assert 0.8 * 60 * minutes < total < 1.15 * 60 * minutes
     if minutes > 1:  # else nothing is pruned between two refinements
         assert len(refined) == sum(share < 1 for share in refine_at)

@@ -120,7 +120,7 @@ def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(*LOOKS)
     scene = write_ball_scene(tmp_path / "ball")
     changes = {"train__refine_at": "0.9,1", "points__count": 300, "train__prune_weight": 0.05}
-    changes["downscale"] = 1
+    changes |= {"downscale": 1, "train__supersampled": 0.07}  # from step 56 on
     assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
     whole = checkpoint(tmp_path / "whole")
     points = {row["step"]: row["points"] for row in rows(tmp_path / "whole")[:-1]}

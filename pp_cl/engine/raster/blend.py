@@ -119,6 +119,7 @@ def blend_backward(
     distortion_weight: float = 0.0,
     voxel_size: float = 0.0,
     max_weight: Array | None = None,
+    pixel: float = 1.0,
 ) -> BlendGradients:
     """The gradients of the points weights.visible, after blend_weights() with derivatives.
 
@@ -128,7 +129,7 @@ def blend_backward(
     (world units) of its fragments; no gradient of the depths is formed. voxel_size: of the grid
     that offsets are counted in, world units; 0: no gradients of offsets. max_weight: (N,)
     float32, becomes for each point the highest sum over an image's pixels of its blend weights so
-    far. Raises ValueError for
+    far. pixel: as what share of one a pixel counts there. Raises ValueError for
     grad_alpha or a distortion loss of a softmax, which has no transmittance, and for offsets unless
     soft points are composited by alpha.
     """
@@ -188,7 +189,7 @@ def blend_backward(
         s=count,
         voxel_size=voxel_size,
         radius=points.radius,
-        is_recorded=max_weight is not None,
+        pixel=0.0 if max_weight is None else pixel,
         visible=weights.visible_rows,
         camera=points.camera_buffer,
         point_camera=points.point_camera,

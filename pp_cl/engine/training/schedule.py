@@ -73,6 +73,11 @@ def learning_rate(
     return rate * (DELAYED + (1 - DELAYED) * math.sin(math.pi / 2 * min(step / delay_steps, 1)))
 
 
+def supersampling_at(step: int, train: TrainConfig) -> int:
+    """RenderResult.supersampling of a step from 0 on, and of what is rendered before it."""
+    return 2 if step >= round((1 - train.supersampled) * train.iterations) else 1
+
+
 def prunings(train: TrainConfig, start: int, end: int) -> int:
     """How many prunings between the steps `start` and `end` may drop points, if the points are seen
     in every step since `start`.
