@@ -51,7 +51,8 @@ def test_the_promise_is_kept_as_fog_clears_and_grids_are_refined(
     if minutes > 1:  # else nothing is pruned between two refinements
         assert len(refined) == sum(share < 1 for share in refine_at)
     shares = [step / train.iterations for step in refined]
-    assert all(abs(share - asked) < 0.2 for share, asked in zip(shares, refine_at, strict=False))
+    most = 0.25 if supersampled else 0.2  # more that was guessed comes after them
+    assert all(abs(share - asked) < most for share, asked in zip(shares, refine_at, strict=False))
 
 
 def test_what_comes_before_the_first_step_is_in_the_minutes():
