@@ -37,7 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "network.rate": (3e-4, 5e-5),
         "train.iterations": 50_000,
         "train.crop": 0,
-        # Ours: the supplemental mentions no jitter, smoothing or averaging, and no rule
+        # Ours: the supplemental mentions no supersampling, jitter, smoothing or averaging, no rule
         # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
         "train.smooth_l1": 0.0,
         "train.sh_eps": 0.0197,
@@ -45,6 +45,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.lobe_rate": 0.0,
         "train.rate_steps": 0,
         "train.offset_rate": (0.0, 0.0),
+        "train.supersampled": 0.0,
         "train.pixel_jitter": False,
         "train.sh_smoothing": 0.0,
         "train.ema": False,

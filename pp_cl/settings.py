@@ -132,7 +132,7 @@ class TrainConfig:
         128, "side in pixels of the square crop of a step (0: whole images)", 0, 2**14
     )
     supersampled: float = setting(
-        0.0,
+        0.25,
         "share of the steps, the last ones, in which features are drawn in images twice as large,"
         " whose means the network sees; they take twice as long, as do renderings from then on",
         0,

@@ -24,7 +24,12 @@ from pp_cl.engine.render import point_radius, view_table
 from pp_cl.engine.training.crops import crop_side
 from pp_cl.engine.training.loss import loss_table
 from pp_cl.engine.training.optim import network_state_table
-from pp_cl.engine.training.schedule import averages_from, expected_stretches, refine_steps
+from pp_cl.engine.training.schedule import (
+    averages_from,
+    expected_stretches,
+    refine_steps,
+    supersampled_from,
+)
 from pp_cl.engine.training.smooth import smoothing_table
 from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import target_table
@@ -150,8 +155,9 @@ class MemoryPlan:
         return self._fault(self.need_of(grid, points, depth_range, step), share)
 
     def grows_after(self, step: int) -> bool:
-        """Whether the next step takes more memory: it refines or begins the EMA."""
-        return step + 1 in [*refine_steps(self._train), averages_from(self._train)]
+        """Whether the next step takes more memory: it refines, begins the EMA or to supersample."""
+        begins = averages_from(self._train), supersampled_from(self._train)
+        return step + 1 in (*refine_steps(self._train), *begins)
 
     def need_of(
         self,
@@ -162,7 +168,7 @@ class MemoryPlan:
         stretches: int | None = None,
     ) -> Need:
         """What a training with these points of a grid takes from a step on. stretches: between
-        refinements and the beginning of the EMA, to which to look ahead; None: all.
+        the steps after which they take more memory, to which to look ahead; None: all.
         """
         middle = sum(depth_range) / 2
         # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
@@ -191,7 +197,7 @@ class MemoryPlan:
         raster, train, n = self._raster, self._train, stretch.points
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
-        k = 2 if train.supersampled > 0 else 1
+        k = stretch.supersampling
         drawn = k**2 * math.prod(image)
         pairs = grown(0, round(n * min(footprint_pixels(k * radius), drawn)))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)

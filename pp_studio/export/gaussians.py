@@ -303,7 +303,7 @@ def config_of(run: Run, steps: int) -> Config:
     raster.radius *= DEVIATION
     train.iterations = steps
     train.crop, train.refine_at, train.ema = CROP, (), True
-    train.mask_weight = train.distortion_weight = train.sh_smoothing = 0.0
+    train.mask_weight = train.distortion_weight = train.sh_smoothing = train.supersampled = 0.0
     train.exposure, train.ssim_weight = "off", 0.0
     train.prune_weight = 0.0  # points are judged in images, where larger windows show more
     # Colours, which begin nearly right, would diverge with their default rates, many times these;

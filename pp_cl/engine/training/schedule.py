@@ -73,9 +73,14 @@ def learning_rate(
     return rate * (DELAYED + (1 - DELAYED) * math.sin(math.pi / 2 * min(step / delay_steps, 1)))
 
 
+def supersampled_from(train: TrainConfig) -> int:
+    """The first step, from 0 on, that is supersampled; train.iterations for none."""
+    return round((1 - train.supersampled) * train.iterations)
+
+
 def supersampling_at(step: int, train: TrainConfig) -> int:
     """RenderResult.supersampling of a step from 0 on, and of what is rendered before it."""
-    return 2 if step >= round((1 - train.supersampled) * train.iterations) else 1
+    return 2 if train.supersampled > 0 and step >= supersampled_from(train) else 1
 
 
 def prunings(train: TrainConfig, start: int, end: int) -> int:
@@ -106,12 +111,13 @@ def refine_steps(train: TrainConfig) -> list[int]:
 @dataclass(frozen=True)
 class Stretch:
     """Steps without a refinement among them. points: at their beginning, expected. refinements: to
-    come. is_averaged: whether averages are kept.
+    come. is_averaged: whether averages are kept. supersampling: of RenderResult.
     """
 
     points: int
     refinements: int
     is_averaged: bool
+    supersampling: int
 
 
 def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[Stretch]:
@@ -119,10 +125,12 @@ def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[S
     come leave is an estimate.
     """
     refined, averaged, start = refine_steps(train), averages_from(train), 0
-    for end in sorted({*refined, int(min(averaged, train.iterations)), train.iterations}):
+    ends = {*refined, int(min(averaged, train.iterations)), supersampled_from(train)}
+    for end in sorted(ends | {train.iterations}):
         if step < end:
             now = max(start, step)
-            yield Stretch(points, sum(now < at for at in refined), averaged <= now)
+            left, supersampling = sum(now < at for at in refined), supersampling_at(now, train)
+            yield Stretch(points, left, averaged <= now, supersampling)
             to_come = prunings(train, now, end) / max(1, prunings(train, start, end))
             points = round(points * LEFT_BY_PRUNING**to_come) * (8 if end in refined else 1)
         start = end
