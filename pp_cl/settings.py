@@ -134,7 +134,8 @@ class TrainConfig:
     supersampled: float = setting(
         0.25,
         "share of the steps, the last ones, in which features are drawn in images twice as large,"
-        " whose means the network sees; they take twice as long, as do renderings from then on",
+        " whose means the network sees; they take twice as long, as do renderings from then on"
+        " (blend alpha)",
         0,
         1,
     )

@@ -20,7 +20,6 @@ from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import Prepared
 from pp_cl.engine.layers.conv import GradientParts
-from pp_cl.engine.layers.simple import avgpool2_backward, avgpool2_forward
 from pp_cl.engine.layers.tiles import grid_shape, tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
@@ -75,24 +74,16 @@ def view_table(
     """
     table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs)
     table |= weights_table(n, pixels, pairs if training else 1)
-    table["features"] = (pixels, 16), np.float32
+    of_image = pixels // supersampling**2
+    table["features"] = (of_image, 16), np.float32
     if until == "weights":
         return table | {"pair_gradient": ((pairs, 2), np.float32)}
     table["visible_features"] = (visible, 16), np.float32
     if training:
         table |= blend_backward_table(visible, pixels, pairs, settings.blend, settings.footprint)
     if supersampling > 1:
-        table |= _means_table(pixels // supersampling**2)
-        table |= _drawn_gradients_table(pixels if training else 0)
+        table["mean_transmittance"] = (of_image,), np.float32
     return table
-
-
-def _means_table(pixels):
-    return {"mean_features": ((pixels, 16), np.float32), "mean_rest": ((pixels,), np.float32)}
-
-
-def _drawn_gradients_table(pixels):
-    return {"grad_features": ((pixels, 16), np.float32), "grad_alpha": ((pixels,), np.float32)}
 
 
 @dataclass
@@ -105,11 +96,10 @@ class RenderResult:
     the image, each way; pairs and weights are of these. points: the N points as the camera of the
     drawn pixels sees them. tile_mask: (rows, columns) bool, the 4x4 tiles of drawn pixels that have
     fragments; None where the network computes all. visible_features: float32, one row of 16 for
-    each point of weights.visible, then room for more. drawn_features: float32, blended from them,
-    16 of each drawn pixel. features: (H, W, 16) float32, their means; transmittance: (H * W,)
-    float32, the means of that of weights, None as there. image: (H, W, 3) float32, unclamped.
-    computed_fraction: share of the network's multiplications that was done; the others would have
-    seen only background.
+    each point of weights.visible, then room for more. features: (H, W, 16) float32, blended from
+    them; transmittance: (H * W,) float32, means of that of weights, None as there. image: (H, W, 3)
+    float32, unclamped. computed_fraction: share of the network's multiplications that was done; the
+    others would have seen only background.
     """
 
     dev: Device
@@ -122,7 +112,6 @@ class RenderResult:
     tile_mask: Pending[np.ndarray] | None
     supersampling: int = 1
     visible_features: Array = field(init=False)
-    drawn_features: Array = field(init=False)
     features: Array = field(init=False)
     transmittance: Array | None = None
     image: Array = field(init=False)
@@ -194,7 +183,7 @@ class Renderer:
         """Render a camera, which is padded to multiples of net.multiple pixels.
 
         until: the last stage wanted: blend weights, blended features or the network's image, which
-        alone is supersampled.
+        alone is supersampled, if it is composited by alpha.
         gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
         the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
         softmax needs the model's.
@@ -203,7 +192,9 @@ class Renderer:
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         padded, left, top = camera.padded(net.multiple)
-        size, k = (padded.height, padded.width), self.supersampling if until == "image" else 1
+        size, k = (padded.height, padded.width), 1
+        if until == "image" and self.settings.blend == "alpha":
+            k = self.supersampling
         if k * max(size) > MOST_SIDE:
             raise UserError(
                 f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
@@ -216,8 +207,7 @@ class Renderer:
         b = self._buffers
         drawn = padded.enlarged(k)
         drawn_size = drawn.height, drawn.width
-        b.require({"camera_buffer": ((21,), np.float32)})
-        b.require({"features": ((*drawn_size, 16), np.float32)})
+        b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
         dev.send(b.camera_buffer, self.model.packed(drawn, depth_range))
         with dev.stage("project"):
             points = self._launches["project"].run(
@@ -246,10 +236,14 @@ class Renderer:
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
         with dev.stage("blend"):
-            blend = partial(blend_forward, dev)
-            self._launches["blend"].run(blend, pairs, weights, b.visible_features, b.features)
-            result.visible_features, result.drawn_features = b.visible_features, b.features
-            self._average(result)
+            blend, rest = partial(blend_forward, dev), None
+            if k > 1:
+                b.require({"mean_transmittance": ((math.prod(size),), np.float32)})
+                rest = b.mean_transmittance
+            blended = pairs, weights, b.visible_features, b.features
+            self._launches["blend"].run(blend, *blended, rest)
+        result.visible_features, result.features = b.visible_features, b.features
+        result.transmittance = weights.transmittance if rest is None else rest
         if until == "features":
             return result
         with dev.stage("network"):
@@ -261,33 +255,6 @@ class Renderer:
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
         return result
-
-    def _average(self, result):
-        """Set what of a result is the mean of drawn pixels."""
-        b, rest = self._buffers, result.weights.transmittance
-        result.features, result.transmittance = result.drawn_features, rest
-        if result.supersampling == 1:
-            return
-        (height, width), pixels = result.size, math.prod(result.size)
-        b.require(_means_table(pixels))
-        result.features = b.mean_features.reshape(height, width, 16)
-        avgpool2_forward(self.dev, result.drawn_features, result.features)
-        if rest is not None:
-            result.transmittance = b.mean_rest
-            means = b.mean_rest.reshape(height, width, 1)
-            avgpool2_forward(self.dev, rest.reshape(*result.drawn_size, 1), means)
-
-    def _of_drawn(self, result, name, grad):
-        """The gradient (H, W, C) of means of drawn pixels, given to these, in a buffer."""
-        if result.supersampling == 1 or grad is None:
-            return grad
-        self._buffers.require(_drawn_gradients_table(math.prod(result.drawn_size)))
-        height, width = result.size
-        channels = grad.size // (height * width)
-        drawn = getattr(self._buffers, name).reshape(*result.drawn_size, channels)
-        self.dev.fill(drawn, 0)
-        avgpool2_backward(self.dev, None, grad.reshape(height, width, channels), drawn)
-        return drawn
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen):
         """(Pairs, BlendWeights, RenderResult.tile_mask). Both stages are enqueued before the number
@@ -356,8 +323,6 @@ class Renderer:
         settings = self.settings
         moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
         with self.dev.stage("backward"):
-            grad_features = self._of_drawn(result, "grad_features", grad_features)
-            grad_alpha = self._of_drawn(result, "grad_alpha", grad_alpha)
             return blend_backward(
                 self.dev,
                 self._buffers,
@@ -366,13 +331,12 @@ class Renderer:
                 result.weights,
                 opacity=result.points.point_opacity,
                 visible_features=result.visible_features,
-                features=result.drawn_features,
+                features=result.features,
                 grad_features=grad_features,
-                grad_alpha=None if grad_alpha is None else grad_alpha.reshape(-1),
+                grad_alpha=grad_alpha,
                 distortion_weight=distortion_weight,
                 voxel_size=self.model.grid.voxel_size if moves else 0.0,
                 max_weight=max_weight,
-                pixel=1 / result.supersampling**2,
             )
 
     def blend(self, result: RenderResult, features: np.ndarray) -> np.ndarray:

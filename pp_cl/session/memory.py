@@ -197,7 +197,7 @@ class MemoryPlan:
         raster, train, n = self._raster, self._train, stretch.points
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
-        k = stretch.supersampling
+        k = stretch.supersampling if raster.blend == "alpha" else 1
         drawn = k**2 * math.prod(image)
         pairs = grown(0, round(n * min(footprint_pixels(k * radius), drawn)))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)

@@ -4,6 +4,7 @@ weights of the fragments; and the gradients of the blend, gathered by visible po
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,19 +55,38 @@ def shade_forward(
 
 
 def blend_forward(
-    dev: Device, pairs: Pairs, weights: BlendWeights, visible_features: Array, features: Array
+    dev: Device,
+    pairs: Pairs,
+    weights: BlendWeights,
+    visible_features: Array,
+    features: Array,
+    mean_transmittance: Array | None = None,
 ) -> None:
-    """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32."""
-    dev.program("raster/blend", **_defines(dev)).launch(
+    """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32: means of
+    the drawn pixels in each of the image. mean_transmittance: (HW,) float32, written if there are
+    several.
+    """
+    (height, width, _), rest = features.shape, weights.transmittance
+    drawn = _drawn_side(pairs, features)
+    dev.program("raster/blend", **_defines(dev, DRAWN=drawn)).launch(
         "blend_forward",
-        pairs.pixels * row_parts(dev, ON_GPU),
-        hw=pairs.pixels,
+        height * width * row_parts(dev, ON_GPU),
+        hw=height * width,
+        width=drawn * width,
         pixel_offset=pairs.pixel_offset,
         pixel_weight_point=weights.pixel_weight_point,
+        transmittance=features if rest is None else rest,
         point_slot=weights.point_slot,
         visible_features=visible_features,
         features=features,
+        mean_transmittance=features if mean_transmittance is None else mean_transmittance,
     )
+
+
+def _drawn_side(pairs, features):
+    """How many pixels are drawn for one of the features (H, W, 16), each way."""
+    height, width, _ = features.shape
+    return math.isqrt(pairs.pixels // (height * width))
 
 
 def blend_backward_table(
@@ -119,7 +139,6 @@ def blend_backward(
     distortion_weight: float = 0.0,
     voxel_size: float = 0.0,
     max_weight: Array | None = None,
-    pixel: float = 1.0,
 ) -> BlendGradients:
     """The gradients of the points weights.visible, after blend_weights() with derivatives.
 
@@ -129,7 +148,7 @@ def blend_backward(
     (world units) of its fragments; no gradient of the depths is formed. voxel_size: of the grid
     that offsets are counted in, world units; 0: no gradients of offsets. max_weight: (N,)
     float32, becomes for each point the highest sum over an image's pixels of its blend weights so
-    far. pixel: as what share of one a pixel counts there. Raises ValueError for
+    far. Raises ValueError for
     grad_alpha or a distortion loss of a softmax, which has no transmittance, and for offsets unless
     soft points are composited by alpha.
     """
@@ -154,9 +173,10 @@ def blend_backward(
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    defines = _defines(
-        dev, DL_DB=int(not is_alpha), MOVES=int(moves), **footprint_macros(points.footprint)
-    )
+    drawn = _drawn_side(pairs, grad_features)
+    width = drawn * grad_features.shape[1]
+    options = {"DL_DB": int(not is_alpha), "MOVES": int(moves), "DRAWN": drawn}
+    defines = _defines(dev, **options, **footprint_macros(points.footprint))
     program = dev.program("raster/blend", **defines)
     if is_alpha:
         launch_groups(
@@ -166,6 +186,7 @@ def blend_backward(
             -(-pairs.pixels // SPAN),
             most=SPAN,
             defines=defines,
+            width=width,
             has_grad_alpha=int(grad_alpha is not None),
             distortion_weight=distortion_weight,
             transmittance=weights.transmittance,
@@ -187,9 +208,10 @@ def blend_backward(
         "blend_backward",
         count * row_parts(dev, ON_GPU),
         s=count,
+        width=width,
         voxel_size=voxel_size,
         radius=points.radius,
-        pixel=0.0 if max_weight is None else pixel,
+        is_recorded=max_weight is not None,
         visible=weights.visible_rows,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
@@ -219,4 +241,4 @@ def blend_backward(
 
 def _defines(dev, **defines):
     group = min(SPAN, group_items(dev))
-    return {"LANES": lanes(dev, ON_GPU), "SPAN": SPAN, "GROUP": group} | defines
+    return {"LANES": lanes(dev, ON_GPU), "SPAN": SPAN, "GROUP": group, "DRAWN": 1} | defines
