@@ -219,8 +219,9 @@ class Renderer:
                 opacity=cloud.opacity,
                 radius=self.point_radius,
             )
+        is_planned = net.is_planned(size)
         pairs, weights, tile_mask = self._pairs_and_weights(
-            points, drawn_size, gamma, early_stop, training, times_seen
+            points, drawn_size, gamma, early_stop, training, times_seen, is_planned
         )
         view = camera, (left, top), size
         result = RenderResult(dev, *view, points, pairs, weights, tile_mask, k)
@@ -248,7 +249,7 @@ class Renderer:
             return result
         with dev.stage("network"):
             plan: Any = None
-            if net.is_planned(size):
+            if is_planned:
                 (rows, columns), covered = grid_shape(*size), tile_mask.get()
                 covered = covered.reshape(rows, k, columns, k).any((1, 3))
                 plan = net.plan_tiles(size, covered, gradient_tiles())
@@ -256,8 +257,8 @@ class Renderer:
             result.image = net.forward(result.features, training, plan)
         return result
 
-    def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen):
-        """(Pairs, BlendWeights, RenderResult.tile_mask). Both stages are enqueued before the number
+    def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen, is_planned):
+        """(Pairs, BlendWeights, RenderResult.tile_mask, None unless the network plans). Both stages are enqueued before the number
         of pairs is known, and run again with more capacity if it was too small.
         """
         settings, by_pair, b = self.settings, self._by_pair, self._buffers
@@ -281,7 +282,7 @@ class Renderer:
                 )
                 weights.read_visible(self.dev)
             tile_mask = None
-            if self.model.net.is_planned(size):
+            if is_planned:
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
             (tile_mask or weights.total).get()  # the host's one wait for the device
             self._capacity[by_pair] = capacity_needed(pairs)
