@@ -258,8 +258,9 @@ class Renderer:
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen, is_planned):
-        """(Pairs, BlendWeights, RenderResult.tile_mask, None unless the network plans). Both stages are enqueued before the number
-        of pairs is known, and run again with more capacity if it was too small.
+        """(Pairs, BlendWeights, RenderResult.tile_mask; None unless is_planned). Both stages are
+        enqueued before the number of pairs is known, and run again with more capacity if it was too
+        small.
         """
         settings, by_pair, b = self.settings, self._by_pair, self._buffers
         while True:
