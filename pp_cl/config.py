@@ -335,6 +335,7 @@ def _resumed(folder, stored, scene, given):
     config, free = configure(load_config(folder.config), scene, given), {*FREE}
     if stored.train.minutes:  # planned meanwhile, as train.iterations are
         config.train.refine_at = stored.train.refine_at
+        config.train.supersampled = stored.train.supersampled
     if config.train.iterations != stored.train.iterations:
         with opened_run(folder, stored) as run:
             if run.header["finished"]:

@@ -108,6 +108,9 @@ def test_a_run_takes_its_minutes_however_often_it_is_stopped(scene, tmp_path, cl
 
         monkeypatch.setattr(Trainer, "train_step", stepping)
         assert main(words) == 130
+    planned = json.loads(folder.config.read_text())
+    planned["train"]["supersampled"] = 0.2  # as a plan may leave it
+    folder.config.write_text(json.dumps(planned))
     assert main(words) == 0
     train, last = json.loads(folder.config.read_text())["train"], folder.rows()[-1]
     assert last["finished"] and 4.5 < last["seconds"] < 7.5  # of the steps alone, half of all
