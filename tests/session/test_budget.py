@@ -97,7 +97,9 @@ def clock(monkeypatch):
 
 def test_a_run_takes_its_minutes_however_often_it_is_stopped(scene, tmp_path, clock, monkeypatch):
     words = ["train", scene, "--out", str(tmp_path / "run"), "--minutes", "0.2"]
-    words += set_words(SMALL, train__refine_at="0.35,1", points__count=300)
+    words += set_words(
+        SMALL, train__refine_at="0.35,1", points__count=300, train__supersampled=0.25
+    )
     folder, train_step = RunFolder(tmp_path / "run"), Trainer.train_step
     for stopped_at in (5, 30, 100):
 
