@@ -5,6 +5,12 @@ from support.models import blend_matrix
 from pp_studio.export.harmonics import observe
 
 
+@pytest.fixture(autouse=True)
+def observed_pixels(run, monkeypatch):
+    """What is compared with it is drawn as an observation is."""
+    monkeypatch.setattr(run.renderer, "supersampling", 1)
+
+
 def test_rows_sum_to_alpha_up_to_an_early_stop_and_columns_to_the_points_weights(run):
     for seen in observe(run, run.cameras("test"), "test"):
         matrix, weights = blend_matrix(seen), seen.point_weights()

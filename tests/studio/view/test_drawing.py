@@ -50,7 +50,8 @@ def test_the_error_is_that_of_the_nearest_view_from_its_own_camera(run, views):
         draw(run, [], near, "error")
 
 
-def test_fragments_are_those_of_the_pairs(run):
+def test_fragments_are_those_of_the_pairs(run, monkeypatch):
+    monkeypatch.setattr(run.renderer, "supersampling", 1)  # as of a view until its weights
     camera = replace(CAMERA, width=45, height=43)  # is padded
     image, line = draw(run, [], camera, "fragments")
     view = run.renderer.forward(camera, run.gamma, until="weights")
