@@ -126,12 +126,14 @@ def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[S
     """
     refined, averaged, start = refine_steps(train), averages_from(train), 0
     ends = {*refined, int(min(averaged, train.iterations)), supersampled_from(train)}
+    stages = 0, *refined, train.iterations
     for end in sorted(ends | {train.iterations}):
         if step < end:
             now = max(start, step)
             left, supersampling = sum(now < at for at in refined), supersampling_at(now, train)
             yield Stretch(points, left, averaged <= now, supersampling)
-            to_come = prunings(train, now, end) / max(1, prunings(train, start, end))
+            stage = max(at for at in stages if at <= start), min(at for at in stages if at >= end)
+            to_come = prunings(train, now, end) / max(1, prunings(train, *stage))
             points = round(points * LEFT_BY_PRUNING**to_come) * (8 if end in refined else 1)
         start = end
 
