@@ -93,7 +93,9 @@ class MemoryPlan:
         """Raise UserError if even the least memory that the training can take does not fit; called
         before the images are read and the hull is known.
         """
+        train, self._train = self._train, replace(self._train, supersampled=0.0)
         self.need = self._need(self._points.count, 0.0, step=0)
+        self._train = train
         if fault := self._fault(self.need):
             raise UserError(": ".join(fault))
 

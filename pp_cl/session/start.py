@@ -105,12 +105,14 @@ def fitting_hull(
     dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
 ) -> tuple[Agreement, Hull, tuple[float, float], str]:
     """(which views' masks agree, first_hull() of them, its (near, far), what it gives up);
-    automatic settings in config are chosen. Where memory is too small and the refinements are
-    automatic, there are as many of these, and the points as close as memory allows. Raises
+    automatic settings in config are chosen. Where memory is too small, nothing is supersampled;
+    where that does not suffice and the refinements are automatic, there are as many of these, and
+    the points as close as memory allows. Raises
     UserError as MemoryPlan.check_points() does, and for an automatic radius of footprints that are
     not soft.
     """
-    is_automatic, train, given_up = config.train.refine_at == UNSET, config.train, ""
+    is_automatic, train = config.train.refine_at == UNSET, config.train
+    given_up: list[str] = []
     raster, is_radius_automatic = config.raster, config.raster.radius == 0
     config.automatic = [
         key for key, one in zip(AUTOMATIC, (is_automatic, is_radius_automatic), strict=True) if one
@@ -130,16 +132,22 @@ def fitting_hull(
             raster.radius = automatic_radius(hull.grid, views, to_come)
         found = hull.grid, len(hull.ids), depth_range(views, hull)
         fault = memory_plan.fault_of(*found)
+        if fault and train.supersampled > 0:
+            train.supersampled = 0.0
+            given_up.append(f"features: not drawn at twice the size in the end ({fault[0]})")
+            fault = memory_plan.fault_of(*found)
         can_be_fewer = is_automatic and len(hull.ids) < last
         fewer = memory_plan.coarser_points(*found) if fault and can_be_fewer else 0
         if not (fault and fewer):
             memory_plan.check_points(*found)
-            return agreement, hull, found[-1], given_up
-        last, spacing = len(hull.ids), spacing_pixels(hull.grid, cameras) / 2**to_come
-        given_up = given_up or (
-            f"points: as close as memory allows; {len(hull.ids)} at first, {spacing:.2f} pixels"
-            f" apart in the end, would be too many ({fault[0]})"
-        )
+            return agreement, hull, found[-1], "\n".join(given_up)
+        if last == math.inf:
+            spacing = spacing_pixels(hull.grid, cameras) / 2**to_come
+            given_up.append(
+                f"points: as close as memory allows; {len(hull.ids)} at first, {spacing:.2f} pixels"
+                f" apart in the end, would be too many ({fault[0]})"
+            )
+        last = len(hull.ids)
         hull = build_grid(dev, views, max(1, int(fewer / TOLERANCE)), scene_box(config), forgiven)
 
 

@@ -19,6 +19,7 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 from pp_cl.engine.step import Trainer
+from pp_cl.engine.training.schedule import supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_target
@@ -156,9 +157,17 @@ class Training:
         return seconds
 
     def _fit_memory(self):
-        """Drop points where memory is too small for all of them from the next step on."""
-        trainer, model = self.trainer, self.trainer.model
+        """Give up supersampling that has not begun, then points, where memory is too small for them
+        from the next step on.
+        """
+        trainer, model, train = self.trainer, self.trainer.model, self.config.train
         count, step = model.cloud.count, trainer.step
+        may_stop = train.supersampled > 0 and supersampling_at(step, train) == 1
+        if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, step):
+            train.supersampled = 0.0
+            self.folder.configure(self.config.to_json())
+            told = f"step {step}: for lack of memory, features are not drawn at twice the size"
+            warnings.warn(told, stacklevel=2)
         try:
             most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, step)
         except UserError as error:

@@ -19,6 +19,7 @@ from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.unet import UNet
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import load
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.session.memory import FILLED, GIB, MIB, MemoryPlan
 from pp_cl.session.training import open_training
@@ -88,7 +89,9 @@ def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsy
     assert main(words) == 0
     told = capsys.readouterr().out
     assert re.search("points: as close as memory allows; .*--memory 0.1: the training needs", told)
-    assert load_config(folder.config).train.refine_at == (0.35, 1)
+    assert "features: not drawn at twice the size in the end (--memory 0.1" in told
+    train = load_config(folder.config).train
+    assert train.refine_at == (0.35, 1) and train.supersampled == 0
     plan = float(re.search(r"memory: up to (\S+) MiB of --memory 0.1", told)[1]) * MIB
     assert FILLED - 0.05 < plan / (0.1 * GIB) < FILLED + 0.001
     assert 0.85 < plan / card.peak_bytes < 1.15
@@ -96,6 +99,18 @@ def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsy
     limit = cl.kernel_work_group_info.LOCAL_MEM_SIZE
     local = [one._kernel.get_work_group_info(limit, card.device) for one, _ in card.launched]
     assert 0 < max(local) <= 32 * 1024
+
+
+def test_what_was_to_be_supersampled_is_given_up_before_points(tmp_path, monkeypatch, capsys):
+    def fault_of(self, grid, points, depth_range, step=0, share=1.0):
+        return ("little", "") if self._train.supersampled and step > 10 else None
+
+    monkeypatch.setattr(MemoryPlan, "fault_of", fault_of)
+    folder = RunFolder(tmp_path / "run")
+    assert main(arguments(write_ball_scene(tmp_path / "ball"), folder.path)) == 0
+    assert "step 44: for lack of memory, features are not drawn" in capsys.readouterr().err
+    assert load_config(folder.config).train.supersampled == 0
+    assert load(folder.path).renderer.supersampling == 1
 
 
 def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
