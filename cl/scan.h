@@ -10,23 +10,14 @@
 #define BLOCK 1024
 #endif
 
-// Sums of blocks: of those before `block`, and of all.
-typedef struct {
-    uint before, all;
-} BlockSums;
-
-// By the work-items of a group. shared: 2 * GROUP values.
-#define BLOCK_SUMS(name, block, blocks, block_sum, shared)                                         \
-    BlockSums name;                                                                                \
+// The sum of the blocks before `block`, of all with their number, by GROUP work-items together.
+#define SUM_BEFORE(block, block_sum, shared, sum)                                                  \
+    uint sum;                                                                                      \
     {                                                                                              \
-        ulong before = 0, all = 0;                                                                 \
-        for (uint i = MEMBER; i < (blocks); i += GROUP) {                                          \
-            const uint sum = (block_sum)[i];                                                       \
-            all += sum;                                                                            \
-            if (i < (block)) before += sum;                                                        \
-        }                                                                                          \
-        group_scan((uint)min(before, (ulong)UINT_MAX), shared, &name.before);                      \
-        group_scan((uint)min(all, (ulong)UINT_MAX), shared, &name.all);                            \
+        ulong part = 0;                                                                            \
+        for (uint i = MEMBER; i < (block); i += GROUP)                                             \
+            part += (block_sum)[i];                                                                \
+        group_scan((uint)min(part, (ulong)UINT_MAX), shared, &sum);                                \
     }
 
 #endif

@@ -185,19 +185,16 @@ class Run:
         that lie within a voxel of the nearest.
         """
         (height, width), k = result.size, result.supersampling
-        if k == 1:
-            return alpha, depth, median
-        alpha, *depths = (
-            array.reshape(height, k, width, k).swapaxes(1, 2).reshape(height, width, k * k)
-            for array in (alpha, depth, median)
-        )
-        reach = [one.min(2, keepdims=True) + self.model.grid.voxel_size for one in depths]
-        near = [one <= most for one, most in zip(depths, reach, strict=True)]
-        means = (
-            np.where(is_near, one, 0).sum(2) / is_near.sum(2, dtype=np.float32)
-            for one, is_near in zip(depths, near, strict=True)
-        )
-        return alpha.mean(2), *means
+
+        def drawn(array):
+            blocks = array.reshape(height, k, width, k).swapaxes(1, 2)
+            return blocks.reshape(height, width, k * k)
+
+        def surface(depths):
+            reach = depths.min(2, keepdims=True) + self.model.grid.voxel_size
+            return depths.mean(2, where=~(depths > reach))  # a NaN stays one
+
+        return drawn(alpha).mean(2), surface(drawn(depth)), surface(drawn(median))
 
     @property
     def nearest(self) -> float:

@@ -46,6 +46,20 @@ def test_a_run_renders_what_the_evaluation_saves(trained, capsys):
         np.testing.assert_array_equal(trained[0].render(trained[0].cameras()[i]).colour, image)
 
 
+def test_depths_of_drawn_pixels_stay_on_the_surface(trained, monkeypatch):
+    run = pp_cl.load(trained[1])
+    camera, views = run.cameras("test")[0], []
+    for side in (1, 2):
+        monkeypatch.setattr(run.renderer, "supersampling", side)
+        views.append(run.render(camera))
+    one, four = views
+    np.testing.assert_array_equal(four.alpha == 0, np.isinf(four.depth))
+    both = np.minimum(one.alpha, four.alpha) > 0.9
+    apart = np.abs(one.median_depth[both] - four.median_depth[both])
+    assert both.sum() > 20 and np.median(apart) < 0.2 * run.model.grid.voxel_size
+    assert abs(one.alpha.mean() - four.alpha.mean()) < 0.02
+
+
 def test_a_finished_run_is_left_alone_and_steps_are_told(scene, trained, tmp_path):
     steps = []
 

@@ -52,8 +52,8 @@ kernel void scan_offsets(
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    BLOCK_SUMS(sums, block, b, block_sum, shared)
-    ulong sum = sums.before;
+    SUM_BEFORE(block, block_sum, shared, before_block)
+    ulong sum = before_block;
     for (uint first = block * BLOCK; first < end; first += GROUP) {
         const uint i = first + MEMBER;
         uint total;
@@ -80,8 +80,7 @@ kernel void scan_nonzero(
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    BLOCK_SUMS(sums, block, b, block_sum, shared)
-    uint listed = sums.before;
+    SUM_BEFORE(block, block_sum, shared, listed)
     for (uint first = block * BLOCK; first < end; first += GROUP) {
         const uint i = first + MEMBER, is_listed = i < end && flags[i] != 0;
         uint total;

@@ -136,9 +136,9 @@ kernel void pairs_fill(
     SHARED(uint, shared, 2 * GROUP);
     const uint begin = GROUP_ID * BLOCK, end = min(n, begin + BLOCK);
     if (begin >= n) return;
-    BLOCK_SUMS(sums, GROUP_ID, (n + BLOCK - 1) / BLOCK, block_sum, shared)
+    SUM_BEFORE(GROUP_ID, block_sum, shared, behind)  // where the pairs of the points so far end
+    SUM_BEFORE((n + BLOCK - 1) / BLOCK, block_sum, shared, all)
     const Camera cam = camera_load(camera);
-    uint behind = sums.before;  // where the pairs of the points so far end
     for (uint run = begin; run < end; run += GROUP * LANES) {
         const uint first = run + MEMBER * LANES,
                    count = first < end ? min((uint)LANES, end - first) : 0;
@@ -152,7 +152,7 @@ kernel void pairs_fill(
             point_offset[first + j] = next;
             next = add_sat(next, point_count[first + j]);
         }
-        if (fragments == 0 || sums.all > p) continue;
+        if (fragments == 0 || all > p) continue;
         for (uint j = 0; is_counted && j < count; j++)
             if (point_count[first + j] > 0) times_seen[first + j] += 1.0f;
         fill(

@@ -93,9 +93,8 @@ class MemoryPlan:
         """Raise UserError if even the least memory that the training can take does not fit; called
         before the images are read and the hull is known.
         """
-        train, self._train = self._train, replace(self._train, supersampled=0.0)
-        self.need = self._need(self._points.count, 0.0, step=0)
-        self._train = train
+        least = replace(self._train, supersampled=0.0)
+        self.need = self._need([*expected_stretches(least, self._points.count, 0)], 0.0)
         if fault := self._fault(self.need):
             raise UserError(": ".join(fault))
 
@@ -178,11 +177,14 @@ class MemoryPlan:
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
         radius = point_radius(self._raster, grid.voxel_size, depth_range)
         radius *= self._largest.fx / middle * math.sqrt(growth)
-        return self._need(points, radius, step, stretches)
+        return self._need(
+            [*islice(expected_stretches(self._train, points, step), stretches)], radius
+        )
 
-    def _need(self, points, radius, step, stretches=None):
-        """The Need from a step on. radius: of the footprints then, pixels of the stored image."""
-        ahead = [*islice(expected_stretches(self._train, points, step), stretches)]
+    def _need(self, ahead, radius):
+        """The Need of some stretches. radius: of the footprints in the first, pixels of the stored
+        image.
+        """
         found = []
         for stretch in ahead:
             # soft points are as wide as points are apart, which refining halves

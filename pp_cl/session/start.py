@@ -107,9 +107,8 @@ def fitting_hull(
     """(which views' masks agree, first_hull() of them, its (near, far), what it gives up);
     automatic settings in config are chosen. Where memory is too small, nothing is supersampled;
     where that does not suffice and the refinements are automatic, there are as many of these, and
-    the points as close as memory allows. Raises
-    UserError as MemoryPlan.check_points() does, and for an automatic radius of footprints that are
-    not soft.
+    the points as close as memory allows. Raises UserError as MemoryPlan.check_points() does, and
+    for an automatic radius of footprints that are not soft.
     """
     is_automatic, train = config.train.refine_at == UNSET, config.train
     given_up: list[str] = []

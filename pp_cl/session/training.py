@@ -46,7 +46,7 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 class HullFacts(NamedTuple):
     """Of the hull of a new training. capped: it has fewer points than asked for. seconds: carving
-    took. given_up: for lack of memory, in a line; "": nothing. sheet: of the masks that disagree
+    took. given_up: for lack of memory, in lines; "": nothing. sheet: of the masks that disagree
     with the others, None if all agree.
     """
 
