@@ -38,9 +38,11 @@ FITTED = 3  # times that the colours are fitted to their samples
 ISLAND = 0.02  # of the largest region: smaller ones of a mask are dropped
 ROUNDS = 2  # of votes
 STANDS_OUT, IS_WALL = 3.0, -4.0  # log-odds above and below which colours are overruled
+LIKE_WALL = -2.0  # below which nearly all views are not believed, either
 CROWDED = 0.3  # of 3x3 pixels that look like the background: the object has single ones
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
+SLIPS = 0.08  # of them: where no more do, theirs are wrong, unless it looks like the background
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
 # A side of the box cuts the object if its outermost layer holds this share of the vertices of the
 # fullest one: then it moves out by so much of the box's diagonal, at most so often.
@@ -188,17 +190,19 @@ def cut_out_all(
         return [some & ~one.mask for some, one in zip(around, windows, strict=True)]
 
     found = differences(windows, points[~inside], beside() if turns else None)
+    held = [np.zeros(label.shape, bool) for label in labels]  # by nearly all views
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
             for i in left:
-                labels[i] = _relabelled(windows[i], seeds[i], *hull)
+                labels[i], held[i] = _relabelled(windows[i], seeds[i], *hull)
         surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
         standing_out = evidence(found, beside(), surely)
         for i in left:  # what stands out, or does not, is no longer open
             label, wall = labels[i].copy(), standing_out[i] < IS_WALL
             crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
             label[(standing_out[i] > STANDS_OUT) & (label != cv2.GC_BGD)] = cv2.GC_FGD
+            label[held[i] & (standing_out[i] >= LIKE_WALL)] = cv2.GC_FGD
             label[wall & crowded & (label != cv2.GC_FGD)] = cv2.GC_BGD
             labels[i] = label
         cut(2 + number)
@@ -211,7 +215,7 @@ def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
     on; None where no side does. The object is the hull of the masks as far as most windows see it,
     as beyond that hardly any mask bounds it.
     """
-    hull, _, voxel_size = forgiving_hull(windows, box)
+    hull, *_, voxel_size = forgiving_hull(windows, box)
     seen = np.bincount(np.concatenate([one.inside(hull)[0] for one in windows]), None, len(hull))
     hull = hull[seen >= MOSTLY_SEEN * len(windows)]
     if not len(hull):
@@ -287,9 +291,9 @@ def _colours(windows, labels):
 
 def forgiving_hull(
     windows: Sequence[Window], box: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """((N, 3) positions in the box that no more than FORGIVEN of the masks reject of the windows
-    that see them, (N,) how many do, the positions' spacing).
+    that see them, (N,) how many do, (N,) how many see them, the positions' spacing).
     """
     grid = Grid.centred_in(box, smallest_voxel_size(box, CELLS))
     positions = grid.lattice()
@@ -307,21 +311,27 @@ def forgiving_hull(
             "the photographs have no part of the box in common that stands out from what is behind"
             " it; give masks with --masks, or another box with --box"
         )
-    return positions[left[in_hull]], rejected[in_hull], grid.voxel_size
+    return positions[left[in_hull]], rejected[in_hull], seen[in_hull], grid.voxel_size
 
 
-def _relabelled(one, seeds, hull, rejections, voxel_size):
-    """(H, W) uint8 of GrabCut's labels, by the hull, and by what no other view of it rejects."""
+def _relabelled(one, seeds, hull, rejections, seen, voxel_size):
+    """((H, W) uint8 of GrabCut's labels, by the hull, and by what no other view of it rejects;
+    (H, W) bool, what hardly any other does).
+    """
     gap = gap_of(one, hull, voxel_size)
     found, rows, columns = one.inside(hull)
-    agreed = found[rejections[found] == ~one.mask[rows, columns]]
-    held, core = silhouette(one, hull, gap), silhouette(one, hull[agreed], gap)
+    others = rejections[found] - ~one.mask[rows, columns]
+
+    def core(most):
+        return _eroded(silhouette(one, hull[found[others <= most]], gap), 2 * gap + 1)
+
+    held = silhouette(one, hull, gap)
     labels = np.where(held & one.mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[_eroded(held, gap) & (seeds == cv2.GC_FGD)] = cv2.GC_FGD
     labels[seeds == cv2.GC_BGD] = cv2.GC_BGD
     labels[~dilated(held, 2 * gap)] = cv2.GC_BGD
-    labels[_eroded(core, 2 * gap + 1)] = cv2.GC_FGD
-    return labels
+    labels[core(0)] = cv2.GC_FGD
+    return labels, core(SLIPS * seen[found])
 
 
 def gap_of(one: Window, hull: np.ndarray, voxel_size: float) -> int:

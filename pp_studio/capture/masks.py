@@ -220,7 +220,7 @@ def _uniform(scene, image_files, windows, box, points):
 
 def _spots(windows, numbers, box):
     """{number of a window: (H, W) bool, holes of its mask where other views see the object}."""
-    hull, _, voxel_size = cut.forgiving_hull([one for one in windows if one.mask is not None], box)
+    hull, *_, voxel_size = cut.forgiving_hull([one for one in windows if one.mask is not None], box)
     found = {}
     for i in numbers:
         one = windows[i]
