@@ -38,11 +38,11 @@ FITTED = 3  # times that the colours are fitted to their samples
 ISLAND = 0.02  # of the largest region: smaller ones of a mask are dropped
 ROUNDS = 2  # of votes
 STANDS_OUT, IS_WALL = 3.0, -4.0  # log-odds above and below which colours are overruled
-LIKE_WALL = -2.0  # below which nearly all views are not believed, either
+LIKE_WALL = -2.0  # below which not even nearly all other views are believed
 CROWDED = 0.3  # of 3x3 pixels that look like the background: the object has single ones
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
-SLIPS = 0.08  # of them: where no more do, theirs are wrong, unless it looks like the background
+SLIPS = 0.08  # of them, too: where no more do, their cuts are wrong; but see LIKE_WALL
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
 # A side of the box cuts the object if its outermost layer holds this share of the vertices of the
 # fullest one: then it moves out by so much of the box's diagonal, at most so often.
@@ -190,19 +190,19 @@ def cut_out_all(
         return [some & ~one.mask for some, one in zip(around, windows, strict=True)]
 
     found = differences(windows, points[~inside], beside() if turns else None)
-    held = [np.zeros(label.shape, bool) for label in labels]  # by nearly all views
+    agreed = [np.zeros(label.shape, bool) for label in labels]  # by nearly all views
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
             for i in left:
-                labels[i], held[i] = _relabelled(windows[i], seeds[i], *hull)
+                labels[i], agreed[i] = _relabelled(windows[i], seeds[i], *hull)
         surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
         standing_out = evidence(found, beside(), surely)
         for i in left:  # what stands out, or does not, is no longer open
             label, wall = labels[i].copy(), standing_out[i] < IS_WALL
             crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
             label[(standing_out[i] > STANDS_OUT) & (label != cv2.GC_BGD)] = cv2.GC_FGD
-            label[held[i] & (standing_out[i] >= LIKE_WALL)] = cv2.GC_FGD
+            label[agreed[i] & (standing_out[i] >= LIKE_WALL)] = cv2.GC_FGD
             label[wall & crowded & (label != cv2.GC_FGD)] = cv2.GC_BGD
             labels[i] = label
         cut(2 + number)

@@ -37,7 +37,7 @@ class Capture:
     """An object before walls of noise: photographs in a folder, true masks, sparse points.
 
     views: (camera, (H, W, 4) uint8) pairs. surface: (N, 3). spoil: changes the first photographs,
-    so many of them. wall: gives the colours behind the object in a camera's image; else the noise
+    `spoiled` of them. wall: gives the colours behind the object in a camera's image; else the noise
     of each differs.
     """
 
