@@ -23,7 +23,7 @@ MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
-AUTOMATIC = ("train.refine_at", "raster.radius")  # which a training chooses itself where they are 0
+AUTOMATIC = ("train.refine_at", "raster.radius", "train.view_opacity")  # by the hull
 MEND_SETTINGS = "restore it or start a new run"
 
 

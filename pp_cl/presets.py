@@ -42,7 +42,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.smooth_l1": 0.0,
         "train.sh_eps": 0.0197,
         "train.opacity_rate": (3e-2, 3e-3),
-        "train.lobe_rate": 0.0,
+        "train.view_opacity": "off",
         "train.rate_steps": 0,
         "train.offset_rate": (0.0, 0.0),
         "train.supersampled": 0.0,

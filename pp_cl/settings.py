@@ -177,8 +177,11 @@ class TrainConfig:
     opacity_rate: tuple = setting(
         (3e-2, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
     )
-    lobe_rate: float = setting(
-        1.0, "rate of the opacities' harmonics, times opacity_rate (0: no harmonics)", 0, 100
+    view_opacity: str = setting(
+        "auto",
+        "opacity that depends on the direction, by harmonics of degrees 1 and 2; auto: unless"
+        " masks contradict each other, as it would fit each view's wrong one",
+        choices=("auto", "on", "off"),
     )
     offset_rate: tuple = setting(
         (1e-2, 1e-3),
@@ -231,7 +234,7 @@ class TrainConfig:
 
 @dataclass
 class Config:
-    """All settings of a run. automatic: those of AUTOMATIC that were 0."""
+    """All settings of a run. automatic: those of AUTOMATIC that the training chose itself."""
 
     preset: str = "tiny"
     automatic: list[str] = field(default_factory=list)

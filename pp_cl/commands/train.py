@@ -118,6 +118,11 @@ def _first_line(training):
         f"points: {points} at first, {spacing:.2f} pixels apart{finer}, wherever the masks have"
         f" the object ({hull.seconds:.1f} s)"
     )
+    if hull.forgiven:
+        line += (
+            f"\nmasks: they contradict each other; up to {hull.forgiven} of {len(trainer.views)}"
+            " may reject a point"
+        )
     if hull.given_up:
         line += f"\n{hull.given_up}"
     if hull.capped:

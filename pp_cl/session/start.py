@@ -113,9 +113,9 @@ def fitting_hull(
     is_automatic, train = config.train.refine_at == UNSET, config.train
     given_up: list[str] = []
     raster, is_radius_automatic = config.raster, config.raster.radius == 0
-    config.automatic = [
-        key for key, one in zip(AUTOMATIC, (is_automatic, is_radius_automatic), strict=True) if one
-    ]
+    is_view_opacity_automatic = train.view_opacity == "auto"
+    left_open = (is_automatic, is_radius_automatic, is_view_opacity_automatic)
+    config.automatic = [key for key, one in zip(AUTOMATIC, left_open, strict=True) if one]
     if is_radius_automatic and raster.footprint != "soft":
         raise UserError(
             f"raster.radius: is automatic, which raster.footprint={raster.footprint}"
@@ -123,6 +123,8 @@ def fitting_hull(
         )
     agreement = agreeing(dev, views, scene_box(config))
     views, _, forgiven = agreement
+    if is_view_opacity_automatic:
+        train.view_opacity = "off" if forgiven else "on"
     hull, train.refine_at = first_hull(dev, config, agreement)
     to_come, cameras = len(refine_steps(train)), [view.camera for view in views]
     last = math.inf  # points of the try before

@@ -46,12 +46,13 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 class HullFacts(NamedTuple):
     """Of the hull of a new training. capped: it has fewer points than asked for. seconds: carving
-    took. given_up: for lack of memory, in lines; "": nothing. sheet: of the masks that disagree
-    with the others, None if all agree.
+    took. forgiven: so many masks may reject a point. given_up: for lack of memory, in lines; "":
+    nothing. sheet: of the masks that disagree with the others, None if all agree.
     """
 
     capped: bool
     seconds: float
+    forgiven: int
     given_up: str
     sheet: np.ndarray | None
 
@@ -286,7 +287,7 @@ def open_training(
             agreement, hull, depth_range, given_up = fitting_hull(dev, config, views, memory_plan)
             seconds = time.perf_counter() - start
             sheet = sheet_of_masks(dev, views, hull, agreement)
-            facts = HullFacts(hull.capped, seconds, given_up, sheet)
+            facts = HullFacts(hull.capped, seconds, agreement.forgiven, given_up, sheet)
         cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
         model = Model(dev, hull.grid, depth_range, cloud, net=net)
         views, left_out = agreement.views, list(agreement.left_out)

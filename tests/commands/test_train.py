@@ -7,7 +7,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.checkpoint import save_checkpoint
 from pp_cl.cli import main
-from pp_cl.config import begin_with, load_config, run_config
+from pp_cl.config import AUTOMATIC, begin_with, load_config, run_config
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.files.run_folder import RunFolder
@@ -66,11 +66,13 @@ def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):
         patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
         assert main(words) == 2
     stored = load_config(folder.config)
-    assert stored.automatic == ["train.refine_at", "raster.radius"] and stored.raster.radius > 0
+    assert stored.automatic == [*AUTOMATIC] and stored.raster.radius > 0
+    assert stored.train.view_opacity == "on"
     config = run_config(folder, scene)
     assert (config.train.refine_at, config.raster.radius) == ((0, 0), 0)
+    assert config.train.view_opacity == "auto"
     _, given = begin_with(folder.config, [])
-    assert not {"train.refine_at", "raster.radius"} & {key for key, _, _ in given}
+    assert not {*AUTOMATIC} & {key for key, _, _ in given}
     own = [("raster.radius", "0.9", "--set")]
     assert run_config(folder, scene, None, own).raster.radius == 0.9
 

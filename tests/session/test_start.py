@@ -1,7 +1,9 @@
 import pytest
+from PIL import Image
 from support.runs import spoken
 from support.scenes import write_ball_scene
 
+from pp_cl.cli import main
 from pp_cl.config import load_config
 
 
@@ -16,3 +18,18 @@ def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
     words = ["train", scene, "--out", out, "--points", str(points), "--iterations", "1"]
     assert spoken(words)[0] == 0
     assert load_config(out / "config.json").raster.radius == radius
+
+
+@pytest.mark.parametrize("wrong, opacity", [(0, "on"), (4, "off")])
+def test_opacity_has_no_direction_where_masks_contradict(tmp_path, capsys, wrong, opacity):
+    """It would fit each view's wrong mask."""
+    scene, out = write_ball_scene(tmp_path / "ball", views=24), tmp_path / "run"
+    for number in range(0, 6 * wrong, 6):
+        file = tmp_path / f"ball/train/r_{number}.png"
+        with Image.open(file) as image:
+            image.paste((0, 0, 0, 0), (24, 18, 48, 30))
+            image.save(file)
+    words = ["train", scene, "--out", str(out), "--points", "4000", "--iterations", "1"]
+    assert main(words) == 0
+    assert ("masks: they contradict each other" in capsys.readouterr().out) == (wrong > 0)
+    assert load_config(out / "config.json").train.view_opacity == opacity

@@ -54,7 +54,7 @@ class Rates:
             sh,
             learning_rate(step, steps, *train.offset_rate) if train.offset_rate[0] else 0.0,
             opacity,
-            train.lobe_rate * opacity,
+            0.0 if train.view_opacity == "off" else opacity,
             learning_rate(step, steps, *network.rate),
         )
 
