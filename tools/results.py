@@ -80,9 +80,9 @@ def lego(preset: str, downscale: int, *steps: int) -> list[Training]:
 TRAININGS = [
     Training("demo", "demo", "tiny", 1500),
     Training("demo", "demo", "tiny", 12000),
-    *lego("tiny", 4, 300, 1150, 3000, 8000),
-    *lego("small", 2, 1500, 6000),
-    *lego("full", 1, 4600, 15000),
+    *lego("tiny", 4, 300, 1150, 8000),
+    *lego("small", 2, 6000),
+    *lego("full", 1, 15000),
     Training("ethiopian_head, 57 photographs", HEAD, "tiny"),
     Training("mary_rose, 60 photographs", "real/mary_rose", "tiny"),
     Training("DTU scan37, 42 photographs", "real/dtu_scan37", "tiny"),
