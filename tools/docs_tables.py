@@ -6,7 +6,8 @@ A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end t
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
 parsers of pp_cl/commands/), `api` (of the public names), `trained` and `evaluated` (what the
 commands of README.md print, of docs/results/readme.json), `kinds` (all that lie in a folder of
-docs/results/), or that of another file docs/results/NAME.json (NAME may be KIND/TABLE), which holds
+docs/results/ and have no marker of their own), or that of another file docs/results/NAME.json (NAME
+may be KIND/TABLE), which holds
 
     commit, date, machine, how    of what code it is, where and how it was measured
     decides    digest of what decides a training in that code (tools/provenance.py)
@@ -24,7 +25,7 @@ import re
 import string
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
@@ -244,12 +245,20 @@ def read_results(folder: Path) -> dict[str, dict]:
     }
 
 
-def read_tables(folder: Path) -> dict[str, str]:
-    """{name: Markdown} of all that can be generated; folder: of the results. Raises TableError."""
+def marked(root: Path) -> list[str]:
+    """The names of the tables for which there is a marker."""
+    texts = (path.read_text("utf-8") for path in documents(root))
+    return [name for text in texts for _, name, _ in BLOCK.findall(text)]
+
+
+def read_tables(folder: Path, own: Collection[str] = ()) -> dict[str, str]:
+    """{name: Markdown} of all that can be generated; folder: of the results. `kinds` has no table
+    of those in `own`, which stand elsewhere. Raises TableError.
+    """
     results = read_results(folder)
     measured = readme(results.pop("readme")) if "readme" in results else {}
     measured |= {name: table(contents) for name, contents in results.items()}
-    measured["kinds"] = kinds(measured)
+    measured["kinds"] = kinds({name: measured[name] for name in measured.keys() - set(own)})
     return measured | {"settings": settings(), "commands": commands(), "api": api()}
 
 
@@ -281,7 +290,7 @@ def main(root: Path = ROOT) -> int:
     """
     path = root / "docs" / "results"
     try:
-        tables = read_tables(path)
+        tables = read_tables(path, marked(root))
         for path in documents(root):
             old = path.read_text("utf-8")
             new = with_tables(old, tables)

@@ -6,9 +6,9 @@ measured anew. A table is written to docs/results/ once all of it was found, the
 everything was; `make docs` puts them into the pages. Scenes are looked for in PP_DATA
 (../shared/data). It takes hours in which nothing else should run.
 
-`--kind NAME` measures for another processor, driver (PP_DEVICE) or GPU than README's. What it finds
-is kept in runs/results-NAME/, and the tables of those parts that were measured go to
-docs/results/NAME/, for the marker `table: kinds`. `--minutes N`, on a GPU that is lent for a while,
+`--kind NAME` measures for another processor, driver (PP_DEVICE) or GPU. What it finds is kept in
+runs/results-NAME/, and the tables of those parts that were measured go to docs/results/NAME/, for
+the marker `table: kinds` or markers of their own. `--minutes N`, on a GPU that is lent for a while,
 measures the parts of WORTH for which there is time, and names those that it left out.
 """
 
@@ -442,7 +442,7 @@ def draw(trained: list[dict], timed: list[dict], folder: Path) -> None:
                 axes = figure.subplots()
                 plot(axes, rows)
                 axes.grid(alpha=0.3)
-                axes.legend(fontsize=8)
+                figure.legend(loc="outside upper center", ncols=5, fontsize=8)
                 figure.savefig(folder / f"{name}{suffix}.png", dpi=120)
 
 
@@ -470,11 +470,13 @@ def plot_quality(axes: "Axes", trained: list[dict]) -> None:
 
 def plot_speed(axes: "Axes", timed: list[dict]) -> None:
     """Time against error, a colour for each variant. timed: {"label", "ms", "error"}."""
+    from matplotlib.ticker import LogLocator
+
     axes.set(xscale="log", yscale="log", xlabel="milliseconds", ylabel="error against float64")
     for i, label in enumerate(dict.fromkeys(row["label"] for row in timed)):
         some = [row for row in timed if row["label"] == label]
         axes.plot([r["ms"] for r in some], [r["error"] for r in some], "os^Dv"[i % 5], label=label)
-    axes.set_xticks([10, 20, 50, 100, 200, 500], labels=["10", "20", "50", "100", "200", "500"])
+    axes.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}")
     axes.minorticks_off()
 
 
