@@ -48,31 +48,6 @@ def row(run: Run, steps: int, cell: float) -> dict:
     }
 
 
-def plot(rows: list[dict], file: str) -> None:
-    """PSNR over seconds, a line for each run and window."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator
-
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.add_subplot()
-    for run in dict.fromkeys(each["run"] for each in rows):
-        mine = sorted((each for each in rows if each["run"] == run), key=lambda each: each["steps"])
-        for size, style in ((1, ":"), (3, "-")):
-            seconds = [each["seconds"] for each in mine]
-            quality = [each["psnr"][size] for each in mine]
-            axes.plot(seconds, quality, style, marker="o", label=f"{run}, {size} times as large")
-            if size == 3:
-                for each, x, y in zip(mine, seconds, quality, strict=True):
-                    axes.annotate(f"{each['steps']}", (x, y), fontsize=8, va="bottom")
-    axes.set(xscale="log", xlabel="seconds on two cores; labels: steps", ylabel="PSNR, dB")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.minorticks_off()
-    axes.legend()
-    axes.grid(alpha=0.3)
-    figure.savefig(file, dpi=120)
-
-
 def main() -> int:
     """Print the rows; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -82,7 +57,6 @@ def main() -> int:
     parser.add_argument("--steps", type=int, nargs="+", default=[QUALITIES[QUICK][0]])
     parser.add_argument("--cell", type=float, default=QUALITIES[QUICK][1], help="0: each point")
     parser.add_argument("--json", metavar="FILE", help="write them there too")
-    parser.add_argument("--plot", metavar="FILE", help="and draw them there")
     options = parser.parse_args()
     rows = []
     try:
@@ -96,8 +70,6 @@ def main() -> int:
         return 2
     if options.json:
         Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-    if options.plot:
-        plot(rows, options.plot)
     return 0
 
 
