@@ -442,7 +442,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     beside = "ours, PyTorch's, theirs over ours; medians of interleaved runs"
     if "pytorch" in found:
         beside += f", {found['pytorch'][0]['torch']}"
-    fitted = "seconds of all cores; means over five held-out views, drawn as viewers draw splats"
+    fitted = "processor seconds a core; means over five test views, drawn as viewers draw splats"
     parts = {
         "trainings": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
