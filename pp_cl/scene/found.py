@@ -1,22 +1,45 @@
-"""What is found of what a scene's files name: the image of a name, the mask of an image."""
+"""What is found in a scene's folder: the image that a name means, the mask of an image, folders of
+images and of models, and what is there in place of a scene.
+"""
 
+import json
 import os
 import posixpath
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from types import ModuleType
 from typing import TypeVar
+from urllib.parse import unquote
 
-from pp_cl.errors import Unusable, UserError
+from pp_cl.errors import Unusable, UserError, few_names, quoted
 from pp_cl.files.atomic import sha256_of
 from pp_cl.files.image import ENDINGS
+from pp_cl.files.untrusted import read_json_text
 
 # where programs put the images that a name may mean, in their order, beside images_2, images_4 ...
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
 MASK_FOLDERS = ("masks", "mask")
 IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says nothing
+# of names that are no UTF-8: of Windows in Chinese, Japanese, Korean, Russian and western Europe
+CODE_PAGES = ("gb18030", "cp932", "big5", "cp949", "cp1251", "cp1252", "cp437", "cp850", "cp866")
+# folders in which models lie, and scenes in a folder without one
+MOST_FOLDERS, MOST_DEPTH = 200, 4
+MOST_JSON = 2**24  # bytes of a file that may be a transforms.json
+# {what lies in the folder of a program or dataset that is not read: which of its exports is}
+EXPORTS = {
+    "*.xml": 'Metashape\'s, maybe; use its Export Cameras with the type "Colmap"',
+    "*.csv": "RealityCapture's, maybe; use its export of registration for COLMAP",
+    "cams/*_cam.txt": "BlendedMVS's; use its scenes as NeuS ships them, with cameras_sphere.npz",
+    "keyframes/*cameras/*.json": "Polycam's; make a transforms.json by `ns-process-data polycam`",
+    "metadata.json": "Record3D's, maybe; make a transforms.json by `ns-process-data record3d`",
+    "camera/*.json": "of Nerfies, maybe, whose objects move; pp-cl needs one that is at rest",
+    "*.zip": "a zip file; unpack it and give the folder in it",
+}
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Fail = Callable[[str], UserError]  # makes the error that names the file and the key
@@ -37,36 +60,39 @@ def usable(
             left_out.append((name(item), error))
 
 
+# Images -------------------------------------------------------------------------------------------
+
+
 def find_image(folder: Path, given: str, fail: Fail, kind: str = "image") -> str:
     """Path relative to the scene's folder of the image that a file there calls `given`: as it is
     written, or what is _alike() for the tails of the path, the longest first, beside the file and
-    in IMAGE_FOLDERS, for the kind mask in MASK_FOLDERS. Raises fail(text) for a path that leaves
-    the folder, Unusable with its text where no image is.
+    in IMAGE_FOLDERS, for the kind mask in MASK_FOLDERS. Nothing outside the folder is looked at.
+    Raises fail(text) for what is no path, Unusable with its text where no image is.
     """
     root = os.path.realpath(folder)
     try:
         for form in dict.fromkeys((given, given.replace("\\", "/"))):
-            if not os.path.isabs(form) and posixpath.normpath(form).split("/")[0] == "..":
-                raise fail(
-                    f"{given[:80]!r} leaves the scene's folder; copy the image into it and write"
-                    " its path from there"
-                )
             path = os.path.join(root, form)
-            if os.path.isfile(path) and (inside := _inside(root, path)):
+            if (inside := _inside(root, path)) and os.path.isfile(path):
                 return inside
-        parts = [p for p in given.replace("\\", "/").split("/") if p not in ("", ".")]
+        stated = posixpath.normpath(given.replace("\\", "/"))
+        parts = [part for part in stated.split("/") if part not in ("", ".", "..")]
         places = MASK_FOLDERS if kind == "mask" else _image_folders(root)
         for start in range(len(parts)):
             *above, name = parts[start:]
             for place in (".", *places):
                 if kind == "mask" and place == "." and not above:
                     continue
-                there = posixpath.normpath(posixpath.join(place, *above))
-                if found := _alike(os.path.join(root, there), name):
+                there = _below(root, posixpath.join(place, *above))
+                if there and (found := _alike(os.path.join(root, there), name)):
                     return posixpath.normpath(posixpath.join(there, found))
     except (OSError, ValueError) as error:  # a name too long, a zero byte
-        raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
-    text = f"no {kind} at {given[:80]!r} in {folder}; copy it there or remove the frame"
+        raise fail(f"{quoted(given, 80)} is not a usable path ({error})") from error
+    text = f"no {kind} at {quoted(given, 80)} in {folder}; copy it there or remove the frame"
+    if stated.startswith("../"):
+        text = f"{quoted(given, 80)} leaves the scene's folder; copy the {kind} into {folder}"
+    elif _bytes(given):
+        text += "; or rename the images in ASCII, as the name is no UTF-8"
     raise Unusable(fail(text), f"no {kind}")
 
 
@@ -95,6 +121,12 @@ def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:
     return {n - low: name for n, name in zip(numbers, names, strict=True)} if is_whole else None
 
 
+def natural(name: str) -> list[tuple[int, str]]:
+    """The key by which names are sorted by the numbers in them: 10 after 9."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)]
+
+
 def _inside(root, path):
     """A path relative to the root, of what a link leads to if that is inside; None outside."""
     for one in (os.path.realpath(path), os.path.normpath(path)):
@@ -103,14 +135,17 @@ def _inside(root, path):
     return None
 
 
-def _image_folders(root):
-    """IMAGE_FOLDERS that there are, in any case, and images_N, the largest images first."""
-    entries = sorted(os.listdir(root))
-    reduced = [entry for entry in entries if re.fullmatch(r"images_\d+", entry)]
-    inside = {entry.lower(): entry for entry in reversed(entries)}
-    usual = (inside.get(place, place) for place in IMAGE_FOLDERS)
-    places = (*usual, *sorted(reduced, key=lambda entry: int(entry[len("images_") :])))
-    return [place for place in places if os.path.isdir(os.path.join(root, place))]
+def _below(root, path):
+    """The folder in the root that a relative path means, in any of its _spellings(), or None."""
+    found = root
+    for part in path.split("/"):
+        there = os.path.join(found, part)
+        if not os.path.isdir(there):
+            names = os.listdir(found) if os.path.isdir(found) else []
+            alike = [one for one in names if _keys(one) & _keys(part)]
+            there = os.path.join(found, alike[0]) if len(alike) == 1 else there
+        found = there
+    return os.path.relpath(found, root).replace(os.sep, "/") if os.path.isdir(found) else None
 
 
 def _alike(folder, name):
@@ -119,9 +154,9 @@ def _alike(folder, name):
     """
     if not os.path.isdir(folder):
         return None
-    bare = _bare(name)
-    alike = _images(folder, os.stat(folder).st_mtime_ns).get(bare.lower(), [])
-    exact = [one for one in alike if _bare(one) == bare]
+    bare, images = _bare(name.strip()), _images(folder, os.stat(folder).st_mtime_ns)
+    alike = list(dict.fromkeys(one for key in _keys(bare) for one in images.get(key, [])))
+    exact = [one for one in alike if _spellings(_bare(one)) & _spellings(bare)]
     exact.sort(key=lambda one: (one != name, ENDINGS.index(os.path.splitext(one)[1].lower())))
     found = next(iter(exact or alike * (len(alike) == 1)), None)
     return found if found and os.path.isfile(os.path.join(folder, found)) else None
@@ -129,11 +164,11 @@ def _alike(folder, name):
 
 @lru_cache(maxsize=256)
 def _images(folder, time):
-    """{name without endings, in lower case: images in a folder}, last changed at that time."""
+    """{each of the _keys() of a name without endings: images in a folder}, last changed then."""
     found = {}
     for name in sorted(os.listdir(folder)):
-        if name.lower().endswith(ENDINGS):
-            found.setdefault(_bare(name).lower(), []).append(name)
+        for key in _keys(_bare(name)) if name.lower().endswith(ENDINGS) else ():
+            found.setdefault(key, []).append(name)
     return found
 
 
@@ -142,6 +177,30 @@ def _bare(name):
     for _ in range(2):
         name = os.path.splitext(name)[0] if name.lower().endswith(ENDINGS) else name
     return name
+
+
+def _spellings(name):
+    """{a name as people see it}: in one form of Unicode, as an accent may be a letter of its own;
+    by any of CODE_PAGES, if it is no UTF-8; as it is, and without the % of addresses.
+    """
+    found = {name}
+    if content := _bytes(name):
+        for page in CODE_PAGES:
+            with suppress(UnicodeDecodeError):
+                found.add(content.decode(page))
+    elif "%" in name:
+        found.add(unquote(name))
+    return {unicodedata.normalize("NFC", one) for one in found}
+
+
+def _keys(name):
+    return {one.lower() for one in _spellings(name)}
+
+
+def _bytes(name):
+    """The bytes of a name that is no UTF-8, for which Python has surrogates; b"" of any other."""
+    is_other = not name.isascii() and any("\udc80" <= letter <= "\udcff" for letter in name)
+    return name.encode("utf-8", "surrogateescape") if is_other else b""
 
 
 # Masks --------------------------------------------------------------------------------------------
@@ -153,21 +212,22 @@ def find_mask(folder: Path, image: str, *, by_number: bool = False) -> str | Non
     has it. None where there is none.
     """
     above, name = posixpath.split(image)
-    if not os.path.isdir(folder / above):
+    if not os.path.isdir(folder) or (there := _below(folder, above or ".")) is None:
         return None
-    masks = _masks(folder / above, os.stat(folder / above).st_mtime_ns)
+    masks = _masks(folder / there, os.stat(folder / there).st_mtime_ns)
     stem = PurePosixPath(name).stem
-    found = masks.get(name) or masks.get(stem)
+    wanted = (name, stem, *_keys(name), *_keys(stem))
+    found = next((masks[key] for key in wanted if key in masks), None)
     if not found and by_number and stem.isdecimal():
         found = masks.get(int(stem))
-    is_there = found and os.path.isfile(folder / above / found)
-    return posixpath.join(above, found) if is_there else None
+    is_there = found and os.path.isfile(folder / there / found)
+    return posixpath.normpath(posixpath.join(there, found)) if is_there else None
 
 
 @lru_cache(maxsize=256)
 def _masks(folder, time):
     """{what an image may be called, or its number: its mask} in a folder last changed then."""
-    names = [name for names in _images(folder, time).values() for name in names]
+    names = sorted({name for names in _images(folder, time).values() for name in names})
     found = {os.path.splitext(name)[0]: name for name in names}
     for name in names:
         bare = _bare(name)
@@ -175,6 +235,9 @@ def _masks(folder, time):
             found.setdefault(image, name)
         if bare.isdecimal():
             found.setdefault(int(bare), name)
+    for image, name in list(found.items()):
+        for key in _keys(image) if isinstance(image, str) else ():
+            found.setdefault(key, name)
     return found
 
 
@@ -208,6 +271,18 @@ def find_masks(
     return found
 
 
+def _in_tree(image):
+    """Its path in the folder of images."""
+    for place in sorted(IMAGE_FOLDERS, key=len, reverse=True):
+        if image.lower().startswith(f"{place}/"):
+            return image[len(place) + 1 :]
+    first, _, rest = image.partition("/")
+    return rest if first.startswith("images_") and rest else image
+
+
+# Folders ------------------------------------------------------------------------------------------
+
+
 def folder_named(folder: Path, names: Sequence[str]) -> str | None:
     """What in a folder is a folder with one of the names, in their order, whatever their case."""
     inside = {entry.lower(): entry for entry in sorted(os.listdir(folder), reverse=True)}
@@ -229,10 +304,81 @@ def image_folder(folder: Path, names: Sequence[str] = IMAGE_FOLDERS) -> str:
     return folder_named(folder, names) or next(iter(reduced), names[0])
 
 
-def _in_tree(image):
-    """Its path in the folder of images."""
-    for place in sorted(IMAGE_FOLDERS, key=len, reverse=True):
-        if image.lower().startswith(f"{place}/"):
-            return image[len(place) + 1 :]
-    first, _, rest = image.partition("/")
-    return rest if first.startswith("images_") and rest else image
+def folder_images(folder: Path, name: str) -> list[str]:
+    """Sorted paths relative to the scene's folder of the images in its folder `name`. Raises
+    UserError where there are none.
+    """
+    found = [
+        file.name
+        for file in sorted((folder / name).glob("*"))
+        if file.suffix.lower() in ENDINGS and file.is_file() and not file.name.startswith(".")
+    ]
+    if not found:
+        raise UserError(f"{folder / name}: no images in it; copy them there")
+    return [f"{name}/{image}" for image in found]
+
+
+def _image_folders(root):
+    """IMAGE_FOLDERS that there are, in any case, and images_N, the largest images first."""
+    entries = sorted(os.listdir(root))
+    reduced = [entry for entry in entries if re.fullmatch(r"images_\d+", entry)]
+    inside = {entry.lower(): entry for entry in reversed(entries)}
+    usual = (inside.get(place, place) for place in IMAGE_FOLDERS)
+    places = (*usual, *sorted(reduced, key=lambda entry: int(entry[len("images_") :])))
+    return [place for place in places if os.path.isdir(os.path.join(root, place))]
+
+
+def folder_of(folder: Path, names: Sequence[str]) -> Path | None:
+    """The folder that has most images of these names, where none of IMAGE_FOLDERS is there."""
+    if _image_folders(folder):
+        return None
+    of_masks = {*MASK_FOLDERS, *IGNORE_FOLDERS}
+    places = [place for place in folders_below(folder) if place.name.lower() not in of_masks]
+    most = max(places, key=lambda p: sum((p / name).is_file() for name in names), default=folder)
+    return most if any((most / name).is_file() for name in names) else None
+
+
+def folders_below(folder: Path) -> list[Path]:
+    """Folders in a folder, in those and so on, the uppermost first; none that is hidden."""
+    found: list[Path] = []
+    level = [folder]
+    for _ in range(MOST_DEPTH):
+        inside: list[Path] = []
+        for place in level:
+            with suppress(OSError):
+                inside += [p for p in sorted(place.iterdir()) if p.name[0] != "." and p.is_dir()]
+        level = inside[: MOST_FOLDERS - len(found)]
+        found += level
+    return found
+
+
+def nested(folder: Path, is_model: Callable[[Path], object]) -> list[Path]:
+    """Folders of models that lie deep in a folder, but for those that have images of their own."""
+    own = [place for place in folders_below(folder) if holds_images(place)]
+    return [p for p in folders_below(folder) if is_model(p) and not {p, *p.parents} & {*own}]
+
+
+def scene_near(folder: Path, reader_of: Callable[[Path], ModuleType | None]) -> str:
+    """Words on the scene that is above a folder or in it; "" where none is."""
+    for near in (*folder.absolute().parents[:2], *folders_below(folder)):
+        if os.access(near, os.R_OK | os.X_OK) and (reader := reader_of(near)):
+            return f"; {near} is one ({reader.FILES}); give that"
+    return ""
+
+
+def instead_of_scene(folder: Path) -> str:
+    """What is in a folder without a scene, in words."""
+    inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    for file in (path for path in inside if path.suffix.lower() == ".json"):
+        with suppress(OSError, ValueError, RecursionError):
+            found = json.loads(read_json_text(file, MOST_JSON, "utf-8-sig"))
+            if isinstance(found, dict) and "frames" in found:
+                return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
+    for pattern, export in EXPORTS.items():
+        if file := next(folder.glob(pattern), None):
+            return f": {quoted(file.name, 40)} is {export}"
+    names = few_names([quoted(path.name, 40) for path in inside]) or "nothing"
+    return (
+        f": {names}, but no file of cameras that is known, such as transforms.json or sparse/0;"
+        " `pp-cl capture` makes one of photographs"
+    )

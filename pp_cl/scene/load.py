@@ -17,7 +17,7 @@ import numpy as np
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, border, check_downscale, evenly
-from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, quoted
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names
 from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.progress import track
 from pp_cl.scene import demo
@@ -28,7 +28,9 @@ from pp_cl.scene.found import (
     LeftOut,
     find_masks,
     folder_named,
+    instead_of_scene,
     pictures_of,
+    scene_near,
     usable,
 )
 from pp_cl.scene.gaze import STATED, other_axes, read_as
@@ -36,7 +38,7 @@ from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
 from pp_cl.scene.masks import AS_GIVEN, OPAQUE, half_transparent, is_by_colour, read_mask_of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
-from pp_cl.scene.readers.common import SPLITS, read_json
+from pp_cl.scene.readers.common import SPLITS
 from pp_cl.scene.silhouette import within_silhouettes
 from pp_cl.settings import Config, SceneConfig
 
@@ -65,15 +67,8 @@ BESIDE = 0.5  # of what is transparent, that a mask which is not of the object h
 WRONG = "what the scene's files say of it is wrong"  # of a view whose error is no Unusable
 OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
 OF_TRAINING = "pictures that are in training, too, so that figures flatter"
-# {what lies in the folder of a program or dataset that is not read: which of its exports is}
-EXPORTS = {
-    "*.xml": 'Metashape\'s, maybe; use its Export Cameras with the type "Colmap"',
-    "*.csv": "RealityCapture's, maybe; use its export of registration for COLMAP",
-    "cams/*_cam.txt": "BlendedMVS's; use its scenes as NeuS ships them, with cameras_sphere.npz",
-    "keyframes/*cameras/*.json": "Polycam's; make a transforms.json by `ns-process-data polycam`",
-}
 LEAST_VIEWS = 8  # for training that are left where some are left out
-NEARBY = 100  # files of a folder without a scene in which one is looked for
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 
 
 class SplitFiles(NamedTuple):
@@ -351,9 +346,12 @@ def find_reader(path: str | Path) -> ModuleType:
     """The module of READERS for a folder. Raises UserError where it holds no scene."""
     folder = Path(path)
     check_folder(folder)
-    if reader := _reader_of(folder):
+    if os.access(folder, os.R_OK | os.X_OK) and (reader := _reader_of(folder)):
         return reader
-    raise UserError(f"{folder}: no scene in it{_found_instead(folder)}")
+    if colmap.model_folder(folder):
+        return colmap
+    instead = scene_near(folder, _reader_of) or instead_of_scene(folder)
+    raise UserError(f"{folder}: no scene in it{instead}")
 
 
 def check_folder(folder: Path) -> None:
@@ -362,6 +360,7 @@ def check_folder(folder: Path) -> None:
         is_video = (mimetypes.guess_type(folder.name)[0] or "").startswith("video/")
         mend = f"a scene is a folder, maybe {folder.absolute().parent}"
         mend = f"`pp-cl capture {folder} --out SCENE` makes a scene of it" if is_video else mend
+        mend = "unpack it and give the folder in it" if folder.suffix.lower() in ARCHIVES else mend
         raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
@@ -370,30 +369,8 @@ def check_folder(folder: Path) -> None:
 
 
 def _reader_of(folder):
-    """The reader of a folder, None where it holds no scene or cannot be read."""
-    if not os.access(folder, os.R_OK | os.X_OK):
-        return None
+    """The reader of a folder, None where it holds no scene."""
     return next((reader for reader in READERS if reader.recognises(folder)), None)
-
-
-def _found_instead(folder):
-    """What is in a folder without a scene, and where one is, in words."""
-    inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    for near in (*folder.absolute().parents[:2], *filter(Path.is_dir, inside[:NEARBY])):
-        if reader := _reader_of(near):
-            return f"; {near} is one ({reader.FILES}); give that"
-    for file in (path for path in inside if path.suffix.lower() == ".json"):
-        with suppress(UserError):
-            if isinstance(data := read_json(file), dict) and "frames" in data:
-                return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
-    for pattern, export in EXPORTS.items():
-        if file := next(folder.glob(pattern), None):
-            return f": {quoted(file.name, 40)} is {export}"
-    found = few_names([quoted(path.name, 40) for path in inside]) or "nothing"
-    return (
-        f": {found}, but no file of cameras that is known, such as transforms.json or sparse/0;"
-        " `pp-cl capture` makes one of photographs"
-    )
 
 
 # Pending images -----------------------------------------------------------------------------------

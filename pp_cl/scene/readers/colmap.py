@@ -21,7 +21,15 @@ from pp_cl.engine.camera import Camera
 from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import UTF_16, opened_regular, refusal
-from pp_cl.scene.found import LeftOut, find_image, folder_named, holds_images, usable
+from pp_cl.scene.found import (
+    LeftOut,
+    find_image,
+    folder_named,
+    folder_of,
+    holds_images,
+    nested,
+    usable,
+)
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.lens import LensDistortion
 from pp_cl.scene.readers.common import (
@@ -35,7 +43,8 @@ from pp_cl.scene.readers.common import (
 )
 
 FILES = "a sparse model of COLMAP beside images"
-# and in numbered folders in them; the folder itself has the model of RealityScan
+# and in numbered folders in them; the folder itself has the model of RealityScan. Where none has
+# one, a model is looked for deeper.
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", ".")
 IMAGES = "images"
 
@@ -94,7 +103,7 @@ class Image(NamedTuple):
 
 def recognises(folder: Path) -> bool:
     """True if the folder has a model in one of the usual places."""
-    return bool(_models(folder))
+    return bool(_usual_models(folder))
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
@@ -115,8 +124,9 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
             why = CUT_UP if lens.model == PANORAMIC else undistort
             text = f"{model}: camera model {lens.model} {why}"
             lenses[identity] = Unusable(text, "a lens that is not modelled")
-    near = _images_of(folder, model) or folder / IMAGES
     images.sort(key=lambda image: image.name)
+    near = _images_of(folder, model) or folder_of(folder, [image.name for image in images])
+    near = near or folder / IMAGES
     chosen = hold_out(images, split, [near / image.name for image in images])
     read = partial(_image_file, folder, near.relative_to(folder).as_posix(), model, lenses)
     return list(usable(progress(chosen), read, lambda image: image.name, left_out))
@@ -140,7 +150,12 @@ def _images_of(folder, model):
 
 
 def _models(folder):
-    """The folders of models in the usual places; the folder itself where it has images, too."""
+    """The folders of models in the usual places, else deeper."""
+    return _usual_models(folder) or nested(folder, _suffix)
+
+
+def _usual_models(folder):
+    """Those in PLACES; the folder itself where it has images, too."""
     places = [folder / place for place in PLACES if place != "." or holds_images(folder)]
     several = [near for place in PLACES[:-1] for near in sorted((folder / place).glob("[0-9]*"))]
     return [place for place in (*several, *places) if _suffix(place)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError, quoted, shown
-from pp_cl.files.image import ENDINGS, same_shape
+from pp_cl.files.image import same_shape
 from pp_cl.files.untrusted import (
     opened_regular,
     opened_zip,
@@ -59,20 +59,6 @@ def progress(items: Sequence[Item]) -> Iterable[Item]:
 
 
 # Images -------------------------------------------------------------------------------------------
-
-
-def folder_images(folder: Path, name: str) -> list[str]:
-    """Sorted paths relative to the scene's folder of the images in its folder `name`. Raises
-    UserError where there are none.
-    """
-    found = [
-        file.name
-        for file in sorted((folder / name).glob("*"))
-        if file.suffix.lower() in ENDINGS and file.is_file() and not file.name.startswith(".")
-    ]
-    if not found:
-        raise UserError(f"{folder / name}: no images in it; copy them there")
-    return [f"{name}/{image}" for image in found]
 
 
 def in_order(

@@ -1,5 +1,5 @@
-"""Reader of scenes as NSVF has them: rgb/ with the split in front of the names, pose/, one
-intrinsics.txt, and near_and_far.txt where it is there.
+"""Reader of scenes as NSVF has them, and Plenoxels (svox2): rgb/ or images/ with the split in front
+of the names, pose/, one intrinsics.txt, and near_and_far.txt where it is there.
 """
 
 from pathlib import Path
@@ -7,19 +7,19 @@ from pathlib import Path
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
-from pp_cl.scene.found import LeftOut, usable
+from pp_cl.scene.found import LeftOut, folder_images, image_folder, usable
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.readers.common import fail_at, fitted, folder_images, read_numbers
+from pp_cl.scene.readers.common import fail_at, fitted, read_numbers
 from pp_cl.scene.readers.frame import rigid
 
 FILES = "rgb, pose and intrinsics.txt (NSVF)"
 PREFIXES = {"0_": "train", "1_": "val", "2_": "test"}
-IMAGES, POSES, INTRINSICS = "rgb", "pose", "intrinsics.txt"
+IMAGES, POSES, INTRINSICS = ("rgb", "images", "image"), "pose", "intrinsics.txt"
 
 
 def recognises(folder: Path) -> bool:
     """True if the folder has the two folders and the intrinsics."""
-    folders = (folder / IMAGES).is_dir() and (folder / POSES).is_dir()
+    folders = (folder / image_folder(folder, IMAGES)).is_dir() and (folder / POSES).is_dir()
     return folders and (folder / INTRINSICS).is_file()
 
 
@@ -58,13 +58,13 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 def _names(folder):
     """{split: names of its images}. Raises UserError where no name has a prefix."""
-    names = {}
-    for name in folder_images(folder, IMAGES):
+    names, place = {}, image_folder(folder, IMAGES)
+    for name in folder_images(folder, place):
         if split := PREFIXES.get(Path(name).name[:2]):
             names.setdefault(split, []).append(name)
     if not names:
         raise UserError(
-            f"{folder / IMAGES}: no image belongs to a split; begin their names with 0_ (train),"
+            f"{folder / place}: no image belongs to a split; begin their names with 0_ (train),"
             " 1_ (val) or 2_ (test)"
         )
     if "test" not in names and "val" in names:
