@@ -49,22 +49,26 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
             yield archive
 
 
-def read_regular(path: Path | str, most: int, encoding: str = "utf-8") -> str:
-    """The text of a file of at most so many bytes; UTF-16 is known by its byte order mark. Raises
-    OSError as opened_regular, ValueError for a larger one and other bytes.
+def read_regular(
+    path: Path | str, most: int, encoding: str = "utf-8", errors: str = "strict"
+) -> str:
+    """The text of a file of at most so many bytes; UTF-16 is known by its byte order mark. errors:
+    what other bytes become. Raises OSError as opened_regular, ValueError for a larger file.
     """
     with opened_regular(path) as file:
         content = file.read(most + 1)
     if len(content) > most:
         raise ValueError(f"larger than {most} bytes")
-    return content.decode("utf-16" if content.startswith(UTF_16) else encoding)
+    return content.decode("utf-16" if content.startswith(UTF_16) else encoding, errors)
 
 
-def read_json_text(path: Path | str, most: int, encoding: str = "utf-8") -> str:
+def read_json_text(
+    path: Path | str, most: int, encoding: str = "utf-8", errors: str = "strict"
+) -> str:
     """read_regular() of JSON of at most MOST_VALUES values, of which each may take a hundred times
     the memory of its text, such as {}. Raises ValueError for more.
     """
-    text = read_regular(path, most, encoding)
+    text = read_regular(path, most, encoding, errors)
     if sum(map(text.count, ",[{")) > MOST_VALUES:
         raise ValueError(f"more than {MOST_VALUES} values")
     return text

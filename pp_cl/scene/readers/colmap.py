@@ -36,6 +36,7 @@ from pp_cl.scene.readers.common import (
     CUT_UP,
     MOST,
     PANORAMIC,
+    as_number,
     fail_at,
     fitted,
     hold_out,
@@ -233,7 +234,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
         if has_controls or not 1 <= len(image.name) <= MOST_NAME:
             raise UserError(f"{where}: {image.name[:80]!r} is no name of an image; rename it")
         name = PurePosixPath(image.name)  # ./a.png is a.png
-        if name in images:
+        if images.get(name, image)[1:] != image[1:]:
             raise UserError(f"{file}: {image.name}: stands there twice; remove one")
         images[name] = image
         if len(images) > MOST_RECORDS:
@@ -276,7 +277,7 @@ POINT = "POINT3D_ID X Y Z R G B"
 def _text_entries(file, form, parse):
     with opened_regular(file) as binary:
         encoding = "utf-16" if binary.read(2) in UTF_16 else "utf-8-sig"
-    with file.open(encoding=encoding) as opened:
+    with file.open(encoding=encoding, errors="surrogateescape") as opened:
         lines = enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1)
         for number, line in lines:
             if len(line) == MOST_LINE:
@@ -302,16 +303,17 @@ def _text_entries(file, form, parse):
 
 def _text_camera(line):
     identity, model, width, height, *parameters = line.split()
-    return int(identity), Lens(model, int(width), int(height), [float(p) for p in parameters])
+    size = int(as_number(width)), int(as_number(height))
+    return int(identity), Lens(model, *size, [as_number(p) for p in parameters])
 
 
 def _text_image(line):
     words = line.split(maxsplit=9)
-    return Image(words[9], int(words[8]), [float(word) for word in words[1:8]])
+    return Image(words[9], int(words[8]), [as_number(word) for word in words[1:8]])
 
 
 def _text_point(line):
-    _, x, y, z, red, green, blue = map(float, line.split(maxsplit=7)[:7])
+    _, x, y, z, red, green, blue = map(as_number, line.split(maxsplit=7)[:7])
     return x, y, z, red, green, blue
 
 
@@ -354,7 +356,7 @@ def _binary_image(opened):
     opened.seek(at + len(name) + 1)
     (points,) = _take(opened, "Q")
     opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
-    return Image(name.decode(), camera, pose)
+    return Image(name.decode(errors="surrogateescape"), camera, pose)
 
 
 def _binary_point(opened):

@@ -2,9 +2,10 @@
 
 import json
 import math
+import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from pp_cl.files.untrusted import (
     refusal,
 )
 from pp_cl.progress import track
-from pp_cl.scene.found import Fail, LeftOut, numbered, pictures_of, usable
+from pp_cl.scene.found import Fail, LeftOut, natural, numbered, pictures_of, usable
 from pp_cl.scene.image_file import ImageFile
 
 HELD_OUT = 8  # one image of so many, the first among them, as LLFF and 3DGS do
@@ -70,9 +71,15 @@ def in_order(
     read: Callable[[int, str], ImageFile],
 ) -> list[ImageFile]:
     """The images of a split whose cameras, called so in a file, stand there in the order of the
-    images' names, by the numbers in these where images are gone. read(index, image) gives an
-    ImageFile. Raises UserError where nothing tells which are gone.
+    images' names, of their numbers where all names are numbers, by these where images are gone.
+    read(index, image) gives an ImageFile. Raises UserError where nothing tells which are gone.
     """
+    if all(PurePosixPath(image).stem.isdecimal() for image in images):
+        ordered = sorted(images, key=natural)
+        if ordered != list(images):
+            what = "images, whose names are numbers, have the cameras in the order of these"
+            warnings.warn(f"{file}: {what}", stacklevel=1)
+        images = ordered
     places = numbered(images, len(cameras))
     if places is None:
         raise UserError(
@@ -140,9 +147,11 @@ def numbers(value: Any, shape: tuple[int, ...] | None = None) -> np.ndarray | No
 
 
 def read_json(file: Path) -> Any:
-    """Content of a JSON file. Raises UserError naming the file and the place that is broken."""
+    """Content of a JSON file; bytes that are no UTF-8 may be names of images. Raises UserError
+    naming the file and the place that is broken.
+    """
     try:
-        return json.loads(read_json_text(file, MOST_JSON, "utf-8-sig"))
+        return json.loads(read_json_text(file, MOST_JSON, "utf-8-sig", "surrogateescape"))
     except json.JSONDecodeError as error:
         raise UserError(
             f"{file}: line {error.lineno}, column {error.colno}: {error.msg}; correct the JSON"
@@ -198,6 +207,11 @@ def _read_array(opened, most):
     return array
 
 
+def as_number(word: str) -> float:
+    """The value of a word of a text, which may have a decimal comma. Raises ValueError."""
+    return float(word.replace(",", ".") if word.count(",") == 1 and "." not in word else word)
+
+
 def read_numbers(file: Path) -> list[list[float]]:
     """The numbers of each line of a text file. Raises UserError naming the file and the line."""
     try:
@@ -207,7 +221,7 @@ def read_numbers(file: Path) -> list[list[float]]:
     rows = []
     for number, line in enumerate(lines, 1):
         try:
-            row = [float(word) for word in line.split()]
+            row = [as_number(word) for word in line.split()]
         except ValueError:
             row = [math.nan]
         if not all(abs(value) < MOST for value in row):

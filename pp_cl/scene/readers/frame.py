@@ -1,6 +1,7 @@
 """One frame of a JSON file of cameras: its keys, checked, and the camera that they make."""
 
 import math
+import warnings
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -154,23 +155,24 @@ def lens_distortion(frame: Frame) -> LensDistortion:
 
 
 def rigid(value: Any, fail: Fail) -> np.ndarray:
-    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal, without a scale
-    that all axes share. Raises Unusable with the text of fail().
+    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its axes made orthonormal, without a scale that
+    all share; left-handed ones stay so. Raises Unusable with the text of fail().
     """
     matrix = numbers(value, (4, 4))
     if matrix is None:
         matrix = numbers(value, (3, 4))
     if matrix is None:
         raise Unusable(fail("must be 4x4 or 3x4 finite numbers, camera-to-world"), "no pose")
+    if len(matrix) == 4 and matrix[:, 3].tolist() == [0, 0, 0, 1] != matrix[3].tolist():
+        what = "matrices are read column by column, as their last column is 0 0 0 1"
+        warnings.warn(what, stacklevel=1)
+        matrix = matrix.T
     if np.abs(matrix[3:] - [0, 0, 0, 1]).max(initial=0) > 1e-6:
         text = f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]"
         raise Unusable(fail(text), "no pose")
     u, scale, vt = np.linalg.svd(matrix[:3, :3])
     alike = np.abs((scale / max(scale.mean(), 1 / MOST)) ** 2 - 1).max() <= ROTATION_TOLERANCE
-    if not alike or np.linalg.det(u @ vt) < 0:
-        text = (
-            f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}, determinant"
-            f" {np.linalg.det(matrix[:3, :3]):.4f}); remove shear and mirroring"
-        )
+    if not alike:
+        text = f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}); remove the shear"
         raise Unusable(fail(text), "no pose")
     return np.hstack([u @ vt, matrix[:3, 3:]])

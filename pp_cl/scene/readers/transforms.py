@@ -1,9 +1,10 @@
 """Reader of scenes in the format of NeRF-synthetic, transforms_<split>.json, and of nerfstudio,
-transforms.json, with the keys of both; and a writer of the former.
+transforms.json, with the keys of both, and of sdfstudio; and a writer of the first.
 """
 
 import math
 import warnings
+from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -12,7 +13,8 @@ import numpy as np
 from pp_cl.engine.views import View
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_folder, write_json
-from pp_cl.files.image import image_size, write_png
+from pp_cl.files.image import image_size, same_shape, write_png
+from pp_cl.files.untrusted import opened_regular
 from pp_cl.scene.found import LeftOut, usable
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import (
@@ -21,13 +23,15 @@ from pp_cl.scene.readers.common import (
     fail_at,
     fitted,
     hold_out,
+    numbers,
     progress,
     read_json,
 )
-from pp_cl.scene.readers.frame import Frame, frame_keys, lens_distortion, pinhole
+from pp_cl.scene.readers.frame import GL_FROM_CV, Frame, frame_keys, lens_distortion, pinhole
 
 FILES = "transforms_train.json or transforms.json"
-SINGLE = "transforms.json"
+SINGLE, SDFSTUDIO = "transforms.json", "meta_data.json"
+ODD = 1 / 8  # of the images, that may have another shape by mistake
 NAMED = ("train", "val", "test")  # splits that transforms.json may list as <split>_filenames
 
 
@@ -51,18 +55,25 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
     files = _split_files(folder)
     file = files[split] if files else _single(folder)
     data = _read(file)
+    unclear: dict[str, Unusable] = {}
     frames: dict[str, Frame] = {}  # by the name of the image, or the path that finds none
     for index, own in enumerate(progress(data["frames"])):
         frame = Frame(file, data, own if isinstance(own, dict) else {}, index)
         name = _image(folder, frame) or _path(frame)
-        if name in frames:
-            raise frame.error("file_path", f"{name!r} stands there twice; remove one")
-        frames[name] = frame
+        if frames.setdefault(name, frame).get("transform_matrix") != frame.get("transform_matrix"):
+            text = frame.error("file_path", f"{name!r} stands there with two poses; remove one")
+            unclear[name] = Unusable(text, "two poses")
     if len({str(frame.get("time")) for frame in frames.values()}) > 1:
         what = "frames differ in time, but motion is not modelled: what moves will be blurred"
         warnings.warn(f"{file}: {what}", stacklevel=1)
     chosen = list(frames) if files else _of_split(file, data, frames, split)
-    return list(usable(chosen, lambda name: _image_file(folder, frames[name]), str, left_out))
+
+    def read(name):
+        if name in unclear:
+            raise unclear[name]
+        return _image_file(folder, frames[name])
+
+    return _of_one_shape(file, data, list(usable(chosen, read, str, left_out)), left_out)
 
 
 def box(folder: Path) -> np.ndarray | None:
@@ -73,8 +84,10 @@ def box(folder: Path) -> np.ndarray | None:
 
 
 def _single(folder):
-    """The transforms.json, None without one."""
-    files = (folder / name for name in (SINGLE, "transform.json"))
+    """The transforms.json, or sdfstudio's file in its place; None without either."""
+    files = [folder / name for name in (SINGLE, "transform.json")]
+    with suppress(OSError), opened_regular(folder / SDFSTUDIO) as opened:
+        files += [folder / SDFSTUDIO] if b'"camtoworld"' in opened.read(2**16) else []
     return next((file for file in files if file.is_file()), None)
 
 
@@ -93,7 +106,22 @@ def _read(file):
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{file}: frames: must be a list of one frame or more")
+    if file.name == SDFSTUDIO:
+        frames = [_of_sdfstudio(frame) for frame in frames if isinstance(frame, dict)]
+        return {"w": data.get("width"), "h": data.get("height"), "frames": frames}
     return data
+
+
+def _of_sdfstudio(own):
+    """A frame of sdfstudio, whose axes are OpenCV's, with nerfstudio's keys."""
+    pose, lens = numbers(own.get("camtoworld"), (4, 4)), numbers(own.get("intrinsics"))
+    keys = {"file_path": own.get("rgb_path"), "mask_path": own.get("foreground_mask")}
+    if pose is not None:
+        keys["transform_matrix"] = (pose @ GL_FROM_CV).tolist()
+    if lens is not None and lens.ndim == 2 and min(lens.shape) > 2:
+        (fx, _, cx), (_, fy, cy) = lens[:2, :3].tolist()
+        keys |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    return keys
 
 
 def _has_image(folder, file):
@@ -138,6 +166,23 @@ def _of_split(file, data, frames, split):
         what = f"{min(missing)!r} is the path of no frame" if missing else "is empty"
         raise UserError(f"{file}: {split}_filenames: {what}; list images of the frames")
     return [name for name in ordered if wanted & {name, paths[name]}]
+
+
+def _of_one_shape(file, data, image_files, left_out):
+    """The images of the shape that nearly all have, where one angle of view is stated for all."""
+    if data.get("camera_angle_x") is None or {"fl_x", "w"} & data.keys():
+        return image_files
+    sizes = [(one.camera.width, one.camera.height) for one in image_files]
+    usual = max(sizes, key=lambda size: sum(same_shape(size, other) for other in sizes), default=())
+    others = [
+        o.name for o, size in zip(image_files, sizes, strict=True) if not same_shape(size, usual)
+    ]
+    if len(others) > ODD * len(sizes):
+        return image_files
+    for name in others:
+        text = f"{file}: {name} has another shape than the others, of which camera_angle_x is"
+        left_out.append((name, Unusable(f"{text}; write it anew", "an image of another shape")))
+    return [one for one in image_files if one.name not in others]
 
 
 def _image_file(folder, frame):
