@@ -4,7 +4,7 @@ import argparse
 import math
 
 from pp_cl.commands import options as shared
-from pp_cl.errors import few_names
+from pp_cl.errors import UserError, few_names
 from pp_cl.presets import PRESETS
 
 HELP = "describe a run or a scene; --picture draws its points over photographs"
@@ -31,7 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the facts, write the image. Raises UserError for options that do not fit."""
+    """Print the facts, write the image. Raises UserError for options that do not fit, and of a
+    scene whose cameras are wrong.
+    """
     from pp_cl.commands.info_facts import describe_scene, run_facts, run_sheet
     from pp_cl.config import nearby_run
     from pp_cl.drivers import open_device
@@ -62,6 +64,8 @@ def run(options: argparse.Namespace) -> None:
         facts["picture"] = options.picture
         lines.append(f"wrote {options.picture}")
     shared.tell(options.json, facts, lines)
+    if facts.get("cameras_are_wrong"):  # as train says
+        raise UserError(facts["problem"])
 
 
 # ---- facts as rows: (what a line is of, "" for a further one of the same, its text)
@@ -146,9 +150,12 @@ def _scene_rows(facts):
         rows.append(("dropped", f"{few_names(dropped)} (pp_cl.json)"))
     hull = facts["hull"]
     if hull is None:
-        return [*rows, ("hull", f"none: {facts['problem']}")]
+        why = "the cameras are wrong" if facts["cameras_are_wrong"] else facts["problem"]
+        return [*rows, ("hull", f"none: {why}")]
     capped = " (capped)" * hull["capped"]
     rows.append(("hull", f"{hull['points']} points{capped}, {_grid_text(hull)}"))
+    if masks["with_alpha"]:
+        rows.append(("", f"{hull['masks_beside']:.2%} of the masks lie beside it"))
     if times := hull["refinements"]:
         pixels = " and ".join(
             f"{hull['voxel_size_pixels'] / 2**n:.2f}" for n in range(1, times + 1)

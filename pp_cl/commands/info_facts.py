@@ -20,10 +20,11 @@ from pp_cl.run import load, scene_is_there, stored_config
 from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.gaze import looked_at, up_of
-from pp_cl.scene.hull import Hull, agreeing, contradicting, spacing_pixels
+from pp_cl.scene.hull import Hull, contradicting, spacing_pixels
 from pp_cl.scene.identity import unpacked_views
 from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits
 from pp_cl.scene.outline import SHOWN_VIEWS, outline_sheet
+from pp_cl.scene.verdict import WrongCameras, judged
 from pp_cl.session.start import first_hull
 
 Facts = dict[str, Any]
@@ -118,13 +119,14 @@ def describe_scene(
     frames = {split: scene_frames(path, split) for split in names}
     opened = open_scene(dev, config, ("train",))
     views = opened.splits["train"]
-    hull, problem, box, right = None, None, scene_box(config), views
+    hull, problem, is_refused, right = None, None, False, views
+    box = scene_box(config)
     try:
-        agreement = agreeing(dev, views, box)
+        agreement, beside = judged(dev, config, views)
         hull, shares = first_hull(dev, config, agreement)
         right = agreement.views
     except UserError as error:
-        problem = str(error)
+        problem, is_refused = str(error), isinstance(error, WrongCameras)
     found = contradicting(views, hull, agreement) if hull else []
     ranges = np.array([view.depth_range for view in right if view.depth_range])
     cameras, stored, lenses = (
@@ -156,6 +158,7 @@ def describe_scene(
         "dropped": [] if path == DEMO else sorted(read_edits(Path(path)).dropped),
         "hull": None,
         "problem": problem,
+        "cameras_are_wrong": is_refused,
     }
     if hull:
         facts["hull"] = {
@@ -166,6 +169,7 @@ def describe_scene(
             "voxel_size_pixels": spacing_pixels(hull.grid, cameras),
             "refinements": sum(0 < share < 1 for share in shares),
             "box": hull.grid.box.tolist(),
+            "masks_beside": beside,
         }
     return facts, views, hull, found
 

@@ -25,6 +25,7 @@ EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 CONVERTED = {"CMYK": "RGB", "YCbCr": "RGB", "RGBa": "RGBA", "La": "LA"}
 LOSSY = (".jpg", ".jpeg", ".jfif")
 ORIENTATION = 0x0112  # the tag of EXIF
+QUARTERS = {6: 1, 3: 2, 8: 3}  # its values that turn and mirror nothing: quarter turns clockwise
 ON_THEIR_SIDE = (5, 6, 7, 8)  # its values with which width and height change places
 UNREADABLE = "an image that cannot be read"
 # A mask may have been a JPEG with subsampled colours, or have a coloured rim. It has colours where
@@ -126,6 +127,16 @@ def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> t
             is_turned = image.getexif().get(ORIENTATION) in ON_THEIR_SIDE
             size = size[::-1] if is_turned else size
         return size
+
+
+def exif_turns(path: Path | str) -> int:
+    """By how many quarter turns clockwise a picture is shown, as its EXIF has it; 0 without. Raises
+    Unusable as read_rgba does.
+    """
+    with _opened(path, checked=False) as image:
+        # a PNG without it would be decoded for it
+        has_exif = image.format != "PNG" or "exif" in image.info
+        return QUARTERS.get(image.getexif().get(ORIENTATION), 0) if has_exif else 0
 
 
 def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:

@@ -9,15 +9,15 @@ import numpy as np
 
 from pp_cl.errors import quoted
 from pp_cl.files.atomic import told, write_json
-from pp_cl.scene.gaze import AXES
 from pp_cl.scene.readers.common import checked_box, fail_at, read_json
+from pp_cl.scene.readings import WORDS
 
 EDITS = "pp_cl.json"
 
 
 class Edits(NamedTuple):
     """box: (2, 3) lower and upper corner in world units. dropped: names of images, as a scene lists
-    them. axes: how the matrices of its cameras are to be read, out of AXES.
+    them. axes: how its cameras are to be read, one of readings.WORDS or several.
     """
 
     box: np.ndarray | None = None
@@ -34,8 +34,10 @@ def read_edits(folder: Path) -> Edits:
     if not isinstance(found, dict) or not found.keys() <= set(Edits._fields):
         keys = " and ".join(f'"{key}"' for key in Edits._fields)
         raise fail_at(file)(f"must be a JSON object with no other keys than {keys}; correct it")
-    if (axes := found.get("axes")) is not None and axes not in AXES:
-        raise fail_at(file, "axes")(f"is {quoted(axes, 40)}; must be one of {', '.join(AXES)}")
+    axes = found.get("axes")
+    if axes is not None and not (isinstance(axes, str) and {*axes.split()} <= {*WORDS} and axes):
+        what = f"is {quoted(axes, 40)}; must be of the words {', '.join(WORDS)}"
+        raise fail_at(file, "axes")(what)
     dropped = found.get("dropped", [])
     if not isinstance(dropped, list) or not all(type(name) is str for name in dropped):
         raise fail_at(file, "dropped")("must be a list of names of images; correct it")

@@ -279,25 +279,44 @@ class Agreement(NamedTuple):
     forgiven: int
 
 
+class Beside(NamedTuple):
+    """The mean share of a mask that lies beside the hull: where no mask is forgiven, 1 where no
+    hull is left; where MOST_LEFT_OUT of them are, which mends some wrong masks, but no cameras.
+    """
+
+    strictly: float
+    forgiving: float
+
+
 def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) -> Agreement:
+    """agreement_of() alone."""
+    return agreement_of(dev, views, box)[0]
+
+
+def agreement_of(
+    dev: Device, views: Sequence[View], box: np.ndarray | None = None
+) -> tuple[Agreement, Beside]:
     """How far masks agree, by what share of each lies where their hull does not. Views that look
     elsewhere, or whose masks lie beside it by MOST_BESIDE and several times the usual share, are
     left out. Where all do a little, as many are forgiven as it takes. Raises UserError as
     build_grid() does.
     """
     if not any(one.has_mask for one in views):
-        return Agreement(list(views), {}, 0)
+        return Agreement(list(views), {}, 0), Beside(0.0, 0.0)
     most = int(MOST_LEFT_OUT * len(views))
     elsewhere = looking_elsewhere(views)
     left_out = {view.name: 1.0 for view in elsewhere if len(elsewhere) <= most}
     left, forgiven = [view for view in views if view.name not in left_out], most // 2
+    beside = 1.0
     try:
-        if _shares_beside(dev, left, box, 0).max() <= MOST_BESIDE / 2:
-            return Agreement(left, left_out, 0)
+        shares = shares_beside(dev, left, box, 0)
+        beside = float(shares.mean())
+        if shares.max() <= MOST_BESIDE / 2:
+            return Agreement(left, left_out, 0), Beside(beside, beside)
     except UserError:  # no place is in all masks
         forgiven = most
     while len(left_out) < most:
-        shares = _shares_beside(dev, left, box, forgiven)
+        shares = shares_beside(dev, left, box, forgiven)
         worst = int(shares.argmax())
         if shares[worst] <= max(MOST_BESIDE, TIMES_USUAL * np.median(shares)):
             break
@@ -306,9 +325,10 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
     least = bisect_left(
         range(int(MOST_FORGIVEN * len(left))),
         True,
-        key=lambda forgiven: _shares_beside(dev, left, box, forgiven).mean() <= MOST_MISSED,
+        key=lambda forgiven: shares_beside(dev, left, box, forgiven).mean() <= MOST_MISSED,
     )
-    return Agreement(left, left_out, least)
+    forgiving = float(shares_beside(dev, left, box, most).mean()) if beside > MOST_BESIDE else 0.0
+    return Agreement(left, left_out, least), Beside(beside, forgiving)
 
 
 def contradicting(views: Sequence[View], hull: Hull, agreement: Agreement) -> list[Disagreement]:
@@ -333,9 +353,17 @@ def misplaced(grid: Grid, ids: np.ndarray, views: Sequence[View]) -> list[View]:
     return [view for view, share in zip(masked, shares, strict=True) if share < least]
 
 
-def _shares_beside(dev, views, box, forgiven):
-    """(V,) the share of each view's mask that is further than a pixel from their silhouette."""
-    hull = build_grid(dev, views, min(COMPARED_POINTS, CELL_CAP), box, forgiven)
+def shares_beside(
+    dev: Device,
+    views: Sequence[View],
+    box: np.ndarray | None,
+    forgiven: int,
+    points: int = COMPARED_POINTS,
+) -> np.ndarray:
+    """(V,) the share of each view's mask that is further than a pixel from their silhouette, by a
+    hull of so many points. Raises UserError as build_grid() does.
+    """
+    hull = build_grid(dev, views, min(points, CELL_CAP), box, forgiven)
     shares = []
     for view in views:
         small = view.near_size(COMPARED_SIZE)

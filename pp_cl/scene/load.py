@@ -21,7 +21,7 @@ from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names
 from pp_cl.files.image import is_transparent, read_rgba
 from pp_cl.progress import track
 from pp_cl.scene import demo
-from pp_cl.scene.edits import EDITS, read_edits
+from pp_cl.scene.edits import EDITS, Edits, read_edits
 from pp_cl.scene.found import (
     IGNORE_FOLDERS,
     MASK_FOLDERS,
@@ -33,12 +33,12 @@ from pp_cl.scene.found import (
     scene_near,
     usable,
 )
-from pp_cl.scene.gaze import STATED, other_axes, read_as
 from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
 from pp_cl.scene.masks import AS_GIVEN, OPAQUE, half_transparent, is_by_colour, read_mask_of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import SPLITS
+from pp_cl.scene.readings import STATED, read_as
 from pp_cl.scene.silhouette import within_silhouettes
 from pp_cl.settings import Config, SceneConfig
 
@@ -46,7 +46,8 @@ DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
 # holds such files, read_split(folder, split, left_out) gives a list of ImageFile of one of them
-# without reading pixels and adds the views that cannot be used to left_out. Only some have
+# without reading pixels and adds the views that cannot be used to left_out. STATES is the kind of
+# its matrices and of their axes, out of readings.MATRICES and opengl or opencv. Only some have
 # splits(folder), the names of its splits, and box(folder), the box that the files state around the
 # object. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
@@ -175,7 +176,7 @@ def scene_frames(path: str | Path, split: str = "train", *, edited: bool = True)
 
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> SplitFiles:
     """The images of a split; edited: but for those that the user has dropped. Raises UserError
-    where too few are left, and for cameras in other axes than the format's.
+    where too few are left.
     """
     if path == DEMO:
         return SplitFiles(demo.demo_frames(split), [], [])
@@ -184,18 +185,13 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
     left_out: LeftOut = []
-    image_files = reader.read_split(folder, split, left_out)
+    done: list[tuple[str, str]] = []
     edits = read_edits(folder)
+    image_files = _right_handed(folder, reader.read_split(folder, split, left_out), left_out, done)
+    if edits.axes and edits.axes != STATED:
+        image_files = _as_edited(folder, reader, split, image_files, edits)
     if edited:
         image_files = [one for one in image_files if one.name not in edits.dropped]
-    if edits.axes:
-        image_files = [replace(o, camera=read_as(o.camera, edits.axes)) for o in image_files]
-    elif axes := other_axes([one.camera for one in image_files]):
-        raise UserError(
-            f"{folder}: its cameras do not look at one place; they would if their matrices were of"
-            f' the kind "{axes}". If so, write {{"axes": "{axes}"}} into {folder / EDITS}; if they'
-            f' are right, {{"axes": "{STATED}"}}'
-        )
     if not image_files and not left_out:
         lacks = f"; {EDITS} drops some" if edited and edits.dropped else ""
         raise UserError(f"{folder}: split {split} has no images{lacks}; add some")
@@ -203,7 +199,8 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     check = partial(with_sound_lens, folder)
     image_files = list(usable(image_files, check, lambda one: one.name, left_out))
     _check_left(image_files, left_out, LEAST_VIEWS if split == "train" else 1)
-    image_files, done = _masked(folder, reader, image_files, split)
+    image_files, told = _masked(folder, reader, image_files, split)
+    done += told
     image_files = _ignoring(folder, IGNORE_FOLDERS, image_files, split)
     ignored = "pixels are ignored where the masks in ignore are white"
     done += [(one.name, ignored) for one in image_files if one.ignore and not one.ignores_black]
@@ -216,6 +213,37 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
         found = zip(image_files, pictures[len(trained) :], strict=True)
         done += [(one.name, OF_TRAINING) for one, picture in found if picture in known]
     return SplitFiles(image_files, left_out, done)
+
+
+def _as_edited(folder: Path, reader: ModuleType, split: str, image_files: list, edits: Edits):
+    """The images of a split with cameras as `axes` of the edits has them, of all splits."""
+    others: list[ImageFile] = []
+    for other in scene_splits(folder):
+        if other != split:
+            with suppress(UserError):
+                others += _right_handed(folder, reader.read_split(folder, other, []), [], [])
+    every = read_as([*image_files, *others], str(edits.axes), reader.STATES, folder)
+    return every[: len(image_files)]
+
+
+def _right_handed(folder, image_files, left_out, done):
+    """The images; where most poses are left-handed, those in the world's mirror image."""
+    is_left = [np.linalg.det(one.camera.pose[:, :3]) < 0 for one in image_files]
+    are_most, kept = 2 * sum(is_left) >= len(is_left), []
+    for one, left in zip(image_files, is_left, strict=True):
+        if left != are_most:
+            text = (
+                f"{folder / one.name}: its camera's axes have another handedness than the others'"
+            )
+            left_out.append((one.name, Unusable(f"{text}; write them again", "a mirrored pose")))
+        elif not left:
+            kept.append(one)
+        else:
+            pose = one.camera.pose * [[-1], [1], [1]]
+            kept.append(replace(one, camera=replace(one.camera, pose=pose)))
+            what = "poses are left-handed (determinant -1), and read in the world's mirror image"
+            done.append((one.name, what))
+    return kept
 
 
 def with_sound_lens(folder: Path, image_file: ImageFile) -> ImageFile:

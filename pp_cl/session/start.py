@@ -19,7 +19,6 @@ from pp_cl.scene.hull import (
     TOLERANCE,
     Agreement,
     Hull,
-    agreeing,
     build_grid,
     contradicting,
     depth_range,
@@ -27,6 +26,7 @@ from pp_cl.scene.hull import (
 )
 from pp_cl.scene.load import DEMO, scene_box
 from pp_cl.scene.outline import outline_sheet
+from pp_cl.scene.verdict import judged
 from pp_cl.session.budget import NEVER
 from pp_cl.session.memory import MemoryPlan
 from pp_cl.settings import Config, NetworkConfig
@@ -121,7 +121,7 @@ def fitting_hull(
             f"raster.radius: is automatic, which raster.footprint={raster.footprint}"
             " cannot be; give it in world units at a depth range of 4 (0.0015 in the paper)"
         )
-    agreement = agreeing(dev, views, scene_box(config))
+    agreement, _ = judged(dev, config, views)
     views, _, forgiven = agreement
     if is_view_opacity_automatic:
         train.view_opacity = "off" if forgiven else "on"

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from pp_cl.engine.camera import Camera
-from pp_cl.scene.gaze import other_axes
+from pp_cl.scene.verdict import other_axes
 
 COUNT = 24
+STATES = "camera-to-world", "opengl"
 ORIGINS = ((0, 0, 0), (2, -3, 1), (30, 10, -20))
 
 
@@ -60,4 +61,4 @@ def cameras(capture, seed, origin):
 @pytest.mark.parametrize("capture", CAPTURES)
 def test_right_axes_are_not_doubted(capture, origin):
     for seed in range(20):
-        assert other_axes(cameras(CAPTURES[capture], seed, origin)) is None
+        assert other_axes(cameras(CAPTURES[capture], seed, origin), STATES) is None

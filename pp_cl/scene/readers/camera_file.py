@@ -46,7 +46,11 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
         raise UserError(f"{file}: holds no cameras; give {FORMATS}")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{file}: {listed or 'the list'}: must hold one camera or more")
-    return [read(Frame(file, shared, own, i, listed), size) for i, own in enumerate(frames)]
+    cameras = [read(Frame(file, shared, own, i, listed), size) for i, own in enumerate(frames)]
+    for i, camera in enumerate(cameras):
+        if np.linalg.det(camera.pose[:, :3]) < 0:
+            raise UserError(f"{file}: {listed}[{i}]: its axes are left-handed; mirror them back")
+    return cameras
 
 
 def _transforms_camera(frame, size):

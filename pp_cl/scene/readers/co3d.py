@@ -22,6 +22,7 @@ from pp_cl.scene.readers.common import MOST, SPLITS, hold_out, progress, read_js
 from pp_cl.scene.readers.frame import Frame, rigid
 
 FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
+STATES = "world-to-camera", "opencv"
 ANNOTATIONS = "frame_annotations.jgz"
 # characters of a file of annotations, and frames in it: the largest category has less than half
 MOST_TEXT, MOST_FRAMES = 2**30, 2**20

@@ -44,6 +44,7 @@ from pp_cl.scene.readers.common import (
 )
 
 FILES = "a sparse model of COLMAP beside images"
+STATES = "world-to-camera", "opencv"
 # and in numbered folders in them; the folder itself has the model of RealityScan. Where none has
 # one, a model is looked for deeper.
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", ".")

@@ -13,6 +13,7 @@ from pp_cl.scene.readers.common import fail_at, fitted, in_order, read_npy
 from pp_cl.scene.readers.frame import rigid
 
 FILES = "poses_bounds.npy (LLFF)"
+STATES = "camera-to-world", "opengl"
 POSES = "poses_bounds.npy"
 NUMBERS = 17  # 3x4 pose, (height, width, focal length) as its fifth column; near, far
 # LLFF: down, right, backwards; OpenCV: right, down, forwards

@@ -15,6 +15,7 @@ from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import fail_at, in_order, read_npz
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
+STATES = "world-to-camera", "opencv"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 IMAGES = ("image", "images", "rgb")
 MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours

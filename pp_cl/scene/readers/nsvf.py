@@ -13,6 +13,7 @@ from pp_cl.scene.readers.common import fail_at, fitted, read_numbers
 from pp_cl.scene.readers.frame import rigid
 
 FILES = "rgb, pose and intrinsics.txt (NSVF)"
+STATES = "camera-to-world", "opencv"
 PREFIXES = {"0_": "train", "1_": "val", "2_": "test"}
 IMAGES, POSES, INTRINSICS = ("rgb", "images", "image"), "pose", "intrinsics.txt"
 

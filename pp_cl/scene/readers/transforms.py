@@ -30,6 +30,7 @@ from pp_cl.scene.readers.common import (
 from pp_cl.scene.readers.frame import GL_FROM_CV, Frame, frame_keys, lens_distortion, pinhole
 
 FILES = "transforms_train.json or transforms.json"
+STATES = "camera-to-world", "opengl"
 SINGLE, SDFSTUDIO = "transforms.json", "meta_data.json"
 ODD = 1 / 8  # of the images, that may have another shape by mistake
 NAMED = ("train", "val", "test")  # splits that transforms.json may list as <split>_filenames

@@ -1,0 +1,171 @@
+"""Whether a scene's cameras are right, by how much of its masks lies beside their hull, and in
+which reading they would be.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.views import View, evenly, fitting_downscale
+from pp_cl.errors import UserError
+from pp_cl.scene.edits import EDITS, read_edits
+from pp_cl.scene.gaze import ahead, meeting
+from pp_cl.scene.hull import MOST_LEFT_OUT, Agreement, agreement_of, shares_beside
+from pp_cl.scene.image_file import ImageFile, shrink
+from pp_cl.scene.load import DEMO, find_reader, list_split, scene_box, scene_splits
+from pp_cl.scene.readings import MEANING, PIXELS, STATED, TURNED, Stated, read_as, readings
+from pp_cl.settings import Config
+
+# Of the masks, in the mean, beside their hull: 0 to 0.016 in sound scenes, 0.15 and more with wrong
+# cameras. With an eighth of the masks forgiven, 0.05 and more with wrong cameras, but 0.001 with
+# masks of which some are wrong.
+MOST_BESIDE, PERSISTING = 0.06, 0.02
+INEXACT = MOST_BESIDE / 3
+# Of a reading in which cameras are right: this little beside, so many times less than as stated.
+MEETS, TIMES_LESS = 0.01, 4.0
+TRIED_VIEWS, TRIED_SIZE, TRIED_POINTS = 32, 160, 20_000  # of a coarse hull: a quarter of a second
+LEAST_CAMERAS = 4
+OBLONG = 1.1  # times as wide as high, or as high as wide, that pixels seldom are
+
+
+class WrongCameras(UserError):
+    """A scene's cameras cannot be right. The message names the reading in which they are."""
+
+
+def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreement, float]:
+    """(agreeing() of a scene's training views, the share of their masks beside the hull). Raises
+    WrongCameras where cameras cannot be right, by masks, or without these by where they look;
+    UserError as agreeing() does.
+    """
+    path, fault = config.scene.path, None
+    axes = STATED if path == DEMO else read_edits(Path(path)).axes
+    if not any(view.has_mask for view in views) and axes is None:
+        _check_without_masks(path, [view.file_camera for view in views])
+    try:
+        agreement, (beside, forgiving) = agreement_of(dev, views, scene_box(config))
+    except UserError as error:  # no place is in all masks
+        fault, beside, forgiving = error, 1.0, 1.0
+    if beside > MOST_BESIDE and forgiving > PERSISTING:
+        if axes is None and (reading := fitting_reading(dev, path, views)):
+            what = (
+                "its masks leave no point"
+                if fault
+                else f"{beside:.0%} of its masks lie beside their hull"
+            )
+            raise _refusal(path, what, reading, views)
+        if fault:
+            raise fault
+        if axes != STATED:
+            raise WrongCameras(
+                f"{path}: {beside:.0%} of its masks lie beside their hull, so cameras or masks are"
+                " wrong, in no way that is known: check the order of poses and images, focal"
+                f' lengths and masks; if all are right, write {{"axes": "{STATED}"}} into'
+                f" {Path(path) / EDITS}"
+            )
+    if MOST_BESIDE / 3 < beside <= MOST_BESIDE:
+        told = f"{beside:.1%} of the masks lie beside their hull: cameras or masks are inexact"
+        warnings.warn(f"{path}: {told}", stacklevel=2)
+    return agreement, beside
+
+
+def _check_without_masks(path, cameras):
+    """Raise WrongCameras where cameras would look at one place in another reading alone."""
+    if reading := other_axes(cameras, find_reader(path).STATES):
+        raise _refusal(path, "its cameras do not look at one place", reading, [])
+    if oblong := _oblong(cameras):
+        warnings.warn(f"{path}: {oblong}; are both focal lengths right?", stacklevel=3)
+
+
+def _refusal(path, what, reading, views):
+    """The WrongCameras that names a reading."""
+    words, file = reading.split(), Path(path) / EDITS
+    would = " and ".join(MEANING[word] for word in words)
+    if words[0] in PIXELS:
+        what += f", and {_oblong([view.file_camera for view in views])}"
+    mend = ", or turn the pictures" if {"upside-down", TURNED} & {*words} else ""
+    mend = ", or mirror the pictures back" if "mirrored" in words else mend
+    return WrongCameras(
+        f"{path}: {what}; its cameras would be right as {would}. If they are of the"
+        f' kind "{reading}", write {{"axes": "{reading}"}} into {file}{mend}; if they are right as'
+        f' stated, {{"axes": "{STATED}"}}'
+    )
+
+
+def _oblong(cameras):
+    """Words on pixels that are not square; "" where they are."""
+    wide = float(np.median([camera.fy / camera.fx for camera in cameras]))
+    sides = "wide as high" if wide > 1 else "high as wide"
+    ratio = max(wide, 1 / wide)
+    return f"pixels would be {ratio:.2f} times as {sides}" if ratio > OBLONG else ""
+
+
+def other_axes(cameras: Sequence[Camera], stated: Stated) -> str | None:
+    """The reading of matrices and their axes by which cameras would best look at one place from
+    around it. None where they do so as they are, or in no reading.
+    """
+    if len(cameras) < LEAST_CAMERAS or meeting(cameras):
+        return None
+    files = [ImageFile("", camera) for camera in cameras]
+    other = "opengl" if stated[1] == "opencv" else "opencv"
+    inverse = "world-to-camera" if stated[0] == "camera-to-world" else "camera-to-world"
+    found = {
+        reading: meeting([one.camera for one in read_as(files, reading, stated)])
+        for reading in (other, inverse, f"{other} {inverse}")
+    }
+    best = max(found, key=lambda reading: found[reading])
+    return best if found[best] else None
+
+
+def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None:
+    """The reading in which a scene's cameras meet on the masks of its training views, if any."""
+    stated, small = find_reader(path).STATES, _small(evenly(views, TRIED_VIEWS))
+    splits = scene_splits(path)
+    files = [one for split in splits for one in list_split(path, split, edited=False).image_files]
+    forgiven = int(MOST_LEFT_OUT * len(small))
+    as_stated = _beside(dev, small, forgiven)
+    limit, found = min(MEETS, as_stated / TIMES_LESS), {}
+    for reading in readings(stated):
+        if found and " " in reading:
+            break  # a simpler one will do
+        as_read = read_as(files, reading, stated, Path(path))
+        cameras = {one.name: one.camera for one in as_read}
+        tried = [
+            replace(view, stored_camera=cameras[view.name].downscaled(view.shrunk))
+            for view in small
+        ]
+        is_other = any(as_read[i].camera is not files[i].camera for i in range(len(files)))
+        if is_other and ahead([view.camera for view in tried]):
+            found[reading] = _beside(dev, tried, forgiven)
+            if found[reading] > limit:
+                del found[reading]
+    return min(found, key=lambda reading: found[reading]) if found else None
+
+
+def _small(views):
+    """The views as reduced images, which are carved with quickly."""
+    small = []
+    for view in views:
+        stored = view.stored_camera
+        k = fitting_downscale((stored.width, stored.height), TRIED_SIZE)
+        camera, ignored = stored.downscaled(k), view.ignored
+        if ignored is not None:
+            ignored = ignored[: k * camera.height : k, : k * camera.width : k]
+        image = shrink(view.image, k)
+        changed = {"image": image, "ignored": ignored, "downscale": 1, "shrunk": k * view.shrunk}
+        small.append(
+            replace(view, stored_camera=camera, unshrunk_camera=view.file_camera, **changed)
+        )
+    return small
+
+
+def _beside(dev, views, forgiven):
+    """The mean share of the views' masks beside their hull, 1 where there is none."""
+    try:
+        return float(shares_beside(dev, views, None, forgiven, TRIED_POINTS).mean())
+    except UserError:
+        return 1.0
