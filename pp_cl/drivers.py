@@ -204,18 +204,31 @@ def _give_cache():
                 lock.unlink()
     if sys.platform == "win32":
         return  # which has caches elsewhere
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    home = os.path.expanduser("~/.cache")
+    for name, usual in (("XDG_CACHE_HOME", home), ("POCL_CACHE_DIR", "")):
+        folder = os.environ.get(name) or usual
+        if not folder or not (fault := _fault_of(folder)):
+            continue
+        # another file system may be of the same kind
+        places = (tempfile.gettempdir(), "/var/tmp", os.getcwd())  # noqa: S108 - of a new folder
+        place = next((place for place in places if not _fault_of(place)), None)
+        temporary = os.environ[name] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE, dir=place)
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        what = f"{folder}: {fault}; kernels are built again, in {temporary}"
+        warnings.warn(f"{what}: set {name} to keep them", stacklevel=3)
+
+
+def _fault_of(folder):
+    """What keeps drivers from a cache in a folder, which is made; "" if nothing does."""
     try:
         os.makedirs(folder, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(bytes(2**20))  # a full disk is noticed as well
     except OSError as error:
-        temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE)
-        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        warnings.warn(
-            f"{folder}: {error.strerror}; kernels are built again: set XDG_CACHE_HOME to keep them",
-            stacklevel=3,
-        )
+        return error.strerror
+    # PoCL keeps kernels as libraries, and ends the process where it may not load them
+    is_noexec = os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0)
+    return "is mounted noexec, so that no kernel in it runs" if is_noexec else ""
 
 
 # ---- drivers: found, tried, loaded

@@ -32,18 +32,21 @@ UNREADABLE = "an image that cannot be read"
 # this share of the cells that are not dark differ by more than so many levels between the channels;
 # a cell is the mean of 4 x 4 pixels of the image at this size.
 COLOUR_SIDE, COLOURLESS, DARK, COLOURED = 512, 16, 64, 0.3
+MOST_LABEL = 40  # of a mask that holds the numbers of classes, not alpha
 # bits per channel stand in the header chunk, the first of all
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
-def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarray:
+def read_rgba(
+    path: Path | str, size: tuple[int, int] | None = None, *, turned: bool = False
+) -> np.ndarray:
     """(H, W, 4) uint8 straight sRGB and alpha of an image file, whatever its kind; no alpha means
-    255. size: (width, height) that it is to have: where it lies on its side, it is turned as its
-    EXIF says. Raises Unusable naming a file that is missing, truncated, no image, larger than
-    MOST_PIXELS, or of another kind of numbers.
+    255. size: (width, height) that it is to have: where it lies on its side, and where it is to be
+    turned, it is turned as its EXIF says. Raises Unusable naming a file that is missing, truncated,
+    no image, larger than MOST_PIXELS, or of another kind of numbers.
     """
     with _opened(path) as image:
-        if size is not None and size == image.size[::-1] != image.size:
+        if turned or (size is not None and size == image.size[::-1] != image.size):
             ImageOps.exif_transpose(image, in_place=True)
         srgb = in_srgb(path, image)
         return np.array(srgb if srgb.mode == "RGBA" else srgb.convert("RGBA"))
@@ -94,6 +97,7 @@ def read_mask(path: Path | str) -> np.ndarray:
     """
     with _opened(path) as opened:
         image = in_srgb(path, opened).copy()
+    palette = image if image.mode == "P" else None
     if image.mode != "L":
         rgba = image.convert("RGBA")
         alpha = np.array(rgba.getchannel("A"))
@@ -104,9 +108,17 @@ def read_mask(path: Path | str) -> np.ndarray:
         cells = np.array(sample).reshape(128, 4, 128, 4, 3).mean((1, 3))
         shown = cells[cells.max(2) > DARK]
         if len(shown) and (np.ptp(shown, axis=1) > COLOURLESS).mean() > COLOURED:
-            raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
-        image = image.convert("L")
+            if palette is None:
+                what = "has colours; write a gray mask, white where the object is"
+                raise UserError(f"{path}: {what}")
+            image = palette
+        image = image.convert("L") if image is not palette else image
     gray = np.array(image)
+    values = np.unique(gray)
+    are_labels = image is palette or values[-1] <= MOST_LABEL
+    if are_labels and values[-1] > 1 and Path(path).suffix.lower() not in LOSSY:
+        _tell(path, "masks of labels are read as the object wherever the label is not 0")
+        return np.where(gray > 0, np.uint8(255), np.uint8(0))
     if gray.max() == 1:  # a JPEG may hold noise of that size
         if Path(path).suffix.lower() in LOSSY:
             raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
@@ -133,6 +145,8 @@ def exif_turns(path: Path | str) -> int:
     """By how many quarter turns clockwise a picture is shown, as its EXIF has it; 0 without. Raises
     Unusable as read_rgba does.
     """
+    if Path(path).suffix.lower() == ".exr":
+        return 0
     with _opened(path, checked=False) as image:
         # a PNG without it would be decoded for it
         has_exif = image.format != "PNG" or "exif" in image.info

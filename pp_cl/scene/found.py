@@ -220,8 +220,9 @@ def find_mask(folder: Path, image: str, *, by_number: bool = False) -> str | Non
     found = next((masks[key] for key in wanted if key in masks), None)
     if not found and by_number and stem.isdecimal():
         found = masks.get(int(stem))
-    is_there = found and os.path.isfile(folder / there / found)
-    return posixpath.normpath(posixpath.join(there, found)) if is_there else None
+    if not found or not os.path.isfile(folder / there / found):
+        return None
+    return posixpath.normpath(posixpath.join(there, found))
 
 
 @lru_cache(maxsize=256)
@@ -375,7 +376,7 @@ def instead_of_scene(folder: Path) -> str:
             if isinstance(found, dict) and "frames" in found:
                 return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
     for pattern, export in EXPORTS.items():
-        if file := next(folder.glob(pattern), None):
+        for file in folder.glob(pattern):
             return f": {quoted(file.name, 40)} is {export}"
     names = few_names([quoted(path.name, 40) for path in inside]) or "nothing"
     return (

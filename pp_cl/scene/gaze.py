@@ -6,7 +6,8 @@ import numpy as np
 
 from pp_cl.engine.camera import Camera
 
-MOST = 0.9  # of the cameras, that have before them what all look at
+MOST = 0.9  # of the cameras, that have before them what all look at, or have one side up
+RING = 0.2  # of the spread of eyes along a ring, that they have across it
 ASIDE = 35.0  # degrees between a camera's axis and what all look at, in the median
 SPREAD = 0.2  # of the distance to what they look at, by which eyes differ around an object
 # the length of the mean of the axes: of cameras that go 90 degrees around an object on an arc. Of
@@ -15,13 +16,37 @@ ONE_WAY = 0.9
 
 
 def up_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) unit vector that is up in the images: as far as possible across all horizontal edges of
-    the images, on the side of their mean upper edge.
+    """(3,) unit vector that is up in the images, as upward() finds it."""
+    return upward(cameras)[0]
+
+
+def upward(cameras: Sequence[Camera]) -> tuple[np.ndarray, str]:
+    """((3,) unit vector that is up, "" or from what else than upper edges it is taken): across all
+    horizontal edges of the images, as far as possible, on the side of their mean upper edge. Where
+    upper edges contradict each other, as those of pictures on their side do, it is across all
+    vertical edges, or else the axis of the cameras' ring or of the world; then cameras are above.
     """
-    right, up = (np.stack([camera.pose[:, axis] for camera in cameras]) for axis in (0, 1))
-    mean = -up.mean(axis=0)
-    # the mean decides where the right axes leave more than one direction open
-    spread = right.T @ right / len(cameras) - 0.1 * np.outer(mean, mean)
+    right, down = (np.stack([camera.pose[:, axis] for camera in cameras]) for axis in (0, 1))
+    up, side = _across(right, -down), _across(down, right)
+    if (-down @ up > 0).mean() >= MOST:
+        return up, ""
+    eyes = np.stack([camera.eye for camera in cameras])
+    above, share = eyes.mean(0) - looked_at(cameras), (right @ side > 0).mean()
+    spread, axes = np.linalg.eigh(np.cov(eyes.T))
+    if max(share, 1 - share) >= MOST:
+        up, by = side, "the images' sides"
+    elif spread[0] < RING * spread[1]:
+        up, by = axes[:, 0], "the ring of the cameras"
+    else:
+        up, by = np.eye(3)[np.abs(above).argmax()], "an axis of the world"
+    return up if up @ above >= 0 else -up, by
+
+
+def _across(edges, ends):
+    """(3,) unit vector across (N, 3) edges, on the side of the mean of (N, 3) vectors."""
+    mean = ends.mean(axis=0)
+    # the mean decides where the edges leave more than one direction open
+    spread = edges.T @ edges / len(edges) - 0.1 * np.outer(mean, mean)
     direction = np.linalg.eigh(spread)[1][:, 0]
     return direction if direction @ mean >= 0 else -direction
 

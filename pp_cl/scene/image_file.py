@@ -29,7 +29,7 @@ class ImageFile:
     scene's folder, no mask: the image's own alpha. camera: of the stored image, freed of
     distortion. depth_range: (near, far), Euclidean distances in world units, if stated. lens: of
     the image as it lies in the file. ignore: path of an image that is white, or black, where this
-    one says nothing.
+    one says nothing. turned: the picture is turned as its EXIF says, though its size does not ask.
     """
 
     name: str
@@ -39,6 +39,7 @@ class ImageFile:
     lens: LensDistortion = field(default_factory=LensDistortion)
     ignore: str | None = None
     ignores_black: bool = False
+    turned: bool = False
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], downscale: int) -> int:
@@ -92,7 +93,7 @@ def read_view(
         mask = read_mask_of_size(folder / image_file.ignore, size) > OPAQUE // 2
         mask = np.where(mask != image_file.ignores_black, np.uint8(OPAQUE), np.uint8(0))
         ignored = used(np.dstack([mask] * 4))[..., 3] > MASK_THRESHOLD
-    image = read_rgba(folder / image_file.name, size)
+    image = read_rgba(folder / image_file.name, size, turned=image_file.turned)
     if image_file.mask:
         image[..., 3] = read_mask_of_size(folder / image_file.mask, image.shape[1::-1])
     elif masks.mask_from in ("box", "none"):

@@ -17,8 +17,8 @@ import numpy as np
 
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, border, check_downscale, evenly
-from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names
-from pp_cl.files.image import is_transparent, read_rgba
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, few_names, one_line
+from pp_cl.files.image import exif_turns, is_transparent, read_rgba
 from pp_cl.progress import track
 from pp_cl.scene import demo
 from pp_cl.scene.edits import EDITS, Edits, read_edits
@@ -35,7 +35,14 @@ from pp_cl.scene.found import (
 )
 from pp_cl.scene.image_file import ImageFile, read_view, shrink, shrink_factor
 from pp_cl.scene.lens import BAND_BYTES
-from pp_cl.scene.masks import AS_GIVEN, OPAQUE, half_transparent, is_by_colour, read_mask_of_size
+from pp_cl.scene.masks import (
+    AS_GIVEN,
+    OPAQUE,
+    fits_turned,
+    half_transparent,
+    is_by_colour,
+    read_mask_of_size,
+)
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import SPLITS
 from pp_cl.scene.readings import STATED, read_as
@@ -68,6 +75,9 @@ BESIDE = 0.5  # of what is transparent, that a mask which is not of the object h
 WRONG = "what the scene's files say of it is wrong"  # of a view whose error is no Unusable
 OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
 OF_TRAINING = "pictures that are in training, too, so that figures flatter"
+FITS = 1.2  # times better that masks fit pictures which are turned, in the median
+TURNED = "pictures are turned as their EXIF says, as their masks fit only so"
+STORED = "pictures are taken as they are stored, not turned as their EXIF says"
 LEAST_VIEWS = 8  # for training that are left where some are left out
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 
@@ -356,7 +366,7 @@ def _lines(split, used, left_out, done):
 def _tell(folder, lines):
     """Warn of each line once, however often a command asks: equal warnings of one line are one."""
     for line in lines:
-        warnings.warn(f"{folder}: {line}", stacklevel=1)
+        warnings.warn(one_line(f"{folder}: {line}"), stacklevel=1)
 
 
 # Finding a scene ----------------------------------------------------------------------------------
@@ -431,7 +441,10 @@ def load_scene(
         found = (listed or {}).get(split) or list_split(folder, split)
         lines += _lines(split, *found)
         chosen[split], left_out[split] = [], []
-        for one in _by_rule(masks, evenly(found.image_files, most), split):
+        chosen_files = _by_rule(masks, evenly(found.image_files, most), split)
+        chosen_files, done = _as_masks_fit(folder, chosen_files)
+        lines += _lines(split, found.image_files, [], done)
+        for one in chosen_files:
             try:
                 if downscale:
                     check_downscale(one.name, one.camera, downscale)
@@ -473,6 +486,29 @@ def _by_rule(rule, image_files, split):
     if rule.ignore:
         image_files = _ignoring(Path(rule.ignore), ["."], image_files, split)
     return image_files
+
+
+def _as_masks_fit(folder, image_files):
+    """(The images, what was done): pictures whose EXIF turns them though their size does not ask
+    for it are turned where their masks fit only so.
+    """
+    asked = []
+    for one in image_files:
+        with suppress(Unusable):  # what cannot be read is left out later
+            turns, is_square = exif_turns(folder / one.name), one.camera.width == one.camera.height
+            asked += [one] if turns == 2 or (turns and is_square) else []
+    fits = []
+    for one in evenly([one for one in asked if one.mask], MEASURED):
+        with suppress(UserError):
+            image, turned = (
+                read_rgba(folder / one.name, turned=is_turned) for is_turned in (False, True)
+            )
+            mask = read_mask_of_size(folder / str(one.mask), image.shape[1::-1])
+            fits.append(fits_turned(image, turned, mask))
+    is_turned = bool(fits) and np.median(fits) > FITS
+    turned = {one.name for one in asked if one.mask and is_turned}
+    image_files = [replace(one, turned=one.name in turned) for one in image_files]
+    return image_files, [(one.name, TURNED if one.name in turned else STORED) for one in asked]
 
 
 def _read_views(folder, image_files, masks, dev, factor, left_out):

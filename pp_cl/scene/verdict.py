@@ -4,6 +4,7 @@ which reading they would be.
 
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View, evenly, fitting_downscale
 from pp_cl.errors import UserError
 from pp_cl.scene.edits import EDITS, read_edits
-from pp_cl.scene.gaze import ahead, meeting
-from pp_cl.scene.hull import MOST_LEFT_OUT, Agreement, agreement_of, shares_beside
+from pp_cl.scene.gaze import ahead, meeting, upward
+from pp_cl.scene.hull import MOST_LEFT_OUT, Agreement, Beside, agreement_of, shares_beside
 from pp_cl.scene.image_file import ImageFile, shrink
 from pp_cl.scene.load import DEMO, find_reader, list_split, scene_box, scene_splits
 from pp_cl.scene.readings import MEANING, PIXELS, STATED, TURNED, Stated, read_as, readings
@@ -25,6 +26,7 @@ from pp_cl.settings import Config
 # cameras. With an eighth of the masks forgiven, 0.05 and more with wrong cameras, but 0.001 with
 # masks of which some are wrong.
 MOST_BESIDE, PERSISTING = 0.06, 0.02
+NOWHERE = Beside(1.0, 1.0)  # of masks that leave no hull
 INEXACT = MOST_BESIDE / 3
 # Of a reading in which cameras are right: this little beside, so many times less than as stated.
 MEETS, TIMES_LESS = 0.01, 4.0
@@ -42,51 +44,55 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     WrongCameras where cameras cannot be right, by masks, or without these by where they look;
     UserError as agreeing() does.
     """
-    path, fault = config.scene.path, None
+    path, box, fault = config.scene.path, scene_box(config), None
     axes = STATED if path == DEMO else read_edits(Path(path)).axes
-    if not any(view.has_mask for view in views) and axes is None:
-        _check_without_masks(path, [view.file_camera for view in views])
-    try:
-        agreement, (beside, forgiving) = agreement_of(dev, views, scene_box(config))
-    except UserError as error:  # no place is in all masks
-        fault, beside, forgiving = error, 1.0, 1.0
-    if beside > MOST_BESIDE and forgiving > PERSISTING:
-        if axes is None and (reading := fitting_reading(dev, path, views)):
-            what = (
-                "its masks leave no point"
-                if fault
-                else f"{beside:.0%} of its masks lie beside their hull"
-            )
-            raise _refusal(path, what, reading, views)
-        if fault:
-            raise fault
-        if axes != STATED:
-            raise WrongCameras(
-                f"{path}: {beside:.0%} of its masks lie beside their hull, so cameras or masks are"
-                " wrong, in no way that is known: check the order of poses and images, focal"
-                f' lengths and masks; if all are right, write {{"axes": "{STATED}"}} into'
-                f" {Path(path) / EDITS}"
-            )
-    if MOST_BESIDE / 3 < beside <= MOST_BESIDE:
-        told = f"{beside:.1%} of the masks lie beside their hull: cameras or masks are inexact"
+    cameras = [view.file_camera for view in views]
+    if by := upward(cameras)[1]:
+        told = f"upper edges of the images contradict each other; up is taken from {by}"
         warnings.warn(f"{path}: {told}", stacklevel=2)
-    return agreement, beside
+    if not any(view.has_mask for view in views) and axes is None:
+        _check_without_masks(path, cameras)
+    try:
+        agreement, beside = agreement_of(dev, views, box)
+    except UserError as error:  # no place is in all masks
+        fault, beside = error, NOWHERE
+    whole = beside
+    if box is not None and beside.strictly > MOST_BESIDE:  # the box may cut the object off
+        with suppress(UserError):
+            _, whole = agreement_of(dev, views)
+    if axes != STATED and whole.strictly > MOST_BESIDE and whole.forgiving > PERSISTING:
+        what = f"{whole.strictly:.0%} of its masks lie beside their hull"
+        what = "its masks leave no point" if whole == NOWHERE else what
+        if axes is None and (reading := fitting_reading(dev, path, views)):
+            raise _refusal(path, what, reading, cameras)
+        if not fault:
+            raise WrongCameras(
+                f"{path}: {what}, so cameras or masks are wrong, in no way that is known: check the"
+                " order of poses and images, focal lengths and masks; if all are right, write"
+                f' {{"axes": "{STATED}"}} into {Path(path) / EDITS}'
+            )
+    if fault:
+        raise fault
+    if INEXACT < beside.strictly <= MOST_BESIDE:
+        told = f"{beside.strictly:.1%} of the masks lie beside their hull"
+        warnings.warn(f"{path}: {told}: cameras or masks are inexact", stacklevel=2)
+    return agreement, beside.strictly
 
 
 def _check_without_masks(path, cameras):
     """Raise WrongCameras where cameras would look at one place in another reading alone."""
     if reading := other_axes(cameras, find_reader(path).STATES):
-        raise _refusal(path, "its cameras do not look at one place", reading, [])
+        raise _refusal(path, "its cameras do not look at one place", reading, cameras)
     if oblong := _oblong(cameras):
         warnings.warn(f"{path}: {oblong}; are both focal lengths right?", stacklevel=3)
 
 
-def _refusal(path, what, reading, views):
+def _refusal(path, what, reading, cameras):
     """The WrongCameras that names a reading."""
     words, file = reading.split(), Path(path) / EDITS
     would = " and ".join(MEANING[word] for word in words)
     if words[0] in PIXELS:
-        what += f", and {_oblong([view.file_camera for view in views])}"
+        what += f", and {_oblong(cameras)}"
     mend = ", or turn the pictures" if {"upside-down", TURNED} & {*words} else ""
     mend = ", or mirror the pictures back" if "mirrored" in words else mend
     return WrongCameras(
@@ -128,7 +134,8 @@ def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None
     files = [one for split in splits for one in list_split(path, split, edited=False).image_files]
     forgiven = int(MOST_LEFT_OUT * len(small))
     as_stated = _beside(dev, small, forgiven)
-    limit, found = min(MEETS, as_stated / TIMES_LESS), {}
+    limit = min(MEETS, as_stated / TIMES_LESS)
+    found: dict[str, float] = {}  # {reading: share beside the hull}
     for reading in readings(stated):
         if found and " " in reading:
             break  # a simpler one will do

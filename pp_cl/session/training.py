@@ -165,7 +165,8 @@ class Training:
         count, step = model.cloud.count, trainer.step
         may_stop = train.supersampled > 0 and supersampling_at(step, train) == 1
         if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, step):
-            train.supersampled = 0.0
+            for settings in (self.config, trainer.config):  # an extended training has its own
+                settings.train.supersampled = 0.0
             self.folder.configure(self.config.to_json())
             told = f"step {step}: for lack of memory, features are not drawn at twice the size"
             warnings.warn(told, stacklevel=2)

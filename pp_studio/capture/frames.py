@@ -13,7 +13,7 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from pp_cl import track
 from pp_cl.engine import Device
@@ -59,6 +59,10 @@ DECODED, MOST_DECODED = 18, 3 * 2**28  # bytes of a pixel that is decoded, and o
 FRAMES, GROUP = 120, 12  # of a video
 LOCAL = ["-protocol_whitelist", "file,pipe"]  # a video names no other machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
+# Frames in which lines of two moments are woven are found by their content, as many state it not,
+# and lose those of one; pixels become square, whatever shape the film states.
+WHOLE = "idet,yadif=deint=interlaced"
+SQUARE = "scale=w='iw*max(sar,1)':h='ih*max(1/sar,1)',setsar=1"
 HDR = ("arib-std-b67", "smpte2084")  # transfers of phones: HLG and PQ
 WHITE = 203  # candela per square metre, of BT.2408's diffuse white
 # to sRGB: brighter than 0.7 of white is compressed; HLG and PQ are of BT.2020, tagged or not
@@ -173,6 +177,8 @@ def _take(folder, file, target):
             facts["focal"] = _focal_of_larger(told.get_ifd(EXIF), image.size)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
+    except UnidentifiedImageError:
+        return facts | {"reason": f"is no image of a known kind ({', '.join(FORMATS)})"}
     except Exception as error:  # decoders meet broken bytes with whatever comes up
         return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
     facts |= _look(upright)
@@ -259,7 +265,7 @@ def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[
         pixels,
         bits_per_pixel=8 * channels,
         input_params=LOCAL,
-        output_params=["-vf", filters, *EACH_ONCE],
+        output_params=["-vf", f"{WHOLE},{SQUARE},{filters}", *EACH_ONCE],
     )
     try:
         yield (meta := next(decoded))

@@ -23,6 +23,7 @@ FEW = 0.15  # of the matches that images have with their best: pairs of a turned
 # are far apart, or look alike where a pattern repeats
 BELIEVED = 2.0  # of the points' median error: observations that are further off count less
 CONVERGED = 1e-5  # relative change of the sum of errors
+MOST_ERROR = 20.0  # pixels by which points are off in their images, in the mean
 BLURRED = 0.4  # of the median sharpness
 
 
@@ -47,13 +48,17 @@ def place(
             copy = Path(shutil.copy(database, again))  # a stopped run finds its own as it was
             if forget_focal_lengths(copy):
                 found += _mapped(copy, images, again, len(taken), turns)
-        if found:
-            best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()))
-            for folder in list(unfinished.iterdir()):
-                shutil.rmtree(folder)
+        for folder in list(unfinished.iterdir()):
+            shutil.rmtree(folder)
+        found.sort(key=lambda one: (one.num_reg_images(), one.num_points3D()))
+        while found:
+            best = found[-1]
             with Progress("refining all poses"):
                 refine(best)
-            best.write(unfinished)
+            if (error := best.compute_mean_reprojection_error()) < MOST_ERROR:
+                best.write(unfinished)
+                break
+            found.pop()  # its optimisation failed
         placed = {image.name for image in best.images.values() if image.has_pose} if found else ()
         reasons = _reasons(database, taken, placed)
         if len(placed) < least:
@@ -66,7 +71,7 @@ def place(
         return {
             "placed": len(placed),
             "points": best.num_points3D(),
-            "error": round(best.compute_mean_reprojection_error(), 3),
+            "error": round(error, 3),
             "unplaced": reasons,
         }
 

@@ -107,6 +107,7 @@ def export_run(
         if name == "splat-spz":
             table, times = splat.in_spz(table)
             unit += "" if times == 1 else f", times {times:g}"
+            unit += splat.cut_in_spz(table)
         told = f"{len(table)} Gaussians{unit}"
         if name == "splat-glb":
             write = partial(splat.write_splat_glb, path, table, metres * origin)

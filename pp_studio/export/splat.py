@@ -88,6 +88,14 @@ def in_spz(table: np.ndarray) -> tuple[np.ndarray, float]:
     return scaled, times
 
 
+def cut_in_spz(table: np.ndarray) -> str:
+    """What a .spz cuts off of splats(), in words; "" where nothing."""
+    over = np.abs(table["harmonics"][:, 1:]) - 1  # of colours by direction
+    if not (over > 0).any():
+        return ""
+    return f", {(over > 0).mean():.2%} of its harmonics cut to 1, by {over.max():.2f} at most"
+
+
 def write_splat_spz(path: Path, table: np.ndarray) -> None:
     """Write splats() with y up, of in_spz(), as Niantic's .spz. Raises UserError as atomic_path."""
     from gsply import GSData, write_spz

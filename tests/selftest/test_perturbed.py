@@ -11,8 +11,6 @@ from pp_cl.engine.device import device as device_module
 from pp_cl.engine.device.device import Program
 from pp_cl.selftest.run import CASES, run_cases
 
-pytestmark = pytest.mark.slow
-
 KERNELS = device_module.kernel_folder()
 # (kernel file, text that stands there once, what it becomes, the case that must fail)
 FLIPS = [
@@ -42,16 +40,18 @@ FLIPS = [
     ("raster/alpha", "through = 1.0f - alpha", "through = 1.0f + alpha", "alpha: forward, soft"),
     ("raster/blend", "b / T * dL_db", "T / b * dL_db", "alpha: backward, soft"),
     ("raster/blend", "+ g - B;", "- g - B;", "alpha: gradient of alpha"),
-    ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
+    ("raster/blend", "sum + (1.0f - DRAWN", "sum + (1.0f + DRAWN", "softmax: forward, soft"),
     ("raster/blend", "feature) - pixel_blend", "feature) + pixel_blend", "softmax: backward, soft"),
     ("raster/blend", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
     ("raster/blend", "front.x - behind.x", "front.x + behind.x", "alpha: distortion loss"),
     ("raster/blend", "d, opacity[i]", "d, -opacity[i]", "alpha: offsets of points"),
     ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
+    ("layers/conv", "bias, relu", "bias, !relu", "conv: direct, hard inputs"),
     ("layers/direct.h", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
     ("layers/conv_local", "+ p] += v", "+ p] -= v", "conv: local, hard inputs"),
     ("layers/conv_local_backward_weights", "[0] += v", "[0] -= v", "conv: local, hard inputs"),
+    ("layers/winograd", "bias, relu", "bias, !relu", "conv: winograd, hard inputs"),
     ("layers/winograd.h", "[i] += value", "[i] -= value", "conv: winograd, hard inputs"),
     ("layers/winograd_backward", "[i] += v", "[i] -= v", "conv: winograd, hard inputs"),
     ("layers/weights", ": vload16((rest", ": -vload16((rest", "conv: winograd"),
@@ -77,14 +77,22 @@ FLIPS = [
 ]  # fmt: skip
 
 
+def test_every_text_stands_once_in_its_file():
+    assert [flip for flip in FLIPS if path_of(flip[0]).read_text().count(flip[1]) != 1] == []
+
+
+def path_of(file):
+    path = KERNELS / f"{file}.cl"
+    return path if path.exists() else KERNELS / file
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("file, text, flipped, name", FLIPS, ids=lambda v: v.replace("/", "."))
 def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, name):
-    path = f"{file}.cl" if KERNELS.joinpath(f"{file}.cl").exists() else file
-    assert (KERNELS / path).read_text().count(text) == 1, "there is nothing to flip"
     case = next(case for case in CASES if case.name == name)
     monkeypatch.setattr(dev, "is_cpu", acts_as_cpu(dev, file, text))
     assert [row.passed for row in run_cases(dev, [case])] == [True]
-    if path == file:  # a header, which kernels of its wing include
+    if path_of(file) == KERNELS / file:  # a header, which kernels of its wing include
         folder = shutil.copytree(KERNELS, tmp_path / "cl")
         (folder / file).write_text((folder / file).read_text().replace(text, flipped))
         monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)

@@ -101,14 +101,19 @@ def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsy
     assert 0 < max(local) <= 32 * 1024
 
 
-def test_what_was_to_be_supersampled_is_given_up_before_points(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("steps, at", [((60,), 44), ((6, 60), 44)], ids=["new", "extended"])
+def test_what_was_to_be_supersampled_is_given_up_before_points(
+    tmp_path, monkeypatch, capsys, steps, at
+):
     def fault_of(self, grid, points, depth_range, step=0, share=1.0):
         return ("little", "") if self._train.supersampled and step > 10 else None
 
     monkeypatch.setattr(MemoryPlan, "fault_of", fault_of)
-    folder = RunFolder(tmp_path / "run")
-    assert main(arguments(write_ball_scene(tmp_path / "ball"), folder.path)) == 0
-    assert "step 44: for lack of memory, features are not drawn" in capsys.readouterr().err
+    folder, scene = RunFolder(tmp_path / "run"), write_ball_scene(tmp_path / "ball")
+    for count in steps:
+        words = arguments(scene, folder.path, train__iterations=count)
+        assert main(words) == 0
+    assert f"step {at}: for lack of memory, features are not drawn" in capsys.readouterr().err
     assert load_config(folder.config).train.supersampled == 0
     assert load(folder.path).renderer.supersampling == 1
 

@@ -228,7 +228,8 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
             text = f"{MODELS[model]} parameters, finite and not huge; copy the file again"
             lens = Unusable(f"{where}: {model} has {text}", BROKEN_CAMERA)
         lenses[identity] = lens
-    file, images = folder / f"images{suffix}", {}
+    images: dict[PurePosixPath, Image] = {}
+    file = folder / f"images{suffix}"
     for where, image in _records(file, _binary_image, IMAGE, _text_image):
         # the name goes into messages of one line
         has_controls = any(unicodedata.category(letter) == "Cc" for letter in image.name)

@@ -269,7 +269,6 @@ BAD_BYTES = {
     "2D points beyond the end": ("images.bin", lambda b: b[:-8] + struct.pack("<Q", 9)),
     "more than the count": ("cameras.bin", lambda b: b + b"x"),
     "model number": ("cameras.bin", lambda b: b[:12] + struct.pack("<i", 99) + b[16:]),
-    "name": ("images.bin", lambda b: b[:72] + b"\xff" + b[73:]),
     "no name": ("images.bin", lambda b: b[:72] + b[82:]),
 }
 
@@ -280,3 +279,9 @@ def test_bad_bytes(binary, case):
     file = binary / "sparse" / "0" / name
     file.write_bytes(change(file.read_bytes()))
     refused(binary, file)
+
+
+def test_a_name_in_no_code_page_costs_its_view(binary):
+    file = binary / "sparse/0/images.bin"
+    file.write_bytes(file.read_bytes().replace(b"000001.png", b"\xff00001.png"))
+    left_out(binary, file.parent, "rename the images in ASCII")

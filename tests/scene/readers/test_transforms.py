@@ -129,8 +129,6 @@ BAD_FRAMES = {
     "no matrix": ("transform_matrix", None),
     "NaN": ("transform_matrix", np.where(np.eye(4) == 1, np.nan, MATRIX).tolist()),
     "scaled": ("transform_matrix", (MATRIX * [1.01, 1.01, 1.05, 1]).tolist()),
-    "mirrored": ("transform_matrix", (MATRIX * [-1, 1, 1, 1]).tolist()),
-    "transposed": ("transform_matrix", MATRIX.T.tolist()),
     "negative focal length": ("fl_x", -5),
     "NaN number": ("cx", math.nan),
     "huge number": ("fl_y", 10**400),
