@@ -47,9 +47,6 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     path, box, fault = config.scene.path, scene_box(config), None
     axes = STATED if path == DEMO else read_edits(Path(path)).axes
     cameras = [view.file_camera for view in views]
-    if by := upward(cameras)[1]:
-        told = f"upper edges of the images contradict each other; up is taken from {by}"
-        warnings.warn(f"{path}: {told}", stacklevel=2)
     if not any(view.has_mask for view in views) and axes is None:
         _check_without_masks(path, cameras)
     try:
@@ -73,6 +70,9 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
             )
     if fault:
         raise fault
+    if by := upward([view.camera for view in agreement.views])[1]:
+        told = f"upper edges of the images contradict each other; up is taken from {by}"
+        warnings.warn(f"{path}: {told}", stacklevel=2)
     if INEXACT < beside.strictly <= MOST_BESIDE:
         told = f"{beside.strictly:.1%} of the masks lie beside their hull"
         warnings.warn(f"{path}: {told}: cameras or masks are inexact", stacklevel=2)
