@@ -155,7 +155,8 @@ def _scene_rows(facts):
     capped = " (capped)" * hull["capped"]
     rows.append(("hull", f"{hull['points']} points{capped}, {_grid_text(hull)}"))
     if masks["with_alpha"]:
-        rows.append(("", f"{hull['masks_beside']:.2%} of the masks lie beside it"))
+        strictly = ", if none is forgiven" * (masks["forgiven"] > 0)
+        rows.append(("", f"{hull['masks_beside']:.2%} of the masks lie beside it{strictly}"))
     if times := hull["refinements"]:
         pixels = " and ".join(
             f"{hull['voxel_size_pixels'] / 2**n:.2f}" for n in range(1, times + 1)

@@ -28,7 +28,7 @@ IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says noth
 # of names that are no UTF-8: of Windows in Chinese, Japanese, Korean, Russian and western Europe
 CODE_PAGES = ("gb18030", "cp932", "big5", "cp949", "cp1251", "cp1252", "cp437", "cp850", "cp866")
 # folders in which models lie, and scenes in a folder without one
-MOST_FOLDERS, MOST_DEPTH = 200, 4
+MOST_FOLDERS, MOST_DEPTH = 200, 6
 MOST_JSON = 2**24  # bytes of a file that may be a transforms.json
 # {what lies in the folder of a program or dataset that is not read: which of its exports is}
 EXPORTS = {

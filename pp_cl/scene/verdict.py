@@ -19,7 +19,7 @@ from pp_cl.scene.gaze import ahead, meeting, upward
 from pp_cl.scene.hull import MOST_LEFT_OUT, Agreement, Beside, agreement_of, shares_beside
 from pp_cl.scene.image_file import ImageFile, shrink
 from pp_cl.scene.load import DEMO, find_reader, list_split, scene_box, scene_splits
-from pp_cl.scene.readings import MEANING, PIXELS, STATED, TURNED, Stated, read_as, readings
+from pp_cl.scene.readings import EXIF, MEANING, SQUARE, STATED, Stated, read_as, readings
 from pp_cl.settings import Config
 
 # Of the masks, in the mean, beside their hull: 0 to 0.016 in sound scenes, 0.15 and more with wrong
@@ -27,7 +27,7 @@ from pp_cl.settings import Config
 # masks of which some are wrong.
 MOST_BESIDE, PERSISTING = 0.06, 0.02
 NOWHERE = Beside(1.0, 1.0)  # of masks that leave no hull
-INEXACT = MOST_BESIDE / 3
+INEXACT, EXACT = MOST_BESIDE / 3, MOST_BESIDE / 30
 # Of a reading in which cameras are right: this little beside, so many times less than as stated.
 MEETS, TIMES_LESS = 0.01, 4.0
 TRIED_VIEWS, TRIED_SIZE, TRIED_POINTS = 32, 160, 20_000  # of a coarse hull: a quarter of a second
@@ -47,8 +47,13 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     path, box, fault = config.scene.path, scene_box(config), None
     axes = STATED if path == DEMO else read_edits(Path(path)).axes
     cameras = [view.file_camera for view in views]
-    if not any(view.has_mask for view in views) and axes is None:
-        _check_without_masks(path, cameras)
+    has_masks = any(view.has_mask for view in views)
+    if (
+        not has_masks
+        and axes is None
+        and (reading := other_axes(cameras, find_reader(path).STATES))
+    ):
+        raise _refusal(path, "its cameras do not look at one place", reading, cameras)
     try:
         agreement, beside = agreement_of(dev, views, box)
     except UserError as error:  # no place is in all masks
@@ -70,6 +75,8 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
             )
     if fault:
         raise fault
+    if (oblong := _oblong(cameras)) and not (has_masks and beside.strictly < EXACT):
+        warnings.warn(f"{path}: {oblong}; are both focal lengths right?", stacklevel=2)
     if by := upward([view.camera for view in agreement.views])[1]:
         told = f"upper edges of the images contradict each other; up is taken from {by}"
         warnings.warn(f"{path}: {told}", stacklevel=2)
@@ -79,21 +86,13 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     return agreement, beside.strictly
 
 
-def _check_without_masks(path, cameras):
-    """Raise WrongCameras where cameras would look at one place in another reading alone."""
-    if reading := other_axes(cameras, find_reader(path).STATES):
-        raise _refusal(path, "its cameras do not look at one place", reading, cameras)
-    if oblong := _oblong(cameras):
-        warnings.warn(f"{path}: {oblong}; are both focal lengths right?", stacklevel=3)
-
-
 def _refusal(path, what, reading, cameras):
     """The WrongCameras that names a reading."""
     words, file = reading.split(), Path(path) / EDITS
     would = " and ".join(MEANING[word] for word in words)
-    if words[0] in PIXELS:
+    if words[0] == SQUARE:
         what += f", and {_oblong(cameras)}"
-    mend = ", or turn the pictures" if {"upside-down", TURNED} & {*words} else ""
+    mend = ", or turn the pictures" if {"upside-down", EXIF} & {*words} else ""
     mend = ", or mirror the pictures back" if "mirrored" in words else mend
     return WrongCameras(
         f"{path}: {what}; its cameras would be right as {would}. If they are of the"
@@ -134,23 +133,20 @@ def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None
     files = [one for split in splits for one in list_split(path, split, edited=False).image_files]
     forgiven = int(MOST_LEFT_OUT * len(small))
     as_stated = _beside(dev, small, forgiven)
-    limit = min(MEETS, as_stated / TIMES_LESS)
-    found: dict[str, float] = {}  # {reading: share beside the hull}
+    best, least = None, min(MEETS, as_stated / TIMES_LESS)
     for reading in readings(stated):
-        if found and " " in reading:
+        if best and " " in reading:
             break  # a simpler one will do
-        as_read = read_as(files, reading, stated, Path(path))
-        cameras = {one.name: one.camera for one in as_read}
+        cameras = {one.name: one.camera for one in read_as(files, reading, stated, Path(path))}
         tried = [
             replace(view, stored_camera=cameras[view.name].downscaled(view.shrunk))
             for view in small
         ]
-        is_other = any(as_read[i].camera is not files[i].camera for i in range(len(files)))
-        if is_other and ahead([view.camera for view in tried]):
-            found[reading] = _beside(dev, tried, forgiven)
-            if found[reading] > limit:
-                del found[reading]
-    return min(found, key=lambda reading: found[reading]) if found else None
+        # what is not meant for these files is as they state it
+        if ahead([view.camera for view in tried]) and not _alike(tried, small):
+            share = _beside(dev, tried, forgiven)
+            best, least = (reading, share) if share < least else (best, least)
+    return best
 
 
 def _small(views):
@@ -168,6 +164,11 @@ def _small(views):
             replace(view, stored_camera=camera, unshrunk_camera=view.file_camera, **changed)
         )
     return small
+
+
+def _alike(views, others):
+    cameras = ([view.camera.packed((0, 1)) for view in some] for some in (views, others))
+    return np.array_equal(*cameras)
 
 
 def _beside(dev, views, forgiven):
