@@ -281,7 +281,7 @@ class Agreement(NamedTuple):
 
 class Beside(NamedTuple):
     """The mean share of a mask that lies beside the hull: where no mask is forgiven, 1 where no
-    hull is left; where MOST_LEFT_OUT of them are, which mends some wrong masks, but no cameras.
+    hull is left; where MOST_FORGIVEN of them are, which mends wrong masks, but no wrong cameras.
     """
 
     strictly: float
@@ -327,8 +327,9 @@ def agreement_of(
         True,
         key=lambda forgiven: shares_beside(dev, left, box, forgiven).mean() <= MOST_MISSED,
     )
-    forgiving = float(shares_beside(dev, left, box, most).mean()) if beside > MOST_BESIDE else 0.0
-    return Agreement(left, left_out, least), Beside(beside, forgiving)
+    quarter = int(MOST_FORGIVEN * len(left))
+    forgiving = shares_beside(dev, left, box, quarter).mean() if beside > MOST_BESIDE else beside
+    return Agreement(left, left_out, least), Beside(beside, float(forgiving))
 
 
 def contradicting(views: Sequence[View], hull: Hull, agreement: Agreement) -> list[Disagreement]:

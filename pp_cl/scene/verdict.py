@@ -23,9 +23,9 @@ from pp_cl.scene.readings import EXIF, MEANING, SQUARE, STATED, Stated, read_as,
 from pp_cl.settings import Config
 
 # Of the masks, in the mean, beside their hull: 0 to 0.016 in sound scenes, 0.15 and more with wrong
-# cameras. With an eighth of the masks forgiven, 0.05 and more with wrong cameras, but 0.001 with
-# masks of which some are wrong.
-MOST_BESIDE, PERSISTING = 0.06, 0.02
+# cameras (docs/scenes.md). With a quarter of the masks forgiven, 0.016 and more with wrong cameras,
+# 0 where half of the masks lack a part.
+MOST_BESIDE, PERSISTING = 0.06, 0.005
 NOWHERE = Beside(1.0, 1.0)  # of masks that leave no hull
 INEXACT, EXACT = MOST_BESIDE / 3, MOST_BESIDE / 30
 # Of a reading in which cameras are right: this little beside, so many times less than as stated.
@@ -53,7 +53,8 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
         and axes is None
         and (reading := other_axes(cameras, find_reader(path).STATES))
     ):
-        raise _refusal(path, "its cameras do not look at one place", reading, cameras)
+        what = "its cameras do not look at one place"
+        raise WrongCameras(_told(path, what, reading, cameras))
     try:
         agreement, beside = agreement_of(dev, views, box)
     except UserError as error:  # no place is in all masks
@@ -62,17 +63,23 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     if box is not None and beside.strictly > MOST_BESIDE:  # the box may cut the object off
         with suppress(UserError):
             _, whole = agreement_of(dev, views)
-    if axes != STATED and whole.strictly > MOST_BESIDE and whole.forgiving > PERSISTING:
-        what = f"{whole.strictly:.0%} of its masks lie beside their hull"
-        what = "its masks leave no point" if whole == NOWHERE else what
-        if axes is None and (reading := fitting_reading(dev, path, views)):
-            raise _refusal(path, what, reading, cameras)
-        if not fault:
-            raise WrongCameras(
-                f"{path}: {what}, so cameras or masks are wrong, in no way that is known: check the"
-                " order of poses and images, focal lengths and masks; if all are right, write"
-                f' {{"axes": "{STATED}"}} into {Path(path) / EDITS}'
-            )
+    what = f"{whole.strictly:.0%} of its masks lie beside their hull"
+    what = "its masks leave no point" if whole == NOWHERE else what
+    if axes is None and whole.strictly > INEXACT:
+        reading = fitting_reading(dev, path, views)
+        told = _told(path, what, reading, cameras) if reading else ""
+        if reading and whole.strictly > MOST_BESIDE:
+            raise WrongCameras(told)
+        if whole.strictly <= MOST_BESIDE:
+            told = told or f"{path}: {what}: cameras or masks are inexact"
+            warnings.warn(told, stacklevel=2)
+    is_wrong = whole.strictly > MOST_BESIDE and whole.forgiving > PERSISTING
+    if is_wrong and axes != STATED and not fault:
+        raise WrongCameras(
+            f"{path}: {what}, so cameras or masks are wrong, in no way that is known: check the"
+            " order of poses and images, focal lengths and masks; if all are right, write"
+            f' {{"axes": "{STATED}"}} into {Path(path) / EDITS}'
+        )
     if fault:
         raise fault
     if (oblong := _oblong(cameras)) and not (has_masks and beside.strictly < EXACT):
@@ -80,21 +87,19 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     if by := upward([view.camera for view in agreement.views])[1]:
         told = f"upper edges of the images contradict each other; up is taken from {by}"
         warnings.warn(f"{path}: {told}", stacklevel=2)
-    if INEXACT < beside.strictly <= MOST_BESIDE:
-        told = f"{beside.strictly:.1%} of the masks lie beside their hull"
-        warnings.warn(f"{path}: {told}: cameras or masks are inexact", stacklevel=2)
     return agreement, beside.strictly
 
 
-def _refusal(path, what, reading, cameras):
-    """The WrongCameras that names a reading."""
+def _told(path, what, reading, cameras):
+    """What is said of cameras that would be right in a reading."""
     words, file = reading.split(), Path(path) / EDITS
     would = " and ".join(MEANING[word] for word in words)
     if words[0] == SQUARE:
         what += f", and {_oblong(cameras)}"
-    mend = ", or turn the pictures" if {"upside-down", EXIF} & {*words} else ""
+    mend = ", or correct fl_y" if words[0] == SQUARE else ""
+    mend = ", or turn the pictures" if {"upside-down", EXIF} & {*words} else mend
     mend = ", or mirror the pictures back" if "mirrored" in words else mend
-    return WrongCameras(
+    return (
         f"{path}: {what}; its cameras would be right as {would}. If they are of the"
         f' kind "{reading}", write {{"axes": "{reading}"}} into {file}{mend}; if they are right as'
         f' stated, {{"axes": "{STATED}"}}'
@@ -133,6 +138,8 @@ def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None
     files = [one for split in splits for one in list_split(path, split, edited=False).image_files]
     forgiven = int(MOST_LEFT_OUT * len(small))
     as_stated = _beside(dev, small, forgiven)
+    if as_stated < PERSISTING:
+        return None  # some masks are wrong
     best, least = None, min(MEETS, as_stated / TIMES_LESS)
     for reading in readings(stated):
         if best and " " in reading:
