@@ -133,6 +133,20 @@ def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_p
     assert not os.path.exists(ran.stdout.strip())  # gone with the process
 
 
+@pytest.mark.unix
+def test_a_cache_folder_in_which_nothing_runs_is_replaced(tmp_path, monkeypatch):
+    """On a file system that is mounted noexec PoCL ends the process."""
+    caches = {"XDG_CACHE_HOME": tmp_path / "a", "POCL_CACHE_DIR": tmp_path / "b"}
+    for name, folder in caches.items():
+        monkeypatch.setenv(name, str(folder))
+    flags = {str(folder): SimpleNamespace(f_flag=os.ST_NOEXEC) for folder in caches.values()}
+    monkeypatch.setattr(os, "statvfs", lambda p: flags.get(str(p), SimpleNamespace(f_flag=0)))
+    with pytest.warns(UserWarning, match="is mounted noexec") as told:
+        drivers._give_cache()
+    for name, warning in zip(caches, told, strict=True):
+        assert os.environ[name] in str(warning.message) and os.environ[name] != str(caches[name])
+
+
 def test_a_device_without_room_for_constants_does_not_work():
     problem = find_problem(SimpleNamespace(max_constant_buffer_size=63))
     assert problem == "holds 63 bytes of constants, 64 needed"

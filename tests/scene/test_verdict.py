@@ -143,8 +143,7 @@ def written(folder, form="colmap", change=same):
 
 
 def judge(dev, folder):
-    config = configure(preset("tiny"), str(folder))
-    return judged(dev, config, open_scene(dev, config, ("train",)).splits["train"])
+    return judged(dev, configure(preset("tiny"), str(folder)), open_views(dev, folder))
 
 
 @pytest.mark.parametrize("what", WRONG)
@@ -194,3 +193,24 @@ def test_wrong_masks_of_some_are_no_wrong_cameras(dev, tmp_path, count):
         write_png(file, image)
     _, beside = judge(dev, folder)
     assert beside == 0 if count == 0 else beside > MOST_BESIDE
+
+
+def test_pictures_are_turned_where_their_masks_fit_only_so(dev, tmp_path):
+    folder = written(tmp_path / "scene", "colmap", lambda views: [backed(one) for one in views])
+    before = open_views(dev, folder)
+    lying(folder / "images")
+    with pytest.warns(UserWarning, match="turned as their EXIF says, as their masks fit only so"):
+        after = open_views(dev, folder)
+    for one, other in zip(before, after, strict=True):
+        assert np.array_equal(one.image, other.image)
+
+
+def backed(view):
+    """The object is brighter than what is behind it, which masks leave in the pictures."""
+    image = view.image.copy()
+    image[..., :3] = np.where(image[..., 3:] > 0, 128 + image[..., :3] // 2, image[..., :3] // 4)
+    return replace(view, image=image)
+
+
+def open_views(dev, folder):
+    return open_scene(dev, configure(preset("tiny"), str(folder)), ("train",)).splits["train"]

@@ -4,6 +4,7 @@ is one line, or it is refused with the reason. All are of a ball.
 
 import json
 import shutil
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +149,10 @@ def two_cameras(folder):
         del frame["mask_path"]
 
     frames(folder, split)
+    without_lists(folder)
+
+
+def without_lists(folder):
     file = folder / "transforms.json"
     data = json.loads(file.read_text())
     file.write_text(json.dumps({k: v for k, v in data.items() if not k.endswith("filenames")}))
@@ -165,8 +170,88 @@ def without_masks_named(folder):
     frames(folder, lambda _, frame: frame.pop("mask_path"))
 
 
+def renamed(change):
+    """Give the images of a transforms.json, and its paths of them, the names that change makes."""
+
+    def rename(folder):
+        for i, file in enumerate(sorted((folder / "images").iterdir())):
+            file.rename(file.with_name(change(i)[1]))
+        frames(folder, lambda i, frame: frame.update(file_path=change(i)[0]))
+        without_lists(folder)
+
+    return rename
+
+
+def accent(i):
+    name = f"th\u00e9_{i:02d}.png"
+    return unicodedata.normalize("NFC", f"images/{name}"), unicodedata.normalize("NFD", name)
+
+
+def code_page(folder):
+    """Names in the code page of a Windows in Chinese, of images that are there in UTF-8."""
+    file = folder / "sparse/0/images.bin"
+    for image in sorted((folder / "images").iterdir()):
+        name = f"\u7167{image.name[2:]}"
+        file.write_bytes(file.read_bytes().replace(image.name.encode(), name.encode("gbk")))
+        (folder / f"masks/{image.name}.png").rename(folder / f"masks/{name}.png")
+        image.rename(image.with_name(name))
+
+
+def of_sdfstudio(folder):
+    data = json.loads((folder / "transforms.json").read_text())
+    own = []
+    for frame in data["frames"]:
+        lens = [[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]]
+        pose = (np.array(frame["transform_matrix"]) @ GL_FROM_CV).tolist()
+        image, mask = frame["file_path"], frame["mask_path"]
+        keys = {"rgb_path": image, "foreground_mask": mask, "camtoworld": pose, "intrinsics": lens}
+        own.append(keys)
+    size = {"width": data["frames"][0]["w"], "height": data["frames"][0]["h"]}
+    (folder / "meta_data.json").write_text(json.dumps(size | {"frames": own}))
+    (folder / "transforms.json").unlink()
+
+
+def listed_twice(folder):
+    file = folder / "transforms.json"
+    data = json.loads(file.read_text())
+    data["frames"].append(data["frames"][3] | {"id": 99})
+    file.write_text(json.dumps(data))
+
+
+def with_commas(folder):
+    for file in (folder / "pose").iterdir():
+        file.write_text(file.read_text().replace(".", ","))
+
+
 # {report: (format, what is done to the folder, what is said)}
 TRAINS = {
+    "an accent in another form": ("nerfstudio", renamed(accent), ""),
+    "paths from where a tool was run": (
+        "nerfstudio",
+        frame_by_frame("file_path", lambda i, path: f"..\\work/{path}"),
+        "",
+    ),
+    "names in a code page": ("colmap", code_page, ""),
+    "a model deeper than usual": ("colmap", moved(("sparse/0", "out/sfm/sparse/0")), ""),
+    "images in a folder of their own": (
+        "colmap",
+        moved(("images", "mapping"), ("sparse/0", "sfm_loops")),
+        "",
+    ),
+    "Plenoxels' folders": ("nsvf", moved(("rgb", "images")), ""),
+    "sdfstudio": ("nerfstudio", of_sdfstudio, ""),
+    "a frame listed twice": ("nerfstudio", listed_twice, ""),
+    "matrices by column": (
+        "nerfstudio",
+        frame_by_frame("transform_matrix", lambda i, m: np.transpose(m).tolist()),
+        "column by column",
+    ),
+    "decimal commas": ("nsvf", with_commas, ""),
+    "labels": (
+        "colmap",
+        images(lambda mask: mask.point(lambda v: v // 85), names="masks"),
+        "label",
+    ),
     "a workspace of COLMAP": (
         "colmap",
         workspace,

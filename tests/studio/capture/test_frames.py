@@ -280,3 +280,33 @@ def test_what_a_film_repeats_takes_the_place_of_no_other_picture(tmp_path, rng):
     write_video(tmp_path / "film.webm", [*shown, *[shown[-1]] * 260], 24)
     found = take_images(tmp_path / "film.webm", tmp_path / "images")
     assert len(found["images"]) == 40
+
+
+@pytest.fixture
+def moving(tmp_path, rng):
+    """A film of a smooth picture that moves to the left."""
+    pytest.importorskip("imageio_ffmpeg")
+    wide = Image.fromarray(rng.integers(0, 256, (6, 40, 3), np.uint8)).resize((800, 120))
+    shown = [np.array(wide)[:, 4 * k : 4 * k + 160] for k in range(80)]
+    write_video(tmp_path / "film.webm", shown, 24)
+    return tmp_path / "film.webm"
+
+
+def taken(film, tmp_path):
+    found = take_images(film, tmp_path / film.stem)["images"]
+    return [read_rgba(tmp_path / film.stem / one["name"])[..., :3].astype(float) for one in found]
+
+
+def test_pixels_of_a_film_become_square(moving, tmp_path):
+    film = remade(moving, "narrow.mkv", ["-vf", "scale=120:120,setsar=4/3", "-f", "matroska"])
+    assert {image.shape for image in taken(film, tmp_path)} == {(120, 160, 3)}
+
+
+def test_a_frame_is_of_one_moment(moving, tmp_path):
+    """Where the lines of two alternate, whether the film states it or not."""
+    woven = ["-vf", "tinterlace=interleave_top", "-c:v", "libx264", "-f", "matroska"]
+    rough = [
+        np.mean([np.abs(np.diff(image, 2, 0)).mean() for image in taken(film, tmp_path)])
+        for film in (moving, remade(moving, "woven.mkv", woven))
+    ]
+    assert rough[1] < 1.5 * rough[0]
