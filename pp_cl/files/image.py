@@ -32,7 +32,8 @@ UNREADABLE = "an image that cannot be read"
 # this share of the cells that are not dark differ by more than so many levels between the channels;
 # a cell is the mean of 4 x 4 pixels of the image at this size.
 COLOUR_SIDE, COLOURLESS, DARK, COLOURED = 512, 16, 64, 0.3
-MOST_LABEL = 40  # of a mask that holds the numbers of classes, not alpha
+# of a mask that holds the numbers of classes, not alpha; its pixels that are as those beside them
+MOST_LABEL, FLAT = 40, 0.8
 # bits per channel stand in the header chunk, the first of all
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
@@ -115,8 +116,7 @@ def read_mask(path: Path | str) -> np.ndarray:
         image = image.convert("L") if image is not palette else image
     gray = np.array(image)
     values = np.unique(gray)
-    are_labels = image is palette or values[-1] <= MOST_LABEL
-    if are_labels and values[-1] > 1 and Path(path).suffix.lower() not in LOSSY:
+    if image is palette or (1 < values[-1] <= MOST_LABEL and _is_flat(gray)):
         _tell(path, "masks of labels are read as the object wherever the label is not 0")
         return np.where(gray > 0, np.uint8(255), np.uint8(0))
     if gray.max() == 1:  # a JPEG may hold noise of that size
@@ -125,6 +125,12 @@ def read_mask(path: Path | str) -> np.ndarray:
         _tell(path, "masks of 0 and 1 are read as 0 and 255")
         return gray * np.uint8(255)
     return gray
+
+
+def _is_flat(gray):
+    """Whether what is not 0 in (H, W) values is of areas, not of noise."""
+    shown = gray[:, 1:] > 0
+    return bool((gray[:, 1:] == gray[:, :-1])[shown].mean() > FLAT) if shown.any() else False
 
 
 def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> tuple[int, int]:

@@ -128,6 +128,12 @@ WRONG = {
     "upside down": ("colmap", pictured(lambda image: image[::-1, ::-1]), same, "upside-down"),
     "OpenGL's axes": ("nsvf", posed(lambda pose: pose @ GL_FROM_CV), same, "opengl"),
     "from the world": ("nsvf", posed(np.linalg.inv), same, "world-to-camera"),
+    "OpenCV's axes, from the world": (
+        "nerf_synthetic",
+        posed(lambda pose: np.linalg.inv(pose) @ GL_FROM_CV),
+        same,
+        "opencv world-to-camera",
+    ),
     "oblong pixels": ("colmap", oblong, same, "square-pixels"),
     "off by one": ("colmap", off_by_one, same, "next"),
     "numbers without zeros": ("llff", same, unpadded, "by-number"),

@@ -5,7 +5,6 @@ is one line, or it is refused with the reason. All are of a ball.
 import json
 import shutil
 import unicodedata
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -158,14 +157,6 @@ def without_lists(folder):
     file.write_text(json.dumps({k: v for k, v in data.items() if not k.endswith("filenames")}))
 
 
-def read_wrongly(inverted, flipped):
-    def other(_, matrix):
-        pose = np.array(matrix) @ GL_FROM_CV if flipped else np.array(matrix)
-        return (np.linalg.inv(pose) if inverted else pose).tolist()
-
-    return frame_by_frame("transform_matrix", other)
-
-
 def without_masks_named(folder):
     frames(folder, lambda _, frame: frame.pop("mask_path"))
 
@@ -281,15 +272,6 @@ TRAINS = {
         "left out of the training: images/000003.png (100% of it)",
     ),
 }
-REFUSED = {
-    "OpenCV's axes": ("nerfstudio", read_wrongly(False, True), 'of the kind "opencv"'),
-    "matrices from the world": (
-        "nerfstudio",
-        read_wrongly(True, False),
-        'of the kind "world-to-camera"',
-    ),
-    "both": ("nerfstudio", read_wrongly(True, True), 'of the kind "opencv world-to-camera"'),
-}  # fmt: skip
 
 
 def train(folder, out):
@@ -312,28 +294,10 @@ def test_it_trains_and_says_what_was_done(tmp_path, report):
     )
 
 
-@pytest.mark.parametrize("report", REFUSED)
-def test_it_is_refused_with_the_reason(tmp_path, report):
-    form, change, told = REFUSED[report]
-    change(a_ball(tmp_path / "scene", form))
-    status, lines = train(tmp_path / "scene", tmp_path / "run")
-    assert status == 2 and told in lines[-1] and not (tmp_path / "run").exists()
-
-
 def test_a_test_split_of_which_no_image_has_a_mask_is_listed(tmp_path):
     folder = a_ball(tmp_path / "scene", "colmap")
     gone("masks/000000.png.png", "masks/000008.png.png")(folder)
     assert [one.mask for one in list_split(folder, "test").image_files] == [None, None]
-
-
-def test_axes_that_the_user_has_stated(tmp_path):
-    folder = a_ball(tmp_path / "scene", "nerfstudio")
-    read_wrongly(True, True)(folder)
-    _, lines = train(folder, tmp_path / "run")
-    edits = lines[-1].partition("write ")[2].partition(" into ")[0]
-    (Path(folder) / "pp_cl.json").write_text(edits)
-    status, lines = train(folder, tmp_path / "run")
-    assert status == 0, lines
 
 
 def test_a_test_view_of_another_place_is_not_measured(tmp_path):
