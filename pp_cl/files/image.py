@@ -98,7 +98,6 @@ def read_mask(path: Path | str) -> np.ndarray:
     """
     with _opened(path) as opened:
         image = in_srgb(path, opened).copy()
-    palette = image if image.mode == "P" else None
     if image.mode != "L":
         rgba = image.convert("RGBA")
         alpha = np.array(rgba.getchannel("A"))
@@ -109,14 +108,10 @@ def read_mask(path: Path | str) -> np.ndarray:
         cells = np.array(sample).reshape(128, 4, 128, 4, 3).mean((1, 3))
         shown = cells[cells.max(2) > DARK]
         if len(shown) and (np.ptp(shown, axis=1) > COLOURLESS).mean() > COLOURED:
-            if palette is None:
-                what = "has colours; write a gray mask, white where the object is"
-                raise UserError(f"{path}: {what}")
-            image = palette
-        image = image.convert("L") if image is not palette else image
+            raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
+        image = image.convert("L")
     gray = np.array(image)
-    values = np.unique(gray)
-    if image is palette or (1 < values[-1] <= MOST_LABEL and _is_flat(gray)):
+    if 1 < gray.max() <= MOST_LABEL and _is_flat(gray):
         _tell(path, "masks of labels are read as the object wherever the label is not 0")
         return np.where(gray > 0, np.uint8(255), np.uint8(0))
     if gray.max() == 1:  # a JPEG may hold noise of that size
