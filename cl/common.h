@@ -27,6 +27,11 @@
 
 #define BACKGROUND 1.0f  // every feature of a pixel without fragments
 
+// The depth of a key, the weight beside a point.
+ALWAYS_INLINE float upper_float(const ulong word) {
+    return as_float((uint)(word >> 32));
+}
+
 // The upper half of a 16-vector lane by lane, for (float8)(...): Oclgrind 21.10 takes lane 11 of a
 // shuffle for undefined.
 #define UPPER_HALF(v) (v).s8, (v).s9, (v).sa, (v).sb, (v).sc, (v).sd, (v).se, (v).sf

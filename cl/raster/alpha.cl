@@ -4,7 +4,7 @@
 // alpha_i = o_i d_i,  b_i = T_i alpha_i,  T_(i+1) = T_i (1 - alpha_i),  T_1 = 1
 //
 // The background gets the transmittance T behind all fragments. An opaque fragment lets
-// LEAST_THROUGH pass, so that what lies behind it is known when gradients are computed.
+// LEAST_THROUGH pass.
 #include "common.h"
 #include "lanes.h"
 #include "raster/footprint.h"
@@ -12,8 +12,6 @@
 #ifndef DERIVATIVES
 #define DERIVATIVES 1  // 0: no derivatives, which only gradients need
 #endif
-
-#define LEAST_THROUGH 0x1p-24f  // of 1 - alpha, far below what an image shows
 
 // One work-item per pixel: reads its fragments, nearest first, writes their weights b with their
 // points, and the derivatives s = T d of the weights by the opacities, with which dL/do = s * dL/db

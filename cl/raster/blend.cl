@@ -32,9 +32,6 @@
 #ifndef MOVES
 #define MOVES 0  // 1: the points' offsets have gradients
 #endif
-#ifndef DRAWN
-#define DRAWN 1  // pixels that are drawn for one of the image, each way; 1 with the softmax
-#endif
 #ifndef SPAN
 #define SPAN 64  // pixels whose distortion loss is one sum
 #endif
@@ -42,61 +39,39 @@
 #define DL_DB 0  // 1: pair_gradient lacks dL/db: softmax_gradient wrote it
 #endif
 
-#define DRAWN_SHARE (1.0f / (DRAWN * DRAWN))
-
-// The image's pixel that a drawn one lies in. width: of the drawn ones.
-static inline uint image_pixel(const uint q, const uint width) {
-    return DRAWN == 1 ? q : q / width / DRAWN * (width / DRAWN) + q % width / DRAWN;
-}
-
-// The depth of a key, the weight beside a point.
-static inline float upper_float(const ulong word) {
-    return as_float((uint)(word >> 32));
-}
-
-// One work-item per part of a pixel of the image: reads the fragments of its drawn pixels and their
-// points' features, writes the blended features and, where several are drawn, the transmittance.
+// One work-item per part of a pixel: reads its fragments and their points' features, writes the
+// blended features.
 kernel void blend_forward(
-    const uint hw,                           // pixels of the image
-    const uint width,                        // drawn ones of a row
-    global const uint *pixel_offset,         // (?) of all that are drawn, and one more
+    const uint hw,                           // pixels
+    global const uint *pixel_offset,         // (HW+1)
     global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
-    global const float *transmittance,       // (...) of all that are drawn, read if DRAWN > 1
     global const uint *point_slot,           // (N) row of a visible point
     global const float16 *visible_features,  // (?, 16) of the visible points
-    global float16 *features,                // (H, W, 16)
-    global float *mean_transmittance)        // (...) (HW), written if DRAWN > 1
+    global float16 *features)                // (H, W, 16)
 {
-    const uint pixel = get_global_id(0) / ROW_PARTS;
-    if (pixel >= hw) return;
-    const uint corner = DRAWN * (pixel / (width / DRAWN) * width + pixel % (width / DRAWN));
+    const uint q = get_global_id(0) / ROW_PARTS;
+    if (q >= hw) return;
+    const uint end = pixel_offset[q + 1];
     floats sum = 0.0f;
-    float weights = 0.0f, rest = 0.0f;
-    for (uint k = 0; k < DRAWN * DRAWN; k++) {
-        const uint q = DRAWN == 1 ? pixel : corner + k / DRAWN * width + k % DRAWN;
-        const uint end = pixel_offset[q + 1];
-        if (DRAWN > 1) rest += transmittance[q];
-        for (uint i = pixel_offset[q]; i < end && (uint)pixel_weight_point[i] != NONE; i += BATCH) {
-            float b[BATCH];
-            floats feature[BATCH];
-            bool listed = true;
-            GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
-                const ulong weight_point = j == 0 || i + j < end ? pixel_weight_point[i + j] : NONE;
-                listed = listed && (uint)weight_point != NONE;
-                b[j] = listed ? upper_float(weight_point) : 0.0f;
-                feature[j] =
-                    listed ? load_part(visible_features, point_slot[(uint)weight_point]) : 0.0f;
-            }
-            GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
-                sum += b[j] * feature[j];
-                weights += b[j];
-            }
-            if (!listed) break;
+    float weights = 0.0f;
+    for (uint i = pixel_offset[q]; i < end && (uint)pixel_weight_point[i] != NONE; i += BATCH) {
+        float b[BATCH];
+        floats feature[BATCH];
+        bool listed = true;
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
+            const ulong weight_point = j == 0 || i + j < end ? pixel_weight_point[i + j] : NONE;
+            listed = listed && (uint)weight_point != NONE;
+            b[j] = listed ? upper_float(weight_point) : 0.0f;
+            feature[j] =
+                listed ? load_part(visible_features, point_slot[(uint)weight_point]) : 0.0f;
         }
+        GPU_UNROLLED_FOR (uint j = 0; j < BATCH; j++) {
+            sum += b[j] * feature[j];
+            weights += b[j];
+        }
+        if (!listed) break;
     }
-    sum *= DRAWN_SHARE;
-    store_part(sum + (1.0f - DRAWN_SHARE * weights) * BACKGROUND, features, pixel);
-    if (DRAWN > 1 && ROW_PART == 0) mean_transmittance[pixel] = DRAWN_SHARE * rest;
+    store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
 }
 
 // One work-item per pixel: reads its `tracked` nearest fragments, writes the weight and the
@@ -127,8 +102,7 @@ kernel void softmax_gradient(
 // points' features, write what each of the `tracked` nearest ones adds to the gradients of its
 // point, by alpha compositing, with those of alpha and of the distortion loss; and that loss.
 kernel void alpha_gradient(
-    const uint hw,       // drawn pixels
-    const uint width,    // of a row
+    const uint hw,       // pixels
     const uint tracked,  // fragments of a pixel that get gradients
     const int has_grad_alpha,
     const float distortion_weight,           // 0: none, and `distortion` is not written
@@ -139,8 +113,8 @@ kernel void alpha_gradient(
     global const float *transmittance,       // (HW)
     global const uint *point_slot,           // (N) row of a visible point
     global const float16 *visible_features,  // (?, 16) of the visible points
-    global const float16 *grad_features,     // (H, W, 16) G, of the image
-    global const float *grad_alpha,          // (?) g, of the image, read with has_grad_alpha
+    global const float16 *grad_features,     // (H, W, 16) G
+    global const float *grad_alpha,          // (?) g, HW with has_grad_alpha
     global float2 *pair_gradient,            // (P, 2) b, s dL/db; cleared before
     global float *distortion)                // ((HW+SPAN-1)/SPAN) of each run, without its weight
 {
@@ -149,9 +123,8 @@ kernel void alpha_gradient(
     if (GROUP_ID * SPAN >= hw) return;
     float sum = 0.0f;
     for (uint q = GROUP_ID * SPAN + MEMBER; q < last; q += GROUP) {
-        const uint pixel = image_pixel(q, width);
-        const float16 G = DRAWN_SHARE * grad_features[pixel];
-        const float g = has_grad_alpha ? DRAWN_SHARE * grad_alpha[pixel] : 0.0f;
+        const float16 G = grad_features[q];
+        const float g = has_grad_alpha ? grad_alpha[q] : 0.0f;
         const uint begin = pixel_offset[q];
         // depths count from here, so that sums of them keep their digits
         const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
@@ -209,7 +182,6 @@ kernel void alpha_gradient(
 // blend weights if it is the highest so far.
 kernel void blend_backward(
     const uint s,                            // visible points
-    const uint width,                        // of a row of drawn pixels
     const float voxel_size,                  // of the grid, world units
     const float radius,                      // of a point without offsets, world units
     const int is_recorded,                   // 0: max_weight is not touched
@@ -219,10 +191,10 @@ kernel void blend_backward(
     global const float *point_shape,         // (N, SHAPE) footprint.h
     global const float *cloud_offset,        // (?, OFFSETS) (N, OFFSETS), read of Gaussians
     global const float *opacity,             // (N)
-    global const uint2 *pair_point_falloff,  // (P, 2) point, bits of d
+    global const uint *pair_point_falloff,   // (P, ?) point, with one sample bits of d
     global const uint *point_offset,         // (N+1)
     global const uint *pair_pixel,           // (P)
-    global float2 *pair_gradient,            // (P, 2) b, s dL/db; s is read with DL_DB
+    global float *pair_gradient,             // (P, 1+SAMPLES) b, s dL/db of each; s with DL_DB
     global const float *pixel_blend,         // (?) (HW) G.F, read with DL_DB
     global const float16 *visible_features,  // (?, 16) a row for each, read with CLAMPED, DL_DB
     global const float16 *grad_features,     // (H, W, 16) G
@@ -242,31 +214,38 @@ kernel void blend_backward(
     floats dL_df = 0.0f;
     float dL_do = 0.0f, weight = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
-        float2 of_fragment = pair_gradient[pair];
-        if (of_fragment.x == 0.0f && of_fragment.y == 0.0f) continue;  // mostly dropped
-        const uint q = pair_pixel[pair];
-        const floats G = load_part(grad_features, image_pixel(q, width));
-        if (DL_DB && ROW_PART == 0) {
-            of_fragment.y *= dot16(grad_features[q], feature) - pixel_blend[q];
-            pair_gradient[pair].y = of_fragment.y;
+        global float *row = pair_gradient + (size_t)(1 + SAMPLES) * pair;
+        const float b = row[0];
+        float of_samples[SAMPLES], sum = 0.0f;
+        bool is_empty = b == 0.0f;
+        UNROLLED_FOR (uint k = 0; k < SAMPLES; k++) {
+            of_samples[k] = row[1 + k];
+            is_empty = is_empty && of_samples[k] == 0.0f;
         }
-        dL_df += of_fragment.x * G;
-        dL_do += of_fragment.y;
-        weight += of_fragment.x;
+        if (is_empty) continue;  // mostly dropped
+        const uint q = pair_pixel[pair];
+        const floats G = load_part(grad_features, q);
+        if (DL_DB && ROW_PART == 0) {
+            of_samples[0] *= dot16(grad_features[q], feature) - pixel_blend[q];
+            row[1] = of_samples[0];
+        }
+        UNROLLED_FOR (uint k = 0; k < SAMPLES; k++)
+            sum += of_samples[k];
+        dL_df += b * G;
+        dL_do += sum;
+        weight += b;
 #if MOVES
-        const float d = as_float(pair_point_falloff[pair].y);  // 0 at the very rim
-        if (ROW_PART == 0 && d > 0.0f && of_fragment.y != 0.0f)
-            offset_add(&moved, &cam, q, d, opacity[i] * of_fragment.y / d);
+        const float d = as_float(pair_point_falloff[2 * pair + 1]);  // 0 at the very rim
+        if (ROW_PART == 0 && d > 0.0f && sum != 0.0f)
+            offset_add(&moved, &cam, q, d, opacity[i] * sum / d);
 #endif
     }
-    dL_df *= DRAWN_SHARE;
     // features that shade.cl has clamped to 0 have no gradient
     if (CLAMPED) dL_df = load_part(visible_features, g) == 0.0f ? 0.0f : dL_df;
     store_part(dL_df, grad_visible_features, g);
     if (ROW_PART > 0) return;
     grad_opacity[g] = dL_do;
     // fmax() would hide a NaN
-    weight *= DRAWN_SHARE;
     if (is_recorded && (weight > max_weight[i] || isnan(weight))) max_weight[i] = weight;
 #if MOVES
     const Offsets offset = FORM > 1 ? OFFSETS_AT(cloud_offset, i) : (Offsets)(0.0f);

@@ -33,6 +33,24 @@
 #define MOST_OFFSET 0.5f  // PointCloud.most_offset of points that are no Gaussians
 #endif
 
+// Samples of a pixel, each way: the camera's pixels are the samples, boxes and lists are of pixels.
+#ifndef SIDE
+#define SIDE 1
+#endif
+#define SAMPLES (SIDE * SIDE)
+
+// What a pair keeps of its fragment: the point and, of a single sample, the bits of its falloff.
+#if SIDE == 1
+#define STORE_FRAGMENT(point, falloff, pair, pairs)                                                \
+    vstore2((uint2)(point, as_uint(falloff)), pair, pairs)
+#else
+#define STORE_FRAGMENT(point, falloff, pair, pairs) ((pairs)[pair] = (point))
+#endif
+
+// The least of 1 - alpha, so that what lies behind an opaque fragment is known when gradients are
+// computed; far below what an image shows.
+#define LEAST_THROUGH 0x1p-24f
+
 #define MARGIN 0.01f  // pixels around a box; far above the rounding of places
 
 // Half the width of the smallest footprint, in pixels: a disc of this radius always reaches a
@@ -120,11 +138,15 @@ ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
 #include "raster/footprint/gaussian.h"
 #endif
 
-// Tests pixel (column, row) of each point's box.
+// Tests pixel (column, row) of each point's box, which it covers if it covers one of the samples;
+// falloff and depth are of the first.
 ALWAYS_INLINE Coverage
 footprints_test(const Footprints *f, const Rim *rim, const int column, const int row) {
     const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
-    Coverage c = footprints_cover(f, rim, LANED(convert_float)(x), LANED(convert_float)(y));
+    const floats px = LANED(convert_float)(SIDE * x), py = LANED(convert_float)(SIDE * y);
+    Coverage c = footprints_cover(f, rim, px, py);
+    UNROLLED_FOR (int s = 1; s < SAMPLES; s++)
+        c.covers |= footprints_cover(f, rim, px + s % SIDE, py + s / SIDE).covers;
     c.covers &= x <= LANES_FROM(f->box[2]) & y <= LANES_FROM(f->box[3]);
     return c;
 }

@@ -66,17 +66,18 @@ ALWAYS_INLINE void fill(
     global const ushort4 *point_box,
     global const uint *point_count,
     global uint *pair_pixel,
-    global uint2 *pair_point_falloff,
+    global uint *pair_point_falloff,
     global ulong *point_key,
     global volatile uint *pixel_count) {
     const Footprints f = footprints_load(first, count, point_camera, point_shape, point_box);
     const Rim rim = footprints_rim(cam, &f);
+    const int width = cam->width / SIDE;
     // of each point: its next pair, where they end, the first pixel of its box
     uint next[LANES], end[LANES], corner[LANES];
     for (uint j = 0; j < count; j++) {
         next[j] = offset;
         offset = end[j] = offset + point_count[first + j];
-        corner[j] = f.box[1][j] * cam->width + f.box[0][j];
+        corner[j] = f.box[1][j] * width + f.box[0][j];
     }
     int row = 0, column = 0;
     while (row < f.rows) {
@@ -89,7 +90,7 @@ ALWAYS_INLINE void fill(
             found |= select((uints)(0), (uints)(1u << k), c.covers);
             LANES_INTO(falloff[k], c.falloff);
             LANES_INTO(depth[k], c.depth);
-            beside[k] = row * cam->width + column;
+            beside[k] = row * width + column;
             if (++column == f.columns) {
                 column = 0;
                 row++;
@@ -101,7 +102,7 @@ ALWAYS_INLINE void fill(
                 const uint k = 31 - clz(left & -left), pair = next[j]++;
                 const uint pixel = corner[j] + beside[k];
                 pair_pixel[pair] = pixel;
-                pair_point_falloff[pair] = (uint2)(first + j, as_uint(falloff[k][j]));
+                STORE_FRAGMENT(first + j, falloff[k][j], pair, pair_point_falloff);
                 point_key[pair] = upsample(as_uint(depth[k][j]), BESIDE_DEPTH(pixel, pair));
             }
     }
@@ -109,7 +110,7 @@ ALWAYS_INLINE void fill(
         for (uint pair = next[j]; pair < end[j]; pair++) {
             const float depth = point_camera[first + j].w;
             pair_pixel[pair] = corner[j];
-            pair_point_falloff[pair] = (uint2)(first + j, as_uint(0.0f));
+            STORE_FRAGMENT(first + j, 0.0f, pair, pair_point_falloff);
             point_key[pair] = upsample(as_uint(depth), BESIDE_DEPTH(corner[j], pair));
         }
 }
@@ -128,7 +129,7 @@ kernel void pairs_fill(
     global const uint *block_sum,       // ((N+BLOCK-1)/BLOCK) of them
     global uint *point_offset,          // (N+1) first pair of each point
     global uint *pair_pixel,            // (P)
-    global uint2 *pair_point_falloff,   // (P, 2) point, bits of d in [0, 1]
+    global uint *pair_point_falloff,    // (P, ?) point, with one sample bits of d in [0, 1]
     global ulong *point_key,            // (P) depth << 32 | pair, on GPUs place, by point
     global float *times_seen,           // (N) accumulates
     global volatile uint *pixel_count)  // (?) (HW) accumulates on GPUs, else untouched

@@ -44,10 +44,10 @@ ALWAYS_INLINE bool project(
     f->z = select((floats)(0.0f), f->z, drawn);
     f->t = select((floats)(-1.0f), f->t, drawn);
     // no pixel: last before first
-    LANES_INTO(f->box[0], select((ints)(1), x0, in_image));
-    LANES_INTO(f->box[1], select((ints)(1), y0, in_image));
-    LANES_INTO(f->box[2], select((ints)(0), x1, in_image));
-    LANES_INTO(f->box[3], select((ints)(0), y1, in_image));
+    LANES_INTO(f->box[0], select((ints)(1), x0 / SIDE, in_image));
+    LANES_INTO(f->box[1], select((ints)(1), y0 / SIDE, in_image));
+    LANES_INTO(f->box[2], select((ints)(0), x1 / SIDE, in_image));
+    LANES_INTO(f->box[3], select((ints)(0), y1 / SIDE, in_image));
     footprints_measure(f);
     return true;
 }

@@ -19,12 +19,15 @@ def project_spheres(
     positions: Array,
     *,
     point_radius: Array,
+    side: int = 1,
 ) -> ProjectedPoints:
-    """Project points anywhere. positions: (N, 3) float32, world. point_radius: (N,)."""
+    """Project points anywhere. positions: (N, 3) float32, world. point_radius: (N,). side: of
+    project_grid().
+    """
     n = len(positions)
     b.require(projection_table(n, footprint))
     arrays = {"camera": camera_buffer, "positions": positions, "point_radius": point_radius}
-    launch_projection(dev, b, "project_spheres", n, footprint, **arrays)
+    launch_projection(dev, b, "project_spheres", n, footprint, side, **arrays)
     return ProjectedPoints(
         footprint,
         camera_buffer,
@@ -34,6 +37,7 @@ def project_spheres(
         b.block_sum,
         b.point_shape,
         b.point_opacity,
+        side=side,
     )
 
 

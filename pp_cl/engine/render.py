@@ -6,7 +6,6 @@ project -> pairs -> blend weights -> shade the visible points -> blend their fea
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,7 +19,7 @@ from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import Prepared
 from pp_cl.engine.layers.conv import GradientParts
-from pp_cl.engine.layers.tiles import grid_shape, tiles_covered
+from pp_cl.engine.layers.tiles import tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
     BlendGradients,
@@ -57,6 +56,13 @@ def point_radius(
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
 
 
+def is_supersampled(settings: RasterConfig) -> bool:
+    """Whether points can have several samples of a pixel: discs composited by alpha, of which one
+    list is right for all samples.
+    """
+    return settings.blend == "alpha" and settings.footprint in ("soft", "disc")
+
+
 def view_table(
     settings: RasterConfig,
     n: int,
@@ -68,21 +74,19 @@ def view_table(
     training: bool = False,
     supersampling: int = 1,
 ) -> Table:
-    """The buffers of Renderer for a view of n points with so many drawn pixels, fragments and
-    visible points. until, training: of forward(); with record_weights() if it ends at the weights,
-    with backward() in a training. supersampling: of RenderResult.
+    """The buffers of Renderer for a view of n points with so many pixels, fragments and visible
+    points. until, training: of forward(); with record_weights() if it ends at the weights, with
+    backward() in a training. supersampling: of RenderResult.
     """
-    table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs)
-    table |= weights_table(n, pixels, pairs if training else 1)
-    of_image = pixels // supersampling**2
-    table["features"] = (of_image, 16), np.float32
+    table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs, supersampling)
+    table |= weights_table(n, pixels, pairs if training else 0, supersampling)
+    table["features"] = (pixels, 16), np.float32
     if until == "weights":
         return table | {"pair_gradient": ((pairs, 2), np.float32)}
     table["visible_features"] = (visible, 16), np.float32
     if training:
-        table |= blend_backward_table(visible, pixels, pairs, settings.blend, settings.footprint)
-    if supersampling > 1:
-        table["mean_transmittance"] = (of_image,), np.float32
+        kind = settings.blend, settings.footprint
+        table |= blend_backward_table(visible, pixels, pairs, *kind, supersampling)
     return table
 
 
@@ -92,14 +96,12 @@ class RenderResult:
     the next view.
 
     camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
-    offset: (left, top) of the view in it. supersampling: pixels that points are drawn in for one of
-    the image, each way; pairs and weights are of these. points: the N points as the camera of the
-    drawn pixels sees them. tile_mask: (rows, columns) bool, the 4x4 tiles of drawn pixels that have
-    fragments; None where the network computes all. visible_features: float32, one row of 16 for
-    each point of weights.visible, then room for more. features: (H, W, 16) float32, blended from
-    them; transmittance: (H * W,) float32, means of that of weights, None as there. image: (H, W, 3)
-    float32, unclamped. computed_fraction: share of the network's multiplications that was done; the
-    others would have seen only background.
+    offset: (left, top) of the view in it. points: the N points as the camera sees them.
+    tile_mask: (rows, columns) bool, the 4x4 tiles of pixels that have fragments; None where the
+    network computes all. supersampling: samples of a pixel, each way. visible_features: float32,
+    one row of 16 for each point of weights.visible, then room for more. features: (H, W, 16)
+    float32, blended from them. image: (H, W, 3) float32, unclamped. computed_fraction: share of the
+    network's multiplications that was done; the others would have seen only background.
     """
 
     dev: Device
@@ -113,21 +115,18 @@ class RenderResult:
     supersampling: int = 1
     visible_features: Array = field(init=False)
     features: Array = field(init=False)
-    transmittance: Array | None = None
     image: Array = field(init=False)
     computed_fraction: float = 1.0
 
     @property
-    def drawn_size(self) -> tuple[int, int]:
-        """(height, width) of the pixels that points are drawn in."""
-        height, width = self.size
-        return self.supersampling * height, self.supersampling * width
+    def transmittance(self) -> Array | None:
+        """(H * W,) float32 of weights."""
+        return self.weights.transmittance
 
     def fragments(self) -> np.ndarray:
         """(height, width) int64: the fragments of each pixel, without the padding."""
         counts = np.diff(self.pairs.pixel_offset.get().astype(np.int64))
-        (height, width), k = self.size, self.supersampling
-        return self.cropped(counts.reshape(height, k, width, k).sum((1, 3)))
+        return self.cropped(counts.reshape(self.size))
 
     def clamped(self) -> np.ndarray:
         """(height, width, 3) float32 image without the padding, clamped to [0, 1]."""
@@ -192,10 +191,10 @@ class Renderer:
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         padded, left, top = camera.padded(net.multiple)
-        size, k = (padded.height, padded.width), 1
-        if until == "image" and self.settings.blend == "alpha":
-            k = self.supersampling
-        if k * max(size) > MOST_SIDE:
+        size, side = (padded.height, padded.width), 1
+        if until == "image" and is_supersampled(self.settings):
+            side = self.supersampling
+        if max(size) > MOST_SIDE:
             raise UserError(
                 f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
                 " are rendered; render parts of it"
@@ -205,10 +204,8 @@ class Renderer:
             self._by_pair = by_pair
             self.release()
         b = self._buffers
-        drawn = padded.enlarged(k)
-        drawn_size = drawn.height, drawn.width
         b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
-        dev.send(b.camera_buffer, self.model.packed(drawn, depth_range))
+        dev.send(b.camera_buffer, self.model.packed(padded.enlarged(side), depth_range))
         with dev.stage("project"):
             points = self._launches["project"].run(
                 partial(project_grid, dev, b, self.settings.footprint),
@@ -218,13 +215,14 @@ class Renderer:
                 cloud_offset=cloud.offset,
                 opacity=cloud.opacity,
                 radius=self.point_radius,
+                side=side,
             )
         is_planned = net.is_planned(size)
         pairs, weights, tile_mask = self._pairs_and_weights(
-            points, drawn_size, gamma, early_stop, training, times_seen, is_planned
+            points, size, gamma, early_stop, training, times_seen, is_planned
         )
         view = camera, (left, top), size
-        result = RenderResult(dev, *view, points, pairs, weights, tile_mask, k)
+        result = RenderResult(dev, *view, points, pairs, weights, tile_mask, side)
         if until == "weights":
             return result
         with dev.stage("shade"):
@@ -237,22 +235,15 @@ class Renderer:
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
         with dev.stage("blend"):
-            blend, rest = partial(blend_forward, dev), None
-            if k > 1:
-                b.require({"mean_transmittance": ((math.prod(size),), np.float32)})
-                rest = b.mean_transmittance
             blended = pairs, weights, b.visible_features, b.features
-            self._launches["blend"].run(blend, *blended, rest)
+            self._launches["blend"].run(partial(blend_forward, dev), *blended)
         result.visible_features, result.features = b.visible_features, b.features
-        result.transmittance = weights.transmittance if rest is None else rest
         if until == "features":
             return result
         with dev.stage("network"):
             plan: Any = None
             if is_planned:
-                (rows, columns), covered = grid_shape(*size), tile_mask.get()
-                covered = covered.reshape(rows, k, columns, k).any((1, 3))
-                plan = net.plan_tiles(size, covered, gradient_tiles())
+                plan = net.plan_tiles(size, tile_mask.get(), gradient_tiles())
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
         return result
@@ -280,6 +271,7 @@ class Renderer:
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
                     derivatives=training,
+                    points=points,
                 )
                 weights.read_visible(self.dev)
             tile_mask = None
@@ -313,8 +305,8 @@ class Renderer:
         max_weight: Array | None = None,
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
-        alpha compositing also from dL/dalpha (H * W,), and of the distortion loss of each drawn
-        pixel with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless
+        alpha compositing also from dL/dalpha (H * W,), and of the distortion loss of each sample
+        with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless
         soft points are composited by alpha, there are none of offsets. max_weight: of
         blend_backward().
 

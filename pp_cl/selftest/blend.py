@@ -281,6 +281,46 @@ def _distortion(dev, rng):
         yield relative(blended.scene.backward.distortion.get(), runs, GRADIENT)
 
 
+def _samples(dev, rng):
+    """Of 2 x 2 samples: what the mean of as many pixels has; points cover all, some and none."""
+    shapes = (257, None, 0.0), (257, None, 0.3), (33, 1e-3, 0.0), (31, 0.4, 0.05), (1, 0.4, 0.0)
+    for kind, (n, radius, stop) in product(("soft", "disc"), shapes):
+        of_samples = {"rule": "alpha", "early_stop": stop}
+        fine = Blended(dev, rng, n, kind=kind, radius=radius, **of_samples)
+        view = dev, fine.camera, fine.positions, fine.radius
+        scene = PairedPoints(*view, kind=kind, side=2)
+        image = scene.blend(fine.opacity, 0.1, fine.point_features, **of_samples)
+        expected = dense.features(fine.blend, fine.point_features)
+        yield relative(image, _means(expected, scene.shape), WEIGHT["alpha"])
+        rest = _means(fine.blend["background"][:, None], scene.shape)
+        found = scene.weights.transmittance.get().reshape(rest.shape)
+        yield absolute(found, rest, WEIGHT["alpha"])
+        needed = fine.scene.weights.visible.get()
+        yield exact(np.isin(needed, scene.weights.visible.get()), np.ones(len(needed), bool))
+        grad = rng.normal(size=(*scene.shape, 16))
+        fine.grad[:] = (grad / 4).repeat(2, 0).repeat(2, 1).reshape(-1, 16)
+        gradients = scene.gradients(grad, distortion_weight=3.0)
+        features, opacity = fine.reference_gradients(distortion_weight=3.0)
+        yield relative(gradients["features"], features, GRADIENT)
+        yield relative(gradients["opacity"], opacity, GRADIENT)
+        distortion = dense.distortion(fine.geometry, fine.blend).sum()
+        found = scene.backward.distortion.get().sum()
+        yield each(found, distortion, GRADIENT, floor=1e-3)  # of one fragment a pixel: roundings
+        if kind == "soft":  # as those of one sample are, which _offsets() has
+            expected = fine.scene.gradients(fine.grad, voxel_size=0.3)["offset"]
+            yield relative(scene.gradients(grad, voxel_size=0.3)["offset"], expected, GRADIENT)
+        alpha = rng.normal(size=scene.shape)
+        of_each = (alpha / 4).repeat(2, 0).repeat(2, 1).ravel()
+        expected = fine.scene.gradients(0 * fine.grad, of_each)["opacity"]
+        yield relative(scene.gradients(0 * grad, alpha.ravel())["opacity"], expected, GRADIENT)
+
+
+def _means(samples, shape):
+    """(H, W, C) of (4 H W, C) samples, two by two."""
+    height, width = shape
+    return samples.reshape(height, 2, width, 2, -1).mean((1, 3))
+
+
 def _of_both(what, function):
     """A case of each blend."""
     return [Case(f"{rule}: {what}", partial(function, rule)) for rule in BLENDS]
@@ -303,5 +343,6 @@ CASES = (
     Case("alpha: gradient of alpha", _gradient_of_alpha),
     Case("alpha: distortion loss", _distortion),
     Case("alpha: offsets of points", _offsets),
+    Case("alpha: samples of a pixel", _samples),
     Case("alpha: shapes of Gaussians", _gaussians),
 )

@@ -46,7 +46,9 @@ def some_opacities(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 class PairedPoints:
-    """Points (N, 3) of radius, one or (N,), projected and paired with the pixels of a camera."""
+    """Points (N, 3) of radius, one or (N,), projected and paired with the pixels of a camera, or
+    with pixels of side x side of these as samples.
+    """
 
     backward: BlendGradients  # of the last gradients()
 
@@ -59,6 +61,7 @@ class PairedPoints:
         *,
         kind: str = "soft",
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
+        side: int = 1,
     ):
         exact = partial(dense.geometry, camera, positions, radius, kind, depth_range=depth_range)
         buffers, n = Buffers(dev), len(positions)
@@ -69,13 +72,15 @@ class PairedPoints:
             dev.upload(camera.packed(depth_range)),
             dev.upload(positions, np.float32),
             point_radius=dev.upload(np.broadcast_to(radius, n), np.float32),
+            side=side,
         )
         self._pair(dev, camera, n, exact, depth_range, buffers, projected)
 
     def _pair(self, dev, camera, n, exact, depth_range, buffers, projected):
         self.dev, self.camera, self.n, self.buffers = dev, camera, n, buffers
         self._exact, self.depth_range = exact, depth_range
-        self.shape, self.projected = (camera.height, camera.width), projected
+        self.shape = camera.height // projected.side, camera.width // projected.side
+        self.projected = projected
         self.times_seen = dev.zeros((n,))
         self.pairs = find_all_pairs(dev, buffers, projected, self.shape, times_seen=self.times_seen)
 
@@ -128,7 +133,7 @@ class PairedPoints:
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
         view = self.buffers, self.pairs, self.projected.camera_buffer
         self.weights = blend_weights(
-            self.dev, *view, self.opacity, blend=rule, gamma=gamma, **drops
+            self.dev, *view, self.opacity, blend=rule, gamma=gamma, points=self.projected, **drops
         )
         self.weights.read_visible(self.dev)
         visible = self.weights.visible.get()

@@ -20,7 +20,7 @@ from pp_cl.engine.model import REFINING_BYTES
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud, sh_blocks
 from pp_cl.engine.raster.project import footprint_pixels
-from pp_cl.engine.render import point_radius, view_table
+from pp_cl.engine.render import is_supersampled, point_radius, view_table
 from pp_cl.engine.training.crops import crop_side
 from pp_cl.engine.training.loss import loss_table
 from pp_cl.engine.training.optim import network_state_table
@@ -201,15 +201,14 @@ class MemoryPlan:
         raster, train, n = self._raster, self._train, stretch.points
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
-        k = stretch.supersampling if raster.blend == "alpha" else 1
-        drawn = k**2 * math.prod(image)
-        pairs = grown(0, round(n * min(footprint_pixels(k * radius), drawn)))
+        side, pixels = stretch.supersampling if is_supersampled(raster) else 1, math.prod(image)
+        pairs = grown(0, round(n * min(footprint_pixels(radius, side), pixels)))
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
-        share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(image))
-        of_crop = k**2 * math.prod(crop), round(share * pairs), round(share * visible)
-        of_step = view_table(raster, n, *of_crop, training=True, supersampling=k)
-        of_preview = view_table(raster, n, drawn, pairs, visible, supersampling=k)
-        of_pruning = view_table(raster, n, math.prod(image), pairs, 0, until="weights")
+        share = min(1.0, CROP_SHARE * math.prod(crop) / pixels)
+        of_crop = math.prod(crop), round(share * pairs), round(share * visible)
+        of_step = view_table(raster, n, *of_crop, training=True, supersampling=side)
+        of_preview = view_table(raster, n, pixels, pairs, visible, supersampling=side)
+        of_pruning = view_table(raster, n, pixels, pairs, 0, until="weights")
 
         held = [
             PointCloud.table(n, sh_blocks(self._points.sh_degree)),

@@ -62,7 +62,9 @@ SETTINGS = {
 
 @pytest.mark.parametrize("blend", BLENDS)
 @pytest.mark.parametrize("early_stop", [0.0, 0.001])
-@pytest.mark.parametrize("name, side", [*((name, 1) for name in SETTINGS), ("soft", 2)])
+@pytest.mark.parametrize(
+    "name, side", [*((name, 1) for name in SETTINGS), ("soft", 2), ("disc", 2)]
+)
 def test_image_and_gradients(dev, rng, name, side, early_stop, blend):
     settings = RasterConfig(blend=blend, early_stop=early_stop, **SETTINGS[name])
     model, camera = make_model(dev, rng), ring_cameras(1, 30)[0].crop(3, 4, 22, 17)
@@ -87,23 +89,17 @@ def test_image_and_gradients(dev, rng, name, side, early_stop, blend):
         assert relative_error(value, want_net[key]) < 5e-5, key
 
 
-def test_alpha_is_the_mean_of_drawn_pixels(dev, rng):
+def test_all_samples_of_a_pixel_share_its_fragments(dev, rng):
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
-    renderer = Renderer(dev, model, RasterConfig(radius=0.85), supersampling=2)
-    result = renderer.forward(camera, GAMMA, training=True)
-    drawn = result.weights.transmittance.get().reshape(32, 2, 32, 2)
-    np.testing.assert_allclose(result.transmittance.get(), drawn.mean((1, 3)).ravel(), atol=1e-6)
-    assert result.fragments().sum() == result.pairs.total
-
-    grad = rng.normal(size=(32, 32)).astype(np.float32)
-    zeros = dev.zeros((32, 32, 16))
-    found = renderer.backward_features(result, zeros, grad_alpha=dev.upload(grad.ravel()))
-    found = found.opacity.get()[: result.weights.visible.size]
-    given = dev.upload((grad / 4).repeat(2, 0).repeat(2, 1).ravel())
-    drawn = dev.zeros((64, 64, 16))  # as if these were the image's
-    expected = renderer.backward_features(result, drawn, grad_alpha=given).opacity.get()
-    assert np.abs(found).max() > 0
-    np.testing.assert_array_equal(found, expected[: len(found)])
+    found = {}
+    for side in (1, 2):
+        renderer = Renderer(dev, model, RasterConfig(radius=0.85), supersampling=side)
+        result = renderer.forward(camera, GAMMA, training=True)
+        found[side] = result.fragments()
+        assert found[side].sum() == result.pairs.total
+    assert (found[2] >= found[1]).all() and found[2].sum() < 2.2 * found[1].sum()
+    rest = result.weights.sample_transmittance.get().mean(1)
+    np.testing.assert_allclose(result.transmittance.get(), rest, atol=1e-6)
 
 
 def test_padding_does_not_move_the_image(dev, rng):

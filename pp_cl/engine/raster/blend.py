@@ -4,7 +4,6 @@ weights of the fragments; and the gradients of the blend, gathered by visible po
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ from pp_cl.engine.device.launch import group_items, lanes, launch_groups, row_pa
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.points import four_blocks, offset_width, stored_degree
 from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
-from pp_cl.engine.raster.weights import BlendWeights, clear_pairs
+from pp_cl.engine.raster.weights import BlendWeights, clear_pairs, sample_macros
 
 ON_GPU = 4  # lanes there: each work-item reads vectors
 SPAN = 64  # pixels whose distortion loss is one sum
@@ -60,43 +59,28 @@ def blend_forward(
     weights: BlendWeights,
     visible_features: Array,
     features: Array,
-    mean_transmittance: Array | None = None,
 ) -> None:
-    """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32: means of
-    the drawn pixels in each of the image. mean_transmittance: (HW,) float32, written if there are
-    several.
-    """
-    (height, width, _), rest = features.shape, weights.transmittance
-    drawn = _drawn_side(pairs, features)
-    dev.program("raster/blend", **_defines(dev, DRAWN=drawn)).launch(
+    """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32."""
+    dev.program("raster/blend", **_defines(dev)).launch(
         "blend_forward",
-        height * width * row_parts(dev, ON_GPU),
-        hw=height * width,
-        width=drawn * width,
+        pairs.pixels * row_parts(dev, ON_GPU),
+        hw=pairs.pixels,
         pixel_offset=pairs.pixel_offset,
         pixel_weight_point=weights.pixel_weight_point,
-        transmittance=features if rest is None else rest,
         point_slot=weights.point_slot,
         visible_features=visible_features,
         features=features,
-        mean_transmittance=features if mean_transmittance is None else mean_transmittance,
     )
 
 
-def _drawn_side(pairs, features):
-    """How many pixels are drawn for one of the features (H, W, 16), each way."""
-    height, width, _ = features.shape
-    return math.isqrt(pairs.pixels // (height * width))
-
-
 def blend_backward_table(
-    visible: int, pixels: int, pairs: int, blend: str, footprint: str = "soft"
+    visible: int, pixels: int, pairs: int, blend: str, footprint: str = "soft", side: int = 1
 ) -> Table:
-    """The buffers of the backward pass for a number of pixels, and capacities for numbers of
-    visible points and of pairs. blend: one of BLENDS.
+    """The buffers of the backward pass for a number of pixels of side x side samples, and
+    capacities for numbers of visible points and of pairs. blend: one of BLENDS.
     """
     return {
-        "pair_gradient": ((pairs, 2), np.float32),
+        "pair_gradient": ((pairs, 1 + side**2), np.float32),
         "distortion": ((-(-pixels // SPAN) if blend == "alpha" else 1,), np.float32),
         "pixel_blend": ((pixels if blend == "softmax" else 1,), np.float32),
         "grad_visible_features": ((visible, 16), np.float32),
@@ -113,8 +97,8 @@ class BlendGradients:
     visible_features: (S, 16). opacity: (S,). offset: (S, 4) of soft points composited by alpha, (S,
     16) of Gaussians, through the falloff of their fragments; None if not asked for.
     distortion: (ceil(HW/SPAN),) of so many pixels each, undefined without its weight.
-    pair_gradient: (P, 2), by pair of a visible point the blend weight b and what the fragment adds
-    to dL/dopacity, both 0 where it is dropped or not tracked.
+    pair_gradient: (P, 1 + samples), by pair of a visible point the blend weight b and what each
+    sample of the fragment adds to dL/dopacity, 0 where it is dropped or not tracked.
     """
 
     visible_features: Array
@@ -144,7 +128,7 @@ def blend_backward(
 
     opacity: (N,). visible_features, features: of blend_forward(). grad_features: dL/dfeatures (H,
     W, 16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times
-    sum_ij b_i b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths
+    sum_ij b_i b_j |z_i - z_j| of every sample to the loss, with b and z the weights and depths
     (world units) of its fragments; no gradient of the depths is formed. voxel_size: of the grid
     that offsets are counted in, world units; 0: no gradients of offsets. max_weight: (N,)
     float32, becomes for each point the highest sum over an image's pixels of its blend weights so
@@ -161,7 +145,7 @@ def blend_backward(
         )
     count = weights.total.get()
     rows = len(visible_features), pairs.pixels, pairs.capacity
-    b.require(blend_backward_table(*rows, weights.blend, points.footprint))
+    b.require(blend_backward_table(*rows, weights.blend, points.footprint, pairs.side))
     clear_pairs(dev, pairs, weights, b.pair_gradient)
     of_fragments: dict[str, Any] = {
         "hw": pairs.pixels,
@@ -169,27 +153,31 @@ def blend_backward(
         "pixel_offset": pairs.pixel_offset,
         "pair_key": pairs.pair_key,
         "pixel_weight_point": weights.pixel_weight_point,
-        "pixel_derivative": weights.pixel_derivative,
         "grad_features": grad_features,
         "pair_gradient": b.pair_gradient,
     }
-    drawn = _drawn_side(pairs, grad_features)
-    width = drawn * grad_features.shape[1]
-    options = {"DL_DB": int(not is_alpha), "MOVES": int(moves), "DRAWN": drawn}
-    defines = _defines(dev, **options, **footprint_macros(points.footprint))
-    program = dev.program("raster/blend", **defines)
+    options = {"DL_DB": int(not is_alpha), "MOVES": int(moves and pairs.side == 1)}
+    defines = _defines(dev, **options, **footprint_macros(points.footprint, pairs.side))
+    program, file, kernel = dev.program("raster/blend", **defines), "raster/blend", "alpha_gradient"
+    if pairs.side > 1:
+        file, kernel, defines = "raster/samples", "sampled_gradient", sample_macros(dev, pairs)
+        of_fragments["sample_derivative"] = weights.pixel_derivative
+        of_fragments["sample_transmittance"] = weights.sample_transmittance
+        of_fragments["opacity"] = opacity
+    else:
+        of_fragments["pixel_derivative"] = weights.pixel_derivative
     if is_alpha:
+        if pairs.side == 1:
+            of_fragments["transmittance"] = weights.transmittance
         launch_groups(
             dev,
-            "raster/blend",
-            "alpha_gradient",
+            file,
+            kernel,
             -(-pairs.pixels // SPAN),
             most=SPAN,
-            defines=defines,
-            width=width,
+            defines=defines | {"SPAN": SPAN},
             has_grad_alpha=int(grad_alpha is not None),
             distortion_weight=distortion_weight,
-            transmittance=weights.transmittance,
             point_slot=weights.point_slot,
             visible_features=visible_features,
             grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
@@ -208,7 +196,6 @@ def blend_backward(
         "blend_backward",
         count * row_parts(dev, ON_GPU),
         s=count,
-        width=width,
         voxel_size=voxel_size,
         radius=points.radius,
         is_recorded=max_weight is not None,
@@ -230,6 +217,22 @@ def blend_backward(
         grad_offset=b.grad_offset,
         max_weight=opacity if max_weight is None else max_weight,
     )
+    if moves and pairs.side > 1:
+        dev.program("raster/sampled_offsets", **sample_macros(dev, pairs)).launch(
+            "sampled_offsets",
+            count,
+            s=count,
+            voxel_size=voxel_size,
+            visible=weights.visible_rows,
+            camera=points.camera_buffer,
+            point_camera=points.point_camera,
+            point_shape=points.point_shape,
+            opacity=opacity,
+            point_offset=pairs.point_offset,
+            pair_pixel=pairs.pair_pixel,
+            pair_gradient=b.pair_gradient,
+            grad_offset=b.grad_offset,
+        )
     return BlendGradients(
         b.grad_visible_features,
         b.grad_opacity,
@@ -241,4 +244,4 @@ def blend_backward(
 
 def _defines(dev, **defines):
     group = min(SPAN, group_items(dev))
-    return {"LANES": lanes(dev, ON_GPU), "SPAN": SPAN, "GROUP": group, "DRAWN": 1} | defines
+    return {"LANES": lanes(dev, ON_GPU), "SPAN": SPAN, "GROUP": group} | defines

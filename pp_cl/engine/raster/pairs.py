@@ -31,12 +31,13 @@ class Pairs:
     The arrays have a capacity of P pairs. If the view has more, pixel_offset is all zeros and the
     other arrays must not be read: find the pairs again with more capacity (capacity_needed()).
 
-    footprint: of the points, one of FOOTPRINTS. count: how many pairs there are, of read_count().
-    point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
-    pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
-    pair_pixel: (P,) uint32, y*W + x. pair_point_falloff: (P, 2) uint32, the point, and the bits
-    of the falloff d of Eq. (1). pair_key: (P,) uint64, depth bits << 32 | pair, sorted within
-    each pixel by depth, then by point.
+    footprint: of the points, one of FOOTPRINTS. side: samples of a pixel, each way. count: how many
+    pairs there are, of read_count(). point_offset: (N+1,) uint32, point i owns pairs
+    point_offset[i] to point_offset[i+1]. pixel_offset: (HW+1,) uint32, pixel q owns keys
+    pixel_offset[q] to pixel_offset[q+1]. pair_pixel: (P,) uint32, y*W + x. pair_point_falloff: (P,
+    2) uint32, the point, and the bits of the falloff d of Eq. (1); with several samples of a pixel
+    (P, 1), the point. pair_key: (P,) uint64, depth bits << 32 | pair, sorted within each pixel by
+    depth, then by point.
     """
 
     footprint: str
@@ -45,6 +46,7 @@ class Pairs:
     pair_pixel: Array
     pair_point_falloff: Array
     pair_key: Array
+    side: int = 1
     count: Any = None
 
     def read_count(self, dev: Device) -> None:
@@ -72,13 +74,13 @@ class Pairs:
         return self.pixel_offset.size - 1
 
 
-def pairs_table(n: int, pixels: int, pairs: int) -> Table:
-    """The buffers for n points, a number of pixels and a capacity in pairs."""
+def pairs_table(n: int, pixels: int, pairs: int, side: int = 1) -> Table:
+    """The buffers for n points, a number of pixels and a capacity in pairs. side: as Pairs."""
     return {
         "point_offset": ((n + 1,), np.uint32),
         "pixel_offset": ((pixels + 1,), np.uint32),
         "pair_pixel": ((pairs,), np.uint32),
-        "pair_point_falloff": ((pairs, 2), np.uint32),
+        "pair_point_falloff": ((pairs, 2 if side == 1 else 1), np.uint32),
         "pair_key": ((pairs,), np.uint64),
         # for sorting the keys, then the entries of weights.py
         "pair_scratch": ((pairs,), np.uint64),
@@ -98,8 +100,8 @@ def find_pairs(
 
     times_seen: (N,) float32, counts for each point the images in which it has a fragment.
     """
-    n, pixels = len(points.point_box), size[0] * size[1]
-    b.require(pairs_table(n, pixels, capacity))
+    n, pixels, side = len(points.point_box), size[0] * size[1], points.side
+    b.require(pairs_table(n, pixels, capacity, side))
     if not dev.is_cpu:
         b.require({"pixel_count": ((pixels,), np.uint32)})
         dev.fill(b.pixel_count, 0)
@@ -108,7 +110,7 @@ def find_pairs(
         "raster/pairs",
         "pairs_fill",
         blocks_of(n),
-        defines={"LANES": lanes(dev), "BLOCK": BLOCK, **footprint_macros(points.footprint)},
+        defines={"LANES": lanes(dev), "BLOCK": BLOCK, **footprint_macros(points.footprint, side)},
         n=n,
         p=capacity,
         is_counted=times_seen is not None,
@@ -136,6 +138,7 @@ def find_pairs(
         b.pair_pixel,
         b.pair_point_falloff,
         b.pair_key,
+        side,
     )
 
 

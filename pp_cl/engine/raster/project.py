@@ -34,7 +34,8 @@ class ProjectedPoints:
     point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels that may be covered;
     last < first means none. point_shape: (N, 1) float32, the radius in world units; of Gaussians
     (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h). point_opacity: (N,) float32
-    in [0, 1], from the eye; of spheres undefined. cloud_offset, radius: of project_grid().
+    in [0, 1], from the eye; of spheres undefined. cloud_offset, radius: of project_grid(). side:
+    samples of a pixel, each way; boxes and counts are of pixels, the camera is of the samples.
     """
 
     footprint: str
@@ -47,11 +48,15 @@ class ProjectedPoints:
     point_opacity: Array
     cloud_offset: Array | None = None
     radius: float = 0.0
+    side: int = 1
 
 
-def footprint_pixels(radius: float) -> float:
-    """How many pixels a point covers, about. radius: of its footprint, pixels."""
-    return math.pi * max(LEAST_RADIUS, radius) ** 2
+def footprint_pixels(radius: float, side: int = 1) -> float:
+    """How many pixels a point covers, about, of side x side samples each: the area of a disc and of
+    what is as near to it as samples are to their pixel's centre. radius: of its footprint, pixels.
+    """
+    radius, apart = max(LEAST_RADIUS / side, radius), 1 - 1 / side
+    return math.pi * radius**2 + 4 * radius * apart + apart**2
 
 
 def projection_table(n: int, footprint: str = "soft") -> Table:
@@ -66,9 +71,13 @@ def projection_table(n: int, footprint: str = "soft") -> Table:
     }
 
 
-def footprint_macros(footprint: str) -> dict[str, int]:
-    """The defines of a program that includes cl/raster/footprint.h, for one of FOOTPRINTS."""
+def footprint_macros(footprint: str, side: int = 1) -> dict[str, int]:
+    """The defines of a program that includes cl/raster/footprint.h, for one of FOOTPRINTS and side
+    x side samples of a pixel.
+    """
     return {
+        "SIDE": side,
+        "SAMPLES": side**2,
         "FOOTPRINT": FOOTPRINTS.index(footprint),
         "OFFSETS": offset_width(footprint),
         "SHAPE": 4 if footprint == "gaussian" else 1,
@@ -76,7 +85,7 @@ def footprint_macros(footprint: str) -> dict[str, int]:
 
 
 def launch_projection(
-    dev: Device, b: Buffers, kernel: str, n: int, footprint: str, **arguments: Any
+    dev: Device, b: Buffers, kernel: str, n: int, footprint: str, side: int = 1, **arguments: Any
 ) -> None:
     """Launch a kernel that projects n points of one of FOOTPRINTS into the buffers b of
     projection_table().
@@ -90,7 +99,7 @@ def launch_projection(
             "LANES": lanes(dev),
             "BLOCK": BLOCK,
             "MOST_OFFSET": f"{MOST_OFFSET}f",
-            **footprint_macros(footprint),
+            **footprint_macros(footprint, side),
         },
         n=n,
         point_camera=b.point_camera,
@@ -113,8 +122,10 @@ def project_grid(
     cloud_offset: Array,
     opacity: Array,
     radius: float,
+    side: int = 1,
 ) -> ProjectedPoints:
-    """Project the points, each in the cell of a grid's vertex, into a camera.
+    """Project the points, each in the cell of a grid's vertex, into a camera, whose pixels are the
+    samples if there are side x side of them in a pixel.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
     PointCloud.offset; of Gaussians (N, 16). opacity: (N, 9) float32, PointCloud.opacity. radius: of
@@ -128,6 +139,7 @@ def project_grid(
         "project_grid",
         n,
         footprint,
+        side,
         camera=camera_buffer,
         grid=grid_buffer,
         point_id=point_id,
@@ -147,4 +159,5 @@ def project_grid(
         b.point_opacity,
         cloud_offset,
         radius,
+        side,
     )

@@ -15,7 +15,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.device.scan import nonzero, read_total
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import footprint_macros
+from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 
 BLENDS = ("softmax", "alpha")
 NO_POINT = 0xFFFFFFFF  # in pixel_weight_point, behind which fragments were dropped
@@ -30,11 +30,12 @@ class BlendWeights:
     pixel_weight_point: (P,) uint64, weight bits << 32 | point, each pixel's fragments by depth;
     where fragments are dropped, a number without a point ends the pixel's list. pixel_derivative:
     (P,) float32 alike, the factor s of the backward pass, dL/dopacity = s * dL/db
-    (cl/raster/blend.cl); None without derivatives. point_is_visible: (N,) uint8, 1 for visible
-    points. point_slot: (N,) uint32, where a visible point stands in `visible`, undefined for
-    others. transmittance: (HW,) float32 behind all fragments, None with the softmax. visible_rows:
-    (N,) uint32, `visible` at its front; found: (1,) uint32, how many; total: the same, of
-    read_visible().
+    (cl/raster/blend.cl), with several samples of a pixel (P, samples); None without derivatives.
+    point_is_visible: (N,) uint8, 1 for visible points. point_slot: (N,) uint32, where a visible
+    point stands in `visible`, undefined for others. transmittance: (HW,) float32 behind all
+    fragments, None with the softmax; sample_transmittance: (HW, samples) of each sample, where
+    there are several. visible_rows: (N,) uint32, `visible` at its front; found: (1,) uint32, how
+    many; total: the same, of read_visible().
     """
 
     blend: str
@@ -46,6 +47,7 @@ class BlendWeights:
     transmittance: Array | None
     visible_rows: Array
     found: Array
+    sample_transmittance: Array | None = None
     total: Any = None
 
     def read_visible(self, dev: Device) -> None:
@@ -60,12 +62,16 @@ class BlendWeights:
         return self.visible_rows[: self.total.get()]
 
 
-def weights_table(n: int, pixels: int, derivatives: int) -> Table:
-    """The buffers for n points and a number of pixels, with a capacity for a number of derivatives;
-    pixel_weight_point lies in pairs_table()'s pair_scratch.
+def weights_table(n: int, pixels: int, derivatives: int, side: int = 1) -> Table:
+    """The buffers for n points and a number of pixels of side x side samples, with a capacity for
+    a number of derivatives, 0: none; pixel_weight_point lies in pairs_table()'s pair_scratch.
     """
-    return {
-        "pixel_derivative": ((derivatives,), np.float32),
+    rows, samples = max(derivatives, 1), side**2
+    by_sample: Table = {
+        "pixel_derivative": ((rows, samples), np.float32),
+        "sample_transmittance": ((pixels if derivatives else 1, samples), np.float32),
+    }
+    return (by_sample if side > 1 else {"pixel_derivative": ((rows,), np.float32)}) | {
         "transmittance": ((pixels,), np.float32),
         "point_is_visible": ((n,), np.uint8),
         "visible": ((n,), np.uint32),
@@ -86,6 +92,7 @@ def blend_weights(
     max_tracked: int = 0,
     early_stop: float = 0.0,
     derivatives: bool = True,
+    points: ProjectedPoints | None = None,
 ) -> BlendWeights:
     """The weights of all pairs, in the buffers b of find_pairs().
 
@@ -93,9 +100,11 @@ def blend_weights(
     max_tracked: only this many nearest fragments of a pixel get gradients (64 in the paper); 0:
     all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
     have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
-    pass reads. Which points are visible is known after read_visible().
+    pass reads. points: needed for several samples of a pixel, which alpha compositing of discs
+    has. Which points are visible is known after read_visible().
     """
-    b.require(weights_table(pairs.points, pairs.pixels, pairs.capacity if derivatives else 1))
+    side, capacity = pairs.side, pairs.capacity if derivatives else 0
+    b.require(weights_table(pairs.points, pairs.pixels, capacity, side))
     dev.fill(b.point_is_visible, 0)
     defines: dict[str, Any] = {"LANES": lanes(dev), "DERIVATIVES": int(derivatives)}
     shared: dict[str, Any] = {
@@ -103,20 +112,36 @@ def blend_weights(
         "early_stop": early_stop,
         "pixel_offset": pairs.pixel_offset,
         "pair_key": pairs.pair_key,
-        "pair_point_falloff": pairs.pair_point_falloff,
         "opacity": opacity,
         "pixel_weight_point": b.pair_scratch,
-        "pixel_derivative": b.pixel_derivative,
         "point_is_visible": b.point_is_visible,
     }
-    if blend == "alpha":
+    of_one = {
+        "pair_point_falloff": pairs.pair_point_falloff,
+        "pixel_derivative": b.pixel_derivative,
+    }
+    if points and side > 1:
+        program = dev.program("raster/samples", **sample_macros(dev, pairs, derivatives))
+        program.launch(
+            "sampled_weights",
+            pairs.pixels,
+            camera=camera_buffer,
+            point_camera=points.point_camera,
+            point_shape=points.point_shape,
+            pair_point=pairs.pair_point_falloff,
+            sample_derivative=b.pixel_derivative,
+            transmittance=b.transmittance,
+            sample_transmittance=b.sample_transmittance,
+            **shared,
+        )
+    elif blend == "alpha":
         program = dev.program("raster/alpha", **footprint_macros(pairs.footprint), **defines)
-        program.launch("alpha_weights", pairs.pixels, transmittance=b.transmittance, **shared)
+        shared |= {"transmittance": b.transmittance, **of_one}
+        program.launch("alpha_weights", pairs.pixels, **shared)
     else:
         program = dev.program("raster/softmax", DROPS=int(early_stop > 0), **defines)
-        program.launch(
-            "softmax_weights", pairs.pixels, sharpness=1 / gamma, camera=camera_buffer, **shared
-        )
+        shared |= {"sharpness": 1 / gamma, "camera": camera_buffer, **of_one}
+        program.launch("softmax_weights", pairs.pixels, **shared)
     nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
     return BlendWeights(
         blend,
@@ -128,7 +153,15 @@ def blend_weights(
         b.transmittance if blend == "alpha" else None,
         b.visible,
         b.visible_count,
+        b.sample_transmittance if side > 1 else None,
     )
+
+
+def sample_macros(dev: Device, pairs: Pairs, derivatives: bool = True) -> dict[str, Any]:
+    """The defines of cl/raster/samples.cl, whose lanes are the samples of a pixel."""
+    macros: dict[str, Any] = footprint_macros(pairs.footprint, pairs.side)
+    on_cpu = {"ON_CPU": 1} if dev.is_cpu else {}
+    return macros | on_cpu | {"LANES": pairs.side**2, "DERIVATIVES": int(derivatives)}
 
 
 def listed_fragments(
@@ -151,9 +184,9 @@ def listed_fragments(
 
 
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
-    """Set (P, 2) float32 to 0 at the pairs of visible points."""
+    """Set (P, 1 + samples) float32 to 0 at the pairs of visible points."""
     count = weights.total.get()
-    dev.program("raster/weights").launch(
+    dev.program("raster/weights", SAMPLES=pairs.side**2).launch(
         "clear_pairs",
         count,
         s=count,
