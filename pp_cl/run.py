@@ -167,11 +167,9 @@ class Run:
         def sample(dx, dy):
             result = self.renderer.forward(camera.shifted(dx, dy), self.gamma, **options)
             with self.dev.stage("depth"):
-                found = depth_forward(
-                    self.dev, result.points, result.pairs, result.weights, result.drawn_size
-                )
-            drawn = [self.dev.download(array) for array in found]
-            layers = [result.cropped(array) for array in self._averaged(result, *drawn)]
+                view = result.points, result.pairs, result.weights, result.size
+                found = depth_forward(self.dev, *view, self.model.grid.voxel_size)
+            layers = [result.cropped(self.dev.download(array)) for array in found]
             if features:
                 layers.append(result.cropped(self.dev.download(result.features)))
             return RenderedView(result.clamped(), *layers)
@@ -179,22 +177,6 @@ class Run:
         rendered = mean_rendered_view(sample(dx, dy) for dy in shifts for dx in shifts)
         self.checked(rendered.colour)
         return rendered
-
-    def _averaged(self, result, alpha, depth, median):
-        """Of the image's pixels: the mean of the drawn ones' alpha, and of those of their depths
-        that lie within a voxel of the nearest.
-        """
-        (height, width), k = result.size, result.supersampling
-
-        def drawn(array):
-            blocks = array.reshape(height, k, width, k).swapaxes(1, 2)
-            return blocks.reshape(height, width, k * k)
-
-        def surface(depths):
-            reach = depths.min(2, keepdims=True) + self.model.grid.voxel_size
-            return depths.mean(2, where=~(depths > reach))  # a NaN stays one
-
-        return drawn(alpha).mean(2), surface(drawn(depth)), surface(drawn(median))
 
     @property
     def nearest(self) -> float:

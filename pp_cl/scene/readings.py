@@ -82,8 +82,12 @@ def read_as(
         cameras = [_rolled(camera, n) for camera, n in zip(cameras, turns, strict=True)]
     text = sorted(range(len(cameras)), key=lambda i: image_files[i].name)
     counted = sorted(text, key=lambda i: natural(image_files[i].name))
-    orders = (counted, text), (text, counted), (counted, counted[1:] + counted[:1])
-    orders = dict(zip(ORDERS, (*orders, (counted, counted[-1:] + counted[:-1])), strict=True))
+    orders = {
+        "by-number": (counted, text),
+        "by-name": (text, counted),
+        "next": (counted, counted[1:] + counted[:1]),
+        "previous": (counted, counted[-1:] + counted[:-1]),
+    }
     for word in {*words} & {*ORDERS}:
         pose = {i: cameras[j].pose for i, j in zip(*orders[word], strict=True)}
         cameras = [replace(camera, pose=pose[i]) for i, camera in enumerate(cameras)]

@@ -224,6 +224,29 @@ def _depth(rule, dev, rng):
     yield exact(np.concatenate(_depths(dev, scene)), [0, np.inf, np.inf])
 
 
+def _depth_of_samples(dev, rng):
+    """Of 2 x 2 samples: the mean of what as many pixels have within a voxel of the nearest."""
+    for n, kind, stop in ((257, "soft", 0.0), (257, "soft", 1e-2), (33, "disc", 0.0)):
+        fine = Blended(dev, rng, n, radius=0.4, rule="alpha", early_stop=stop, kind=kind)
+        scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, kind=kind, side=2)
+        scene.blend(fine.opacity, 0.1, fine.point_features, rule="alpha", early_stop=stop)
+        alpha, *depths = (_fours(one, scene.shape) for one in _depths(dev, fine.scene))
+        found = _depths(dev, scene, 0.3)
+        yield absolute(found[0], alpha.mean(1), SUMMED + stop)
+        for samples, depth in zip(depths, found[1:], strict=True):
+            near = samples <= samples.min(1, keepdims=True) + np.float32(0.3)
+            is_far = np.isinf(samples.min(1))
+            yield exact(np.isinf(depth), is_far)
+            mean = np.where(near & ~is_far[:, None], samples, 0).sum(1) / near.sum(1)
+            yield relative(depth[~is_far], mean[~is_far], SUMMED)
+
+
+def _fours(values, shape):
+    """(H W, 4) samples of the pixels of an image (H, W), of (4 H W,)."""
+    height, width = shape
+    return values.reshape(height, 2, width, 2).swapaxes(1, 2).reshape(-1, 4)
+
+
 def _medians(blended, weight, z):
     """Two (HW,) between which the medians lie: of shares just below and above one half."""
     fragments = blended.geometry["fragment"] & ~blended.dropped
@@ -237,8 +260,9 @@ def _medians(blended, weight, z):
     return np.sort(bounds, axis=0)
 
 
-def _depths(dev, scene):
-    arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
+def _depths(dev, scene, voxel_size=0.0):
+    view = scene.projected, scene.pairs, scene.weights, scene.shape
+    arrays = depth_forward(dev, *view, voxel_size)
     return [array.get().ravel() for array in arrays]
 
 
@@ -276,5 +300,6 @@ CASES = (
     Case("raster: thousands of equal depths", _equal_depths),
     Case("raster: shade", _shade),
     *(Case(f"raster: depth, {rule}", partial(_depth, rule)) for rule in BLENDS),
+    Case("raster: depth of samples", _depth_of_samples),
     *(Case(f"raster: highest weights, {rule}", partial(_record, rule)) for rule in BLENDS),
 )

@@ -12,7 +12,7 @@ PLANS = 50  # in the minutes given
 FIXED = 0.8  # share of the steps after which their number rises no more: soon the averages begin
 FOG = 0.35  # of the first step's time, which later ones save: a third of the steps clears it
 DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
-SUPERSAMPLED = 2.0  # times that a step takes longer once it is supersampled
+SUPERSAMPLED = 1.3  # times that a step takes longer once it is supersampled
 # Steps of a training, for each of its refinements, below which it is better without any: in the
 # time of 250 steps of `small`, lego has 27.4 dB with its refinement and 29.8 without, in that of
 # 800 steps 31.5 and 32.3.

@@ -135,7 +135,7 @@ def fitting_hull(
         fault = memory_plan.fault_of(*found)
         if fault and train.supersampled > 0:
             train.supersampled = 0.0
-            given_up.append(f"features: not drawn at twice the size in the end ({fault[0]})")
+            given_up.append(f"features: of one sample a pixel in the end ({fault[0]})")
             fault = memory_plan.fault_of(*found)
         can_be_fewer = is_automatic and len(hull.ids) < last
         fewer = memory_plan.coarser_points(*found) if fault and can_be_fewer else 0

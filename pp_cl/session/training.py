@@ -168,7 +168,7 @@ class Training:
             for settings in (self.config, trainer.config):  # an extended training has its own
                 settings.train.supersampled = 0.0
             self.folder.configure(self.config.to_json())
-            told = f"step {step}: for lack of memory, features are not drawn at twice the size"
+            told = f"step {step}: for lack of memory, features are of one sample a pixel"
             warnings.warn(told, stacklevel=2)
         try:
             most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, step)

@@ -89,7 +89,7 @@ def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsy
     assert main(words) == 0
     told = capsys.readouterr().out
     assert re.search("points: as close as memory allows; .*--memory 0.1: the training needs", told)
-    assert "features: not drawn at twice the size in the end (--memory 0.1" in told
+    assert "features: of one sample a pixel in the end (--memory 0.1" in told
     train = load_config(folder.config).train
     assert train.refine_at == (0.35, 1) and train.supersampled == 0
     plan = float(re.search(r"memory: up to (\S+) MiB of --memory 0.1", told)[1]) * MIB
@@ -113,7 +113,7 @@ def test_what_was_to_be_supersampled_is_given_up_before_points(
     for count in steps:
         words = arguments(scene, folder.path, train__iterations=count)
         assert main(words) == 0
-    assert f"step {at}: for lack of memory, features are not drawn" in capsys.readouterr().err
+    assert f"step {at}: for lack of memory, features are of one sample" in capsys.readouterr().err
     assert load_config(folder.config).train.supersampled == 0
     assert load(folder.path).renderer.supersampling == 1
 

@@ -7,7 +7,7 @@ from pyopencl.array import Array
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
-from pp_cl.engine.raster.weights import BlendWeights
+from pp_cl.engine.raster.weights import BlendWeights, sample_macros
 
 
 def depth_forward(
@@ -16,15 +16,36 @@ def depth_forward(
     pairs: Pairs,
     weights: BlendWeights,
     size: tuple[int, int],
+    voxel_size: float = 0.0,
 ) -> tuple[Array, Array, Array]:
     """(alpha, depth, median) of the view that points, pairs and weights belong to, float32 (H, W).
 
     alpha: share of the pixel that is not background, in [0, 1]; 1 after an early stop. depth: of
     the surface, along the camera's axis, world units, mean by blend weight; median: where half of
     the weight is reached, interpolated between fragments; both infinite where alpha is 0. size: (H,
-    W).
+    W). voxel_size: world units within which samples of a pixel show the same surface.
     """
     alpha, depth, median = (dev.empty(size) for _ in range(3))
+    if pairs.side > 1:
+        dev.program("raster/sampled_depth", **sample_macros(dev, pairs)).launch(
+            "sampled_depth",
+            pairs.pixels,
+            early_stop=weights.early_stop,
+            voxel_size=voxel_size,
+            camera=points.camera_buffer,
+            point_camera=points.point_camera,
+            point_shape=points.point_shape,
+            hw=pairs.pixels,
+            pixel_offset=pairs.pixel_offset,
+            pair_key=pairs.pair_key,
+            pair_point=pairs.pair_point_falloff,
+            pixel_weight_point=weights.pixel_weight_point,
+            opacity=weights.opacity,
+            pixel_alpha=alpha,
+            pixel_depth=depth,
+            pixel_median=median,
+        )
+        return alpha, depth, median
     dev.program("raster/depth", **footprint_macros(points.footprint)).launch(
         "depth_forward",
         pairs.pixels,

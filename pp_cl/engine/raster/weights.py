@@ -26,8 +26,9 @@ ALL = 2**32 - 1  # fragments of a pixel that get gradients
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
-    blend: one of BLENDS. tracked: how many nearest fragments of a pixel get gradients.
-    pixel_weight_point: (P,) uint64, weight bits << 32 | point, each pixel's fragments by depth;
+    blend: one of BLENDS. opacity, early_stop: of blend_weights(). tracked: how many nearest
+    fragments of a pixel get gradients. pixel_weight_point: (P,) uint64, weight bits << 32 | point,
+    each pixel's fragments by depth;
     where fragments are dropped, a number without a point ends the pixel's list. pixel_derivative:
     (P,) float32 alike, the factor s of the backward pass, dL/dopacity = s * dL/db
     (cl/raster/blend.cl), with several samples of a pixel (P, samples); None without derivatives.
@@ -39,6 +40,8 @@ class BlendWeights:
     """
 
     blend: str
+    opacity: Array
+    early_stop: float
     tracked: int
     pixel_weight_point: Array
     pixel_derivative: Array | None
@@ -145,6 +148,8 @@ def blend_weights(
     nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
     return BlendWeights(
         blend,
+        opacity,
+        early_stop,
         max_tracked or ALL,
         b.pair_scratch,
         b.pixel_derivative if derivatives else None,
