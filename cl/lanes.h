@@ -32,7 +32,8 @@
 // A simulator that cannot defines it as (void), too; NVIDIA's compiler takes no pointer for it.
 #define FRAGMENTS_AHEAD 32
 #define POINTS_AHEAD 8
-#if (LANES == 16 || defined(ON_CPU)) && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) && defined(__has_builtin)
+#if (LANES == 16 || defined(ON_CPU)) && !defined(READ_AHEAD) && !defined(__NV_CL_C_VERSION) &&     \
+    defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
 // through a number, since its argument is a pointer to private memory
 #define READ_AHEAD(address) __builtin_prefetch((const void *)(uintptr_t)(address))
