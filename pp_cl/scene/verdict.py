@@ -48,13 +48,9 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     axes = STATED if path == DEMO else read_edits(Path(path)).axes
     cameras = [view.file_camera for view in views]
     has_masks = any(view.has_mask for view in views)
-    if (
-        not has_masks
-        and axes is None
-        and (reading := other_axes(cameras, find_reader(path).STATES))
-    ):
-        what = "its cameras do not look at one place"
-        raise WrongCameras(_told(path, what, reading, cameras))
+    reading = None if has_masks or axes else other_axes(cameras, find_reader(path).STATES)
+    if reading:
+        raise WrongCameras(_told(path, "its cameras do not look at one place", reading, cameras))
     try:
         agreement, beside = agreement_of(dev, views, box)
     except UserError as error:  # no place is in all masks
