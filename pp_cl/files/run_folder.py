@@ -107,7 +107,8 @@ class RunFolder:
         finally:
             with suppress(OSError):
                 owner.unlink(missing_ok=True)
-            lock.release()
+            with suppress(OSError):  # the system releases it when the process ends
+                lock.release()
 
     def check_sheets(self, step: int) -> None:
         """Raise UserError for an image that training from this step on would lose, and that no

@@ -28,7 +28,7 @@ FLIPS = [
     ("raster/footprint/sphere.h", "along - half", "along + half", "raster: pairs, sphere"),
     ("raster/footprint/gaussian.h", "(wide + least", "(wide - least", "alpha: shapes of Gaussians"),
     ("raster/project", "seen += basis[k]", "seen -= basis[k]", "raster: opacities by direction"),
-    ("raster/pairs", "row * width + column", "row * width - column", "raster: pairs, soft"),
+    ("raster/pairs", "as_uint(depth[k]", "as_uint(-depth[k]", "raster: pairs, soft"),
     ("raster/footprint.h", "as_uint(falloff", "as_uint(-falloff", "raster: pairs, soft"),
     ("raster/lists_by_bucket", "keys[a] < k", "keys[a] > k", "raster: thousands of equal depths"),
     ("raster/lists_by_key", "[middle] < k", "[middle] > k", "raster: thousands of equal depths"),
