@@ -15,8 +15,9 @@ import numpy as np
 from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.grid import MOST_IDS, Grid
 from pp_cl.engine.network.layers import parameter_table, unet_layers
+from pp_cl.engine.network.specular import specular_layers
 from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES
-from pp_cl.engine.training.exposure import decided_at
+from pp_cl.engine.training.exposure import MATRIX, decided_at
 from pp_cl.engine.training.schedule import ema_start
 from pp_cl.engine.training.state import PointState
 from pp_cl.errors import Diverged, UserError, quoted, shown
@@ -34,8 +35,10 @@ KEYS: dict[str, tuple] = dict.fromkeys(
     ("step", "initial_points", "format", "extended_from"), (int,)
 )
 KEYS |= dict.fromkeys(("views", "depth_range", "left_out", "notes"), (list,))
-KEYS |= {"finished": (bool,), "exposed": (bool,), "grid": (dict,), "pixels": (dict, type(None))}
-OPTIONAL = {"extended_from", "exposed", "left_out", "notes"}
+KEYS |= dict.fromkeys(("finished", "specular"), (bool,)) | {"exposed": (str, bool)}
+KEYS |= {"grid": (dict,), "pixels": (dict, type(None))}
+# exposed is true in runs of 0.3.0
+OPTIONAL = {"extended_from", "exposed", "left_out", "notes", "specular"}
 MEND = "delete it to train again, or restore a copy"
 OTHER_RUN = "its config.json may belong to another run"
 Arrays = Mapping[str, np.ndarray | DeviceRows]
@@ -226,7 +229,7 @@ def _problem_of_forms(stored, config):
         # gains are kept until it is decided that the training needs none
         if "exposed" in header or step < decided_at(header.get("extended_from", 0), views):
             gains = views
-    expected = stored_forms(config, n, step, gains)
+    expected = stored_forms(config, n, step, gains, has_specular="specular" in header)
     for name in sorted(expected.keys() | forms.keys()):
         found, wanted = forms.get(name), expected.get(name)
         if wanted is None:
@@ -236,9 +239,16 @@ def _problem_of_forms(stored, config):
     return ""
 
 
-def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> dict[str, Form]:
+def stored_forms(
+    config: Config,
+    n: int,
+    step: int | None,
+    gains: int = 0,
+    *,
+    has_specular: bool = False,
+) -> dict[str, Form]:
     """{name: Form} of the arrays of a checkpoint with n points after `step` steps, None: finished.
-    gains: the views that have them.
+    gains: the views that have them. has_specular: whether the model has that layer.
     """
     degrees = SH_DEGREES[: config.points.sh_degree + 1]
     sh_dtype = np.float16 if step is None else np.float32
@@ -247,6 +257,9 @@ def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> di
     table["points.opacity"] = (n, OPACITIES), np.float32
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
     table |= {f"net.{name}": row for name, row in network.items()}
+    if has_specular:
+        layer = parameter_table(specular_layers())
+        table |= {f"specular.{name}": row for name, row in layer.items()}
     if step is not None:
         table |= {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
         state = PointState.table(n)
@@ -255,5 +268,5 @@ def stored_forms(config: Config, n: int, step: int | None, gains: int = 0) -> di
             table |= {f"average.{name}": row for name, row in network.items()}
         table |= {f"state.{name}": row for name, row in state.items()}
     if gains:
-        table["exposure"] = (gains, 3, 4), np.float32
+        table["exposure"] = (gains, MATRIX + 3, 4), np.float32
     return {name: Form(tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in table.items()}

@@ -23,6 +23,8 @@ MOST_TEXT = 4096  # characters of a setting
 RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
+# settings that runs of 0.3.0 lack, as they were trained
+ADDED = {"train.specular": "off"}
 AUTOMATIC = ("train.refine_at", "raster.radius", "train.view_opacity")  # by the hull
 MEND_SETTINGS = "restore it or start a new run"
 
@@ -214,7 +216,7 @@ def load_config(path: Path | str) -> Config:
         if not isinstance(values, dict):
             raise broken(f"{shown(section, 40)} is no section of settings")
         found |= {f"{section}.{key}": value for key, value in values.items()}
-    config = Config(name, automatic)
+    config, found = Config(name, automatic), ADDED | found
     for key, section, item in every_setting(config):
         if key not in found:
             raise broken(f"{key} is missing")

@@ -10,7 +10,7 @@ from pp_cl.engine.training.target import Target
 from pp_cl.files.atomic import own, remove_ours, write_json
 from pp_cl.files.image import image_paths, write_png
 from pp_cl.files.sheets import write_comparison
-from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
+from pp_cl.metrics.psnr_ssim import Metrics, coloured_alike, mean
 from pp_cl.metrics.published import differences, published_rows
 from pp_cl.progress import Progress, track
 from pp_cl.run import Run, load
@@ -30,8 +30,8 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Measure a run, or the one in a folder, as `pp-cl eval` does; writes metrics.json, whose
     content it returns, and comparison.png into the folder `out`, else RUN/eval, or RUN/eval/SPLIT
-    for other splits than test. Where the run's images had gains, views are also measured after the
-    best ones, exposed_alike().
+    for other splits than test. Where the run's images differed in colour, views are also
+    measured with theirs, coloured_alike().
 
     metrics: out of psnr, ssim, lpips. save_images: write every view to images/ there, too. device,
     scene: of a folder, as load() takes them. Raises UserError for a missing or broken split, and
@@ -64,8 +64,8 @@ def evaluate_run(
         truth = view.ignoring(truth, image)
         rows.append({"name": view.name} | measure(image, truth))
         if "exposed" in run.header:
-            matched = exposed_alike(truth, image, alpha)
-            rows[-1]["after_gains"] = measure(image, matched)
+            coloured = coloured_alike(image, truth, alpha)
+            rows[-1]["after_colour"] = measure(coloured, truth)
         if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
             shown.append((image, truth))
         if save_images:
@@ -74,7 +74,7 @@ def evaluate_run(
     means = mean([{name: row[name] for name in metrics} for row in rows])
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
     if "exposed" in run.header:
-        result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
+        result["mean_after_colour"] = mean([row["after_colour"] for row in rows])
     header, cameras = run.header, [view.file_camera for view in views]
     points = {"initial": header["initial_points"], "final": run.model.cloud.count}
     published = published_rows(here.name, cameras)

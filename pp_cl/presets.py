@@ -49,6 +49,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.pixel_jitter": False,
         "train.sh_smoothing": 0.0,
         "train.ema": False,
+        "train.specular": "off",
         "train.mask_weight": 0.0,
         "train.distortion_weight": 0.0,
         "train.prune_every": 500,

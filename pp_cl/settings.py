@@ -147,8 +147,8 @@ class TrainConfig:
     smooth_l1: float = setting(0.05, "errors below this count by their square (0: L1)", 0, 1)
     exposure: str = setting(
         "auto",
-        "exposure compensation: a gain for each view and channel; auto: where photographs differ so"
-        " much in exposure that gains explain a quarter of the error",
+        "exposure compensation: a gain for each view and channel, or a 3x4 colour matrix for each"
+        " view; auto: where they explain a quarter of the error",
         choices=("auto", "on", "off"),
     )
     mask_weight: float = setting(
@@ -216,6 +216,13 @@ class TrainConfig:
         " pixels apart)",
         0,
         1,
+    )
+    specular: str = setting(
+        "auto",
+        "specular layer, fitted after the last step: colours of a pixel by its features and its"
+        " direction; auto: as far as it explains views that it was not fitted to; needs"
+        " raster.blend=alpha",
+        choices=("auto", "off"),
     )
     ema: bool = setting(
         True, "average the parameters (EMA) over the last 15 % of the steps and keep the averages"

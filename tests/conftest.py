@@ -14,6 +14,7 @@ from support.runs import Runs
 from pp_cl import drivers
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.training import specular
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 from pp_cl.scene import hull
@@ -74,12 +75,14 @@ def cache_of_its_own(tmp_path_factory):
 @pytest.fixture(scope="session", autouse=True)
 def small_work():
     """Points of the hull by which masks are compared, and texels: what a ball needs; steps of
-    fitting Gaussians: few, as one file sees to how good these are (export/test_splat.py).
+    fitting Gaussians and specular layers: few, as one file each sees to how good these are
+    (export/test_splat.py, training/test_specular.py).
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hull, "COMPARED_POINTS", 8000)
         patch.setitem(QUALITIES, QUICK, (40, 0.0))
         patch.setattr(texture, "SIDE", 256)
+        patch.setattr(specular, "STEPS", 8)
         yield
 
 

@@ -10,7 +10,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import AUTO, OFFERED, device_class
 from pp_cl.engine.layers.conv import unpack_weights
 from pp_cl.engine.network.layers import multiplications
-from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.network.unet import Network, UNet
 from pp_cl.reference import network as reference
 
 CHANNELS_IN, CHANNELS_OUT = 16, 3
@@ -75,7 +75,7 @@ def network_runner(net: UNet, x: Array, grad_image: Array | None = None) -> Call
     return run
 
 
-def plain_parameters(net: UNet, arrays: dict[str, Array]) -> dict[str, np.ndarray]:
+def plain_parameters(net: Network, arrays: dict[str, Array]) -> dict[str, np.ndarray]:
     """{name: (CO, CI, K, K) or (CO,) numpy array} of a network's parameters or gradients."""
     channels, plain = {layer.name: layer.channels for layer in net.layers}, {}
     for name, array in arrays.items():

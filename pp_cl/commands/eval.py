@@ -6,7 +6,7 @@ from pathlib import Path
 from pp_cl.commands import options as shared
 
 HELP = "render a run's views and measure them"
-AFTER_GAINS = "after the views' best gains"
+AFTER_COLOUR = "with each view's colour"
 OTHER_LPIPS = "lpips_alex"
 
 
@@ -37,8 +37,8 @@ def run(options: argparse.Namespace) -> None:
     own = f"{folder} ({len(result['per_image'])} views{state})"
     published = {} if result["published_differs"] else result["published"]
     ranked = [(own, result["mean"]), *published.items()]
-    if "mean_after_gains" in result:
-        ranked.append((AFTER_GAINS, result["mean_after_gains"]))
+    if "mean_after_colour" in result:
+        ranked.append((AFTER_COLOUR, result["mean_after_colour"]))
     if "psnr" in metrics:
         ranked.sort(key=lambda row: -row[1]["psnr"])
     shared.write_json_option(options.json, result)

@@ -95,6 +95,8 @@ def run(options: argparse.Namespace) -> None:
         )
     print(memory_line(training.memory_plan), flush=True)
     seconds = _run(training, options)
+    if fitted := training.trainer.fitted:
+        print(_specular_line(fitted))
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
         f" {training.trainer.model.cloud.count} points"
@@ -131,6 +133,17 @@ def _first_line(training):
             f" finer grid would have more than {CELL_CAP} cells"
         )
     return line
+
+
+def _specular_line(fitted):
+    """A line of text: what the specular layer has brought."""
+    if fitted.layer is None:
+        return "specular: left out, it explains nothing of views that it is not fitted to"
+    before, after = (-10 * math.log10(mse) for mse in (fitted.before, fitted.after))
+    return (
+        f"specular: kept at {fitted.scale:.2f}; the object in training views"
+        f" {before:.2f} -> {after:.2f} dB"
+    )
 
 
 def _images_line(training, chosen):

@@ -12,6 +12,7 @@ from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.first_features import FirstFeatures
+from pp_cl.engine.network.specular import Specular
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 
@@ -23,7 +24,8 @@ class Model:
 
     grid: the vertices in whose cells points lie; grid_buffer: the same, packed, (8) float32 on the
     device. depth_range: (near, far), distances from the eye in world units, of all cameras. What
-    the device gets is relative to the grid's centre, which refinement keeps.
+    the device gets is relative to the grid's centre, which refinement keeps. specular: the layer
+    that is fitted once a training has ended, where it is worth having.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class Model:
         cloud: PointCloud,
         *,
         net: UNet | FirstFeatures,
+        specular: Specular | None = None,
     ):
         self.dev = dev
         self.grid = grid
@@ -41,6 +44,7 @@ class Model:
         self.depth_range = depth_range
         self.cloud = cloud
         self.net = net
+        self.specular = specular
 
     def positions(self) -> np.ndarray:
         """(N, 3) float64 world positions of the points."""
@@ -69,16 +73,23 @@ class Model:
 
     def header(self) -> dict:
         """JSON-able description that load() needs beside the arrays."""
-        return {
+        header = {
             "grid": self.grid.header(),
             "depth_range": [float(x) for x in self.depth_range],
         }
+        return header | ({"specular": True} if self.specular else {})
 
     def arrays(self) -> dict[str, DeviceRows]:
         """{name: array} of everything learned, as a checkpoint stores it."""
-        parameters = self.net.parameters.items()
-        network = {f"net.{name}": DeviceRows(self.dev, array) for name, array in parameters}
-        return self.cloud.arrays(self.dev) | network
+        parameters = self.network_parameters().items()
+        networks = {name: DeviceRows(self.dev, array) for name, array in parameters}
+        return self.cloud.arrays(self.dev) | networks
+
+    def network_parameters(self) -> dict[str, Array]:
+        """{name in a checkpoint: array} of the networks."""
+        found = {f"net.{name}": array for name, array in self.net.parameters.items()}
+        layer = self.specular.parameters if self.specular else {}
+        return found | {f"specular.{name}": array for name, array in layer.items()}
 
     @classmethod
     def load(
@@ -95,6 +106,8 @@ class Model:
         """
         grid = Grid.of_header(header["grid"])
         cloud = PointCloud.load(dev, arrays, degree)
-        for name, parameter in net.parameters.items():
-            dev.write(parameter, arrays.pop(f"net.{name}"))
-        return cls(dev, grid, tuple(header["depth_range"]), cloud, net=net)
+        specular = Specular(dev) if header.get("specular") else None
+        model = cls(dev, grid, tuple(header["depth_range"]), cloud, net=net, specular=specular)
+        for name, array in model.network_parameters().items():
+            dev.write(array, arrays.pop(name))
+        return model

@@ -187,7 +187,7 @@ class Renderer:
         the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
         softmax needs the model's.
         training: keep what backward() needs. gradient_tiles: returns that argument of
-        UNet.plan_tiles(); called after the wait for the device. times_seen: of find_pairs().
+        Network.plan_tiles(); called after the wait for the device. times_seen: of find_pairs().
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         padded, left, top = camera.padded(net.multiple)
@@ -246,6 +246,9 @@ class Renderer:
                 plan = net.plan_tiles(size, tile_mask.get(), gradient_tiles())
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
+            if specular := self.model.specular:
+                through: Any = weights.transmittance  # which alpha compositing has
+                specular.add(result.image, b.features, through, points.camera_buffer, side)
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen, is_planned):
@@ -287,8 +290,8 @@ class Renderer:
     def backward(
         self, result: RenderResult, grad_image: Array, **options: Any
     ) -> tuple[BlendGradients, GradientParts | None]:
-        """(what backward_features() returns, the network's part of what UNet.backward() does), from
-        dL/dimage of result.image. options: of backward_features().
+        """(what backward_features() returns, the network's part of what Network.backward() does),
+        from dL/dimage of result.image. options: of backward_features().
         """
         with self.dev.stage("network backward"):
             grad_features, parts = self.model.net.backward(grad_image)

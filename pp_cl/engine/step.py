@@ -32,6 +32,7 @@ from pp_cl.engine.training.schedule import (
     supersampling_at,
 )
 from pp_cl.engine.training.smooth import Smoother
+from pp_cl.engine.training.specular import Fitted, SpecularFit
 from pp_cl.engine.training.state import PointState, split_opacity
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View
@@ -51,6 +52,7 @@ class Trainer:
         self.dev = dev
         self.config = config
         self.model = model
+        self.model.specular = None  # is fitted at the end
         self.views = views
         self.step = self.begun = 0
         self.renderer = Renderer(dev, model, config.raster)
@@ -67,6 +69,7 @@ class Trainer:
         self._smoother: Smoother | None = None  # made when it is due, anew when the points change
         self._refine_steps = refine_steps(train)
         self.crops = Crops(views, train, self.refinements_to_come)
+        self.fitted: Fitted | None = None  # by finish()
 
     def take_plan(self) -> None:
         """Follow config.train.iterations and refine_at, which a plan for some minutes changes."""
@@ -80,9 +83,9 @@ class Trainer:
         return sum(self.step < step for step in self._refine_steps)
 
     @property
-    def is_exposed(self) -> bool:
-        """Whether images are divided by gains."""
-        return self.exposure is not None and self.exposure.is_applied
+    def exposed(self) -> str:
+        """By what images differ from the model's, as Exposure.kind has it."""
+        return self.exposure.kind if self.exposure else ""
 
     @property
     def gamma(self) -> float:
@@ -202,9 +205,12 @@ class Trainer:
         step.
         """
         train, step = self.config.train, self.step
-        is_undecided = self.exposure is not None and not self.exposure.is_applied
-        if is_undecided and step == decided_at(self.begun, len(self.views)):
-            self.exposure = self.exposure.decided()
+        for is_last in (False, True):
+            due = step == decided_at(self.begun, len(self.views), is_last=is_last)
+            if self.exposure and due:
+                self.exposure.decide(is_last)
+                if is_last and not self.exposure.is_applied:
+                    self.exposure = None
         if train.sh_smoothing > 0 and step % SMOOTHING_EVERY == 0:
             with self.dev.stage("smoothing"):
                 self._smooth(rates)
@@ -267,6 +273,22 @@ class Trainer:
             self.renderer.release()  # for whole views with weights by pair
             self._keep(points_that_views_show(self.renderer, self.views, self.config))
             self._keep(points_of_large_parts(self.model))
+        if self.config.train.specular == "auto" and self._composited:
+            self._fit_specular()
+
+    def _fit_specular(self):
+        """Give the model its specular layer, if it is worth having."""
+        train = self.config.train
+        self.renderer.supersampling = supersampling_at(self.step, train)
+        fit = SpecularFit(self.renderer, self.views, self._whole_target, self.gamma, train.seed)
+        self.fitted = fit.fitted()
+        self.model.specular = self.fitted.layer
+
+    def _whole_target(self, index):
+        """(h, w, 3) on the device: what the image of a view, by index, should be."""
+        camera = self.views[index].camera
+        image, alpha = self._target.crop(self.views[index], (0, 0, camera.width, camera.height))
+        return self.exposure.target(index, image, alpha) if self.exposed else image
 
     # ---- what the session shows and stores -------------------------------------------------------
 
@@ -290,7 +312,9 @@ class Trainer:
         exposure = {"exposure": DeviceRows(self.dev, self.exposure.state)} if self.exposure else {}
         return self.model.arrays() | self.optimiser.arrays() | exposure
 
-    def restore(self, step: int, arrays: dict[str, np.ndarray], begun: int) -> None:
+    def restore(
+        self, step: int, arrays: dict[str, np.ndarray], begun: int, exposed: str = ""
+    ) -> None:
         """Resume after `step` steps with the training state of a checkpoint, which is taken out of
         `arrays`; the model has been loaded already. A finished training stores no such state: its
         moments start anew, and its EMA if that is due.
@@ -302,7 +326,6 @@ class Trainer:
             if "exposure" not in arrays:
                 self.exposure = None
             elif self.exposure:
-                self.dev.write(self.exposure.state, arrays.pop("exposure"))
-                self.exposure.is_applied |= step >= decided_at(begun, len(self.views))
+                self.exposure.restore(arrays.pop("exposure"), exposed)
         elif self.config.train.ema and step >= ema_start(self.config.train.iterations):
             self.optimiser.update_ema(1.0)

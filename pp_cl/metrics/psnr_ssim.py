@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from pp_cl.engine.training.exposure import PRIOR
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.lpips import Lpips
@@ -34,15 +35,23 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     return float(structural_similarity(*both, data_range=1.0, channel_axis=-1, **window))
 
 
-def exposed_alike(truth: np.ndarray, prediction: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """(H, W, 3) the truth, its object divided by the gains that bring the prediction nearest to it.
-    truth, prediction: (H, W, 3) in [0, 1], over white. alpha: (H, W) of the truth.
+def coloured_alike(prediction: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """(H, W, 3) the prediction whose object has the colours of the truth: by the 3x4 matrix that
+    brings the other half of its pixels nearest to it. The halves are squares of 8 pixels in turn.
+
+    prediction, truth: (H, W, 3) in [0, 1], over white. alpha: (H, W) of the truth.
     """
-    white = 1 - alpha[..., None].astype(np.float64)
-    p, t = prediction - white, truth - white
-    weighted = alpha[..., None] * p
-    gains = (weighted * t).sum((0, 1)) / np.maximum((weighted * p).sum((0, 1)), 1e-12)
-    return np.clip(t / np.maximum(gains, 1e-3) + white, 0, 1)
+    alpha = alpha.astype(np.float64)
+    white = 1 - alpha[..., None]
+    y, x = np.mgrid[: alpha.shape[0], : alpha.shape[1]] // 8
+    known, wanted = np.dstack([prediction - white, alpha]), truth - white
+    found, prior = np.empty_like(wanted), PRIOR * alpha.size
+    for half in (0, 1):
+        is_here = (x + y) % 2 == half
+        a, p, t = alpha[~is_here, None], known[~is_here], wanted[~is_here]
+        squares, mixed = (a * p).T @ p + prior * np.eye(4), (a * p).T @ t + prior * np.eye(4, 3)
+        found[is_here] = known[is_here] @ np.linalg.solve(squares, mixed)
+    return np.clip(found + white, 0, 1)
 
 
 class Metrics:

@@ -157,3 +157,20 @@ def _bilinear(n):
 
 def _along_both(rows, columns, x):
     return np.einsum("Yy,Xx,yxc->YXc", rows, columns, x, optimize=True)
+
+
+def encoded_directions(directions: np.ndarray, octaves: int = 4) -> np.ndarray:
+    """(..., 3 + 6 octaves): unit vectors (..., 3) as cl/layers/specular.h encodes them."""
+    angles = [2.0**k * np.pi / 2 * directions for k in range(octaves)]
+    waves = [wave(angle) for angle in angles for wave in (np.sin, np.cos)]
+    return np.concatenate([directions, *waves], -1)
+
+
+def specular(
+    layers: list, parameters: dict, features: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """(H, W, 3): what the specular layer adds to pixels of alpha 1, by their features (H, W, 16)
+    and directions (H, W, 3). layers, parameters: of network().
+    """
+    x = np.concatenate([features, encoded_directions(directions)], -1)
+    return network(layers, parameters, x)["image"] - 0.5

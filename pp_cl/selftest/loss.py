@@ -1,5 +1,7 @@
 """Cases of the losses: L1 and SSIM, masks, exposure, and their sum."""
 
+from functools import partial
+
 import numpy as np
 
 from pp_cl.engine.training.exposure import DECAY, PRIOR, Exposure
@@ -9,6 +11,7 @@ from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
 ONE = np.uint8(1)
+FULL = 2e-5  # of matrices: normal equations of a condition of some hundred, in float32
 FLAT = 3e-6  # variances of nothing: rounding of Var[d] over C2 = 0.03^2
 
 
@@ -116,31 +119,47 @@ def _sum_of_terms(dev, rng):
         yield each([found["loss"], found["distortion"]], expected, LOSS)
 
 
-def _exposure(dev, rng):
-    """The gains of three views, one seen twice and one never, and images divided by them."""
-    known, left, top = np.zeros((3, 3, 3)), 3, 1
+def _exposure(dev, rng, is_full):
+    """The matrices of three views, one seen twice and one never, and images that they are undone
+    in.
+    """
+    sums, left, top = np.zeros((3, 2, 8, 4)), 3, 1
     exposure = Exposure(dev, 3, is_applied=True)
+    exposure.is_full = is_full
     for view, side in zip((0, 2, 0), (1, 33, 257), strict=True):
         alpha = rng.random((side, 29))
         prediction = rng.random((side + 3, 36, 3))
-        inside = prediction[top : top + side, left : left + 29] - (1 - alpha[..., None])
-        image = rng.uniform(0.5, 1.5, 3) * inside + (1 - alpha[..., None])
-        shown_as, shot, mask = (dev.upload(one, np.float32) for one in (prediction, image, alpha))
-        target = exposure.target(view, shot, mask).get()
-        gains = exposure.state.get()[:, :, 3].astype(np.float64)
-        expected = (image - (1 - alpha[..., None])) / gains[view] + (1 - alpha[..., None])
-        yield relative(target, expected, 8 * EPS)
+        white = 1 - alpha[..., None]
+        rendered = prediction[top : top + side, left : left + 29] - white
+        turned = rendered @ (np.eye(3) + 0.2 * rng.normal(size=(3, 3))).T
+        image = turned + 0.1 * rng.random(3) * alpha[..., None]
+        arrays = (prediction, image + white, alpha)
+        shown_as, shot, mask = (dev.upload(one, np.float32) for one in arrays)
+        matrix = exposure.state.get()[view, 16:].astype(np.float64)
+        expected = (image - alpha[..., None] * matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T
+        yield relative(exposure.target(view, shot, mask).get(), expected + white, 32 * EPS)
         exposure.fit(view, shown_as, shot, mask, (left, top))
-        weighted = alpha[..., None] * inside
-        shown = image - 1 + alpha[..., None]
-        sums = [(weighted * shown).sum((0, 1)), (weighted * inside).sum((0, 1))]
-        sums.append((alpha[..., None] * shown**2).sum((0, 1)))
-        known[view] = DECAY * known[view] + np.stack(sums, axis=1)
-        pull = PRIOR * alpha.size
-        gains = (known[..., 0] + pull) / (known[..., 1] + pull)
-        gains /= np.exp(np.log(gains).mean(axis=0))
-        yield relative(exposure.state.get()[..., :3], known, 16 * EPS)
-        yield each(exposure.state.get()[..., 3], gains, 32 * EPS)
+        y, x = np.mgrid[:side, :29] // 8
+        sums[view] *= DECAY
+        for half in range(2):
+            a = np.where((x + y) % 2 == half, alpha, 0)
+            p = np.concatenate([rendered, alpha[..., None]], -1)
+            sums[view, half, :4] += np.einsum("yx,yxi,yxj->ij", a, p, p)
+            sums[view, half, 4:7] += np.einsum("yx,yxi,yxj->ij", a, image, p)
+            sums[view, half, 7, :3] += np.einsum("yx,yxi->i", a, image**2)
+        yield relative(exposure.state.get()[:, :16].reshape(sums.shape), sums, 16 * EPS)
+        expected = _matrices(sums.sum(1), PRIOR * alpha.size, is_full)
+        yield relative(exposure.state.get()[:, 16:], expected, FULL if is_full else 32 * EPS)
+
+
+def _matrices(sums, prior, is_full):
+    """(views, 3, 4) of sums (views, 8, 4), relative to their mean."""
+    squares, mixed = sums[:, :4] + prior * np.eye(4), sums[:, 4:7] + prior * np.eye(3, 4)
+    if not is_full:
+        squares, mixed = squares * np.eye(4), mixed * np.eye(3, 4)
+    found = np.linalg.solve(squares, mixed.swapaxes(1, 2)).swapaxes(1, 2)
+    square = np.concatenate([found, np.tile([[[0.0, 0, 0, 1]]], (len(sums), 1, 1))], 1)
+    return (square @ np.linalg.inv(square.mean(0)))[:, :3]
 
 
 CASES = (
@@ -148,6 +167,7 @@ CASES = (
     Case("loss: flat and equal images", _hard_loss),
     Case("loss: mask", _mask_loss),
     Case("loss: ignored pixels", _ignored),
-    Case("loss: exposure", _exposure),
+    Case("loss: exposure", partial(_exposure, is_full=False)),
+    Case("loss: colours of a view", partial(_exposure, is_full=True)),
     Case("loss: sum of its terms", _sum_of_terms),
 )

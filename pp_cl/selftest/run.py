@@ -13,7 +13,7 @@ import pyopencl
 from pp_cl import __version__
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.choice import OFFERED, device_class
-from pp_cl.selftest import blend, device, layers, loss, metrics, optim, raster, scene
+from pp_cl.selftest import blend, device, layers, loss, metrics, optim, raster, scene, specular
 from pp_cl.selftest.case import Case
 
 SEED = 7
@@ -27,6 +27,7 @@ CASES: tuple[Case, ...] = (
     *layers.CASES,
     *loss.CASES,
     *optim.CASES,
+    *specular.CASES,
     *metrics.CASES,
 )
 

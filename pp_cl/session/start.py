@@ -39,7 +39,7 @@ FINEST, COARSEST = 1.25, 1.5
 # better where points lie farther apart
 LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
-# what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
+# what `make network` keeps: {"net.NAME": as Network.parameters, float16}
 DEMO_NETWORK = Path(__file__).with_name("demo.npz")
 
 

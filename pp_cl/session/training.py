@@ -153,7 +153,8 @@ class Training:
             seconds += time.perf_counter() - start
             # Before the checkpoint: a log row without its checkpoint is made again by resuming,
             # but a finished run is not resumed.
-            log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
+            row = self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True}
+            log.write(row | ({"specular": trainer.fitted.scale} if trainer.fitted else {}))
             self._save(finished=True)
         return seconds
 
@@ -227,7 +228,7 @@ class Training:
     def _save(self, finished):
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
-        header |= {"exposed": True} if trainer.is_exposed else {}
+        header |= {"exposed": trainer.exposed} if trainer.exposed else {}
         arrays = trainer.model.arrays() if finished else trainer.arrays()
         save_checkpoint(self.folder.checkpoint, header, arrays)
         self._expect_save()
@@ -295,7 +296,7 @@ def open_training(
         info["initial_points"] = model.cloud.count
     trainer = Trainer(dev, followed, model, views)
     if stored:
-        trainer.restore(header["step"], arrays, begun)
+        trainer.restore(header["step"], arrays, begun, header.get("exposed", ""))
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
     measured = []

@@ -312,5 +312,5 @@ def config_of(run: Run, steps: int) -> Config:
     train.rate_steps = 0
     train.sh_rate = (1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster)
     train.opacity_rate, train.offset_rate = (2.3e-2, 6.8e-3), (4e-2 * faster, 4e-3 * faster)
-    train.view_opacity = "off"  # splats have one
+    train.view_opacity = train.specular = "off"  # splats have neither
     return config

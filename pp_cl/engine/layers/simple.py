@@ -4,6 +4,8 @@ bilinear upsampling, and the image at the end.
 tiles: those of the result to compute, None = all. All raise ValueError for shapes that do not fit.
 """
 
+from typing import Any
+
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
@@ -107,6 +109,36 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
     """
     grads = {"grad_image": grad_image, "grad_features": grad_features}
     _per_pixel(dev, "residual_backward", grad_features.shape, share=SHARE, **grads)
+
+
+def specular_forward(
+    dev: Device,
+    parameters: dict[str, Array],
+    hidden: int,
+    image: Array,
+    features: Array,
+    transmittance: Array,
+    camera: Array,
+    side: int,
+) -> None:
+    """Specular.add(). parameters: "a.weight" and so on, of layers with so many hidden channels."""
+    n = image.shape[0] * image.shape[1]
+    named: dict[str, Any] = {}
+    for name, array in parameters.items():
+        layer, kind = name.split(".")
+        named[f"{kind}_{layer}"] = array
+    dev.program("layers/specular", LANES=lanes(dev), HIDDEN=hidden).launch(
+        "specular_forward",
+        -(-n // lanes(dev)),
+        n=n,
+        width=image.shape[1],
+        side=float(side),
+        camera=camera,
+        transmittance=transmittance,
+        features=features,
+        image=image,
+        **named,
+    )
 
 
 def first_features_forward(dev: Device, features: Array, image: Array) -> None:

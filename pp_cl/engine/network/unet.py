@@ -1,4 +1,4 @@
-"""The U-Net on a device: its parameters, and its forward and its backward pass."""
+"""Networks on a device, the U-Net above all: parameters, and the forward and the backward pass."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -36,6 +36,7 @@ from pp_cl.engine.layers.simple import (
 )
 from pp_cl.engine.layers.tiles import tiles_find, tiles_with
 from pp_cl.engine.network.layers import (
+    Layer,
     array_shapes,
     convolutions,
     gradient_of,
@@ -89,7 +90,7 @@ class Workspace:
         """Forget the launches, which keep the caller's arrays alive."""
         self.launches = {name: Prepared(self._dev) for name in ("weights", "forward", "backward")}
 
-    def plan(self, net: "UNet", size: Size, training: bool) -> None:
+    def plan(self, net: "Network", size: Size, training: bool) -> None:
         """Make room for images of this size, in the same buffers where they are large enough. The
         arrays are undefined then.
         """
@@ -127,44 +128,37 @@ def _work_rows(convs):
     }
 
 
-class UNet:
-    """The network, its parameters and gradients, and the buffers it works in.
+class Network:
+    """A network of layers, its parameters and gradients, and the buffers it works in.
 
-    widths: channels of the three levels. blocks: what a level computes, of settings.BLOCKS.
+    layers: in the order of the forward pass; the image is 0.5 + 0.5 times what the last one gives.
     residual: adds output.SHARE of the first three features to the image. variant: of the
     convolutions, as choose() takes it; blocking: of their kernels, as shipped for the device; both
-    may be replaced before the first pass. layers: in the order of the forward pass. parameters:
+    may be replaced before the first pass. parameters:
     {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
     on the device; all_parameters: the 1-D array that they lie in, with zeros between them. Weights
     and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output channels
     beyond CO at 0, with gradient 0. multiple: of which the sides of images are, in pixels.
     """
 
-    multiple = 4  # two poolings halve the height and the width
+    multiple = 4  # two poolings of the U-Net halve the height and the width
 
     def __init__(
         self,
         dev: Device,
-        widths: tuple[int, int, int] = (16, 32, 64),
+        layers: list[Layer],
         *,
-        blocks: str = "double",
         residual: bool = False,
         seed: int = 0,
         variant: str = AUTO,
     ):
         self.dev = dev
         self._residual = residual
-        self.layers = unet_layers(widths, blocks=blocks)
+        self.layers = layers
         self.variant, self.blocking = variant, blocking_of(dev)
         self.all_parameters, self.parameters = self._packed()
         self._gradients: Any = None  # of sum_gradients(): (the whole, its parts by name)
-        rng = np.random.default_rng(seed)
-        for layer in convolutions(self.layers):
-            shape = layer.weight_shape()
-            bound = 1 / np.sqrt(math.prod(shape[1:]))
-            weight, bias = rng.uniform(-bound, bound, shape), rng.uniform(-bound, bound, shape[0])
-            dev.write(self.parameters[layer.name + ".weight"], pack_weights(weight))
-            dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
+        self.reset(seed)
         self.relu_outputs = {layer.name for layer in self.layers if layer.relu}
         self._workspaces: dict[bool, Workspace] = {}  # {training: Workspace}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
@@ -172,16 +166,15 @@ class UNet:
         self._trained: Any = None
         self._is_frozen = False
 
-    @classmethod
-    def of_settings(cls, dev: Device, settings: NetworkConfig, *, seed: int = 0) -> "UNet":
-        """The network of a run."""
-        return cls(
-            dev,
-            settings.widths,
-            blocks=settings.blocks,
-            residual=settings.residual,
-            seed=seed,
-        )
+    def reset(self, seed: int) -> None:
+        """Write the parameters that a training starts with."""
+        rng = np.random.default_rng(seed)
+        for layer in convolutions(self.layers):
+            shape = layer.weight_shape()
+            bound = 1 / np.sqrt(math.prod(shape[1:]))
+            weight, bias = rng.uniform(-bound, bound, shape), rng.uniform(-bound, bound, shape[0])
+            self.dev.write(self.parameters[layer.name + ".weight"], pack_weights(weight))
+            self.dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
 
     def _packed(self):
         """(zeros like all_parameters, {name: array in them}) of the parameters."""
@@ -258,7 +251,7 @@ class UNet:
         sizes, RuntimeError for training once frozen.
         """
         if training and self._is_frozen:
-            raise RuntimeError("UNet.freeze() was called: the network can no longer be trained")
+            raise RuntimeError("Network.freeze() was called: the network can no longer be trained")
         height, width, channels = x.shape
         taken = sum(self.layers[0].sources)
         if height % self.multiple or width % self.multiple or channels != taken:
@@ -304,7 +297,7 @@ class UNet:
         Raises RuntimeError without such a forward.
         """
         if self._trained is None:
-            raise RuntimeError("UNet.backward needs a forward(training=True) before it")
+            raise RuntimeError("Network.backward needs a forward(training=True) before it")
         space, (plan, x), self._trained = self._workspaces[True], self._trained, None
         plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
         parts = space.launches["backward"].run(partial(self._backward, space), plan, x, grad_y)
@@ -397,3 +390,32 @@ class UNet:
             transformed = [conv for conv in convs.values() if conv.variant == "winograd"]
             scratch += map(scratch_floats, transformed)
         return table | {"scratch": ((max(scratch),), np.float32)}
+
+
+class UNet(Network):
+    """The U-Net that turns blended features into colours.
+
+    widths: channels of the three levels. blocks: what a level computes, of settings.BLOCKS.
+    options: of Network.
+    """
+
+    def __init__(
+        self,
+        dev: Device,
+        widths: tuple[int, int, int] = (16, 32, 64),
+        *,
+        blocks: str = "double",
+        **options: Any,
+    ):
+        super().__init__(dev, unet_layers(widths, blocks=blocks), **options)
+
+    @classmethod
+    def of_settings(cls, dev: Device, settings: NetworkConfig, *, seed: int = 0) -> "UNet":
+        """The network of a run."""
+        return cls(
+            dev,
+            settings.widths,
+            blocks=settings.blocks,
+            residual=settings.residual,
+            seed=seed,
+        )

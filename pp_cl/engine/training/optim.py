@@ -168,7 +168,7 @@ def adam_update(
 ) -> None:
     """One Adam step of all weights and biases of which `parts` has gradients, in place.
 
-    parameter, moments "m" and "v": float32 arrays of one shape, laid out as UNet.all_parameters;
+    parameter, moments "m" and "v": float32 arrays of one shape, laid out as Network.all_parameters;
     the moments start as zeros. step: from 1 on. Raises ValueError when the shapes differ.
     """
     _same_shape(parameter, *moments.values())

@@ -1,0 +1,67 @@
+// What the finish is fitted to (layers/specular.h): pixels of all views, drawn in any order.
+#include "layers/specular.h"
+
+#define ROW (CHANNELS + 6)  // of a pixel: features, direction, colours
+
+// One work-item per chosen pixel: writes its features, its direction, and what its colour in the
+// target has beyond that in the image, over alpha.
+kernel void specular_rows(
+    const uint m,      // chosen pixels
+    const uint first,  // row of the first one
+    const uint width,  // of the image
+    const uint target_width,
+    const uint left,  // of the target's corner in the image
+    const uint top,
+    const float side,                   // pixels of the camera in one of the image, each way
+    global const uint *chosen,          // (m) pixels of the image
+    global const float *camera,         // (21) camera.h
+    global const float *transmittance,  // (?) of the image
+    global const float *features,       // (H, W, 16) of the image
+    global const float *image,          // (H, W, 3)
+    global const float *target,         // (?, target_width, 3)
+    global float *rows)                 // (ROWS, ROW)
+{
+    const uint i = get_global_id(0);
+    if (i >= m) return;
+    const uint pixel = chosen[i], x = pixel % width, y = pixel / width;
+    const Camera cam = camera_load(camera);
+    global float *row = rows + ROW * ((size_t)first + i);
+    for (int c = 0; c < CHANNELS; c++)
+        row[c] = features[(size_t)CHANNELS * pixel + c];
+    vstore3(direction_of(&cam, x, y, side), 0, row + CHANNELS);
+    const float3 wanted = vload3((size_t)target_width * (y - top) + x - left, target);
+    const float alpha = 1.0f - transmittance[pixel];
+    vstore3((wanted - vload3(pixel, image)) / alpha, 0, row + CHANNELS + 3);
+}
+
+// One work-item per pixel of a batch: writes what the network sees, and what its image should be.
+kernel void specular_batch(
+    const uint n,
+    const float unit,          // of the colours
+    global const uint *drawn,  // (n) rows
+    global const float *rows,  // (ROWS, ROW)
+    global float *inputs,      // (?, ?, INPUTS) n in all
+    global float *wanted)      // (?, ?, 3)
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    global const float *row = rows + ROW * (size_t)drawn[i];
+    global float *input = inputs + INPUTS * (size_t)i;
+    for (int c = 0; c < CHANNELS; c++)
+        input[c] = row[c];
+    global float *encoded = input + CHANNELS;
+    const float direction[3] = {row[CHANNELS], row[CHANNELS + 1], row[CHANNELS + 2]};
+    ENCODE(float, direction, encoded)
+    vstore3(0.5f + vload3(0, row + CHANNELS + 3) / unit, i, wanted);
+}
+
+// One work-item per value: writes the gradient of the mean square of what is wrong.
+kernel void specular_gradient(
+    const uint n,
+    global const float *image,   // (H, W, 3)
+    global const float *wanted,  // (H, W, 3)
+    global float *gradient)      // (H, W, 3)
+{
+    const uint i = get_global_id(0);
+    if (i < n) gradient[i] = 2.0f / n * (image[i] - wanted[i]);
+}

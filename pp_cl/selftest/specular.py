@@ -1,0 +1,116 @@
+"""Cases of the specular layer: of an image, and of what it is fitted to."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.layers.conv import pack_bias, pack_weights
+from pp_cl.engine.network.layers import convolutions
+from pp_cl.engine.network.specular import INPUTS, Specular
+from pp_cl.engine.training.specular import ROW, draw_batch, gradient_of_squares, keep_pixels
+from pp_cl.reference import network
+from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
+
+BOUND = 2e-6  # sums of up to 43 products; the formulas of doubled angles add their errors up
+PADDED = 2, 1  # (left, top) of an image in what is rendered
+
+
+def random_layer(dev: Device, rng: np.random.Generator) -> tuple[Specular, dict[str, np.ndarray]]:
+    """A layer, and its parameters as the float64 twin takes them."""
+    layer, parameters = Specular(dev), {}
+    for one in convolutions(layer.layers):
+        shape = one.weight_shape()
+        weight, bias = rng.normal(size=shape) / np.sqrt(shape[1]), rng.normal(size=shape[0])
+        for kind, values, packed in (
+            ("weight", weight.astype(np.float32), pack_weights),
+            ("bias", bias.astype(np.float32), pack_bias),
+        ):
+            parameters[f"{one.name}.{kind}"] = values.astype(np.float64)
+            dev.write(layer.parameters[f"{one.name}.{kind}"], packed(values))
+    return layer, parameters
+
+
+def _view(dev, rng, height, width, side):
+    """(what renderer.forward() would have made of random pixels, its (H, W, 3) directions): alpha 0
+    and 1 among them, and below what the layer is added from. The middle one looks along an axis.
+    """
+    pose = np.eye(3, 4)[[2, 0, 1]]
+    sizes = width / 2, height / 2, width, height
+    camera = Camera(pose, 0.9 * width, 1.1 * width, *sizes)
+    alpha = rng.choice([0.0, 0.005, 0.01, 0.5, 1.0, -1.0], (height, width))
+    alpha = np.where(alpha < 0, rng.random(alpha.shape), alpha)
+    alpha[np.abs(alpha - 0.02) < 1e-3] = 1  # either is right there
+    features, image = rng.normal(size=(height, width, 16)), rng.random((height, width, 3))
+    rays = camera.rays()
+    view: Any = SimpleNamespace(
+        dev=dev,
+        size=(height, width),
+        offset=PADDED,
+        supersampling=side,
+        points=SimpleNamespace(camera_buffer=dev.upload(camera.enlarged(side).packed((1, 9)))),
+        transmittance=dev.upload(1 - alpha.ravel(), np.float32),
+        features=dev.upload(features, np.float32),
+        image=dev.upload(image, np.float32),
+    )
+    return view, rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def _forward(dev, rng):
+    """Images whose pixels show all, something, too little and nothing."""
+    layer, parameters = random_layer(dev, rng)
+    for n in SIZES:
+        for height, width, side in ((1, n, 1), (n, 3, 2)):
+            view, directions = _view(dev, rng, height, width, side)
+            before = view.image.get()
+            camera = view.points.camera_buffer
+            layer.add(view.image, view.features, view.transmittance, camera, side)
+            alpha = 1 - view.transmittance.get().reshape(height, width, 1).astype(np.float64)
+            features = view.features.get()
+            added = network.specular(layer.layers, parameters, features, directions)
+            is_shown = alpha[..., 0] >= 0.02
+            yield relative(
+                view.image.get(), before + np.where(alpha >= 0.02, alpha * added, 0), BOUND
+            )
+            yield exact(view.image.get()[~is_shown], before[~is_shown])
+
+
+def _batches(dev, rng):
+    """Pixels that are kept of two views, batches of them, and a step's gradient."""
+    for n in SIZES:
+        rows, expected = dev.zeros((2 * n + 1, ROW)), np.zeros((2 * n + 1, ROW))
+        for first, side in ((0, 1), (n + 1, 2)):
+            view, directions = _view(dev, rng, n + 3, 9, side)
+            left, top = PADDED
+            target = rng.random((n, 5, 3)).astype(np.float32)
+            y, x = top + np.arange(n), left + rng.integers(0, 5, n)
+            keep_pixels(view, (9 * y + x).astype(np.uint32), dev.upload(target), rows, first)
+            alpha = 1 - view.transmittance.get().reshape(n + 3, 9)[y, x, None].astype(np.float64)
+            missing = target[y - top, x - left].astype(np.float64) - view.image.get()[y, x]
+            with np.errstate(divide="ignore"):
+                lacking = np.where(alpha > 0, missing / alpha, np.inf * np.sign(missing))
+            of_pixels = view.features.get()[y, x], directions[y, x], lacking
+            expected[first : first + n] = np.concatenate(of_pixels, -1)
+        found = rows.get()
+        usable = np.isfinite(expected).all(1)
+        yield each(found[usable], expected[usable], 8 * EPS, floor=EPS)
+        kept = np.where(usable[:, None], found, 0)
+        drawn, unit = rng.integers(0, len(kept), n).astype(np.uint32), 0.3
+        inputs, wanted = dev.empty((n, 1, INPUTS)), dev.empty((n, 1, 3))
+        draw_batch(dev, dev.upload(kept), dev.upload(drawn), unit, inputs, wanted)
+        of_rows = kept[drawn].astype(np.float64)
+        seen = of_rows[:, :16], network.encoded_directions(of_rows[:, 16:19])
+        yield relative(inputs.get()[:, 0], np.concatenate(seen, -1), 16 * EPS)
+        yield relative(wanted.get()[:, 0], 0.5 + of_rows[:, 19:] / unit, 2 * EPS)
+        image, gradient = dev.upload(rng.random((n, 1, 3)), np.float32), dev.empty((n, 1, 3))
+        gradient_of_squares(dev, image, wanted, gradient)
+        wrong = image.get().astype(np.float64) - wanted.get()
+        yield relative(gradient.get(), 2 * wrong / wrong.size, 4 * EPS)
+
+
+CASES = (
+    Case("specular: layer of an image", _forward),
+    Case("specular: pixels that it is fitted to", _batches),
+)
