@@ -24,7 +24,7 @@ RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
 # settings that runs of 0.3.0 lack, as they were trained
-ADDED = {"train.specular": "off"}
+ADDED: dict[str, Any] = {"train.specular": "off", "train.members": 1}
 AUTOMATIC = ("train.refine_at", "raster.radius", "train.view_opacity")  # by the hull
 MEND_SETTINGS = "restore it or start a new run"
 

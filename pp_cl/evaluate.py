@@ -56,7 +56,7 @@ def evaluate_run(
     for i, view in enumerate(track(views, "measuring", "view")):
         start = time.perf_counter()
         rendered = run.renderer.forward(view.camera, run.gamma)
-        image, computed = run.checked(rendered.clamped()), rendered.computed_fraction
+        image, computed = run.checked(run.shown(rendered)), rendered.computed_fraction
         costs.append((time.perf_counter() - start, computed))
         del rendered  # else its arrays would stay beside the larger ones of the next view
         whole = targets.crop(view, (0, 0, view.camera.width, view.camera.height))

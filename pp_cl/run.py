@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.depth import depth_forward
-from pp_cl.engine.render import Renderer
+from pp_cl.engine.render import Renderer, RenderResult
 from pp_cl.engine.training.schedule import gamma_at, supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError, few_names
@@ -38,13 +38,16 @@ NEAREST = 0.05  # of a point to the eye, in radii of the object
 
 @dataclass
 class Run:
-    """The model of a run's last checkpoint, and the header of that."""
+    """The model of a run's last checkpoint, and the header of that. others: further members, of
+    whose images and its own the mean is shown.
+    """
 
     dev: Device
     folder: RunFolder
     config: Config
     header: dict[str, Any]
     model: Model
+    others: list["Run"] = field(default_factory=list)
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -172,11 +175,20 @@ class Run:
             layers = [result.cropped(self.dev.download(array)) for array in found]
             if features:
                 layers.append(result.cropped(self.dev.download(result.features)))
-            return RenderedView(result.clamped(), *layers)
+            return RenderedView(self.shown(result, **options), *layers)
 
         rendered = mean_rendered_view(sample(dx, dy) for dy in shifts for dx in shifts)
         self.checked(rendered.colour)
         return rendered
+
+    def shown(self, result: RenderResult, **options: Any) -> np.ndarray:
+        """(height, width, 3) float32 in [0, 1]: what the run shows of a view, by what its renderer
+        has made of it, and its other members by the options of Renderer.forward().
+        """
+        images = [result.clamped()]
+        for other in self.others:
+            images.append(other.renderer.render(result.camera, other.gamma, **options))
+        return images[0] if len(images) == 1 else np.mean(images, 0)
 
     @property
     def nearest(self) -> float:
@@ -245,4 +257,8 @@ def load(
     header, arrays = load_run_state(place, config)
     net = UNet.of_settings(dev, config.network)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
-    return Run(dev, place, config, header, model)
+    others = []
+    for number in range(2, config.train.members + 1):
+        if (member := place.member(number)).checkpoint.exists():
+            others.append(load(member.path, dev, scene=scene))
+    return Run(dev, place, config, header, model, others)

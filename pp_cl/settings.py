@@ -224,6 +224,13 @@ class TrainConfig:
         " raster.blend=alpha",
         choices=("auto", "off"),
     )
+    members: int = setting(
+        1,
+        "trainings, with the next seeds, of whose images the mean is shown; each takes as long as"
+        " one, or its share of the minutes",
+        1,
+        8,
+    )
     ema: bool = setting(
         True, "average the parameters (EMA) over the last 15 % of the steps and keep the averages"
     )

@@ -47,11 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.config import run_config
-    from pp_cl.drivers import device_line, open_device
-    from pp_cl.engine.training.schedule import refine_steps
     from pp_cl.files.run_folder import RunFolder
-    from pp_cl.session.memory import memory_line
-    from pp_cl.session.training import is_finished, open_training, stored_state
+    from pp_cl.session.training import members
 
     if options.view:
         require("the viewer", "viser")
@@ -68,6 +65,20 @@ def run(options: argparse.Namespace) -> None:
         raise UserError("SCENE: name the folder of a scene, or the word demo")
     scene = options.scene or load_config(folder.config).scene.path
     config = run_config(folder, scene, preset, given)
+    chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
+    for one, of_one in members(folder, config):
+        if one is not folder:
+            print(f"a training with the next seed, in {one}")
+        _train(one, of_one, options, chosen)
+
+
+def _train(folder, config, options, chosen):
+    """Train one run. chosen: whether the preset chose the images' size."""
+    from pp_cl.drivers import device_line, open_device
+    from pp_cl.engine.training.schedule import refine_steps
+    from pp_cl.session.memory import memory_line
+    from pp_cl.session.training import is_finished, open_training, stored_state
+
     stored = stored_state(folder, config)
     if stored and is_finished(stored, config):
         print(
@@ -78,7 +89,6 @@ def run(options: argparse.Namespace) -> None:
     dev = open_device(options.device)
     print(device_line(dev, options.device))
     training = open_training(dev, folder, config, stored)
-    chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))
     if begun := training.trainer.begun:

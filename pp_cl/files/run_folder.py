@@ -39,6 +39,10 @@ class RunFolder:
     def __str__(self) -> str:
         return str(self.path)
 
+    def member(self, number: int) -> "RunFolder":
+        """The folder of a further member, from 2 on."""
+        return RunFolder(self.path / f"member-{number}")
+
     def evaluation(self, split: str) -> Path:
         """Folder of the evaluation of a split: eval for test, eval/SPLIT for others."""
         return self.path / "eval" if split == "test" else self.path / "eval" / split

@@ -45,8 +45,9 @@ class Budget:
             self._times.clear()
         if len(self._times) < FEWEST or seconds < self._next:
             return False
-        self._next = seconds + 60 * train.minutes / PLANS
-        left = 60 * train.minutes - seconds
+        given = 60 * train.minutes / train.members
+        self._next = seconds + given / PLANS
+        left = given - seconds
         clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
         left /= clearing * statistics.median(self._times)
         replan(train, step, left, self._ending)

@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pp_cl.engine.device.buffers import PIECE_BYTES, grown, table_bytes
+from pp_cl.engine.device.buffers import PIECE_BYTES, Table, grown, table_bytes
 from pp_cl.engine.device.device import compiler_bytes
 from pp_cl.engine.device.host import available_bytes, resident_bytes
 from pp_cl.engine.grid import MOST_IDS, Grid
 from pp_cl.engine.model import REFINING_BYTES
+from pp_cl.engine.network.specular import Specular
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud, sh_blocks
 from pp_cl.engine.raster.project import footprint_pixels
@@ -31,6 +32,7 @@ from pp_cl.engine.training.schedule import (
     supersampled_from,
 )
 from pp_cl.engine.training.smooth import smoothing_table
+from pp_cl.engine.training.specular import SIDE, fit_table
 from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import target_table
 from pp_cl.errors import UserError
@@ -73,6 +75,10 @@ class MemoryPlan:
         self.need: Need
         self._raster, self._train, self._points = config.raster, config.train, config.points
         self.budget = config.train.memory_gib
+        self._specular: Table = {}
+        if config.train.specular == "auto" and config.raster.blend == "alpha":
+            batch = SIDE, SIDE
+            self._specular = Specular(self.dev).table(batch, batch)
         self._downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
         cameras = [one.camera for one in image_files]
         self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
@@ -220,7 +226,10 @@ class MemoryPlan:
             loss_table(self.dev, crop, crop, train.ssim_weight),
             {"image": ((self._image,), np.uint8)},
         ]
-        taking_turns = [[of_step, target_table(crop)], [of_preview, target_table(image)]]
+        of_views = [of_preview, target_table(image)]
+        if stretch.refinements == 0 and self._specular:
+            of_views += [fit_table(n), self._specular]
+        taking_turns = [[of_step, target_table(crop)], of_views]
         if stretch.refinements == 0 and train.prune_weight > 0:
             taking_turns.append([of_pruning])
         device = _bytes(held) + max(map(_bytes, taking_turns))

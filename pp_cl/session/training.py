@@ -3,7 +3,7 @@
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -342,9 +342,11 @@ def train_scene(
     folder = RunFolder(out)
     given = [(*s, "settings") for s in settings.items()]
     config = run_config(folder, str(scene), preset, given)
-    stored, dev = stored_state(folder, config), open_device(device)
-    if not is_finished(stored, config):
-        open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
+    dev, is_stopped = open_device(device), is_stopped or (lambda: False)
+    for one, of_one in members(folder, config):
+        stored = stored_state(one, of_one)
+        if not is_finished(stored, of_one) and not (one is not folder and is_stopped()):
+            open_training(dev, one, of_one, stored).run(on_step, is_stopped)
     return load(out, dev)
 
 
@@ -365,6 +367,17 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
                 refuse_setting(folder, "scene.path", there.scene.path, now)
             folder.configure(configure(there, now).to_json())
     return stored
+
+
+def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Config]]:
+    """The run in a folder, then its further members, each as the first one is by then: with the
+    settings that it has chosen, and the next seed.
+    """
+    yield folder, config
+    for i in range(1, config.train.members):
+        seed = (config.train.seed + i) % 2**32
+        train = replace(config.train, seed=seed, members=1, minutes=0.0)
+        yield folder.member(i + 1), replace(config, train=train)
 
 
 def is_finished(stored: Stored | None, config: Config) -> bool:

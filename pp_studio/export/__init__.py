@@ -26,8 +26,8 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "glb": ("cloud.glb", (".glb",), "the coloured points"),
     "mesh": (
         "mesh.ply",
-        (".ply", ".glb"),
-        "the surface with coloured vertices, .ply or .glb by --out",
+        (".ply", ".glb", ".obj", ".stl"),
+        "the surface with coloured vertices, .ply, .glb, .obj or .stl (without colours) by --out",
     ),
     "textured": ("model.glb", (".glb",), "the surface with few faces and a texture"),
     "html": (

@@ -2,18 +2,24 @@
 which are fused into one signed distance field, a TSDF (Curless and Levoy 1996).
 """
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.ndimage import gaussian_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from pp_cl import Camera, RenderedView, Run, track
 from pp_cl.engine import Grid
 from pp_cl.errors import UserError
+from pp_cl.files import atomic_file
 from pp_studio.export.gltf import gltf_colours, write_glb
 from pp_studio.export.points import (
     coloured_points,
@@ -29,6 +35,10 @@ TRUNCATION = 4.0  # of the distances, in voxel sizes: depths scatter by one or t
 # that slips between the points hollows out what all other views hide.
 HIDDEN = 0.03
 COVERED = 0.5  # alpha from which a pixel shows the object
+# Standard deviation, in voxel sizes, of the Gaussian that smooths the field. On the demo, whose
+# surface is known, .7 halves the roughness and lowers the mean error; 1 loses its spokes.
+SMOOTHING = 0.7
+LOOSE = 0.02  # of the largest part's faces: parts with fewer are left out
 MARGIN = 2  # vertices around the points, so that the surface is closed
 SLAB = 1 << 20  # vertices that are projected at once: 50 MB of temporary arrays
 
@@ -52,11 +62,15 @@ def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.nda
     grid = box_around(run.model.grid, run.model.cloud.ids.get())
     cameras = track(run.cameras("train"), "depths", "view")
     distances = fuse(grid, ((camera, run.render(camera)) for camera in cameras))
-    outside = np.pad(distances, 1, constant_values=1)  # closes what no view shows
+    # its border closes what no view shows
+    outside = gaussian_filter(
+        np.pad(distances, MARGIN, constant_values=1), SMOOTHING, mode="nearest"
+    )
     if outside.min() >= 0:
         raise UserError(f"{run.folder}: the training views show no surface; train it longer")
     vertices, faces, _, _ = marching_cubes(outside, 0, gradient_direction="ascent")
-    positions = np.asarray(grid.origin) + grid.voxel_size * (vertices[:, ::-1] - 1)
+    positions = np.asarray(grid.origin) + grid.voxel_size * (vertices[:, ::-1] - MARGIN)
+    faces = _large_parts(faces, len(positions))
     faces = faces[inside(positions, box)[faces].all(1)]
     if not len(faces):
         raise UserError(
@@ -65,6 +79,19 @@ def surface(run: Run, box: np.ndarray | None = None) -> tuple[np.ndarray, np.nda
         )
     used, faces = np.unique(faces, return_inverse=True)
     return in_world(positions[used], grid.voxel_size), faces.reshape(-1, 3).astype(np.int32)
+
+
+def _large_parts(faces, vertices):
+    """The faces (F, 3) of parts that are no crumbs beside the largest one; says how many are."""
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(vertices, vertices))
+    _, part = connected_components(graph, directed=False)
+    sizes = np.bincount(part[faces[:, 0]])
+    is_large = sizes >= LOOSE * sizes.max()
+    if crumbs := np.count_nonzero(sizes[~is_large]):
+        told = f"the surface: {crumbs} loose parts are left out, {sizes[~is_large].sum()} faces"
+        warnings.warn(f"{told} of {len(faces)}", stacklevel=3)
+    return faces[is_large[part[faces[:, 0]]]]
 
 
 def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
@@ -78,8 +105,16 @@ def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
-    """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does."""
-    if Path(path).suffix.lower() == ".glb":
+    """Write a PLY, GLB, OBJ or STL file, by the suffix. Raises UserError as atomic_file does."""
+    suffix = Path(path).suffix.lower()
+    if suffix in (".obj", ".stl"):
+        solid = trimesh.Trimesh(
+            mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False
+        )
+        data: Any = solid.export(file_type=suffix[1:])
+        with atomic_file(Path(path)) as file:
+            file.write(data.encode() if isinstance(data, str) else data)
+    elif suffix == ".glb":
         near = mesh.vertices - mesh.vertices.mean(0)
         normals = trimesh.Trimesh(near, mesh.faces, process=False).vertex_normals  # else all flat
         attributes = {

@@ -116,4 +116,4 @@ def test_the_end_holds_no_view_beside_another(dev, scene, tmp_path, monkeypatch)
 
     monkeypatch.setattr(trainer, "_keep", keeping)
     trainer.finish()
-    assert len(drawn) == len(trainer.views)
+    assert len(drawn) == 2 * len(trainer.views)  # to prune, and to fit the specular layer

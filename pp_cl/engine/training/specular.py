@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.network.specular import INPUTS, Specular
 from pp_cl.engine.render import Renderer, RenderResult
@@ -41,6 +41,18 @@ class Fitted(NamedTuple):
     after: float
 
 
+def fit_table(points: int) -> Table:
+    """The buffers of SpecularFit for a model of so many points: in small ones, few pixels tell."""
+    image = (SIDE, SIDE, 3), np.float32
+    return {
+        "rows": ((min(MOST_ROWS, points), ROW), np.float32),
+        "drawn": ((SIDE * SIDE,), np.uint32),
+        "inputs": ((SIDE, SIDE, INPUTS), np.float32),
+        "wanted": image,
+        "gradient": image,
+    }
+
+
 class SpecularFit:
     """The pixels that a layer is fitted to, of each view about as many. renderer: of the model
     without a layer. target(i): (h, w, 3) float32 on the device, what the image of views[i] should
@@ -58,10 +70,11 @@ class SpecularFit:
         self.dev, self._seed = renderer.dev, seed
         self._buffers = Buffers(self.dev)
         looked_at = evenly(range(len(views)), MOST_VIEWS)
-        most, rng = MOST_ROWS // len(looked_at), np.random.default_rng(seed)
-        self._rows = self.dev.empty((most * len(looked_at), ROW))
+        self._rows = self.dev.empty(*fit_table(renderer.model.cloud.count)["rows"])
+        most, rng = len(self._rows) // len(looked_at), np.random.default_rng(seed)
         counts: list[int] = []
-        for i in looked_at:
+
+        def keep(i):
             rendered = renderer.forward(views[i].camera, gamma)
             chosen = _object_pixels(views[i], rendered)
             if len(chosen) > most:
@@ -69,6 +82,9 @@ class SpecularFit:
             if len(chosen):
                 keep_pixels(rendered, chosen, target(i), self._rows, first=sum(counts))
             counts.append(len(chosen))
+
+        for i in looked_at:
+            keep(i)
         self._fold = np.repeat(np.arange(len(counts)) % FOLDS, counts)
         lacking = self.dev.download(self._rows[: sum(counts)])[:, -3:]
         self._before = float(np.mean(lacking**2, dtype=np.float64)) if len(lacking) else 0.0
@@ -133,9 +149,8 @@ class SpecularFit:
 
     def _batch(self, rows):
         """(inputs, wanted images) on the device of SIDE * SIDE rows."""
-        b, image = self._buffers, ((SIDE, SIDE, 3), np.float32)
-        b.require({"drawn": (rows.shape, np.uint32), "wanted": image, "gradient": image})
-        b.require({"inputs": ((SIDE, SIDE, INPUTS), np.float32)})
+        b = self._buffers
+        b.require({name: row for name, row in fit_table(0).items() if name != "rows"})
         self.dev.send(b.drawn, rows)
         draw_batch(self.dev, self._rows, b.drawn, self._unit, b.inputs, b.wanted)
         return b.inputs, b.wanted

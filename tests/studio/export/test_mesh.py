@@ -30,7 +30,7 @@ def test_vertices_have_the_colours_of_the_ball_there(mesh):
     assert np.median(np.abs(mesh.colours - expected)[high]) < 30
 
 
-@pytest.mark.parametrize("suffix", ["ply", "glb"])
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj", "stl"])
 def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
     path = tmp_path / f"a.{suffix}"
     write_mesh(path, mesh)
@@ -49,9 +49,13 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
                 "extensions": {"KHR_materials_unlit": {}},
             }
         ]
+    elif suffix == "stl":  # of corners without colours, a vertex for each
+        assert np.array_equal(np.float32(read.triangles), mesh.vertices[mesh.faces])
+        return
     else:
         assert np.array_equal(read.visual.vertex_colors[:, :3], mesh.colours)
-    assert np.array_equal(np.float32(read.vertices), mesh.vertices)
+    decimals = {"rtol": 0, "atol": 1e-8 if suffix == "obj" else 0}
+    np.testing.assert_allclose(np.float32(read.vertices), mesh.vertices, **decimals)
     assert np.array_equal(read.faces, mesh.faces)
 
 
@@ -59,3 +63,19 @@ def test_no_surface_is_one_line(run, monkeypatch):
     monkeypatch.setattr(module, "fuse", lambda grid, _: np.ones(grid.dims[::-1]))
     with pytest.raises(UserError, match="show no surface"):
         surface(run)
+
+
+def test_crumbs_are_left_out_and_said(run, monkeypatch):
+    fuse = module.fuse
+
+    def with_a_crumb(grid, views):
+        distances = fuse(grid, views)
+        distances[:6, :6, :6] = 1
+        distances[1:5, 1:5, 1:5] = -1
+        return distances
+
+    monkeypatch.setattr(module, "fuse", with_a_crumb)
+    monkeypatch.setattr(module, "LOOSE", 0.2)  # of a small ball
+    with pytest.warns(UserWarning, match="1 loose parts are left out"):
+        vertices, faces = surface(run)
+    assert trimesh.Trimesh(vertices, faces).body_count == 1
