@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 from contextlib import suppress
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -48,6 +49,11 @@ def pytest_collection_modifyitems(items):
     for item in items if not hasattr(os, "fork") else ():
         if item.get_closest_marker("unix"):
             item.add_marker(pytest.mark.skip(reason="needs Unix"))
+    if part := os.environ.get("PP_SLOW_PART"):  # of so many, such as 3/8
+        number, parts = map(int, part.split("/"))
+        for item in items:
+            if item.get_closest_marker("slow") and crc32(item.nodeid.encode()) % parts == number:
+                item.add_marker(pytest.mark.picked)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=PRESETS,
         help="tiny (default): images of about 200 pixels, minutes on a CPU; small: of 400, and"
-        " full: of up to 1600, made for 800, longer; paper: the paper's numbers",
+        " full: of up to 1600, made for 800, longer; best: the mean of two such; paper: the"
+        " paper's numbers",
     )
     add(
         "--config",

@@ -20,7 +20,9 @@ LEAST_REFINED = 1000
 # Times as long as a step of halved images that one without a refinement takes: a guess, which the
 # next plan corrects.
 WHOLE = 1.5
-ENDING = 0.15  # of a step's time, for as many pixels of a training view, which the end looks at
+# Of a step's time, for as many pixels of a training view, which the end looks at, and again for the
+# specular layer; and seconds of that one's fit.
+ENDING, LOOKING, FITTING = 0.15, 0.3, 4.0
 FEWEST, MOST = 10, 100  # last steps whose median time counts: first ones may build kernels
 
 
@@ -31,7 +33,10 @@ class Budget:
 
     def __init__(self, train: TrainConfig, pixels: int, may_stay_coarse: bool = False):
         self._train, self._may_stay_coarse = train, may_stay_coarse
-        self._ending = ENDING * pixels / train.crop**2 if train.crop else 0.0  # steps
+        is_fitted = train.specular == "auto"
+        share = ENDING + LOOKING * is_fitted
+        self._ending = share * pixels / train.crop**2 if train.crop else 0.0  # steps
+        self._fitting = FITTING * is_fitted
         self._times: deque[float] = deque(maxlen=MOST)
         self._last = self._next = 0.0  # seconds: of the last step, and at which to plan
 
@@ -47,7 +52,7 @@ class Budget:
             return False
         given = 60 * train.minutes / train.members
         self._next = seconds + given / PLANS
-        left = given - seconds
+        left = given - seconds - self._fitting
         clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
         left /= clearing * statistics.median(self._times)
         replan(train, step, left, self._ending)

@@ -75,15 +75,17 @@ class MemoryPlan:
         self.need: Need
         self._raster, self._train, self._points = config.raster, config.train, config.points
         self.budget = config.train.memory_gib
-        self._specular: Table = {}
-        if config.train.specular == "auto" and config.raster.blend == "alpha":
-            batch = SIDE, SIDE
-            self._specular = Specular(self.dev).table(batch, batch)
         self._downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
         cameras = [one.camera for one in image_files]
         self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
         sizes = [(camera.width, camera.height) for camera in cameras]
         factor = 1 if is_demo else shrink_factor(sizes, self._downscale)
+        self._specular: Table = {}
+        if config.train.specular == "auto" and config.raster.blend == "alpha":
+            batch = SIDE, SIDE
+            pixels = sum(one.width * one.height for one in cameras) // self._downscale**2
+            self._specular = Specular(self.dev).table(batch, batch)
+            self._specular |= fit_table(self.dev, pixels)
         self._images = image_bytes(sizes, factor)
         self._image = image_bytes([(self._largest.width, self._largest.height)], factor)
         self._reading_bytes = 0 if is_demo else reading_cost(image_files, config.scene, factor)[1]
@@ -228,7 +230,7 @@ class MemoryPlan:
         ]
         of_views = [of_preview, target_table(image)]
         if stretch.refinements == 0 and self._specular:
-            of_views += [fit_table(n), self._specular]
+            of_views.append(self._specular)
         taking_turns = [[of_step, target_table(crop)], of_views]
         if stretch.refinements == 0 and train.prune_weight > 0:
             taking_turns.append([of_pruning])

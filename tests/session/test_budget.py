@@ -10,7 +10,7 @@ from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
 from pp_cl.engine.training.schedule import refine_steps, supersampling_at
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session.budget import NEVER, Budget
+from pp_cl.session.budget import FITTING, NEVER, Budget
 from pp_cl.settings import TrainConfig
 
 SMALL = {key: value for key, value in SETTINGS.items() if key != "train.iterations"}
@@ -31,7 +31,7 @@ def simulated(minutes, refine_at, seconds_of, built=0.0, supersampled=0.0):
         refined += [step] if step in refine_steps(train) else []
         budget.plan(step, total)
         assert [at for at in refine_steps(train) if at <= step] == refined
-    return total + 18 * seconds_of(1.0, len(refined)), train, refined
+    return total + FITTING + 53 * seconds_of(1.0, len(refined)), train, refined
 
 
 @pytest.mark.parametrize("minutes, supersampled", [(1, 0), (1, 0.3), (5, 0), (60, 0), (60, 0.3)])
@@ -98,7 +98,11 @@ def clock(monkeypatch):
 def test_a_run_takes_its_minutes_however_often_it_is_stopped(scene, tmp_path, clock, monkeypatch):
     words = ["train", scene, "--out", str(tmp_path / "run"), "--minutes", "0.2"]
     words += set_words(
-        SMALL, train__refine_at="0.35,1", points__count=300, train__supersampled=0.25
+        SMALL,
+        train__refine_at="0.35,1",
+        points__count=300,
+        train__supersampled=0.25,
+        train__specular="off",  # a third of so few seconds
     )
     folder, train_step = RunFolder(tmp_path / "run"), Trainer.train_step
     for stopped_at in (5, 30, 100):

@@ -25,7 +25,9 @@ ROW = 22  # floats of a pixel: features, direction, colours
 MOST_VIEWS, MOST_ROWS = 128, 2**18  # views that are looked at, pixels that are kept of them
 LEAST_ALPHA = 0.5  # of these
 RATE = 5e-3  # first learning rate, which falls as a cosine to 0
-STEPS = 500  # half as many for each fold: more fit single views
+# Steps, half as many for each fold: the least, the most, and one for so many pixels of the object in
+# all views. Of few pixels, more steps fit single views.
+STEPS, MOST_STEPS, PIXELS = 500, 4000, 2400
 FOLDS = 3
 LEAST_SCALE = 0.1  # of a layer that is kept
 
@@ -41,11 +43,11 @@ class Fitted(NamedTuple):
     after: float
 
 
-def fit_table(points: int) -> Table:
-    """The buffers of SpecularFit for a model of so many points: in small ones, few pixels tell."""
-    image = (SIDE, SIDE, 3), np.float32
+def fit_table(dev: Device, pixels: int) -> Table:
+    """The buffers of SpecularFit for views of so many pixels in all."""
+    image, most = ((SIDE, SIDE, 3), np.float32), dev.info["max_allocation_bytes"] // (4 * ROW)
     return {
-        "rows": ((min(MOST_ROWS, points), ROW), np.float32),
+        "rows": ((min(MOST_ROWS, pixels, most), ROW), np.float32),
         "drawn": ((SIDE * SIDE,), np.uint32),
         "inputs": ((SIDE, SIDE, INPUTS), np.float32),
         "wanted": image,
@@ -70,13 +72,18 @@ class SpecularFit:
         self.dev, self._seed = renderer.dev, seed
         self._buffers = Buffers(self.dev)
         looked_at = evenly(range(len(views)), MOST_VIEWS)
-        self._rows = self.dev.empty(*fit_table(renderer.model.cloud.count)["rows"])
+        cameras = [views[i].camera for i in looked_at]
+        self._table = fit_table(self.dev, sum(one.width * one.height for one in cameras))
+        self._rows = self.dev.empty(*self._table.pop("rows"))
         most, rng = len(self._rows) // len(looked_at), np.random.default_rng(seed)
         counts: list[int] = []
+        pixels = 0
 
         def keep(i):
+            nonlocal pixels
             rendered = renderer.forward(views[i].camera, gamma)
             chosen = _object_pixels(views[i], rendered)
+            pixels += len(chosen)
             if len(chosen) > most:
                 chosen = np.sort(rng.choice(chosen, most, replace=False))
             if len(chosen):
@@ -85,6 +92,7 @@ class SpecularFit:
 
         for i in looked_at:
             keep(i)
+        self._steps = min(MOST_STEPS, max(STEPS, pixels // PIXELS))
         self._fold = np.repeat(np.arange(len(counts)) % FOLDS, counts)
         lacking = self.dev.download(self._rows[: sum(counts)])[:, -3:]
         self._before = float(np.mean(lacking**2, dtype=np.float64)) if len(lacking) else 0.0
@@ -99,11 +107,13 @@ class SpecularFit:
         for fold in range(FOLDS):
             is_out = self._fold == fold
             if is_out.any() and not is_out.all():
-                sums += self._products(self._trained(every[~is_out], STEPS // 2), every[is_out])
+                sums += self._products(
+                    self._trained(every[~is_out], self._steps // 2), every[is_out]
+                )
         scale = min(1.0, max(0.0, float(sums[0] / sums[1]))) if sums[1] > 0 else 0.0
         if scale < LEAST_SCALE:
             return Fitted(None, scale, self._before, self._before)
-        layer = self._trained(every, STEPS)
+        layer = self._trained(every, self._steps)
         rp, pp = self._products(layer, every) / (3 * len(every))
         layer.scale(scale * self._unit)
         after = self._before - 2 * scale * rp + scale**2 * pp
@@ -150,7 +160,7 @@ class SpecularFit:
     def _batch(self, rows):
         """(inputs, wanted images) on the device of SIDE * SIDE rows."""
         b = self._buffers
-        b.require({name: row for name, row in fit_table(0).items() if name != "rows"})
+        b.require(self._table)
         self.dev.send(b.drawn, rows)
         draw_batch(self.dev, self._rows, b.drawn, self._unit, b.inputs, b.wanted)
         return b.inputs, b.wanted
