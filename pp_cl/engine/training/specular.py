@@ -25,8 +25,8 @@ ROW = 22  # floats of a pixel: features, direction, colours
 MOST_VIEWS, MOST_ROWS = 128, 2**18  # views that are looked at, pixels that are kept of them
 LEAST_ALPHA = 0.5  # of these
 RATE = 5e-3  # first learning rate, which falls as a cosine to 0
-# Steps, half as many for each fold: the least, the most, and one for so many pixels of the object in
-# all views. Of few pixels, more steps fit single views.
+# Steps: the least, the most, and one for so many pixels of the object in all views; half as many
+# for each fold. Where pixels are few, more steps would fit single views.
 STEPS, MOST_STEPS, PIXELS = 500, 4000, 2400
 FOLDS = 3
 LEAST_SCALE = 0.1  # of a layer that is kept
