@@ -80,7 +80,7 @@ REFUSED = [
     ("export run --format ply --out folder.ply", "folder.ply"),
     ("export run --format ply --out " + 250 * "x" + ".ply", "name"),
     ("export run --format glb --out none/a.glb", "none"),
-    ("export run --format mesh --out a.obj", ".ply or .glb"),
+    ("export run --format mesh --out a.off", ".ply or .glb"),
     ("export run --format scene --out .", "folder"),
     *((f"export run --format scene --out {name}", name) for name in ("full", "file")),
     ("export run --format ply --out /proc/a.ply", "/proc/a"),
