@@ -259,6 +259,7 @@ def test_a_refinement_that_does_not_fit_has_less_to_refine_or_keeps_what_is_lear
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
     settings |= {"train__supersampled": 0}  # else that would be given up first
+    settings |= {"train__specular": "off"}  # whose fit would be what does not fit
     schedule = "pp_cl.engine.training.schedule"
     monkeypatch.setattr(f"{schedule}.LEFT_BY_PRUNING", 0.05)
     monkeypatch.setattr(f"{schedule}.prunings", lambda train, start, end: int(end > start + 1))
