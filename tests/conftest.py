@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(items):
     for item in items if not hasattr(os, "fork") else ():
         if item.get_closest_marker("unix"):
             item.add_marker(pytest.mark.skip(reason="needs Unix"))
-    if part := os.environ.get("PP_SLOW_PART"):  # of so many, such as 3/8
+    if part := os.environ.get("PP_SLOW_PART"):  # of so many, such as 3/16
         number, parts = map(int, part.split("/"))
         for item in items:
             if item.get_closest_marker("slow") and crc32(item.nodeid.encode()) % parts == number:

@@ -16,6 +16,7 @@ from support.sweeps import jobs_of, pretend, words_of
 from pp_cl.cli import main
 from pp_cl.config import run_config
 from pp_cl.drivers import open_device
+from pp_cl.engine.training import specular
 from pp_cl.evaluate import evaluate_run
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load
@@ -107,6 +108,7 @@ def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkey
     assert len(begun) == 5  # one run twice
     rows = json.loads((out / "sweep.json").read_text())["runs"]
     plan, dev = jobs_of(scenes, tmp_path / "alone", [1, 2]), open_device()
+    monkeypatch.setattr(specular, "STEPS", 500)  # as in the workers, which no fixture reaches
     for row, job in zip(rows, plan, strict=True):
         expected = undisturbed(dev, job)
         assert (row["scene"], row["seed"]) == (job.name, job.seed)
