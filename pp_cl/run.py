@@ -260,5 +260,6 @@ def load(
     others = []
     for number in range(2, config.train.members + 1):
         if (member := place.member(number)).checkpoint.exists():
-            others.append(load(member.path, dev, scene=scene))
+            other = load(member.path, dev, scene=scene)
+            others += [other] if other.header["finished"] else []
     return Run(dev, place, config, header, model, others)

@@ -149,8 +149,8 @@ def _first_line(training):
 def _specular_line(fitted):
     """A line of text: what the specular layer has brought."""
     if fitted.layer is None:
-        return "specular: left out, it explains nothing of views that it is not fitted to"
-    before, after = (-10 * math.log10(mse) for mse in (fitted.before, fitted.after))
+        return "specular: left out, it explains too little of views that it is not fitted to"
+    before, after = (-10 * math.log10(max(mse, 1e-10)) for mse in (fitted.before, fitted.after))
     return (
         f"specular: kept at {fitted.scale:.2f}; the object in training views"
         f" {before:.2f} -> {after:.2f} dB"

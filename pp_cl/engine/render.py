@@ -19,6 +19,7 @@ from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import Prepared
 from pp_cl.engine.layers.conv import GradientParts
+from pp_cl.engine.layers.simple import specular_forward
 from pp_cl.engine.layers.tiles import tiles_covered
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import (
@@ -248,7 +249,8 @@ class Renderer:
             result.image = net.forward(result.features, training, plan)
             if specular := self.model.specular:
                 through: Any = weights.transmittance  # which alpha compositing has
-                specular.add(result.image, b.features, through, points.camera_buffer, side)
+                seen = b.features, through, points.camera_buffer
+                specular_forward(dev, specular.parameters, result.image, *seen, side)
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen, is_planned):

@@ -8,6 +8,7 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.layers.conv import pack_bias, pack_weights
+from pp_cl.engine.layers.simple import specular_forward
 from pp_cl.engine.network.layers import convolutions
 from pp_cl.engine.network.specular import INPUTS, Specular
 from pp_cl.engine.training.specular import ROW, draw_batch, gradient_of_squares, keep_pixels
@@ -65,8 +66,8 @@ def _forward(dev, rng):
         for height, width, side in ((1, n, 1), (n, 3, 2)):
             view, directions = _view(dev, rng, height, width, side)
             before = view.image.get()
-            camera = view.points.camera_buffer
-            layer.add(view.image, view.features, view.transmittance, camera, side)
+            seen = view.features, view.transmittance, view.points.camera_buffer
+            specular_forward(dev, layer.parameters, view.image, *seen, side)
             alpha = 1 - view.transmittance.get().reshape(height, width, 1).astype(np.float64)
             features = view.features.get()
             added = network.specular(layer.layers, parameters, features, directions)

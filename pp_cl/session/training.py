@@ -345,8 +345,10 @@ def train_scene(
     dev, is_stopped = open_device(device), is_stopped or (lambda: False)
     for one, of_one in members(folder, config):
         stored = stored_state(one, of_one)
-        if not is_finished(stored, of_one) and not (one is not folder and is_stopped()):
+        if not is_finished(stored, of_one):
             open_training(dev, one, of_one, stored).run(on_step, is_stopped)
+        if is_stopped():
+            break
     return load(out, dev)
 
 

@@ -37,7 +37,7 @@ HIDDEN = 0.03
 COVERED = 0.5  # alpha from which a pixel shows the object
 # Standard deviation, in voxel sizes, of the Gaussian that smooths the field. On the demo, whose
 # surface is known, neighbouring faces then differ by 7.1 degrees, not 10.0, and vertices lie no
-# farther from it; 1 would lose its spokes.
+# farther from it.
 SMOOTHING = 0.7
 LOOSE = 0.02  # of the largest part's faces: parts with fewer are left out
 MARGIN = 2  # vertices around the points, so that the surface is closed

@@ -45,7 +45,7 @@ def test_the_mean_of_their_images_is_shown(both, dev):
     assert mean > own[0]
 
 
-def test_it_resumes_in_either_member(scene, both, tmp_path, monkeypatch, capsys):
+def test_it_resumes_in_either_member(scene, both, tmp_path, monkeypatch, capsys, dev):
     out, train_step = tmp_path / "run", Trainer.train_step
     for seed, step in ((0, 7), (1, 12)):
 
@@ -57,9 +57,11 @@ def test_it_resumes_in_either_member(scene, both, tmp_path, monkeypatch, capsys)
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "train_step", stopping)
             assert main(arguments(scene, out, **SETTINGS)) == 130
+    assert not load(out, dev).others  # the second is not finished
     assert main(arguments(scene, out, **SETTINGS)) == 0
     assert checkpoint(out) == checkpoint(both)
     assert checkpoint(out / "member-2") == checkpoint(both / "member-2")
+    assert len(load(out, dev).others) == 1
     capsys.readouterr()
     assert main(arguments(scene, out, **SETTINGS)) == 0
     assert capsys.readouterr().out.count("is finished") == 2

@@ -114,20 +114,22 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
 def specular_forward(
     dev: Device,
     parameters: dict[str, Array],
-    hidden: int,
     image: Array,
     features: Array,
     transmittance: Array,
     camera: Array,
     side: int,
 ) -> None:
-    """Specular.add(). parameters: "a.weight" and so on, of layers with so many hidden channels."""
+    """Add the colours of a specular layer to the image (H, W, 3), by the features (H, W, 16) and
+    the transmittance (H * W,) of a view. parameters: of network/specular.py. camera: (21,), with
+    side x side pixels for each of the image.
+    """
     n = image.shape[0] * image.shape[1]
     named: dict[str, Any] = {}
     for name, array in parameters.items():
         layer, kind = name.split(".")
         named[f"{kind}_{layer}"] = array
-    dev.program("layers/specular", LANES=lanes(dev), HIDDEN=hidden).launch(
+    dev.program("layers/specular", LANES=lanes(dev), HIDDEN=parameters["a.bias"].size).launch(
         "specular_forward",
         -(-n // lanes(dev)),
         n=n,

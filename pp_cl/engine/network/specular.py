@@ -7,10 +7,8 @@ what the images then lack: reflections above all.
 from __future__ import annotations
 
 import numpy as np
-from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.layers.simple import specular_forward
 from pp_cl.engine.network.layers import Layer
 from pp_cl.engine.network.unet import Network
 
@@ -28,7 +26,9 @@ def specular_layers() -> list[Layer]:
 
 
 class Specular(Network):
-    """The specular layer of a model. Its image less 1/2 is what it adds where alpha is 1."""
+    """The specular layer of a model. Its image less 1/2 is what it adds where alpha is 1; images
+    get that from layers/simple.specular_forward().
+    """
 
     def __init__(self, dev: Device) -> None:
         super().__init__(dev, specular_layers())
@@ -38,18 +38,3 @@ class Specular(Network):
         for name in ("c.weight", "c.bias"):
             parameter = self.parameters[name]
             self.dev.write(parameter, np.float32(factor) * self.dev.download(parameter))
-
-    def add(
-        self,
-        image: Array,
-        features: Array,
-        transmittance: Array,
-        camera: Array,
-        side: int,
-    ) -> None:
-        """Add its colours to the image (H, W, 3), by the features (H, W, 16) and the transmittance
-        (H * W,) of a view. camera: (21,), with side x side pixels for each of the image.
-        """
-        specular_forward(
-            self.dev, self.parameters, HIDDEN, image, features, transmittance, camera, side
-        )

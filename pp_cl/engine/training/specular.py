@@ -78,9 +78,7 @@ class SpecularFit:
         most, rng = len(self._rows) // len(looked_at), np.random.default_rng(seed)
         counts: list[int] = []
         pixels = 0
-
-        def keep(i):
-            nonlocal pixels
+        for i in looked_at:
             rendered = renderer.forward(views[i].camera, gamma)
             chosen = _object_pixels(views[i], rendered)
             pixels += len(chosen)
@@ -89,9 +87,7 @@ class SpecularFit:
             if len(chosen):
                 keep_pixels(rendered, chosen, target(i), self._rows, first=sum(counts))
             counts.append(len(chosen))
-
-        for i in looked_at:
-            keep(i)
+            del rendered  # else its arrays would stay beside the larger ones of the next view
         self._steps = min(MOST_STEPS, max(STEPS, pixels // PIXELS))
         self._fold = np.repeat(np.arange(len(counts)) % FOLDS, counts)
         lacking = self.dev.download(self._rows[: sum(counts)])[:, -3:]
