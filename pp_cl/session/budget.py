@@ -21,7 +21,7 @@ LEAST_REFINED = 1000
 # next plan corrects.
 WHOLE = 1.5
 # Of a step's time, for as many pixels of a training view, which the end looks at, and again for the
-# specular layer; and seconds of that one's fit, as far as its steps are the least.
+# specular layer; and seconds of that one's fit.
 ENDING, LOOKING, FITTING = 0.15, 0.3, 4.0
 FEWEST, MOST = 10, 100  # last steps whose median time counts: first ones may build kernels
 

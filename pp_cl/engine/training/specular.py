@@ -25,9 +25,7 @@ ROW = 22  # floats of a pixel: features, direction, colours
 MOST_VIEWS, MOST_ROWS = 128, 2**18  # views that are looked at, pixels that are kept of them
 LEAST_ALPHA = 0.5  # of these
 RATE = 5e-3  # first learning rate, which falls as a cosine to 0
-# Steps: the least, the most, and one for so many pixels of the object in all views; half as many
-# for each fold. Where pixels are few, more steps would fit single views.
-STEPS, MOST_STEPS, PIXELS = 500, 4000, 2400
+STEPS = 500  # half as many for each fold: more fit single views
 FOLDS = 3
 LEAST_SCALE = 0.1  # of a layer that is kept
 
@@ -77,18 +75,15 @@ class SpecularFit:
         self._rows = self.dev.empty(*self._table.pop("rows"))
         most, rng = len(self._rows) // len(looked_at), np.random.default_rng(seed)
         counts: list[int] = []
-        pixels = 0
         for i in looked_at:
             rendered = renderer.forward(views[i].camera, gamma)
             chosen = _object_pixels(views[i], rendered)
-            pixels += len(chosen)
             if len(chosen) > most:
                 chosen = np.sort(rng.choice(chosen, most, replace=False))
             if len(chosen):
                 keep_pixels(rendered, chosen, target(i), self._rows, first=sum(counts))
             counts.append(len(chosen))
             del rendered  # else its arrays would stay beside the larger ones of the next view
-        self._steps = min(MOST_STEPS, max(STEPS, pixels // PIXELS))
         self._fold = np.repeat(np.arange(len(counts)) % FOLDS, counts)
         lacking = self.dev.download(self._rows[: sum(counts)])[:, -3:]
         self._before = float(np.mean(lacking**2, dtype=np.float64)) if len(lacking) else 0.0
@@ -103,13 +98,11 @@ class SpecularFit:
         for fold in range(FOLDS):
             is_out = self._fold == fold
             if is_out.any() and not is_out.all():
-                sums += self._products(
-                    self._trained(every[~is_out], self._steps // 2), every[is_out]
-                )
+                sums += self._products(self._trained(every[~is_out], STEPS // 2), every[is_out])
         scale = min(1.0, max(0.0, float(sums[0] / sums[1]))) if sums[1] > 0 else 0.0
         if scale < LEAST_SCALE:
             return Fitted(None, scale, self._before, self._before)
-        layer = self._trained(every, self._steps)
+        layer = self._trained(every, STEPS)
         rp, pp = self._products(layer, every) / (3 * len(every))
         layer.scale(scale * self._unit)
         after = self._before - 2 * scale * rp + scale**2 * pp
