@@ -1,7 +1,7 @@
-"""The specular layer: a small network of each pixel alone, of its 16 blended features and of the
-direction it is seen in, whose colours times alpha are added to the image (the specular of SNeRG,
-Hedman et al. 2021, section 4). It is fitted once a training has ended (training/specular.py), to
-what the images then lack: reflections above all.
+"""The specular layer: a small network that turns the 16 blended features and the viewing direction
+of one pixel into a colour, which is multiplied by alpha and added to the image (as in SNeRG, Hedman
+et al. 2021, section 4). It is fitted after the training (training/specular.py) to the residuals of
+the images, which are mostly reflections.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.network.layers import Layer
 from pp_cl.engine.network.unet import Network
 
-HIDDEN = 32  # channels of its two hidden layers
-INPUTS = 43  # features, and a direction as cl/layers/specular.h encodes it
+HIDDEN = 32  # channels of both hidden layers
+INPUTS = 43  # features, and the direction as cl/layers/specular.h encodes it
 
 
 def specular_layers() -> list[Layer]:
-    """Its layers: 1x1 convolutions of pixels in any order."""
+    """1x1 convolutions: a pixel does not depend on its neighbours."""
     return [
         Layer("conv", "a", ("x",), 0, HIDDEN, (INPUTS,), 1, True),
         Layer("conv", "b", ("a",), 0, HIDDEN, (HIDDEN,), 1, True),
@@ -26,8 +26,8 @@ def specular_layers() -> list[Layer]:
 
 
 class Specular(Network):
-    """The specular layer of a model. Its image less 1/2 is what it adds where alpha is 1; images
-    get that from layers/simple.specular_forward().
+    """The specular layer of a model. Its output minus 1/2 is the colour added where alpha is 1;
+    layers/simple.specular_forward() adds it to an image.
     """
 
     def __init__(self, dev: Device) -> None:

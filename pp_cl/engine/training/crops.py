@@ -14,7 +14,7 @@ from pp_cl.settings import TrainConfig
 
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
-END_SHARE = 0.25  # of the crops that show one end of the object, at least
+END_SHARE = 0.25  # least share of the crops that show one end of the object
 BETWEEN = 0.125  # pixels by which images at their own size are shifted: farther would blur them
 
 
@@ -31,10 +31,11 @@ class Crop(NamedTuple):
 
 
 class Crops:
-    """Draws crops of views whose images are halved some times. Every choice is a function of
-    (train.seed, step). Raises UserError where halved images are too small.
+    """Draws crops of views whose images are halved a number of times. Every choice is a function of
+    (train.seed, step). Raises UserError if the halved images are too small.
 
-    views: the halved ones. side: of a crop, pixels; 0: whole images. halvings: how often.
+    views: the halved views. side: side of a crop in pixels; 0: whole images. halvings: how many
+    times the images are halved.
     """
 
     def __init__(self, views: Sequence[View], train: TrainConfig, halvings: int):
@@ -70,8 +71,9 @@ class Crops:
         return Crop(index, view, box, jitter, view.crop_camera(box, jitter))
 
     def _jitter(self, view, rng):
-        """Crop.jitter: of a reduced view any stored pixels of a block. Others are shifted between
-        their pixels, unless some of these say nothing, which would spread.
+        """Crop.jitter: for a reduced view a whole number of stored pixels within a block. Other
+        views are shifted by a fraction of a pixel, unless some pixels are ignored: interpolation
+        would spread these.
         """
         if view.downscale > 1:
             return tuple(rng.integers(view.downscale, size=2).tolist())
@@ -86,11 +88,11 @@ def crop_side(side: int, halvings: int) -> int:
 
 
 def draw_start(rng: np.random.Generator, low: int, high: int, size: int, *, limit: int) -> int:
-    """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside
-    [0, limit).
+    """First pixel of a crop of `size` pixels inside [0, limit) that shows as much as possible of
+    the object, which covers [low, high).
 
-    The object's two ends are each in a share END_SHARE of the crops if not in more: uniform draws
-    hardly ever show the ends of what is much wider than a crop.
+    Each end of the object is in at least END_SHARE of the crops: uniform draws hardly ever show the
+    ends of an object much wider than a crop.
     """
     first, last = sorted((low, high - size))
     first, last = max(first, 0), max(min(last, limit - size), 0)

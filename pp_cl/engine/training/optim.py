@@ -30,8 +30,8 @@ NETWORK_EPS = 1e-8  # PyTorch's default
 
 
 def network_state_table(n: int, is_averaged: bool) -> Table:
-    """What the optimiser keeps of a network with n parameters: Adam's moments, and the averages
-    once there are any.
+    """The arrays that the optimiser keeps for a network of n parameters: Adam's moments, and the
+    averages once these are kept.
     """
     names = ("m", "v", "average") if is_averaged else ("m", "v")
     return dict.fromkeys(names, ((n,), np.float32))
@@ -65,11 +65,11 @@ class Optimiser:
         count: int,
         sh_eps: float,
     ) -> None:
-        """One step by the gradients of the visible points, and by those of the network, as they are
-        in parts; None: it has no parameters.
+        """Take one step along the gradients of the visible points and of the network.
 
-        step: from 1. points: as projected into the rendered view. visible: uint32, the visible
-        ones, S = count of them. sh_eps: eps of the SH coefficients.
+        step: from 1. network_parts: None if the network has no parameters. points: as projected
+        into the rendered view. visible: uint32, the indices of the S = count visible points.
+        sh_eps: eps of the SH coefficients.
         """
         net = self.model.net
         rmsprop_update(
@@ -166,7 +166,7 @@ def adam_update(
     rate: float,
     eps: float,
 ) -> None:
-    """One Adam step of all weights and biases of which `parts` has gradients, in place.
+    """One Adam step, in place, of all weights and biases that have a gradient in `parts`.
 
     parameter, moments "m" and "v": float32 arrays of one shape, laid out as Network.all_parameters;
     the moments start as zeros. step: from 1 on. Raises ValueError when the shapes differ.
@@ -242,7 +242,7 @@ def rmsprop_update(
     program.launch(
         "rmsprop_move",
         count * parts,
-        None if fits else parts,  # is refused: the parts of a point wait for each other
+        None if fits else parts,  # the device refuses: the parts of a point wait for each other
         s=count,
         step=step,
         eps=root * sh_eps,

@@ -1,4 +1,6 @@
-"""Which points are kept: during a training by the weights of its steps, at its end by its views."""
+"""Decides which points are kept: during a training by the blend weights of its steps, at its end by
+those of all training views.
+"""
 
 from collections.abc import Sequence
 
@@ -15,8 +17,8 @@ from pp_cl.errors import Diverged
 from pp_cl.settings import Config, TrainConfig
 
 LEAST_OPACITY = 0.01
-MANY_VIEWS = 24  # so many show every place several times
-SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
+MANY_VIEWS = 24  # with this many views, every place is seen by several
+SPECK = 50  # points in a part of the object: a patch of 7 x 7 pixels if they are a pixel apart
 
 
 def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainConfig) -> Array:
@@ -73,21 +75,22 @@ def final_points_to_keep(
 
 
 def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Config) -> Array:
-    """final_points_to_keep() of training views: in one of them, where there are many in two, as
-    what a single image shows is mostly a speck in others.
+    """The points that at least one training view shows, or two if there are many views: a point
+    that only one shows is mostly a floater. (M,) uint32, as final_points_to_keep().
     """
     dev, cloud, train = renderer.dev, renderer.model.cloud, config.train
     max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
     for view in views:
         drawn = renderer.forward(view.camera, schedule.GAMMA[1], until="weights")
         renderer.record_weights(drawn, max_weight, seen, least=train.prune_weight)
-        del drawn  # else its arrays would stay beside the larger ones of the next view
+        del drawn  # frees its arrays before the next view allocates
     least = 2 if len(views) >= MANY_VIEWS else 1
     return final_points_to_keep(dev, max_weight, seen, cloud.opacity, train, least)
 
 
 def points_of_large_parts(model: Model) -> Array:
-    """(M,) uint32, ascending: the points of parts that are large enough to be of the object."""
+    """(M,) uint32, ascending: the points in connected parts large enough to belong to the object.
+    """
     is_large = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
     return model.dev.upload(np.flatnonzero(is_large), np.uint32)
 

@@ -17,8 +17,8 @@ SMOOTHING_EVERY = 64  # steps
 PRUNE_LOOKS = 100  # steps that must have had a point in view before it may be pruned
 EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
 DELAYED = 0.01  # of a learning rate, at the first step of its warm-up
-# The share of the points that pruning leaves by the next refinement or the last step, about: 0.45
-# to 0.73 on lego with the presets tiny, small and full.
+# About the share of the points that pruning leaves by the next refinement or the last step: 0.45 to
+# 0.73 on lego with the presets tiny, small and full.
 LEFT_BY_PRUNING = 0.6
 
 
@@ -38,7 +38,8 @@ class Rates:
     def at(cls, step: int, network: NetworkConfig, train: TrainConfig) -> Rates:
         """The rates of a step from 0 on."""
         steps = train.iterations
-        # these travel about as far in a long training as in a short one: faster, they end noisier
+        # in a long training these travel about as far as in a short one: at full rates they end
+        # noisier
         scale = math.sqrt(min(1.0, train.rate_steps / steps or 1.0))
         sh = tuple(
             slower
@@ -79,7 +80,7 @@ def supersampled_from(train: TrainConfig) -> int:
 
 
 def supersampling_at(step: int, train: TrainConfig) -> int:
-    """RenderResult.supersampling of a step from 0 on, and of what is rendered before it."""
+    """RenderResult.supersampling of a step, counted from 0, and of renderings made before it."""
     return 2 if train.supersampled > 0 and step >= supersampled_from(train) else 1
 
 
@@ -110,8 +111,8 @@ def refine_steps(train: TrainConfig) -> list[int]:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Steps without a refinement among them. points: at their beginning, expected. refinements: to
-    come. is_averaged: whether averages are kept. supersampling: of RenderResult.
+    """A run of steps without a refinement. points: expected at its beginning. refinements: still to
+    come. is_averaged: averages are kept. supersampling: as RenderResult.supersampling.
     """
 
     points: int
@@ -121,8 +122,8 @@ class Stretch:
 
 
 def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[Stretch]:
-    """The stretches of a training from a step on, which begins with these points. What prunings to
-    come leave is an estimate.
+    """The stretches of a training that has `points` points at `step`. The numbers of points that
+    later prunings leave are estimates.
     """
     refined, averaged, start = refine_steps(train), averages_from(train), 0
     ends = {*refined, int(min(averaged, train.iterations)), supersampled_from(train)}
@@ -149,8 +150,8 @@ def gamma_at(step: int, steps: int) -> float:
 
 
 def rising_weight(step: int, steps: int, last: float = 1.0) -> float:
-    """A loss weight that rises linearly from 0 to `last`: of the distortion loss, and of alphas
-    below the mask. At first there is no surface that these could make sharp or opaque.
+    """A loss weight that rises linearly from 0 to `last`, for the distortion loss and for alphas
+    below the mask: at first there is no surface that these could make sharp or opaque.
     """
     return last * step / steps
 

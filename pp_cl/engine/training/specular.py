@@ -1,6 +1,6 @@
-"""Fits the specular layer of a model (network/specular.py) once its training has ended: by squares,
-to pixels of all views in any order. A step of the training sees one view, and its loss takes
-reflections for outliers.
+"""Fits the specular layer of a model (network/specular.py) after the last step of its training, by
+least squares over pixels of all views at once. The training itself cannot learn it: a step sees one
+view, and the loss treats reflections as outliers.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from pp_cl.engine.training.optim import NETWORK_EPS, adam_update, network_state_
 from pp_cl.engine.views import View, evenly
 
 KERNELS = "training/specular"
-SIDE = 64  # of a batch, SIDE x SIDE pixels
-ROW = 22  # floats of a pixel: features, direction, colours
-MOST_VIEWS, MOST_ROWS = 128, 2**18  # views that are looked at, pixels that are kept of them
-LEAST_ALPHA = 0.5  # of these
-RATE = 5e-3  # first learning rate, which falls as a cosine to 0
-STEPS = 500  # half as many for each fold: more fit single views
+SIDE = 64  # a batch has SIDE x SIDE pixels
+ROW = 22  # floats stored for a pixel: features, direction, colours
+MOST_VIEWS, MOST_ROWS = 128, 2**18  # views rendered for the fit; pixels kept from all of them
+LEAST_ALPHA = 0.5  # pixels below this alpha are not fitted to
+RATE = 5e-3  # first learning rate; it falls to 0 along a cosine
+STEPS = 500  # a fold takes half of them; longer fits adapt to single views
 FOLDS = 3
-LEAST_SCALE = 0.1  # of a layer that is kept
+LEAST_SCALE = 0.1  # a layer scaled by less than this is dropped
 
 
 class Fitted(NamedTuple):
-    """layer: None where it is not worth having. scale: by which its colours were multiplied.
-    before, after: mean squares of what the pixels lack, without it and with it.
+    """layer: None if it does not help on views that it was not fitted to. scale: the factor applied
+    to its colours. before, after: mean squared residual of the pixels without the layer and with
+    it.
     """
 
     layer: Specular | None
@@ -42,7 +43,7 @@ class Fitted(NamedTuple):
 
 
 def fit_table(dev: Device, pixels: int) -> Table:
-    """The buffers of SpecularFit for views of so many pixels in all."""
+    """The buffers of SpecularFit. pixels: the number of pixels of all views together."""
     image, most = ((SIDE, SIDE, 3), np.float32), dev.info["max_allocation_bytes"] // (4 * ROW)
     return {
         "rows": ((min(MOST_ROWS, pixels, most), ROW), np.float32),
@@ -54,9 +55,10 @@ def fit_table(dev: Device, pixels: int) -> Table:
 
 
 class SpecularFit:
-    """The pixels that a layer is fitted to, of each view about as many. renderer: of the model
-    without a layer. target(i): (h, w, 3) float32 on the device, what the image of views[i] should
-    be.
+    """Collects pixels, about the same number from each view, and fits a layer to them.
+
+    renderer: renders the model without a layer. target(i): (h, w, 3) float32 on the device, the
+    image that views[i] should give.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class SpecularFit:
         self._buffers = Buffers(self.dev)
         looked_at = evenly(range(len(views)), MOST_VIEWS)
         cameras = [views[i].camera for i in looked_at]
-        self._table = fit_table(self.dev, sum(one.width * one.height for one in cameras))
+        self._table = fit_table(self.dev, sum(camera.width * camera.height for camera in cameras))
         self._rows = self.dev.empty(*self._table.pop("rows"))
         most, rng = len(self._rows) // len(looked_at), np.random.default_rng(seed)
         counts: list[int] = []
@@ -87,12 +89,12 @@ class SpecularFit:
         self._fold = np.repeat(np.arange(len(counts)) % FOLDS, counts)
         lacking = self.dev.download(self._rows[: sum(counts)])[:, -3:]
         self._before = float(np.mean(lacking**2, dtype=np.float64)) if len(lacking) else 0.0
-        # a layer is fitted in units of this, so that Adam's steps suit what it has to learn
+        # the layer learns residuals in this unit, so that Adam's steps have the right size
         self._unit = 2 * math.sqrt(self._before)
 
     def fitted(self) -> Fitted:
-        """The layer, scaled by how much of it is right in views that it is not fitted to, as folds
-        of the views tell.
+        """The layer, scaled by cross-validation over views: by the share of its predictions that
+        holds in views left out of the fit.
         """
         every, sums = np.arange(len(self._fold), dtype=np.uint32), np.zeros(2)
         for fold in range(FOLDS):
@@ -109,7 +111,7 @@ class SpecularFit:
         return Fitted(layer, scale, self._before, float(after))
 
     def _trained(self, rows, steps):
-        """A layer that is fitted to these rows."""
+        """A layer fitted to these rows."""
         dev, rng, layer = self.dev, np.random.default_rng(self._seed), Specular(self.dev)
         table = network_state_table(layer.all_parameters.size, is_averaged=False)
         moments = {kind: dev.zeros(*row) for kind, row in table.items()}
@@ -131,8 +133,8 @@ class SpecularFit:
         return layer
 
     def _products(self, layer, rows):
-        """(2,) float64: of what these rows lack, r, and what the layer gives them, p, the sums of
-        r p and p p.
+        """(2,) float64: the sums of r p and of p p over these rows, with their residuals r and the
+        predictions p of the layer.
         """
         sums, size = np.zeros(2), SIDE * SIDE
         for start in range(0, len(rows), size):
@@ -147,7 +149,7 @@ class SpecularFit:
         return sums
 
     def _batch(self, rows):
-        """(inputs, wanted images) on the device of SIDE * SIDE rows."""
+        """(inputs, wanted images) of SIDE * SIDE rows, on the device."""
         b = self._buffers
         b.require(self._table)
         self.dev.send(b.drawn, rows)
@@ -158,9 +160,9 @@ class SpecularFit:
 def keep_pixels(
     rendered: RenderResult, chosen: np.ndarray, target: Array, rows: Array, first: int
 ) -> None:
-    """Write to the rows (?, ROW) from `first` on what there is at chosen pixels (m,) uint32 of an
-    image, padded: its features, its direction, and what its colour in the target (h, w, 3) has
-    beyond that in the image, over alpha.
+    """Write a row, from `first` on in rows (?, ROW), for each chosen pixel, (m,) uint32 indices
+    into the padded image: its features, its direction, and its residual (target - image) / alpha.
+    target: (h, w, 3).
     """
     left, top = rendered.offset
     rendered.dev.program(KERNELS).launch(
@@ -186,8 +188,9 @@ def keep_pixels(
 def draw_batch(
     dev: Device, rows: Array, drawn: Array, unit: float, inputs: Array, wanted: Array
 ) -> None:
-    """Write the inputs (?, ?, INPUTS) of a layer of n pixels, and the images (?, ?, 3) that it
-    should give: 1/2 and their colours over `unit`. drawn: (n,) uint32, their rows.
+    """Write the inputs (?, ?, INPUTS) of a layer for n pixels, and the image (?, ?, 3) that it
+    should give: 1/2 plus their residuals divided by `unit`. drawn: (n,) uint32, the rows of the
+    pixels.
     """
     dev.program(KERNELS).launch(
         "specular_batch",
@@ -202,7 +205,8 @@ def draw_batch(
 
 
 def gradient_of_squares(dev: Device, image: Array, wanted: Array, gradient: Array) -> None:
-    """Write the gradient by an image (H, W, 3) of the mean square of image - wanted."""
+    """Write the gradient of the mean square of image - wanted with respect to the image (H, W, 3).
+    """
     dev.program(KERNELS).launch(
         "specular_gradient",
         image.size,
@@ -214,11 +218,11 @@ def gradient_of_squares(dev: Device, image: Array, wanted: Array, gradient: Arra
 
 
 def _object_pixels(view, rendered):
-    """(?,) uint32: the pixels of a view's image, padded, that show the object and are not
+    """(?,) uint32: indices into the padded image of the pixels that show the object and are not
     ignored.
     """
     alpha = 1 - rendered.dev.download(rendered.transmittance).reshape(rendered.size)
-    is_told = np.zeros(rendered.size, bool)
+    is_used = np.zeros(rendered.size, bool)
     ignored = view.ignored_crop((0, 0, view.camera.width, view.camera.height))
-    rendered.cropped(is_told)[:] = True if ignored is None else ~ignored
-    return np.flatnonzero(is_told & (alpha >= LEAST_ALPHA)).astype(np.uint32)
+    rendered.cropped(is_used)[:] = True if ignored is None else ~ignored
+    return np.flatnonzero(is_used & (alpha >= LEAST_ALPHA)).astype(np.uint32)

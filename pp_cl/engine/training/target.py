@@ -11,19 +11,19 @@ from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.views import View
 
-AROUND = 2  # pixels on either side of a place that interpolation reads
+AROUND = 2  # pixels that interpolation reads on either side
 
 
 def target_table(size: tuple[int, int]) -> Table:
-    """The buffers of Target for a crop of size (height, width), beside the image's rows."""
+    """The buffers of Target for a crop of size (height, width), without the rows of the image."""
     return {"target": ((*size, 3), np.float32), "alpha": (size, np.float32)}
 
 
 class Target:
     """Makes targets from views.
 
-    A target pixel is the mean of the stored pixels of its block; where a block reaches outside of
-    the image only those inside count, and wholly outside the target is white.
+    A target pixel is the mean of the stored pixels of its block. Of a block that reaches outside
+    the image, only pixels inside count; a block wholly outside is white.
     """
 
     def __init__(self, dev: Device):

@@ -73,7 +73,7 @@ def test_matrices_are_found_and_a_training_goes_on_with_them(dev, tmp_path, monk
         tmp_path / "b",
     )
     assert main(arguments(scene, whole, **SETTINGS)) == 0
-    assert "a matrix of each view is found beside the model" in capsys.readouterr().err
+    assert "a matrix for each view is learned with the model" in capsys.readouterr().err
     assert main(["eval", str(whole)]) == 0
     result = json.loads((whole / "eval" / "metrics.json").read_text())
     assert result["mean_after_colour"]["psnr"] > result["mean"]["psnr"] + 1
