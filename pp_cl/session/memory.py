@@ -248,7 +248,7 @@ class MemoryPlan:
     def _fault(self, need, share=1.0):
         info, name = self.dev.info, self.dev.name
         lower, available = "lower --points or train.crop, or raise --downscale", available_bytes()
-        free = math.inf if available is None else max(0, available - self._program)
+        free = max(0, available - self._program)
         if need.largest > info["max_allocation_bytes"]:
             most = _size(info["max_allocation_bytes"])
             why = f"a buffer of {_size(need.largest)} is more than the {most} that {name} allocates"

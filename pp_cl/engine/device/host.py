@@ -5,29 +5,21 @@ import mmap
 import sys
 from pathlib import Path
 
+import psutil
+
 GROUP = Path("/sys/fs/cgroup")  # of this process, as a container shows it
-PROC = Path("/proc")
 
 
-def available_bytes() -> int | None:
-    """What this process may hold in all: what it holds now and what is free, of the machine and of
-    its container. None where the system does not tell.
+def available_bytes() -> int:
+    """Bytes of memory that this process may hold in all: what it holds now, and what is free on the
+    machine and in its container.
     """
-    try:
-        lines = dict(line.split(":") for line in (PROC / "meminfo").read_text().splitlines())
-        free = int(lines["MemAvailable"].split()[0]) * 1024
-    except (OSError, KeyError, ValueError):
-        return None
-    return min([free, *_free_in_group()]) + resident_bytes()
+    return min([psutil.virtual_memory().available, *_free_in_group()]) + resident_bytes()
 
 
 def resident_bytes() -> int:
-    """Memory that this process holds; 0 where the system does not tell."""
-    try:
-        pages = int((PROC / "self/statm").read_text().split()[1])
-    except (OSError, IndexError, ValueError):
-        return 0
-    return pages * mmap.PAGESIZE
+    """Bytes of memory that this process holds."""
+    return psutil.Process().memory_info().rss
 
 
 def ask_for_huge_pages(address: int, nbytes: int) -> None:
@@ -43,7 +35,7 @@ def ask_for_huge_pages(address: int, nbytes: int) -> None:
 
 
 def _free_in_group():
-    """[bytes below the container's limit], [] where it has none. Its cached files are given up."""
+    """[bytes left below the container's limit], [] if it has none. Cached files count as free."""
     try:
         limit, used = (
             (GROUP / name).read_text().strip() for name in ("memory.max", "memory.current")
