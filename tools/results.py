@@ -38,6 +38,7 @@ from tools.provenance import digest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -51,9 +52,16 @@ HIGHLIGHTS = {f"test/r_{i}.png" for i in range(1, 14)}  # lego's views with a hi
 TOOL = (sys.executable, "-m")
 PP_CL = (*TOOL, "pp_cl")
 OPENSPLAT = [(3.6, 24.2), (14.0, 29.9)]  # minutes on one core, PSNR; its CPU build, 15b7e80
-# published, lego at 800x800: which side of its line the name stands on
-DRAWN = dict.fromkeys(("PlenopticPoints", "Plenoxels", "TensoRF"), "bottom")
-DRAWN |= {"Instant-NGP": "top"}
+# lego at 800x800 on NVIDIA GPUs: minutes, PSNR (docs/results.md names the sources)
+ON_GPUS = {
+    "3DGRT": (7.8, 36.70),
+    "3DGUT": (3.7, 36.47),
+    "TensoRF": (10.0, 36.49),
+    "3DGS-MCMC": (8.9, 35.75),
+    "3DGS": (6.0, 35.70),
+    "Instant-NGP": (2.7, 35.65),
+    "gsplat": (13.5, 32.13),
+}
 NETWORKS = (("128,256,512", 256), ("32,64,128", 200))  # widths, side of the image
 
 
@@ -67,10 +75,11 @@ class Training:
     name: str
     scene: str
     preset: str
-    steps: int | None = None  # None: the preset's
+    steps: int | None = None  # None: the preset's, or as many as its minutes allow
     downscale: int | None = None
     test: str | None = None
     is_captured: bool = False  # the scene is a folder of photographs, which `capture` makes one of
+    minutes: float | None = None  # its budget
 
 
 def lego(preset: str, downscale: int, *steps: int) -> list[Training]:
@@ -94,6 +103,20 @@ TRAININGS = [
             ("mary_rose, 69", "real/mary_rose/images"),
         )
     ),
+]
+
+# PSNR against minutes: each curve is the trainings of one scene and preset, by rising budgets
+CURVES = [
+    Training(name, scene, preset, None, downscale, test, minutes=minutes)
+    for name, scene, preset, downscale, test, budgets in (
+        ("lego", LEGO, "tiny", 4, ALL_VIEWS, (0.5, 1, 2, 4, 8)),
+        ("lego", LEGO, "small", 2, ALL_VIEWS, (2, 4, 8, 16)),
+        ("lego", LEGO, "full", 1, ALL_VIEWS, (5, 10, 20, 40)),
+        ("ethiopian_head", HEAD, "tiny", None, None, (1, 2, 4, 8)),
+        ("mary_rose", "real/mary_rose", "tiny", None, None, (1, 2, 4, 8)),
+        ("DTU scan37", "real/dtu_scan37", "tiny", None, None, (1, 2, 4, 8)),
+    )
+    for minutes in budgets
 ]
 
 QUALITY = [
@@ -182,6 +205,8 @@ def key_of(training: Training) -> str:
     name = Path(training.scene).name
     if training.is_captured:
         name = "_".join(Path(training.scene).parts[-2:])
+    if training.minutes:
+        return f"{name}_{training.preset}_{training.minutes:g}_minutes"
     return f"{name}_{training.steps}" if training.steps else name
 
 
@@ -194,6 +219,8 @@ def train(training: Training, store: Path) -> dict:
     words = ["--preset", training.preset, "--out", run]
     if training.steps:
         words += ["--iterations", training.steps]
+    if training.minutes:
+        words += ["--minutes", training.minutes]
     if training.downscale:
         words += ["--downscale", training.downscale]
     run_program(*PP_CL, "train", scene, *words)
@@ -301,7 +328,7 @@ def splats(store: Path) -> list[dict]:
 
 
 PARTS: dict[str, Callable[[Path], Found]] = {
-    **{key_of(training): partial(train, training) for training in TRAININGS},
+    **{key_of(training): partial(train, training) for training in (*TRAININGS, *CURVES)},
     "demo": demo,
     "rasteriser": rasteriser,
     "pytorch": pytorch,
@@ -314,6 +341,7 @@ PARTS: dict[str, Callable[[Path], Found]] = {
 # the parts of each table that has not its part's name
 OF_TABLE = {
     "trainings": {key_of(training) for training in TRAININGS},
+    "curves": {key_of(training) for training in CURVES},
     "stages": {f"stages_{preset}" for preset in STEPS},
 }
 
@@ -404,9 +432,9 @@ def measure_within(store: Path, minutes: float) -> list[str]:
     return left_out
 
 
-def trained(found: dict[str, Found]) -> list[dict]:
-    """The rows of the trainings that were measured."""
-    return [found[key_of(t)] for t in TRAININGS if key_of(t) in found]
+def trained(found: dict[str, Found], trainings: list[Training]) -> list[dict]:
+    """The rows of these trainings, as far as they were measured."""
+    return [found[key_of(t)] for t in trainings if key_of(t) in found]
 
 
 def timed(found: dict[str, Found]) -> list[dict]:
@@ -432,7 +460,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     """{name: contents} of the tables of which all was found, but for origin()."""
     quality = "means over the held-out views; minutes of training alone"
     blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
-    rows = found | {"trainings": trained(found)}
+    rows = found | {"trainings": trained(found, TRAININGS), "curves": trained(found, CURVES)}
     runs = {preset: found[f"stages_{preset}"] for preset in STEPS if f"stages_{preset}" in found}
     rows["stages"] = by_preset(runs)
     steps = "; ".join(
@@ -445,6 +473,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     fitted = "processor seconds a core; means over five test views, drawn as viewers draw splats"
     parts = {
         "trainings": (quality, QUALITY),
+        "curves": (quality, QUALITY),
         "rasteriser": (blended, RASTERISER),
         "pytorch": (beside, PYTORCH),
         "stages": (f"medians of a step on lego ({steps})", STAGES),
@@ -459,53 +488,74 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     }
 
 
-def draw(trained: list[dict], timed: list[dict], folder: Path) -> None:
+def draw(curves: list[dict], timed: list[dict], machine: str, folder: Path) -> None:
     """quality.png and speed.png, and the same for dark pages."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
-    plots = {"quality": (plot_quality, trained), "speed": (plot_speed, timed)}
     for suffix, look in (("", "default"), ("_dark", "dark_background")):
-        for name, (plot, rows) in plots.items():
-            with style.context(look):
-                figure = Figure(figsize=(8, 4), layout="constrained")
-                axes = figure.subplots()
-                plot(axes, rows)
-                axes.grid(alpha=0.3)
-                figure.legend(loc="outside upper center", ncols=5, fontsize=8)
-                figure.savefig(folder / f"{name}{suffix}.png", dpi=120)
+        with style.context(look):
+            figure = Figure(figsize=(11, 4), layout="constrained")
+            plot_quality(figure, curves)
+            figure.supxlabel(f"minutes of training on {machine}", fontsize=9)
+            figure.savefig(folder / f"quality{suffix}.png", dpi=120)
+            figure = Figure(figsize=(8, 4), layout="constrained")
+            axes = figure.subplots()
+            plot_speed(axes, timed)
+            axes.grid(alpha=0.3)
+            figure.legend(loc="outside upper center", ncols=5, fontsize=8)
+            figure.savefig(folder / f"speed{suffix}.png", dpi=120)
 
 
-def plot_quality(axes: "Axes", trained: list[dict]) -> None:
-    """PSNR of lego's test views against minutes of training, a line for each image size."""
-    axes.set(xscale="log", xlabel="minutes of training on two CPU cores", ylabel="PSNR, dB")
-    rows = [row for row in trained if row["name"] == "lego"]
-    for size in dict.fromkeys(row["size"] for row in rows):
-        some = [row for row in rows if row["size"] == size]
-        minutes, psnr = [row["minutes"] for row in some], [row["psnr"] for row in some]
-        axes.plot(minutes, psnr, "o-", label=f"pp-cl, {size}")
-    axes.plot(
-        *zip(*OPENSPLAT, strict=True), "x--", color="grey", label="OpenSplat on one core, 200x200"
-    )
-    table = published()["synthetic"]
-    lego_column = table["scenes"].index("lego")
-    for method, side in DRAWN.items():
-        psnr = table["methods"][method]["psnr"][lego_column]
-        axes.axhline(psnr, color="grey", linewidth=0.7)
-        place = {"xycoords": ("axes fraction", "data"), "va": side, "fontsize": 7}
-        axes.annotate(f"{method} (GPU), 800x800", (0.01, psnr), **place)
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.margins(y=0.08)
+def plot_quality(figure: "Figure", rows: list[dict]) -> None:
+    """PSNR of test views against minutes of training: a panel for each size of lego's images, and
+    one for captures with a curve each. Others' results stand in the panel of their size alone.
+    """
+    lego = [row for row in rows if row["name"] == "lego"]
+    panels = {
+        f"lego, {size}": {"pp-cl": [row for row in lego if row["size"] == size]}
+        for size in dict.fromkeys(row["size"] for row in lego)
+    }
+    captures = dict.fromkeys(row["name"] for row in rows if row["name"] != "lego")
+    panels["photographs, 200 pixels"] = {
+        name: [row for row in rows if row["name"] == name] for name in captures
+    }
+    for axes, (title, curves) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        axes.set_title(title, fontsize=10)
+        axes.set(xscale="log")
+        for label, curve in curves.items():
+            minutes, psnr = [row["minutes"] for row in curve], [row["psnr"] for row in curve]
+            axes.plot(minutes, psnr, "o-", label=label)
+        if title == "lego, 200x200":
+            label = "OpenSplat, one core"
+            axes.plot(*zip(*OPENSPLAT, strict=True), "x--", color="grey", label=label)
+        if title == "lego, 800x800":
+            table = published()["synthetic"]
+            psnr = table["methods"]["PlenopticPoints"]["psnr"][table["scenes"].index("lego")]
+            axes.axhline(psnr, color="grey", linewidth=0.7, label="PlenopticPoints' paper")
+            axes.plot(*zip(*ON_GPUS.values(), strict=True), "x", color="grey", label="NVIDIA GPUs")
+            for name, place in ON_GPUS.items():
+                offset = {"xytext": (3, 3), "textcoords": "offset points"}
+                axes.annotate(name, place, fontsize=6, **offset)
+        axes.legend(loc="best", fontsize=7)
+        axes.grid(alpha=0.3)
+        label_logarithmic(axes)
+    figure.supylabel("PSNR of test views, dB", fontsize=9)
 
 
 def plot_speed(axes: "Axes", timed: list[dict]) -> None:
     """Time against error, a colour for each variant. timed: {"label", "ms", "error"}."""
-    from matplotlib.ticker import LogLocator
-
     axes.set(xscale="log", yscale="log", xlabel="milliseconds", ylabel="error against float64")
     for i, label in enumerate(dict.fromkeys(row["label"] for row in timed)):
         some = [row for row in timed if row["label"] == label]
         axes.plot([r["ms"] for r in some], [r["error"] for r in some], "os^Dv"[i % 5], label=label)
+    label_logarithmic(axes)
+
+
+def label_logarithmic(axes: "Axes") -> None:
+    """Label the x axis with 1, 2, 5, 10 and so on."""
+    from matplotlib.ticker import LogLocator
+
     axes.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}")
     axes.minorticks_off()
 
@@ -537,7 +587,7 @@ def main() -> int:
         if options.kind or found.keys() >= OF_TABLE.get(name, {name}):
             write_json(folder / f"{name}.json", about | contents)
     if found.keys() == PARTS.keys() and not options.kind:
-        draw(trained(found), timed(found), ROOT / "docs")
+        draw(trained(found, CURVES), timed(found), about["machine"], ROOT / "docs")
     return 0
 
 

@@ -1,3 +1,5 @@
+from matplotlib.figure import Figure
+
 from pp_cl.errors import UserError
 from tools import docs_tables
 from tools import results as TOOL
@@ -37,8 +39,36 @@ def test_tables_and_plots(tmp_path):
         written = docs_tables.table(about | contents)
         last = written.splitlines()[-1].split("|")[1:-1]
         assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
-    TOOL.draw(TOOL.trained(FOUND), TOOL.timed(FOUND), tmp_path)
+    TOOL.draw(TOOL.trained(FOUND, TOOL.CURVES), TOOL.timed(FOUND), "2 cores", tmp_path)
     assert len({*tmp_path.glob("*.png")}) == 4
+
+
+def test_others_results_stand_beside_images_of_their_size():
+    figure = Figure()
+    rows = [ROW | {"size": size} for size in ("200x200", "400x400", "800x800")]
+    TOOL.plot_quality(figure, [*rows, ROW | {"name": "head"}])
+    shown = {
+        axes.get_title(): {text.get_text() for text in axes.get_legend().get_texts()}
+        for axes in figure.axes
+    }
+    assert shown == {
+        "lego, 200x200": {"pp-cl", "OpenSplat, one core"},
+        "lego, 400x400": {"pp-cl"},
+        "lego, 800x800": {"pp-cl", "PlenopticPoints' paper", "NVIDIA GPUs"},
+        "photographs, 200 pixels": {"head"},
+    }
+
+
+def test_a_budget_is_given_to_the_training(tmp_path, monkeypatch):
+    commands = []
+    monkeypatch.setattr(TOOL, "run_program", lambda *words: commands.append(words))
+    found = {"per_image": [], "mean": {}, "views": {"images": ["800x800"]}, "downscale": 1}
+    found |= {"seconds_per_frame": 1, "computed_fraction": 1, "iterations": 9, "seconds": 60}
+    found |= {"points": {"left": 9}}
+    monkeypatch.setattr(TOOL, "read_found", lambda *words: found)
+    TOOL.train(TOOL.Training("demo", "demo", "tiny", minutes=2), tmp_path)
+    assert commands[0][-2:] == ("--minutes", 2)
+    assert len({TOOL.key_of(training) for training in TOOL.CURVES}) == len(TOOL.CURVES)
 
 
 def test_lego_has_its_highlights_apart(tmp_path, monkeypatch):
