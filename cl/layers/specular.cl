@@ -5,11 +5,11 @@
 #ifndef HIDDEN
 #define HIDDEN 32  // outputs of the first and of the second layer
 #endif
-#define LEAST_ALPHA 0.02f  // of a pixel that it is added to
-#define BLOCK 4            // outputs that are summed up at a time
+#define LEAST_ALPHA 0.02f  // pixels below this alpha get no colour
+#define BLOCK 4            // outputs that are summed at a time
 
-// outputs[j] = bias[j] + sum over i of weight[i, j] * inputs[i] for `count` of them, and 0 where
-// that is negative, with relu. weight: ((outputs+15)/16, n, 16).
+// outputs[j] = bias[j] + sum over i of weight[i, j] * inputs[i], j < count; with relu at least 0.
+// weight: ((count+15)/16, n, 16).
 ALWAYS_INLINE void dense(
     const floats *inputs,
     const int n,
@@ -35,11 +35,11 @@ ALWAYS_INLINE void dense(
     }
 }
 
-// One work-item per LANES pixels: adds the layer to the colours of those that show points.
+// One work-item per LANES pixels: adds the layer's colours to the pixels that show points.
 kernel void specular_forward(
     const uint n,  // pixels
     const uint width,
-    const float side,                   // pixels of the camera in one, each way
+    const float side,                   // camera pixels along a side of an image pixel
     global const float *camera,         // (21) camera.h
     global const float *transmittance,  // (n)
     global const float *features,       // (H, W, 16)

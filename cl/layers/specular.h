@@ -1,5 +1,5 @@
-// The finish: a small network of each pixel alone, of its features and of the direction it is seen
-// in, whose colours times alpha are added to the image. It is fitted once a training has ended.
+// The specular layer: a small network turns the features and the viewing direction of one pixel into
+// a colour, which times alpha is added to the image. It is fitted after the training.
 #ifndef PP_SPECULAR_H
 #define PP_SPECULAR_H
 
@@ -10,8 +10,8 @@
 #define INPUTS (CHANNELS + 3 + 6 * OCTAVES)
 #define HALF_PI 1.57079632679489662f
 
-// encoded[0..26] of the unit vector d[3], of numbers or lanes, as NeRF encodes positions: itself,
-// then sines and cosines of 2^k pi/2 times it, by the formulas of the doubled angle.
+// encoded[0..26] of the unit vector d[3] (of floats, or of vectors with a lane per pixel), as NeRF
+// encodes positions: d, then sines and cosines of 2^k pi/2 d, by the double-angle formulas.
 #define ENCODE(type, d, encoded)                                                                   \
     for (int c = 0; c < 3; c++) {                                                                  \
         type cosine, sine = sincos(HALF_PI * d[c], &cosine);                                       \
@@ -25,8 +25,8 @@
         }                                                                                          \
     }
 
-// Unit vector, in world axes, from the eye to the centre of a pixel. side: pixels of the camera in
-// one, each way.
+// Unit vector, in world axes, from the eye to the centre of a pixel. side: camera pixels along a
+// side of an image pixel.
 static inline float3 direction_of(const Camera *cam, const uint x, const uint y, const float side) {
     const float across = (side * (x + 0.5f) - cam->cx) / cam->fx;
     const float down = (side * (y + 0.5f) - cam->cy) / cam->fy;

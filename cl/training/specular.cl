@@ -1,10 +1,10 @@
-// What the finish is fitted to (layers/specular.h): pixels of all views, drawn in any order.
+// Training data of the specular layer (layers/specular.h): pixels of all views, drawn in any order.
 #include "layers/specular.h"
 
-#define ROW (CHANNELS + 6)  // of a pixel: features, direction, colours
+#define ROW (CHANNELS + 6)  // features, direction and residual of a pixel
 
-// One work-item per chosen pixel: writes its features, its direction, and what its colour in the
-// target has beyond that in the image, over alpha.
+// One work-item per chosen pixel: writes its features, its direction and its residual, the target
+// minus the image, over alpha.
 kernel void specular_rows(
     const uint m,      // chosen pixels
     const uint first,  // row of the first one
@@ -12,7 +12,7 @@ kernel void specular_rows(
     const uint target_width,
     const uint left,  // of the target's corner in the image
     const uint top,
-    const float side,                   // pixels of the camera in one of the image, each way
+    const float side,                   // camera pixels along a side of an image pixel
     global const uint *chosen,          // (m) pixels of the image
     global const float *camera,         // (21) camera.h
     global const float *transmittance,  // (?) of the image
@@ -34,10 +34,10 @@ kernel void specular_rows(
     vstore3((wanted - vload3(pixel, image)) / alpha, 0, row + CHANNELS + 3);
 }
 
-// One work-item per pixel of a batch: writes what the network sees, and what its image should be.
+// One work-item per pixel of a batch: writes the layer's inputs, and the output that it should give.
 kernel void specular_batch(
     const uint n,
-    const float unit,          // of the colours
+    const float unit,          // of the residuals
     global const uint *drawn,  // (n) rows
     global const float *rows,  // (ROWS, ROW)
     global float *inputs,      // (?, ?, INPUTS) n in all
@@ -55,7 +55,7 @@ kernel void specular_batch(
     vstore3(0.5f + vload3(0, row + CHANNELS + 3) / unit, i, wanted);
 }
 
-// One work-item per value: writes the gradient of the mean square of what is wrong.
+// One work-item per value: writes the gradient of the mean square of image - wanted.
 kernel void specular_gradient(
     const uint n,
     global const float *image,   // (H, W, 3)
