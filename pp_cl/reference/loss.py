@@ -3,6 +3,7 @@ from that form.
 """
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 C1, C2 = 0.01**2, 0.03**2
 
@@ -17,20 +18,20 @@ WINDOW = _window()
 
 
 def windowed(image: np.ndarray) -> np.ndarray:
-    """(H-10, W-10, 3) weighted mean of each 11x11 window of an (H, W, 3) image."""
-    h, w, _ = image.shape
+    """(H-10, W-10, 3) weighted mean of each 11x11 window of an (H, W, 3) image, in its dtype."""
+    (h, w, _), window = image.shape, WINDOW.astype(image.dtype)
     return sum(
-        WINDOW[j, i] * image[j : h - 10 + j, i : w - 10 + i] for j in range(11) for i in range(11)
+        window[j, i] * image[j : h - 10 + j, i : w - 10 + i] for j in range(11) for i in range(11)
     )
 
 
 def unwindowed(derivatives: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """The adjoint of windowed."""
-    h, w, _ = shape
-    image = np.zeros(shape)
+    (h, w, _), window = shape, WINDOW.astype(derivatives.dtype)
+    image = np.zeros(shape, derivatives.dtype)
     for j in range(11):
         for i in range(11):
-            image[j : h - 10 + j, i : w - 10 + i] += WINDOW[j, i] * derivatives
+            image[j : h - 10 + j, i : w - 10 + i] += window[j, i] * derivatives
     return image
 
 
@@ -52,12 +53,16 @@ def ssim(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def loss(
-    prediction: np.ndarray, target: np.ndarray, weight: float, beta: float = 0.0
+    prediction: np.ndarray,
+    target: np.ndarray,
+    weight: float,
+    beta: float = 0.0,
+    dtype: DTypeLike = np.float64,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(terms (4,): L, L1, 1 - SSIM, mean squared error; gradient (H, W, 3)) of equally large
-    images.
+    images. dtype: float32 shows what the textbook's form loses.
     """
-    x, y = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
+    x, y = np.asarray(prediction, dtype), np.asarray(target, dtype)
     error = np.abs(x - y)
     smooth, gradient = error.mean(), np.sign(x - y) / x.size
     if beta:
@@ -68,6 +73,5 @@ def loss(
         similarity, d_x = ssim(x, y)
         dissimilarity = 1 - similarity
         gradient = gradient - weight * d_x
-    return np.array(
-        [smooth + weight * dissimilarity, error.mean(), dissimilarity, (error**2).mean()]
-    ), gradient
+    terms = smooth + weight * dissimilarity, error.mean(), dissimilarity, (error**2).mean()
+    return np.array(terms, dtype), gradient

@@ -25,6 +25,7 @@ from pp_cl.selftest.case import (
     relative,
 )
 from pp_cl.selftest.points import (
+    AXIS,
     Blended,
     PairedGaussians,
     PairedPoints,
@@ -105,11 +106,12 @@ def _zero_opacity(rule, dev, rng):
         yield exact(weight, np.zeros(3))
         yield exact(scene.features.get(), np.ones((1, 1, 16)))
         gradients = scene.gradients(np.ones((1, 1, 16)))
+        by_opacity = weight / np.zeros(3, np.float32)
         # d G.(f - bg), of a softmax exp(-M) / D with D = 1: a handful of roundings
         expected = scene.geometry()["falloff"][:, 0] * (1 - 16)
         if rule == "softmax":
             expected *= np.exp(-1e-6 / gamma)
-        yield relative(gradients["opacity"], expected, 1e-5)
+        yield relative(gradients["opacity"], expected, 1e-5, naive=by_opacity)
         yield exact(gradients["features"], np.zeros((3, 16)))
 
 
@@ -135,6 +137,26 @@ def _spheres(dev, rng):
         yield relative(gradients["positions"].ravel(), numeric, DIFFERENCES)
         numeric = numeric_gradient(partial(loss, places), radii, STEP)
         yield relative(gradients["radius"], numeric, DIFFERENCES)
+
+
+def _missed_sphere(dev, rng):
+    """A sphere below a pixel covers one whose ray misses it, at a depth that no radius changes."""
+    radius, x = np.float32(1e-3), np.float32(0.01)
+    scene = PairedPoints(dev, AXIS, np.array([[x, 0, 3.0]]), radius, kind="sphere")
+    scene.blend([0.5], 0.1, np.zeros((1, 16)))
+    found = scene.sphere_gradients(np.ones((1, 1, 16)))
+    yield finite(*found.values())
+    naive = -radius / np.sqrt(radius * radius - x * x)  # dz/dR
+    yield exact(found["radius"], np.zeros(1), naive=naive.reshape(1))
+
+
+def _on_the_ray(dev, rng):
+    """A point in the middle of its pixel: it may move to any side."""
+    scene = PairedPoints(dev, AXIS, np.array([[0, 0, 3.0]]), 0.2)
+    scene.blend([0.5], 0.1, np.zeros((1, 16)), rule="alpha")
+    found = scene.gradients(np.ones((1, 1, 16)), voxel_size=0.3)["offset"]
+    away = np.zeros((1, 4), np.float32)
+    yield absolute(found, away, 1e-2, naive=away / np.sqrt((away * away).sum()))
 
 
 def _offsets(dev, rng):
@@ -204,13 +226,59 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
     yield exact(found["offset"][:, 9:], np.zeros((n, 7)))
 
 
+def _needles(dev, rng):
+    """Gaussians a million times as long as they are wide, across the image."""
+    camera, grid = make_camera(), Grid((0.0, 0.0, 0.0), 0.3, (2, 2, 2))
+    ids, learned = some_ids(rng, grid, 8), np.zeros((8, 16), np.float32)
+    learned[:, 3:6] = -5
+    learned[:, 6:8] = 10 ** rng.uniform(2, 4, (8, 1)) * rng.uniform(0.5, 1, (8, 2))
+    scene = PairedGaussians(dev, camera, grid, ids, learned, 0.1)
+    fragment, found = scene.fragments(), scene.geometry()["falloff"]
+    vertices, shapes = grid.positions(ids), learned[:, :9]
+    expected = dense.gaussians(camera, vertices, grid.voxel_size, shapes, 0.1)["falloff"]
+    lower = np.zeros((8, 3, 3), np.float32)
+    lower[:, range(3), range(3)] = 0.1 * np.exp(learned[:, 3:6])
+    lower[:, [1, 2, 2], [0, 0, 1]] = 0.1 * learned[:, 6:9]
+    naive = _by_determinant(camera, dense.camera_space(camera, vertices), lower)
+    yield absolute(found[fragment], expected[fragment], WEIGHT["alpha"], naive=naive[fragment])
+
+
+def _by_determinant(camera, centres, lower):
+    """(N, HW) float32: falloffs of Gaussians, whose determinant is xx yy - xy^2. centres: in camera
+    axes.
+    """
+    x, y, z = centres.astype(np.float32).T
+    jacobian = np.zeros((len(x), 2, 3), np.float32)
+    jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * x / (z * z)
+    jacobian[:, 1, 1], jacobian[:, 1, 2] = camera.fy / z, -camera.fy * y / (z * z)
+    jacobian = jacobian @ camera.pose[:, :3].T.astype(np.float32)
+    spread = jacobian @ (lower @ lower.swapaxes(1, 2)) @ jacobian.swapaxes(1, 2)
+    xx, yy, xy = (spread[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 1)))
+    xx, yy = xx + np.float32(dense.LOW_PASS), yy + np.float32(dense.LOW_PASS)
+    row, column = np.indices((camera.height, camera.width), np.float32).reshape(2, -1) + 0.5
+    u = column - (camera.fx * x / z + camera.cx)[:, None]
+    v = row - (camera.fy * y / z + camera.cy)[:, None]
+    return np.exp(-0.5 * (yy * u * u - 2 * xy * u * v + xx * v * v) / (xx * yy - xy * xy))
+
+
 def _smallest_gamma(dev, rng):
     """gamma = 1e-5 makes exponents of 1e5, which are off by 1e-2: so are the weights."""
     for opacity in (1.0, 0.3, 1e-3, 1e-38):
         scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
         yield finite(*scene.gradients(np.ones((1, 1, 16))).values())
         expected = dense.blend(scene.geometry(), np.full(3, opacity, np.float32), 1e-5)["weight"]
-        yield each(weight, expected[:, 0], 1e-2, floor=1e-28)
+        yield each(weight, expected[:, 0], 1e-2, floor=1e-28, naive=_plain_softmax(scene, 1e-5))
+
+
+def _plain_softmax(scene, gamma):
+    """(N,) float32: the weights of a pixel by its exponents as they are."""
+    view = scene.geometry()
+    d, z, o = (
+        array.astype(np.float32)
+        for array in (view["falloff"][:, 0], view["z"][:, 0], scene.opacity.get())
+    )
+    share = o * d * np.exp(o * z / np.float32(gamma))
+    return share / (np.exp(np.float32(dense.EPS / gamma)) + share.sum())
 
 
 def _opacity_bound(blended):
@@ -242,13 +310,78 @@ def _many_fragments(rule, dev, rng):
     z, opacity = rng.uniform(0.1, 0.99, 20_000), rng.uniform(0, 1, 20_000).astype(np.float32)
     for gamma, stop in ((0.1, 0.0), (0.01, 1e-3 if rule == "alpha" else 0.0)):
         scene, weight = blend_on_axis(dev, z, opacity, gamma, rule=rule, early_stop=stop)
-        blend = dense.blend_by_rule(rule, scene.geometry(), opacity, gamma, stop)
-        yield relative(weight, blend["weight"][:, 0], MANY)
+        geometry, features = scene.geometry(), np.resize(np.eye(16), (20_000, 16))
+        blend = dense.blend_by_rule(rule, geometry, opacity, gamma, stop)
+        naive = _plain_softmax(scene, gamma) if rule == "softmax" else None
+        yield relative(weight, blend["weight"][:, 0], MANY, naive=naive)
         if rule == "alpha":  # down to 1e-30, some hundred factors of half EPS each
             yield each(weight, blend["weight"][:, 0], MANY, floor=1e-26)
-        expected = dense.features(blend, np.resize(np.eye(16), (20_000, 16)))
-        yield relative(scene.features.get().reshape(1, 16), expected, MANY)
-        yield finite(*scene.gradients(rng.normal(size=(1, 1, 16))).values())
+        yield relative(scene.features.get().reshape(1, 16), dense.features(blend, features), MANY)
+        grad = rng.normal(size=(1, 16))
+        found = scene.gradients(grad)
+        yield finite(*found.values())
+        if rule == "alpha" and not stop:
+            expected = dense.gradients(geometry, blend, features, grad)[1]
+            naive = _divided(geometry, opacity, features @ grad[0], grad.sum())
+            yield relative(found["opacity"], expected, MANY, naive=naive)
+
+
+def _divided(geometry, opacity, own, background):
+    """(N,) float32: dL/do of a pixel, from the back, where the transmittance in front of a fragment
+    is that behind it divided by 1 - alpha. own, background: as in dense.gradients().
+    """
+    falloff, found = geometry["falloff"][:, 0].astype(np.float32), np.zeros(len(own), np.float32)
+    alpha, own, behind = opacity * falloff, own.astype(np.float32), np.float32(background)
+    T = np.prod(1 - alpha)
+    for i in np.argsort(-geometry["depth"][:, 0], kind="stable"):
+        T = T / (1 - alpha[i])
+        found[i] = T * falloff[i] * (own[i] - behind)
+        behind = behind + alpha[i] * (own[i] - behind)
+    return found
+
+
+def _opaque(dev, rng):
+    """A fragment of alpha 1 between others."""
+    opacity, features = np.array([0.5, 1, 0.5], np.float32), np.eye(16)[:3]
+    scene, _ = blend_on_axis(dev, [0.9, 0.5, 0.2], opacity, 0.1, rule="alpha")
+    geometry, grad = scene.geometry(), rng.normal(size=(1, 16))
+    blend = dense.alpha(geometry, opacity)
+    expected = dense.gradients(geometry, blend, features, grad)[1]
+    naive = _divided(geometry, opacity, features @ grad[0], grad.sum())
+    yield relative(scene.gradients(grad)["opacity"], expected, GRADIENT, naive=naive)
+
+
+def _behind(dev, rng):
+    """A hundred fragments, of which the last ones hardly show."""
+    z, opacity = np.linspace(0.9, 0.1, 100), np.full(100, 0.15, np.float32)
+    scene, weight = blend_on_axis(dev, z, opacity, 0.1, rule="alpha")
+    geometry, grad, features = scene.geometry(), rng.normal(size=(1, 16)), np.eye(16)
+    blend, features = dense.alpha(geometry, opacity), np.resize(features, (100, 16))
+    own = features @ grad[0]
+    expected = dense.gradients(geometry, blend, features, grad)[1]
+    # what is behind, as the difference of all and of what is in front
+    b, single = weight.astype(np.float32), own.astype(np.float32)
+    T = np.cumprod(np.append(np.float32(1), 1 - opacity), dtype=np.float32)
+    parts = np.append(b * single, T[-1] * np.float32(grad.sum())).cumsum(dtype=np.float32)
+    naive = T[:-1] * single - (parts[-1] - parts[:-1]) / (1 - opacity)
+    most = GRADIENT * blend["through"][:, 0] * (np.abs(own).max() + np.abs(grad.sum()))
+    yield allowed(scene.gradients(grad)["opacity"], expected, most, naive=naive)
+
+
+def _far_distortion(dev, rng):
+    """A hundred fragments within a tenth of a unit, a thousand units away."""
+    positions, opacity = np.zeros((100, 3)), rng.uniform(0, 0.2, 100).astype(np.float32)
+    positions[:, 2] = np.sort(rng.uniform(1000, 1000.1, 100))
+    scene = PairedPoints(dev, AXIS, positions, 0.1, depth_range=(990.0, 1010.0))
+    scene.blend(opacity, 0.1, np.zeros((100, 16)), rule="alpha")
+    scene.gradients(np.zeros((1, 16)), distortion_weight=1.0)
+    geometry = scene.geometry()
+    expected = dense.distortion(geometry, dense.alpha(geometry, opacity))
+    b = scene.weight()[:, 0]
+    z = geometry["depth"][:, 0].astype(np.float32)
+    front, front_z = b.cumsum(dtype=np.float32) - b, (b * z).cumsum(dtype=np.float32) - b * z
+    naive = 2 * (b * (z * front - front_z)).sum(keepdims=True)
+    yield relative(scene.backward.distortion.get(), expected, GRADIENT, naive=naive)
 
 
 def _gradient_of_alpha(dev, rng):
@@ -321,9 +454,11 @@ def _means(samples, shape):
     return samples.reshape(height, 2, width, 2, -1).mean((1, 3))
 
 
-def _of_both(what, function):
-    """A case of each blend."""
-    return [Case(f"{rule}: {what}", partial(function, rule)) for rule in BLENDS]
+def _of_both(what, function, **hard):
+    """A case of each blend. hard: what is hard, by blend."""
+    return [
+        Case(f"{rule}: {what}", partial(function, rule), hard=hard.get(rule, "")) for rule in BLENDS
+    ]
 
 
 CASES = (
@@ -335,14 +470,31 @@ CASES = (
     ),
     *_of_both("awkward sizes", _sizes),
     *_of_both("early stop", _early_stop),
-    *_of_both("opacities of 0", _zero_opacity),
-    *_of_both("20000 fragments in a pixel", _many_fragments),
+    *_of_both(
+        "opacities of 0", _zero_opacity, alpha="T d as b / o, 0 / 0", softmax="b (1/o + z/gamma)"
+    ),
+    *_of_both(
+        "20000 fragments in a pixel",
+        _many_fragments,
+        alpha="T underflows and is not found again",
+        softmax="exp(o z / gamma) overflows",
+    ),
     Case("softmax: gradients of spheres", _spheres),
-    Case("softmax: gamma of 1e-5", _smallest_gamma),
+    Case("softmax: a ray that misses its sphere", _missed_sphere, hard="-R / sqrt(R^2 - w^2)"),
+    Case("softmax: gamma of 1e-5", _smallest_gamma, hard="exp(o z / gamma) overflows"),
     Case("softmax: dL/do at small gammas", _sharp),
+    Case("alpha: an opaque fragment", _opaque, hard="gradients by T / (1 - alpha)"),
+    Case(
+        "alpha: behind a hundred fragments",
+        _behind,
+        hard="all less what is in front cancels",
+    ),
     Case("alpha: gradient of alpha", _gradient_of_alpha),
     Case("alpha: distortion loss", _distortion),
+    Case("alpha: distortion far away", _far_distortion, hard="sums of b z from the eye cancel"),
+    Case("alpha: a point on the ray", _on_the_ray, hard="e / |e| is 0 / 0"),
     Case("alpha: offsets of points", _offsets),
     Case("alpha: samples of a pixel", _samples),
     Case("alpha: shapes of Gaussians", _gaussians),
+    Case("alpha: needles", _needles, hard="the determinant xx yy - xy^2 cancels"),
 )

@@ -31,13 +31,14 @@ def images(rng: np.random.Generator, height: int, width: int) -> tuple[np.ndarra
     return (target + 0.1 * noise[1]).astype(np.float32), target.astype(np.float32)
 
 
-def _loss_checks(dev, prediction, target, weights, *bounds):
+def _loss_checks(dev, prediction, target, weights, *bounds, is_hard=False):
     """weights: of 1 - SSIM, and beta. bounds: of the terms, maybe another of the gradient."""
-    loss = Loss(dev, *weights)
-    grad, _ = loss.forward_backward(dev.upload(prediction), dev.upload(target))
-    terms, expected = reference_loss.loss(prediction, target, *weights)
-    yield each(four_terms(loss), terms, bounds[0], floor=1e-10 / bounds[0])
-    yield relative(grad.get(), expected, bounds[-1])
+    loss, images = Loss(dev, *weights), (prediction, target)
+    grad, _ = loss.forward_backward(*map(dev.upload, images))
+    terms, expected = reference_loss.loss(*images, *weights)
+    textbook = reference_loss.loss(*images, *weights, dtype=np.float32) if is_hard else (None,) * 2
+    yield each(four_terms(loss), terms, bounds[0], floor=1e-10 / bounds[0], naive=textbook[0])
+    yield relative(grad.get(), expected, bounds[-1], naive=textbook[1])
 
 
 def four_terms(loss: Loss) -> np.ndarray:
@@ -47,21 +48,35 @@ def four_terms(loss: Loss) -> np.ndarray:
     return np.array([found["loss"], found["l1"], 1 - found["ssim"], mse])
 
 
-def _hard_loss(dev, rng):
-    """Flat images, equal ones, and variances far below the squares they are the difference of."""
+def _flat(dev, rng):
+    """Flat images, and variances far below the squares they are the difference of."""
     for levels in ((0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)):
         prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
-        yield from _loss_checks(dev, prediction, target, (0.2, 0.0), FLAT)
+        yield from _loss_checks(dev, prediction, target, (0.2, 0.0), FLAT, is_hard=True)
     for level in (0.0, 1.0):
-        noise = 1e-3 * rng.standard_normal((2, 24, 35, 3))
-        target = (level + noise[0]).astype(np.float32)
-        prediction = (target + noise[1]).astype(np.float32)
+        target = (level + 1e-3 * rng.standard_normal((24, 35, 3))).astype(np.float32)
+        prediction = (target + 1e-3 * rng.standard_normal(target.shape)).astype(np.float32)
         # rounding of values of 1 in variances of 1e-6, as shares of C2
-        yield from _loss_checks(dev, prediction, target, (1.0, 0.0), 1e-5, 3e-5)
-        loss = Loss(dev, 0.2)  # of equal images
+        yield from _loss_checks(dev, prediction, target, (1.0, 0.0), 1e-5, 3e-5, is_hard=True)
+
+
+def _equal(dev, rng):
+    for level in (0.0, 1.0):
+        target = (level + 1e-3 * rng.standard_normal((24, 35, 3))).astype(np.float32)
+        loss, difference = Loss(dev, 0.2), target - target
         grad, _ = loss.forward_backward(dev.upload(target), dev.upload(target))
         yield exact(four_terms(loss)[:3], np.zeros(3))
-        yield exact(grad.get(), np.zeros_like(target))
+        naive = difference / np.abs(difference)
+        yield exact(grad.get(), np.zeros_like(target), naive=naive)
+
+
+def _millions(dev, rng):
+    """The mean of 4 million values."""
+    target = (0.1 + 1e-3 * rng.random((1024, 1366, 3))).astype(np.float32)
+    loss, mean = Loss(dev, 0.0), target.mean(dtype=np.float64)
+    loss.forward_backward(dev.zeros(target.shape), dev.upload(target))
+    naive = target.ravel().cumsum()[-1:] / np.float32(target.size)
+    yield each([loss.read(1).get()["l1"]], [mean], LOSS, naive=naive)
 
 
 def _mask_loss(dev, rng):
@@ -149,7 +164,14 @@ def _exposure(dev, rng, is_full):
             sums[view, half, 7, :3] += np.einsum("yx,yxi->i", a, image**2)
         yield relative(exposure.state.get()[:, :16].reshape(sums.shape), sums, 16 * EPS)
         expected = _matrices(sums.sum(1), PRIOR * alpha.size, is_full)
-        yield relative(exposure.state.get()[:, 16:], expected, FULL if is_full else 32 * EPS)
+        found = exposure.state.get()[:, 16:]
+        yield relative(found, expected, FULL if is_full else 32 * EPS)
+        if not is_full:
+            gains, seen = sums.sum(1).astype(np.float32), range(3)
+            naive = gains[:, [4, 5, 6], seen] / gains[:, seen, seen]
+            yield relative(
+                found[:, seen, seen], expected[:, seen, seen], 32 * EPS, naive=naive / naive.mean(0)
+            )
 
 
 def _matrices(sums, prior, is_full):
@@ -164,10 +186,16 @@ def _matrices(sums, prior, is_full):
 
 CASES = (
     Case("loss: L1 and SSIM", _loss),
-    Case("loss: flat and equal images", _hard_loss),
+    Case("loss: flat images", _flat, hard="variances as E[x^2] - E[x]^2 cancel"),
+    Case("loss: equal images", _equal, hard="the derivative d / |d| is 0 / 0"),
+    Case("loss: 4 million values", _millions, hard="added one by one"),
     Case("loss: mask", _mask_loss),
     Case("loss: ignored pixels", _ignored),
-    Case("loss: exposure", partial(_exposure, is_full=False)),
+    Case(
+        "loss: exposure",
+        partial(_exposure, is_full=False),
+        hard="gains of views not seen yet are 0 / 0",
+    ),
     Case("loss: colours of a view", partial(_exposure, is_full=True)),
     Case("loss: sum of its terms", _sum_of_terms),
 )

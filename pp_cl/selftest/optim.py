@@ -124,7 +124,7 @@ def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int 
 
 
 def _adam(dev, rng):
-    """Parameters and moments after twenty steps; the first step is the rate."""
+    """Parameters and moments after twenty steps."""
     for n in SIZES:
         grads = 1e-3 * rng.standard_normal((20, n))
         for eps in (1e-8, 1e-15):
@@ -134,9 +134,15 @@ def _adam(dev, rng):
             yield relative(parameter, twin.parameter, 3e-7)
             yield each(state["m"], twin.m, 8 * EPS, floor=1e-3)
             yield each(state["v"], twin.v, 8 * EPS)
-    _, parameter, _ = adam_steps(dev, np.zeros(257), np.full((1, 257), -3e-4), rate=0.5, eps=1e-15)
-    # what 1 - beta2 in float32 would miss by 7e-6
-    yield each(parameter, np.full(257, 0.5), 4e-7)
+
+
+def _adam_first(dev, rng):
+    """The first step is the rate."""
+    grad, rate = np.full((1, 257), -3e-4, np.float32), 0.5
+    _, parameter, _ = adam_steps(dev, np.zeros(257), grad, rate=rate, eps=1e-15)
+    v = (np.float32(1) - np.float32(optim.BETA2)) * grad[0] * grad[0]
+    naive = -rate * grad[0] / np.sqrt(v / np.float32(1 - optim.BETA2))
+    yield each(parameter, np.full(257, rate), 4e-7, naive=naive)
 
 
 def adam_steps(
@@ -199,21 +205,27 @@ def _rmsprop_checks(cloud):
 
 
 def _rmsprop_extremes(dev, rng):
-    """Some squares leave float32; NaN stays; a gradient of one parameter alone moves it alone."""
+    """Some squares leave float32."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         cloud = Cloud(dev, rng, 31)
         for _ in range(10):
             cloud.step(gradients(rng, 31, scale), np.arange(31))
         for name, values in cloud.learned().items():
             yield relative(values, cloud.twin.values[name], 1e-6 if name == "sh" else 1e-5)
+
+
+def _rmsprop_nothing(dev, rng):
+    """NaN stays where it is; a gradient of one parameter alone moves it alone."""
     cloud, grads = Cloud(dev, rng, 33), gradients(rng, 33, 0.0)
     grads["sh"][1] = -0.0
     grads["sh"][2, 5] = grads["opacity"][4] = grads["offset"][7, 1] = np.nan
     grads["opacity"][10], grads["offset"][13, 3] = 1e-4, -1e-4
     cloud.step(grads, np.arange(33))
     for name, values in cloud.learned().items():
-        expected = cloud.twin.values[name]
-        yield exact(np.isnan(values), np.isnan(expected))
+        expected, naive = cloud.twin.values[name], None
+        if name == "offset":
+            naive = grads[name] / np.sqrt(np.float32(1 - optim.BETA2) * grads[name] ** 2)
+        yield exact(np.isnan(values), np.isnan(expected), naive=naive)
         yield absolute(np.nan_to_num(values), np.nan_to_num(expected), 1e-6 * RATES.opacity)
 
 
@@ -236,6 +248,34 @@ def _bounded(dev, rng):
     yield exact([sh[:, 1:].min(), sh[:, 1:].max()], [-cloud.cloud.most_sh, cloud.cloud.most_sh])
     yield exact(abs(sh[:, 0]).max() > 1, True)
     yield absolute(sh, cloud.twin.values["sh"], 1e-5)
+
+
+def _huge_rates(dev, rng):
+    """Offsets and opacities go to their bounds, from either side."""
+    cloud, rates = Cloud(dev, rng, 257), replace(RATES, offset=1e30, opacity=1e30, lobe=1e30)
+    for _ in range(3):
+        before, grads = cloud.learned()["offset"], gradients(rng, 257)
+        cloud.step(grads, np.arange(257), rates=rates)
+    learned, naive = cloud.learned(), before - np.float32(1e30) * np.sign(grads["offset"])
+    yield exact(learned["offset"], cloud.twin.values["offset"], naive=naive)
+    yield exact(learned["opacity"][:, 0], cloud.twin.values["opacity"][:, 0])
+    # a harmonic that is 0 in float64 is a rounding here: either bound is right
+    yield exact(abs(learned["opacity"]).max(), 1.0)
+
+
+def _from_bounds(dev, rng):
+    """Opacities of 0 and 1 move away from there at the first gradient that says so."""
+    cloud, grads = Cloud(dev, rng, 257), gradients(rng, 257)
+    grads["opacity"][:] = np.where(np.arange(257) % 2, 1e-4, -1e-4)
+    for _ in range(12):
+        cloud.step(grads, np.arange(257))
+    before = cloud.learned()["opacity"][:, 0]
+    yield exact(before, np.arange(257) % 2 == 0)
+    cloud.step(grads | {"opacity": -grads["opacity"]}, np.arange(257))
+    found, expected = (x["opacity"][:, 0] for x in (cloud.learned(), cloud.twin.values))
+    logit, of_logit = np.log(before / (1 - before)), grads["opacity"] * before * (1 - before)
+    moved = logit + np.float32(RATES.opacity) * of_logit / (np.abs(of_logit) + np.float32(1e-15))
+    yield absolute(found, expected, 1e-5, naive=1 / (1 + np.exp(-moved)))
 
 
 def _ema(dev, rng):
@@ -261,7 +301,9 @@ def _smooth(dev, rng):
             sh = dev.upload(values)
             smoother.smooth(sh, amount)
             expected = optim.smoothed(values, vertices, amount)
-            yield relative(sh.get(), expected, 4 * EPS)  # a mean of up to six
+            # of a point that has no neighbours
+            naive = values + (0 * values / np.float32(0) - values) if n == 1 else None
+            yield relative(sh.get(), expected, 4 * EPS, naive=naive)  # a mean of up to six
 
 
 def _refine(dev, rng):
@@ -272,16 +314,22 @@ def _refine(dev, rng):
         array = dev.upload(opacity)
         split_opacity(dev, array)
         wide = opacity.astype(np.float64)
-        yield each(array.get(), wide / (1 + np.sqrt(1 - wide[:, :1])), 3e-7)
+        naive = opacity / (1 + np.sqrt(1 - opacity[:, :1]))
+        naive[:, 0] = 1 - np.sqrt(1 - opacity[:, 0])
+        yield each(array.get(), wide / (1 + np.sqrt(1 - wide[:, :1])), 3e-7, naive=naive)
 
 
 CASES = (
     Case("adam: arrays", _adam),
+    Case("adam: first step", _adam_first, hard="1 - 0.999 in float32 is off by 1e-5 of itself"),
     Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),
     *(Case(f"rmsprop: degree {d}", partial(_rmsprop, d)) for d in SH_DEGREES),
-    Case("rmsprop: gradients of 0, 1e-20, 1e10 and NaN", _rmsprop_extremes),
+    Case("rmsprop: gradients of 1e-20 and 1e10", _rmsprop_extremes),
+    Case("rmsprop: gradients of 0 and NaN", _rmsprop_nothing, hard="without eps, 0 / sqrt(0)"),
     Case("rmsprop: at the bounds", _bounded),
+    Case("rmsprop: rates of 1e30", _huge_rates, hard="values without bounds"),
+    Case("rmsprop: opacities of 0 and 1", _from_bounds, hard="logits have no gradient there"),
     Case("training: moving average", _ema),
-    Case("training: smoothing", _smooth),
-    Case("training: split opacities", _refine),
+    Case("training: smoothing", _smooth, hard="the mean of no neighbours is 0 / 0"),
+    Case("training: split opacities", _refine, hard="1 - sqrt(1 - o) cancels at 1e-7"),
 )

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from pp_cl.engine.camera import look_at
+from pp_cl.engine.camera import Camera, look_at
 from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import shade_forward
@@ -34,11 +34,16 @@ BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
 FALLOFF = 1e-4  # that band's: of a radius of at least 0.75 pixels
 RIM = 1e-3  # the depth of a sphere is steep at its rim
 SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
+SHOWN = [0, 0, 3.0], [0.001, 0, 4.0]  # positions before the eye of AXIS
+BY_SQUARES = {
+    "soft": "1 - sqrt(|c|^2 - (c.r)^2) / h cancels",
+    "sphere": "sqrt(R^2 - w^2) where the ray misses",
+}
 
 
 def _project(dev, rng):
     """Points in the cells of a grid, and spheres, of which the depth range culls some. Those that
-    lie in the image cover a pixel, and the places of these are known.
+    lie in the image cover a pixel, however small they are, and the places of these are known.
     """
     camera, depth_range = make_camera(), (3.5, 4.8)
     for n in SIZES:
@@ -48,7 +53,12 @@ def _project(dev, rng):
         positions = GRID.positions(ids) + GRID.voxel_size * offset[:, :3]
         points = _projected(dev, "disc", camera, ids, offset, np.zeros((n, OPACITIES)), 0.01)
         place, covers = dense.camera_space(camera, positions), points.point_count.get() > 0
-        yield exact(covers | ~_inside(camera, place), np.ones(n, bool))
+        beside = ~_inside(camera, place)
+        x, y, z = place.T.astype(np.float32)
+        column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        off = np.hypot(*(u - np.floor(u) - np.float32(0.5) for u in (column, row)))
+        naive = off * z < 0.01 * camera.fx  # its centre is that near
+        yield exact(covers | beside, np.ones(n, bool), naive=naive | beside)
         radius = 0.01 * np.exp(offset[covers, 3])
         yield relative(points.point_shape.get()[covers, 0], radius, PLACED)
         yield relative(points.point_camera.get()[covers, :3], place[covers], PLACED)
@@ -88,14 +98,39 @@ def _check_opacities(dev, camera, ids, learned):
     yield absolute(points.point_opacity.get()[covers], expected[covers], 8 * EPS)
 
 
-def _projected(dev, footprint, camera, ids, offset, opacity, radius):
+def _far_away(dev, rng):
+    """A scene a million units from the world's origin."""
+    grid, ids = GRID.moved((1e6, -1e6, 1e6)).rounded(), some_ids(rng, GRID, 257)
+    camera = make_camera().moved(grid.centre)
+    yield from _check_places(dev, camera, grid, ids, grid.positions(ids).astype(np.float32))
+
+
+def _many_vertices(dev, rng):
+    """Points of a grid of 4 billion vertices."""
+    grid = Grid((-1.0, -1.0, -1.0), 2 / 1600, (1600, 1600, 1600))
+    ids = np.sort(rng.integers(grid.id_count, size=257)).astype(np.uint32)
+    naive = grid.positions(ids.astype(np.float32)).astype(np.float32)
+    yield from _check_places(dev, make_camera(), grid, ids, naive)
+
+
+def _check_places(dev, camera, grid, ids, naive):
+    """Of points in camera axes. naive: (N, 3) float32, world positions."""
+    opacity, offset = np.zeros((len(ids), OPACITIES)), np.zeros((len(ids), 4))
+    points = _projected(dev, "soft", camera, ids, offset, opacity, 0.01, grid)
+    covers, pose = points.point_count.get() > 0, camera.pose.astype(np.float32)
+    expected = dense.camera_space(camera, grid.positions(ids))[covers]
+    naive = (naive[covers] - pose[:, 3]) @ pose[:, :3]
+    yield relative(points.point_camera.get()[covers, :3], expected, PLACED, naive=naive)
+
+
+def _projected(dev, footprint, camera, ids, offset, opacity, radius, grid=GRID):
     """The points of a grid by project_grid()."""
     return project_grid(
         dev,
         Buffers(dev),
         footprint,
-        dev.upload(camera.packed(dense.DEPTH_RANGE)),
-        dev.upload(GRID.packed()),
+        dev.upload(camera.packed(dense.DEPTH_RANGE, grid.centre)),
+        dev.upload(grid.packed(grid.centre)),
         point_id=dev.upload(ids, np.uint32),
         cloud_offset=dev.upload(offset, np.float32),
         opacity=dev.upload(opacity, np.float32),
@@ -111,20 +146,31 @@ def _inside(camera, place):
     return (z > 0) & inside
 
 
-def _left_out(dev, rng):
-    """Points behind the eye, on its plane, at it, NaN, infinite or too large reach nothing."""
-    positions = [[0, 0, 3.0], [0.001, 0, 4.0], [0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9]]
+def _at_the_eye(dev, rng):
+    """Points behind the eye, on its plane and at it reach nothing."""
+    positions = np.array([*SHOWN, [0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9]], np.float32)
+    yield from _check_left_out(dev, positions, slopes=positions[:, 0] / positions[:, 2])
+
+
+def _no_positions(dev, rng):
+    """Points at NaN, infinite or too far away reach nothing."""
+    positions = list(SHOWN)
     for bad in (np.nan, np.inf, -np.inf, 3e38, -3e38):
         positions += [[bad, 0, 3.0], [0, bad, 3.0], [0, 0, bad]]
+    positions = np.array(positions, np.float32)
+    distance = np.sqrt((positions**2).sum(1))
+    yield from _check_left_out(dev, positions, shown=~((distance < 1e-3) | (distance > FAR)))
+
+
+def _check_left_out(dev, positions, *, shown=None, slopes=None):
+    """Only the first two are shown. shown, slopes: naive formulas' (N,) bool and float32."""
     n, ones = len(positions), np.ones((1, 1, 16))
     for kind in FOOTPRINTS:
-        scene = PairedPoints(
-            dev, AXIS, np.array(positions), 0.01, kind=kind, depth_range=(1e-3, FAR)
-        )
-        yield exact(scene.seen, [0, 1])
+        scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
+        yield exact(np.isin(np.arange(n), scene.seen), np.arange(n) < 2, naive=shown)
         features = scene.blend(np.ones(n), 0.01, np.full((n, 16), 2))
         found = scene.sphere_gradients(ones) if kind == "sphere" else scene.gradients(ones)
-        yield finite(features, *found.values())
+        yield finite(features, *found.values(), naive=slopes)
         yield exact([gradient[2:].any() for gradient in found.values()], [False] * len(found))
 
 
@@ -134,17 +180,35 @@ def _pairs(kind, dev, rng):
     for n in SIZES:
         positions, radius = make_points(rng, n), (10.0 ** rng.uniform(-3, 0, n)).astype(np.float32)
         scene = PairedPoints(dev, camera, positions, radius, kind=kind)
-        yield from _check_pairs(scene, dense.geometry(camera, positions, radius, kind))
+        naive = _by_squares(kind, camera, positions, radius)
+        yield from _check_pairs(scene, dense.geometry(camera, positions, radius, kind), naive)
 
 
-def _check_pairs(scene, expected):
-    """tests/engine/raster/test_pairs.py says more of each."""
+def _by_squares(kind, camera, positions, radius):
+    """{what: (N, HW) float32} as a ray's distance from a centre, |c|^2 - (c.r)^2, has it."""
+    c, r = (
+        array.astype(np.float32)
+        for array in (dense.camera_space(camera, positions), dense.rays(camera))
+    )
+    range2, along = (c * c).sum(1)[:, None], c @ r.T
+    rho2 = range2 - along * along
+    width = np.sqrt(range2) / np.float32(min(camera.fx, camera.fy))
+    reach = np.maximum(radius[:, None], np.float32(dense.LEAST_RADIUS) * width)
+    return {
+        "soft": {"falloff": 1 - np.sqrt(rho2) / reach},
+        "sphere": {"depth": along - np.sqrt(radius[:, None] ** 2 - rho2)},
+    }.get(kind, {})
+
+
+def _check_pairs(scene, expected, naive):
+    """tests/engine/raster/test_pairs.py says more of each. naive: of what a formula has."""
     pairs, fragments, measured = scene.pairs, scene.fragments(), scene.geometry()
     clear = expected["margin"] > BAND
     yield exact(fragments[clear], expected["fragment"][clear])
     yield exact(fragments.sum(), pairs.total)
-    yield relative(measured["falloff"][fragments], expected["falloff"][fragments], FALLOFF)
-    yield relative(measured["depth"][fragments], expected["depth"][fragments], RIM)
+    for what, bound in (("falloff", FALLOFF), ("depth", RIM)):
+        beside = naive[what][fragments] if what in naive else None
+        yield relative(measured[what][fragments], expected[what][fragments], bound, naive=beside)
     yield exact(pairs.pair_point_falloff.get()[: pairs.total, 0], scene.pair_points())
     counts = np.diff(pairs.pixel_offset.get().astype(np.int64))
     yield exact(counts, fragments.sum(axis=0))
@@ -165,9 +229,48 @@ def _equal_depths(dev, rng):
     for n in (*SIZES, 10_000):
         positions = np.zeros((n, 3))
         positions[:, 2] = np.round(rng.uniform(2.2, 5.9, n), 2)
-        pairs = PairedPoints(dev, camera, positions, 0.1).pairs
-        order = np.argsort(positions[:, 2].astype(np.float32), kind="stable")
-        yield exact(pairs.pair_key.get()[: pairs.total] & 0xFFFFFFFF, order)
+        pairs, z = PairedPoints(dev, camera, positions, 0.1).pairs, positions[:, 2]
+        order = np.argsort(z.astype(np.float32), kind="stable")
+        naive = np.argsort(z.astype(np.float32), kind="quicksort")
+        yield exact(pairs.pair_key.get()[: pairs.total] & 0xFFFFFFFF, order, naive=naive)
+
+
+def _close_depths(dev, rng):
+    """Points that lie one float behind another, in any order."""
+    positions = np.zeros((5000, 3), np.float32)
+    positions[:, 2] = (
+        np.float32(3).view(np.uint32) + rng.permutation(5000).astype(np.uint32)
+    ).view(np.float32)
+    scene = PairedPoints(dev, AXIS, positions, 0.1)
+    depth, (near, far) = scene.geometry()["depth"][:, 0].astype(np.float32), scene.depth_range
+    naive = np.argsort(((depth - near) / (far - near) * 65535).astype(np.uint16), kind="stable")
+    order = scene.pairs.pair_key.get()[:5000] & 0xFFFFFFFF
+    yield exact(order, np.argsort(depth, kind="stable"), naive=naive)
+
+
+def _pixel_borders(dev, rng):
+    """Points on the borders of pixels cover those on both sides."""
+    camera = Camera(np.eye(3, 4), 32.0, 32.0, 0.0, 0.5, 33, 1)
+    positions = np.zeros((32, 3))
+    positions[:, 0], positions[:, 2] = np.arange(1, 33) / 8, 4
+    scene = PairedPoints(dev, camera, positions, 1e-3, kind="disc")
+    column = camera.fx * (positions[:, :1] / positions[:, 2:]).astype(np.float32)
+    naive = np.rint(column - 0.5) == np.arange(33)
+    expected = dense.geometry(camera, positions, 1e-3, "disc")["fragment"]
+    yield exact(scene.fragments(), expected, naive=naive)
+
+
+def _beside_the_eye(dev, rng):
+    """Large points near the eye, beyond the image's border."""
+    camera, n, depth_range = Camera(np.eye(3, 4), 26.0, 26.0, 16.0, 16.0, 33, 31), 64, (0.1, 6.0)
+    positions = rng.uniform([-1.5, -1.5, 0.5], [1.5, 1.5, 1.0], (n, 3)).astype(np.float32)
+    scene = PairedPoints(dev, camera, positions, 0.4, depth_range=depth_range)
+    expected = dense.geometry(camera, positions, 0.4, "soft", depth_range=depth_range)
+    clear, (x, y, z) = expected["margin"] > BAND, positions.T[..., None]
+    row, column = np.indices((camera.height, camera.width), np.float32).reshape(2, -1) + 0.5
+    off = [np.abs(26 * u / z + 16 - pixel) for u, pixel in ((x, column), (y, row))]
+    naive = expected["fragment"] & (np.maximum(*off) <= 26 * np.float32(0.4) / z)
+    yield exact(scene.fragments()[clear], expected["fragment"][clear], naive=naive[clear])
 
 
 def _shade(dev, rng):
@@ -201,7 +304,7 @@ def _shade(dev, rng):
 
 
 def _depth(rule, dev, rng):
-    """Alpha, mean and median depth by the blend weights; nothing of opacities of 0."""
+    """Alpha, mean and median depth by the blend weights."""
     for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
         blended = Blended(
             dev, rng, n, gamma=0.02, radius=0.4, rule=rule, early_stop=1e-2, kind=kind
@@ -220,8 +323,14 @@ def _depth(rule, dev, rng):
         yield exact(np.isinf(median), ~covers)
         low, high = _medians(blended, weight, z)
         yield absolute(median[covers], np.clip(median, low, high)[covers], SUMMED * z.max())
-    scene, _ = blend_on_axis(dev, [0.9, 0.5], [0.0, 0.0], 0.1, rule="alpha")
-    yield exact(np.concatenate(_depths(dev, scene)), [0, np.inf, np.inf])
+
+
+def _depth_of_nothing(dev, rng):
+    nothing = np.zeros(1, np.float32)
+    for rule in BLENDS:
+        scene, _ = blend_on_axis(dev, [0.9, 0.5], [0.0, 0.0], 0.1, rule=rule)
+        naive = np.concatenate([nothing, nothing / nothing, nothing / nothing])
+        yield exact(np.concatenate(_depths(dev, scene)), [0, np.inf, np.inf], naive=naive)
 
 
 def _depth_of_samples(dev, rng):
@@ -238,7 +347,8 @@ def _depth_of_samples(dev, rng):
             is_far = np.isinf(samples.min(1))
             yield exact(np.isinf(depth), is_far)
             mean = np.where(near & ~is_far[:, None], samples, 0).sum(1) / near.sum(1)
-            yield relative(depth[~is_far], mean[~is_far], SUMMED)
+            naive = samples.mean(1)[~is_far]
+            yield relative(depth[~is_far], mean[~is_far], SUMMED, naive=naive)
 
 
 def _fours(values, shape):
@@ -293,13 +403,23 @@ def _record(rule, dev, rng):
 
 
 CASES = (
-    Case("raster: project", _project),
+    Case("raster: project", _project, hard="only pixels with their centre in a tiny point"),
     Case("raster: opacities by direction", _opacities),
-    Case("raster: points that are left out", _left_out),
-    *(Case(f"raster: pairs, {kind}", partial(_pairs, kind)) for kind in FOOTPRINTS),
-    Case("raster: thousands of equal depths", _equal_depths),
+    Case("raster: a scene moved by a million", _far_away, hard="world positions in float32"),
+    Case("raster: ids of 4 billion vertices", _many_vertices, hard="ids kept as float32"),
+    Case("raster: points at the eye", _at_the_eye, hard="x / z is 0 / 0"),
+    Case("raster: positions of NaN", _no_positions, hard="t < near || t > far culls no NaN"),
+    *(
+        Case(f"raster: pairs, {kind}", partial(_pairs, kind), hard=BY_SQUARES.get(kind, ""))
+        for kind in FOOTPRINTS
+    ),
+    Case("raster: points on pixel borders", _pixel_borders, hard="halves rounded to even"),
+    Case("raster: large points beside the eye", _beside_the_eye, hard="a box of f R / z pixels"),
+    Case("raster: thousands of equal depths", _equal_depths, hard="an unstable sort"),
+    Case("raster: depths one float apart", _close_depths, hard="depths in 16 bits, as in viewers"),
     Case("raster: shade", _shade),
     *(Case(f"raster: depth, {rule}", partial(_depth, rule)) for rule in BLENDS),
-    Case("raster: depth of samples", _depth_of_samples),
+    Case("raster: depth of nothing", _depth_of_nothing, hard="divided by alpha, 0"),
+    Case("raster: depth of samples", _depth_of_samples, hard="the mean with infinite background"),
     *(Case(f"raster: highest weights, {rule}", partial(_record, rule)) for rule in BLENDS),
 )

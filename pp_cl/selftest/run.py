@@ -4,7 +4,7 @@ import os
 import platform
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from pp_cl.selftest.case import Case
 SEED = 7
 COLUMNS = "{:40} {:>11} {:>9}  {}".format
 HEAD = COLUMNS("case", "worst error", "bound", "pass")
+HARD_COLUMNS = "{:42} {:>8} {:>8} {:>8}  {:4}  {}".format
+HARD_HEAD = HARD_COLUMNS("hard case", "naive", "ours", "bound", "pass", "naive formula")
 CASES: tuple[Case, ...] = (
     *device.CASES,
     *scene.CASES,
@@ -33,9 +35,21 @@ CASES: tuple[Case, ...] = (
 
 
 @dataclass(frozen=True)
+class Hard:
+    """Of a hard case: what the naive formula does, and of the check in which it is worst its error,
+    NaN where that is one, ours, and the bound.
+    """
+
+    what: str
+    naive: float
+    error: float
+    bound: float
+
+
+@dataclass(frozen=True)
 class Row:
     """error, bound: of the case's worst check; None where it ended with an exception. reason: of a
-    failure that numbers do not say, one line, else "".
+    failure that numbers do not say, one line, else "". hard: None also after an exception.
     """
 
     case: str
@@ -44,6 +58,7 @@ class Row:
     passed: bool
     reason: str
     seconds: float
+    hard: Hard | None = None
 
 
 def run_cases(dev: Device, cases: Iterable[Case]) -> Iterator[Row]:
@@ -57,15 +72,19 @@ def run_case(dev: Device, case: Case) -> Row:
     start = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # what is not finite is a result here
-            checks = case.run(dev, np.random.default_rng(SEED))
-            worst = max(checks, key=lambda check: check.share)
+            checks = list(case.run(dev, np.random.default_rng(SEED)))
+        worst = max(checks, key=lambda check: check.share)
     except Exception as fault:
         words = " ".join(f"{type(fault).__name__}: {fault}".split())[:300]
         return Row(case.name, None, None, False, words, time.perf_counter() - start)
     error, bound = float(worst.error), float(worst.bound)
     reason = "" if np.isfinite(error) else "NaN, Inf or a value where there may be none"
+    hard = None
+    if case.hard:
+        apart = max(checks, key=lambda check: (check.naive_share, check.share))
+        hard = Hard(case.hard, float(apart.naive), float(apart.error), float(apart.bound))
     seconds = time.perf_counter() - start
-    return Row(case.name, error, bound, error <= bound, reason, seconds)
+    return Row(case.name, error, bound, error <= bound, reason, seconds, hard)
 
 
 def setup(dev: Device) -> dict[str, str]:
@@ -90,16 +109,42 @@ def setup(dev: Device) -> dict[str, str]:
 def line(row: Row) -> str:
     """A line of the table; below it, indented, the reason of a failure that has one."""
     numbers = ["-" if n is None else f"{n:.2g}" for n in (row.error, row.bound)]
-    reason = f"\n    {row.reason}" if row.reason else ""
-    return COLUMNS(row.case, *numbers, "yes" if row.passed else "NO") + reason
+    return COLUMNS(row.case, *numbers, _passed(row)) + _reason(row)
+
+
+def hard_line(row: Row) -> str:
+    """The same of a hard case, beside the naive formula."""
+    hard = row.hard
+    numbers = [f"{n:.2g}" for n in (hard.naive, hard.error, hard.bound)] if hard else ["-"] * 3
+    what = hard.what if hard else ""
+    return HARD_COLUMNS(row.case, *numbers, _passed(row), what).rstrip() + _reason(row)
+
+
+def _passed(row):
+    return "yes" if row.passed else "NO"
+
+
+def _reason(row):
+    return f"\n    {row.reason}" if row.reason else ""
 
 
 def as_json(dev: Device, rows: Iterable[Row]) -> dict[str, Any]:
-    """{"setup", "passed", "seconds", "cases": [a Row's fields]}; null for what is no number."""
-    rows = [row if np.isfinite(row.error or 0) else replace(row, error=None) for row in rows]
+    """{"setup", "passed", "seconds", "cases": [a Row's fields]}; null for what is no number, but
+    "nan" or "inf" for what the naive formula gives.
+    """
+    rows = list(rows)
     return {
         "setup": setup(dev),
         "passed": all(row.passed for row in rows),
         "seconds": sum(row.seconds for row in rows),
-        "cases": [asdict(row) for row in rows],
+        "cases": [_plain(asdict(row)) for row in rows],
     }
+
+
+def _plain(row):
+    """A row without numbers that JSON has not."""
+    hard = row["hard"] or {"error": 0.0, "naive": 0.0}
+    for fields in (row, hard):
+        fields["error"] = fields["error"] if np.isfinite(fields["error"] or 0) else None
+    hard["naive"] = hard["naive"] if np.isfinite(hard["naive"]) else str(hard["naive"])
+    return row

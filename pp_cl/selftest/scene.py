@@ -120,6 +120,17 @@ def _distortion(dev, rng):
             yield absolute(found, twin.undistorted(image, camera, lens, factor), ROUNDED)
 
 
+def _transparent(dev, rng):
+    """A lens that distorts nothing, over pixels some of which are transparent: these are black."""
+    image = rng.integers(0, 256, (31, 33, 4), np.uint8)
+    image[..., 3] *= rng.random((31, 33)) < 0.5
+    camera, lens = Camera(np.eye(3, 4), 30.0, 30.0, 16.5, 15.5, 33, 31), LensDistortion()
+    alpha = image[..., 3:].astype(np.float32)
+    naive = np.concatenate([image[..., :3] * alpha / alpha, alpha], 2)
+    expected = twin.undistorted(image, camera, lens)
+    yield absolute(undistort(dev, image, camera, lens), expected, ROUNDED, naive=naive)
+
+
 def _demo(dev, rng):
     for n in SIZES:
         for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
@@ -134,5 +145,6 @@ CASES = (
     Case("scene: target", _target),
     Case("scene: target between pixels", _target_between),
     Case("scene: lens", _distortion),
+    Case("scene: transparent pixels", _transparent, hard="colours divided by alpha, 0"),
     Case("scene: demo", _demo),
 )

@@ -42,7 +42,28 @@ def test_what_must_be_zero_may_not_differ():
 
 
 def test_shares_of_bounds():
-    assert case.relative(np.zeros((0, 3)), np.zeros((0, 3)), 0.0) == (0, 0)
-    assert case.finite(np.array([1, np.nan]), np.array([np.inf])) == (2, 0)
+    assert case.relative(np.zeros((0, 3)), np.zeros((0, 3)), 0.0) == Check(0, 0)
+    assert case.finite(np.array([1, np.nan]), np.array([np.inf])) == Check(2, 0)
     shares = [Check(*check).share for check in ((0, 0), (1, 0), (1, 4), (np.inf, 1))]
     assert shares == [0, np.inf, 0.25, np.inf]
+    naive = [Check(1, *check).naive_share for check in ((0,), (0, 0), (0, 1), (4, 1), (4, np.nan))]
+    assert naive == [-1, 0, np.inf, 0.25, np.inf]
+
+
+@pytest.mark.parametrize("name", MEASURES)
+def test_naive_formulas_are_measured_alike(name):
+    measure, error = MEASURES[name]
+    naive = np.array(ACTUAL, np.float32)
+    assert measure(EXPECTED, EXPECTED, naive=naive)[::2] == (0, error)
+    assert measure(ACTUAL, EXPECTED)[::2] == (error, None)
+    with pytest.raises(ValueError, match="float64"):
+        measure(EXPECTED, EXPECTED, naive=np.array(ACTUAL))
+    naive[2] = np.inf
+    assert measure(EXPECTED, EXPECTED, naive=naive).naive == (2 if name == "exact" else np.inf)
+    naive[1] = np.nan
+    assert np.isnan(measure(EXPECTED, EXPECTED, naive=naive).naive)
+
+
+def test_naive_formulas_that_are_not_finite():
+    assert case.finite(np.zeros(2), naive=np.float32([np.inf, 1])) == Check(0, 0, 1)
+    assert np.isnan(case.finite(np.zeros(2), naive=np.float32([np.inf, np.nan])).naive)

@@ -24,6 +24,8 @@ def test_passes(dev, case):
     row = run_case(dev, case)
     assert row.passed, row
     assert row.case == case.name and not row.reason and row.error <= row.bound
+    if case.hard:  # what a naive formula can do is not hard
+        assert row.hard.error <= row.hard.bound and not row.hard.naive <= row.hard.bound
 
 
 def test_names_are_unique():

@@ -5,11 +5,22 @@ import pyopencl as cl
 import pytest
 
 from pp_cl.selftest.case import Case, Check, relative
-from pp_cl.selftest.run import HEAD, Row, as_json, line, run_case, run_cases, setup
+from pp_cl.selftest.run import (
+    HARD_HEAD,
+    HEAD,
+    Hard,
+    Row,
+    as_json,
+    hard_line,
+    line,
+    run_case,
+    run_cases,
+    setup,
+)
 
 
-def case(*checks, name="a: case", variant=None):
-    return Case(name, lambda dev, rng: iter(checks), variant)
+def case(*checks, name="a: case", variant=None, hard=""):
+    return Case(name, lambda dev, rng: iter(checks), variant, hard)
 
 
 def test_the_worst_check_is_the_one_closest_to_its_bound():
@@ -45,6 +56,16 @@ def test_a_case_without_checks_has_checked_nothing():
     assert not run_case(None, case()).passed
 
 
+def test_a_hard_case_shows_the_check_in_which_the_naive_formula_is_worst():
+    checks = Check(0.9, 1.0), Check(0.5, 1.0, 4.0), Check(0.2, 1.0, np.nan), Check(0, 0, np.inf)
+    for some, expected in ((checks[:2], (4, 0.5, 1)), (checks, (np.nan, 0.2, 1))):
+        row = run_case(None, case(*some, hard="1 / 0"))
+        assert row.hard.what == "1 / 0" and (row.error, row.bound) == (0.9, 1.0)
+        found = row.hard.naive, row.hard.error, row.hard.bound
+        np.testing.assert_equal(found, expected)
+    assert run_case(None, case(*checks)).hard is None
+
+
 def test_variants_that_are_not_offered_are_left_out(dev, monkeypatch):
     cases = [case(Check(0, 1), name=str(v), variant=v) for v in (None, "direct", "winograd")]
     monkeypatch.setattr(dev, "is_cpu", True)
@@ -56,6 +77,8 @@ def test_variants_that_are_not_offered_are_left_out(dev, monkeypatch):
 GOOD = Row("a: good", 1.25e-7, 1e-6, True, "", 0.5)
 NAN = Row("a: bad", np.inf, 1e-6, False, "NaN", 0.25)
 RAISED = Row("a: raised", None, None, False, "RuntimeError: no", 0.25)
+HARD = Row("a: hard", 1e-7, 1e-6, True, "", 0.5, Hard("1 / 0", np.nan, 1e-7, 1e-6))
+BAD = Row("a: worse", np.inf, 0.0, False, "NaN", 0.5, Hard("x - x", 2.0, np.inf, 0.0))
 
 
 def test_lines_and_json_have_every_row(dev):
@@ -63,7 +86,18 @@ def test_lines_and_json_have_every_row(dev):
     assert line(GOOD).split() == ["a:", "good", "1.2e-07", "1e-06", "yes"]
     assert line(NAN).split() == ["a:", "bad", "inf", "1e-06", "NO", "NaN"]
     assert line(RAISED).split() == ["a:", "raised", "-", "-", "NO", "RuntimeError:", "no"]
-    stored = json.loads(json.dumps(as_json(dev, [GOOD, NAN, RAISED]), allow_nan=False))
-    assert stored["setup"] == setup(dev) and stored["seconds"] == 1.0
-    assert [row["error"] for row in stored["cases"]] == [1.25e-7, None, None]
+    assert HARD_HEAD.split()[2:5] == ["naive", "ours", "bound"]
+    for row, words in (
+        (HARD, "a: hard nan 1e-07 1e-06 yes 1 / 0"),
+        (BAD, "a: worse 2 inf 0 NO x - x NaN"),
+        (RAISED, "a: raised - - - NO RuntimeError: no"),
+    ):
+        assert " ".join(hard_line(row).split()) == words
+    rows = [GOOD, NAN, RAISED, HARD, BAD]
+    stored = json.loads(json.dumps(as_json(dev, rows), allow_nan=False))
+    assert stored["setup"] == setup(dev) and stored["seconds"] == 2.0
+    assert [row["error"] for row in stored["cases"]] == [1.25e-7, None, None, 1e-7, None]
     assert stored["cases"][2] == vars(RAISED)
+    hard = [row["hard"] for row in stored["cases"][2:]]
+    assert hard[:2] == [None, {"what": "1 / 0", "naive": "nan", "error": 1e-7, "bound": 1e-6}]
+    assert hard[2] == {"what": "x - x", "naive": 2.0, "error": None, "bound": 0.0}
