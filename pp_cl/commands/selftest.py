@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> None:
         print(f"{what:14}{name}")
     cases, head, line = selftest.CASES, selftest.HEAD, selftest.line
     if options.hard:
-        cases = [case for case in cases if case.hard]
+        cases = tuple(case for case in cases if case.hard)
         head, line = selftest.HARD_HEAD, selftest.hard_line
     print(f"\n{head}", flush=True)
     rows = []

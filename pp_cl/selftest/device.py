@@ -52,7 +52,7 @@ def _compact(dev, rng):
 
 
 CASES = (
-    Case("device: scan", _scan, hard="sums above 2^32 wrap around"),
+    Case("device: scan", _scan, hard="sums of 32 bits wrap around"),
     Case("device: list of non-zero values", _nonzero),
     Case("device: compact and gather rows", _compact),
 )

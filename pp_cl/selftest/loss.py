@@ -186,15 +186,15 @@ def _matrices(sums, prior, is_full):
 
 CASES = (
     Case("loss: L1 and SSIM", _loss),
-    Case("loss: flat images", _flat, hard="variances as E[x^2] - E[x]^2 cancel"),
-    Case("loss: equal images", _equal, hard="the derivative d / |d| is 0 / 0"),
+    Case("loss: flat images", _flat, hard="E[x^2] - E[x]^2 cancels"),
+    Case("loss: equal images", _equal, hard="d / abs(d) is 0 / 0"),
     Case("loss: 4 million values", _millions, hard="added one by one"),
     Case("loss: mask", _mask_loss),
     Case("loss: ignored pixels", _ignored),
     Case(
         "loss: exposure",
         partial(_exposure, is_full=False),
-        hard="gains of views not seen yet are 0 / 0",
+        hard="gains of unseen views are 0 / 0",
     ),
     Case("loss: colours of a view", partial(_exposure, is_full=True)),
     Case("loss: sum of its terms", _sum_of_terms),

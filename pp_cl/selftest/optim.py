@@ -321,15 +321,15 @@ def _refine(dev, rng):
 
 CASES = (
     Case("adam: arrays", _adam),
-    Case("adam: first step", _adam_first, hard="1 - 0.999 in float32 is off by 1e-5 of itself"),
+    Case("adam: first step", _adam_first, hard="1 - 0.999 in float32"),
     Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),
     *(Case(f"rmsprop: degree {d}", partial(_rmsprop, d)) for d in SH_DEGREES),
     Case("rmsprop: gradients of 1e-20 and 1e10", _rmsprop_extremes),
-    Case("rmsprop: gradients of 0 and NaN", _rmsprop_nothing, hard="without eps, 0 / sqrt(0)"),
+    Case("rmsprop: gradients of 0 and NaN", _rmsprop_nothing, hard="0 / sqrt(0), without eps"),
     Case("rmsprop: at the bounds", _bounded),
     Case("rmsprop: rates of 1e30", _huge_rates, hard="values without bounds"),
     Case("rmsprop: opacities of 0 and 1", _from_bounds, hard="logits have no gradient there"),
     Case("training: moving average", _ema),
     Case("training: smoothing", _smooth, hard="the mean of no neighbours is 0 / 0"),
-    Case("training: split opacities", _refine, hard="1 - sqrt(1 - o) cancels at 1e-7"),
+    Case("training: split opacities", _refine, hard="1 - sqrt(1 - o) cancels"),
 )

@@ -20,6 +20,7 @@ from pp_cl.selftest.points import (
     AXIS,
     FAR,
     Blended,
+    PairedGaussians,
     PairedPoints,
     blend_on_axis,
     make_camera,
@@ -36,7 +37,7 @@ RIM = 1e-3  # the depth of a sphere is steep at its rim
 SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
 SHOWN = [0, 0, 3.0], [0.001, 0, 4.0]  # positions before the eye of AXIS
 BY_SQUARES = {
-    "soft": "1 - sqrt(|c|^2 - (c.r)^2) / h cancels",
+    "soft": "c.c - (c.r)^2 cancels",
     "sphere": "sqrt(R^2 - w^2) where the ray misses",
 }
 
@@ -160,6 +161,16 @@ def _no_positions(dev, rng):
     positions = np.array(positions, np.float32)
     distance = np.sqrt((positions**2).sum(1))
     yield from _check_left_out(dev, positions, shown=~((distance < 1e-3) | (distance > FAR)))
+
+
+def _no_sizes(dev, rng):
+    """Gaussians of an infinite size or of none that is a number reach nothing."""
+    grid, learned = Grid((0.0, 0.0, 0.0), 0.3, (2, 2, 2)), np.zeros((8, 16), np.float32)
+    learned[2::3, 3], learned[1::3, 4] = np.inf, np.nan
+    scene = PairedGaussians(dev, make_camera(), grid, some_ids(rng, grid, 8), learned, 0.1)
+    radius = np.ceil(3 * np.sqrt(np.exp(2 * learned[:, 3:6]).sum(1)))
+    yield exact(np.isin(np.arange(8), scene.seen), np.arange(8) % 3 == 0, naive=radius != 0)
+    yield finite(scene.blend(np.ones(8), 0.1, np.ones((8, 16)), rule="alpha"))
 
 
 def _check_left_out(dev, positions, *, shown=None, slopes=None):
@@ -403,12 +414,13 @@ def _record(rule, dev, rng):
 
 
 CASES = (
-    Case("raster: project", _project, hard="only pixels with their centre in a tiny point"),
+    Case("raster: project", _project, hard="only pixels whose centres it contains"),
     Case("raster: opacities by direction", _opacities),
     Case("raster: a scene moved by a million", _far_away, hard="world positions in float32"),
-    Case("raster: ids of 4 billion vertices", _many_vertices, hard="ids kept as float32"),
+    Case("raster: ids of 4 billion vertices", _many_vertices, hard="ids stored as float32"),
     Case("raster: points at the eye", _at_the_eye, hard="x / z is 0 / 0"),
-    Case("raster: positions of NaN", _no_positions, hard="t < near || t > far culls no NaN"),
+    Case("raster: sizes of NaN and infinity", _no_sizes, hard="radius == 0 culls none"),
+    Case("raster: positions of NaN", _no_positions, hard="t < near or t > far culls none"),
     *(
         Case(f"raster: pairs, {kind}", partial(_pairs, kind), hard=BY_SQUARES.get(kind, ""))
         for kind in FOOTPRINTS
@@ -416,10 +428,12 @@ CASES = (
     Case("raster: points on pixel borders", _pixel_borders, hard="halves rounded to even"),
     Case("raster: large points beside the eye", _beside_the_eye, hard="a box of f R / z pixels"),
     Case("raster: thousands of equal depths", _equal_depths, hard="an unstable sort"),
-    Case("raster: depths one float apart", _close_depths, hard="depths in 16 bits, as in viewers"),
+    Case("raster: depths one float apart", _close_depths, hard="depths sorted in 16 bits"),
     Case("raster: shade", _shade),
     *(Case(f"raster: depth, {rule}", partial(_depth, rule)) for rule in BLENDS),
     Case("raster: depth of nothing", _depth_of_nothing, hard="divided by alpha, 0"),
-    Case("raster: depth of samples", _depth_of_samples, hard="the mean with infinite background"),
+    Case(
+        "raster: depth of samples", _depth_of_samples, hard="the mean with an infinite background"
+    ),
     *(Case(f"raster: highest weights, {rule}", partial(_record, rule)) for rule in BLENDS),
 )

@@ -79,9 +79,8 @@ def run_case(dev: Device, case: Case) -> Row:
         return Row(case.name, None, None, False, words, time.perf_counter() - start)
     error, bound = float(worst.error), float(worst.bound)
     reason = "" if np.isfinite(error) else "NaN, Inf or a value where there may be none"
-    hard = None
-    if case.hard:
-        apart = max(checks, key=lambda check: (check.naive_share, check.share))
+    apart, hard = max(checks, key=lambda check: (check.naive_share, check.share)), None
+    if case.hard and apart.naive is not None:
         hard = Hard(case.hard, float(apart.naive), float(apart.error), float(apart.bound))
     seconds = time.perf_counter() - start
     return Row(case.name, error, bound, error <= bound, reason, seconds, hard)

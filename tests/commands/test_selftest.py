@@ -29,11 +29,13 @@ def test_all_pass(few, dev, tmp_path, capsys):
     assert stored["passed"] and [row["case"] for row in stored["cases"]] == list(NAMES)
 
 
-def test_a_perturbed_kernel_is_status_1_and_named(few, dev, tmp_path, monkeypatch, capsys):
+def test_a_naive_formula_in_a_kernel_is_status_1_and_named(few, dev, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(dev, "_programs", {})
     shutil.copytree(device_module.kernel_folder(), tmp_path / "cl")
     path = tmp_path / "cl" / "training" / "refine.cl"
-    path.write_text(path.read_text().replace("1.0f + sqrt", "1.0f - sqrt"))
+    text, o = path.read_text(), "opacity[OPACITIES * (size_t)i]"
+    assert text.count(f"1.0f + sqrt(1.0f - {o})") == 1
+    path.write_text(text.replace(f"1.0f + sqrt(1.0f - {o})", f"{o} / (1.0f - sqrt(1.0f - {o}))"))
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path / "cl")
     assert main(["selftest", "--json", str(tmp_path / "a.json")]) == 1
     out, err = capsys.readouterr()
@@ -41,3 +43,17 @@ def test_a_perturbed_kernel_is_status_1_and_named(few, dev, tmp_path, monkeypatc
     assert out.splitlines()[-1].endswith("2 pass")
     stored = json.loads((tmp_path / "a.json").read_text())
     assert [row["passed"] for row in stored["cases"]] == [True, False, True]
+    assert main(["selftest", "--hard"]) == 1
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith(NAMES[1]))
+    assert "NO" in line.split()
+
+
+def test_hard_cases_alone_stand_beside_naive_formulas(few, dev, tmp_path, capsys):
+    assert main(["selftest", "--hard", "--json", str(tmp_path / "a.json")]) == 0
+    stored = json.loads((tmp_path / "a.json").read_text())["cases"]
+    assert [row["case"] for row in stored] == list(NAMES[:2])
+    lines = capsys.readouterr().out.splitlines()
+    for row in stored:
+        (line,) = (line for line in lines if line.startswith(row["case"]))
+        assert line.endswith(row["hard"]["what"]) and f"{row['hard']['naive']:.2g}" in line.split()
+        assert row["hard"]["error"] <= row["hard"]["bound"] < row["hard"]["naive"]
