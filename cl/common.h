@@ -22,6 +22,10 @@
 #define BOUNDED(value, least, most)                                                                \
     ((value) < (least) ? (least) : (value) > (most) ? (most) : (value))
 
+// A gradient of which an optimiser takes the square: with an infinite one, the second moment would
+// be infinite for good, or NaN.
+#define BOUNDED_GRADIENT(type, g) BOUNDED(g, (type)(-1e18f), (type)(1e18f))
+
 // 16 channels of one pixel or point
 #define CHANNELS 16
 

@@ -179,6 +179,13 @@ SPLATS = [
 SPLATTED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_6000": "lego 400x400"}
 SPLATTED |= {"ethiopian_head": "ethiopian_head"}
 FEWER = (100, 250, 500, 1000)  # steps than export's of the demo
+STABILITY = [
+    {"head": "hard case", "cell": "{case}"},
+    {"head": "naive formula", "cell": "{what}"},
+    {"head": "gives", "cell": "{naive}"},
+    {"head": "ours", "cell": "{error:.2g}"},
+    {"head": "bound", "cell": "{bound:.2g}"},
+]
 DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
 
 
@@ -327,6 +334,16 @@ def splats(store: Path) -> list[dict]:
     return rows
 
 
+def stability(store: Path) -> list[dict]:
+    """Rows of STABILITY."""
+    rows = []
+    for row in read_found(store, *PP_CL, "selftest", "--hard")["cases"]:
+        naive = row["hard"]["naive"]
+        shown = {"nan": "NaN", "inf": "infinity"}.get(naive) or f"{naive:.2g}"
+        rows.append(row["hard"] | {"case": row["case"], "naive": shown})
+    return rows
+
+
 PARTS: dict[str, Callable[[Path], Found]] = {
     **{key_of(training): partial(train, training) for training in (*TRAININGS, *CURVES)},
     "demo": demo,
@@ -335,6 +352,7 @@ PARTS: dict[str, Callable[[Path], Found]] = {
     **{f"stages_{preset}": partial(stages, preset) for preset in STEPS},
     "memory": memory,
     "splats": splats,
+    "stability": stability,
 }
 
 
@@ -480,6 +498,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
         "memory": ("the most memory that a few steps take", MEMORY),
         "demo": ("runs of the demo", DEMO),
         "splats": (fitted, SPLATS),
+        "stability": ("errors against float64", STABILITY),
     }
     return {
         name: {"measured": measured, "columns": columns, "rows": rows[name]}

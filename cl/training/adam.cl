@@ -28,7 +28,7 @@ kernel void adam_update(
     const int item = get_global_id(0) / ROW_PARTS;
     if (item >= n) return;
     const Sum found = sum_of(table, rows, partial, item);
-    const floats g = found.sum;
+    const floats g = BOUNDED_GRADIENT(floats, found.sum);
     floats m_new = load_part(m, found.at), v_new = load_part(v, found.at);
     m_new += DECAY1 * (g - m_new);
     v_new += DECAY2 * (g * g - v_new);

@@ -89,8 +89,9 @@ kernel void rmsprop_move(
 #if ROW_PARTS > 1
     barrier(CLK_GLOBAL_MEM_FENCE);  // all parts of a point have read it
 #endif
-    const Offsets o = MOVES_OFFSET ? OFFSETS_AT(grad_offset, g) : (Offsets)(0.0f);
-    const float a = grad_opacity[g];
+    const Offsets offsets = MOVES_OFFSET ? OFFSETS_AT(grad_offset, g) : (Offsets)(0.0f);
+    const Offsets o = BOUNDED_GRADIENT(Offsets, offsets);
+    const float a = BOUNDED_GRADIENT(float, grad_opacity[g]);
     // a NaN is a gradient
     if (row >= s || !(any(grad_visible_features[g] != 0.0f) || any(o != 0.0f) || a != 0.0f)) return;
     const float decay = exp2((step - last) * LOG_BETA2);
@@ -118,7 +119,7 @@ kernel void rmsprop_move(
             OFFSETS_AT(offset, i) = BOUNDED(shifted, -most, most);
         }
     }
-    const floats G = load_part(grad_visible_features, g);
+    const floats G = BOUNDED_GRADIENT(floats, load_part(grad_visible_features, g));
     const floats moment = decay * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
     store_part(moment, v, i);
     const floats scaled = G / (sqrt(moment) + eps);

@@ -180,6 +180,25 @@ def _adam_extremes(dev, rng):
     yield exact(state["v"], np.zeros(33))
 
 
+def _adam_huge(dev, rng):
+    """Gradients whose squares float32 has not."""
+    grads = (1e30 * rng.choice([-1, 1], (5, 31))).astype(np.float32)
+    twin, parameter, _ = adam_steps(dev, np.zeros(31), grads, rate=0.1, eps=1e-8)
+    naive = _textbook_adam(np.zeros(31, np.float32), grads, rate=0.1, eps=1e-8)
+    yield relative(parameter, twin.parameter, 1e-5, naive=naive)
+
+
+def _textbook_adam(parameter, grads, *, rate, eps, beta1=0.9):
+    """The parameter after a step with each gradient, all float32."""
+    m = v = np.zeros_like(parameter)
+    for t, g in enumerate(grads, 1):
+        m = beta1 * m + (1 - beta1) * g
+        v = optim.BETA2 * v + (1 - optim.BETA2) * (g * g)
+        step = m / (np.sqrt(v / (1 - optim.BETA2**t)) + eps)
+        parameter = parameter - rate / (1 - beta1**t) * step
+    return parameter
+
+
 def _rmsprop(degree, dev, rng):
     """Points without a gradient keep their values, and their second moments decay."""
     for n in SIZES:
@@ -212,6 +231,19 @@ def _rmsprop_extremes(dev, rng):
             cloud.step(gradients(rng, 31, scale), np.arange(31))
         for name, values in cloud.learned().items():
             yield relative(values, cloud.twin.values[name], 1e-6 if name == "sh" else 1e-5)
+
+
+def _rmsprop_huge(dev, rng):
+    """Gradients whose squares float32 has not."""
+    cloud = Cloud(dev, rng, 31)
+    grads = {name: np.sign(g) * np.float32(1e30) for name, g in gradients(rng, 31).items()}
+    for _ in range(5):
+        cloud.step(grads, np.arange(31))
+    how = {"rate": RATES.offset, "eps": POINT_EPS, "beta1": 0}
+    offset = _textbook_adam(cloud.start["offset"], [grads["offset"]] * 5, **how)
+    for name, values in cloud.learned().items():
+        naive = offset if name == "offset" else None
+        yield relative(values, cloud.twin.values[name], 1e-5, naive=naive)
 
 
 def _rmsprop_nothing(dev, rng):
@@ -321,10 +353,12 @@ def _refine(dev, rng):
 
 CASES = (
     Case("adam: arrays", _adam),
+    Case("adam: gradients of 1e30", _adam_huge, hard="v is infinite, the step 0"),
     Case("adam: first step", _adam_first, hard="1 - 0.999 in float32"),
     Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),
     *(Case(f"rmsprop: degree {d}", partial(_rmsprop, d)) for d in SH_DEGREES),
     Case("rmsprop: gradients of 1e-20 and 1e10", _rmsprop_extremes),
+    Case("rmsprop: gradients of 1e30", _rmsprop_huge, hard="v is infinite, the step 0"),
     Case("rmsprop: gradients of 0 and NaN", _rmsprop_nothing, hard="0 / sqrt(0), without eps"),
     Case("rmsprop: at the bounds", _bounded),
     Case("rmsprop: rates of 1e30", _huge_rates, hard="values without bounds"),

@@ -2,6 +2,8 @@
 what nobody wrote.
 """
 
+from pathlib import Path
+
 import pytest
 
 from pp_cl.engine.device.kernel import Kernel
@@ -30,6 +32,14 @@ def test_passes(dev, case):
 
 def test_names_are_unique():
     assert len({case.name for case in CASES}) == len(CASES)
+
+
+def test_the_page_of_hard_cases_lists_them():
+    text = (Path(__file__).parents[2] / "docs" / "stability.md").read_text("utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    shown = [row[:2] for row in rows if len(row) == 5][2:]
+    assert shown == [[case.name, case.hard] for case in CASES if case.hard]
+    assert len(shown) >= 30 and not any("|" in what for _, what in shown)
 
 
 # of the kernels that work in another way on GPUs; `make test-gpu-form` runs all tests so

@@ -29,7 +29,8 @@ FOUND |= {"demo": [{"what": "mesh", "result": "0.76"}]}
 FOUND |= {"rasteriser": [RASTER], "memory": [MEMORY]}
 SPLAT = {"name": "demo", "steps": 1500, "seconds": 45.1, "gaussians": 41819}
 SPLAT |= {"psnr_same": 25.0, "psnr_larger": 35.2}
-FOUND |= {"pytorch": [TORCH], "splats": [SPLAT]}
+HARD = {"case": "a: b", "what": "1 / 0", "naive": "NaN", "error": 1e-7, "bound": 1e-6}
+FOUND |= {"pytorch": [TORCH], "splats": [SPLAT], "stability": [HARD]}
 FOUND |= {f"stages_{preset}": STEP for preset in TOOL.STEPS}
 
 
@@ -108,3 +109,12 @@ def test_what_fits_into_the_minutes_is_measured(tmp_path, monkeypatch):
         "pytorch (install PyTorch)",
         "stages_full (too little time)",
     ]
+
+
+def test_hard_cases_beside_naive_formulas(tmp_path, monkeypatch):
+    hard = [HARD | {"naive": naive} for naive in ("nan", "inf", 1234.5)]
+    found = {"cases": [{"case": "a: b", "hard": one} for one in hard]}
+    monkeypatch.setattr(TOOL, "read_found", lambda *words: found)
+    rows = TOOL.stability(tmp_path)
+    assert [row["naive"] for row in rows] == ["NaN", "infinity", "1.2e+03"]
+    assert all(row | {"naive": "NaN"} == HARD for row in rows)
