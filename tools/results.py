@@ -33,6 +33,7 @@ from pp_cl.drivers import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.metrics.published import tables as published
+from pp_cl.selftest.run import Hard
 from pp_studio.export import BEST, QUALITIES, QUICK
 from tools.provenance import digest
 
@@ -183,8 +184,8 @@ STABILITY = [
     {"head": "hard case", "cell": "{case}"},
     {"head": "naive formula", "cell": "{what}"},
     {"head": "gives", "cell": "{naive}"},
-    {"head": "ours", "cell": "{error:.2g}"},
-    {"head": "bound", "cell": "{bound:.2g}"},
+    {"head": "ours", "cell": "{error}"},
+    {"head": "bound", "cell": "{bound}"},
 ]
 DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
 
@@ -338,9 +339,10 @@ def stability(store: Path) -> list[dict]:
     """Rows of STABILITY."""
     rows = []
     for row in read_found(store, *PP_CL, "selftest", "--hard")["cases"]:
-        naive = row["hard"]["naive"]
-        shown = {"nan": "NaN", "inf": "infinity"}.get(naive) or f"{naive:.2g}"
-        rows.append(row["hard"] | {"case": row["case"], "naive": shown})
+        numbers = {name: float(row["hard"][name]) for name in ("naive", "error", "bound")}
+        hard = Hard(row["hard"]["what"], **numbers)
+        shown = dict(zip(numbers, hard.shown(), strict=True))
+        rows.append({"case": row["case"], "what": hard.what} | shown)
     return rows
 
 

@@ -45,6 +45,11 @@ class Hard:
     error: float
     bound: float
 
+    def shown(self) -> list[str]:
+        """The three numbers; errors are counts where the bound is 0."""
+        form = ".2g" if self.bound else ".0f"
+        return [f"{number:{form}}" for number in (self.naive, self.error, self.bound)]
+
 
 @dataclass(frozen=True)
 class Row:
@@ -114,7 +119,7 @@ def line(row: Row) -> str:
 def hard_line(row: Row) -> str:
     """The same of a hard case, beside the naive formula."""
     hard = row.hard
-    numbers = [f"{n:.2g}" for n in (hard.naive, hard.error, hard.bound)] if hard else ["-"] * 3
+    numbers = hard.shown() if hard else ["-"] * 3
     what = hard.what if hard else ""
     return HARD_COLUMNS(row.case, *numbers, _passed(row), what).rstrip() + _reason(row)
 

@@ -29,7 +29,7 @@ FOUND |= {"demo": [{"what": "mesh", "result": "0.76"}]}
 FOUND |= {"rasteriser": [RASTER], "memory": [MEMORY]}
 SPLAT = {"name": "demo", "steps": 1500, "seconds": 45.1, "gaussians": 41819}
 SPLAT |= {"psnr_same": 25.0, "psnr_larger": 35.2}
-HARD = {"case": "a: b", "what": "1 / 0", "naive": "NaN", "error": 1e-7, "bound": 1e-6}
+HARD = {"case": "a: b", "what": "1 / 0", "naive": "nan", "error": "1e-07", "bound": "1e-06"}
 FOUND |= {"pytorch": [TORCH], "splats": [SPLAT], "stability": [HARD]}
 FOUND |= {f"stages_{preset}": STEP for preset in TOOL.STEPS}
 
@@ -112,9 +112,11 @@ def test_what_fits_into_the_minutes_is_measured(tmp_path, monkeypatch):
 
 
 def test_hard_cases_beside_naive_formulas(tmp_path, monkeypatch):
-    hard = [HARD | {"naive": naive} for naive in ("nan", "inf", 1234.5)]
-    found = {"cases": [{"case": "a: b", "hard": one} for one in hard]}
-    monkeypatch.setattr(TOOL, "read_found", lambda *words: found)
+    hard = {"what": "1 / 0", "error": 1e-7, "bound": 1e-6}
+    found = [hard | {"naive": naive} for naive in ("nan", "inf", 1234.5)]
+    found.append(hard | {"naive": 1234.0, "error": 0.0, "bound": 0.0})
+    cases = [{"case": "a: b", "hard": one} for one in found]
+    monkeypatch.setattr(TOOL, "read_found", lambda *words: {"cases": cases})
     rows = TOOL.stability(tmp_path)
-    assert [row["naive"] for row in rows] == ["NaN", "infinity", "1.2e+03"]
-    assert all(row | {"naive": "NaN"} == HARD for row in rows)
+    assert [row["naive"] for row in rows] == ["nan", "inf", "1.2e+03", "1234"]
+    assert rows[0] == HARD and rows[3] == HARD | {"naive": "1234", "error": "0", "bound": "0"}
