@@ -227,7 +227,7 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
 
 
 def _needles(dev, rng):
-    """Gaussians a million times as long as they are wide, across the image."""
+    """Gaussians up to a million times as long as they are wide, across the image."""
     camera, grid = make_camera(), Grid((0.0, 0.0, 0.0), 0.3, (2, 2, 2))
     ids, learned = some_ids(rng, grid, 8), np.zeros((8, 16), np.float32)
     learned[:, 3:6] = -5

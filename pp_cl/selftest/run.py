@@ -84,15 +84,15 @@ def run_case(dev: Device, case: Case) -> Row:
         return Row(case.name, None, None, False, words, time.perf_counter() - start)
     error, bound = float(worst.error), float(worst.bound)
     reason = "" if np.isfinite(error) else "NaN, Inf or a value where there may be none"
-    apart, hard = max(checks, key=_of_naive), None
+    apart, hard = max(checks, key=_naive_rank), None
     if case.hard and apart.naive is not None:
         hard = Hard(case.hard, float(apart.naive), float(apart.error), float(apart.bound))
     seconds = time.perf_counter() - start
     return Row(case.name, error, bound, error <= bound, reason, seconds, hard)
 
 
-def _of_naive(check):
-    """What is largest of the check in which the naive formula is worst."""
+def _naive_rank(check):
+    """By which checks are compared: first the naive formula's error, then ours."""
     return check.naive_share, np.nan_to_num(check.naive or 0.0, nan=np.inf), check.share
 
 
