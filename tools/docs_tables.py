@@ -120,32 +120,17 @@ def settings() -> str:
 
 
 def commands() -> str:
-    """Every command with its arguments; options of several commands come last."""
-    found = {name: _command(name) for name in COMMANDS}
-    users = {}
-    for name, (_, arguments) in found.items():
-        for argument in arguments:
-            users.setdefault(argument, []).append(name)
-    common = [one for one, names in users.items() if len(names) > 1 and one[0].startswith("-")]
-    lines = []
-    for name, (what, arguments) in found.items():
-        others = ", ".join(
-            f"`{a.split()[0].rstrip(',')}`" for a, text in arguments if (a, text) in common
-        )
-        lines += [f"## pp-cl {name}", "", f"{what[0].upper()}{what[1:]}. Also: {others}.", ""]
-        lines += [f"- `{a}`: {text}" for a, text in arguments if (a, text) not in common]
-        lines += [""] * bool(lines[-1])
-    lines += ["## Options of several commands", ""]
-    lines += [f"- `{a}`: {text}" for a, text in common]
-    return "\n".join(lines)
-
-
-def _command(name: str) -> tuple[str, list[tuple[str, str]]]:
-    """(its help, [(an argument as it is written, what it means)]) of a command."""
-    module = importlib.import_module(COMMANDS[name])
-    parser = argparse.ArgumentParser(add_help=False)
-    module.add_arguments(parser)
-    return module.HELP, [(_written(a), a.help.replace("%%", "%")) for a in parser._actions]
+    """Every command with its arguments, as they are written."""
+    lines: list[str] = []
+    for name in COMMANDS:
+        module = importlib.import_module(COMMANDS[name])
+        parser = argparse.ArgumentParser(add_help=False)
+        module.add_arguments(parser)
+        arguments = ", ".join(f"`{_written(action)}`" for action in parser._actions)
+        lines += [f"## pp-cl {name}", "", f"{module.HELP[0].upper()}{module.HELP[1:]}.", ""]
+        lines += textwrap.wrap(arguments, 160, break_long_words=False, break_on_hyphens=False)
+        lines += [""]
+    return "\n".join(lines).rstrip()
 
 
 def api() -> str:
