@@ -22,7 +22,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static -DREAD_AHEAD=(void)" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results readme figures network dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results readme figures network dist oclgrind gpu-check fuzz bits faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -135,6 +135,9 @@ fuzz: $(READY) ## try damaged and odd input on all that pp-cl reads: COUNT (5000
 
 faults: $(READY) ## fail every call that changes a file of a training and an evaluation, kill them: minutes
 	@FAULTS=all $(BIN)/python -m pytest $(ON_ALL_CORES) -m slow tests/test_faults.py $(ARGS)
+
+bits: $(READY) ## compare the bits of short trainings with those of a BASE, a commit or a folder; ARGS="--driver intel" for one driver
+	@$(BIN)/python -m tools.bits $(BASE) $(ARGS)
 
 clean: ## remove .venv and everything built; runs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache

@@ -15,7 +15,12 @@ PATH = re.compile(r"`((?:pp_cl|pp_studio|cl|tests|tools|docs)/[\w./]+)`")
 CARD = re.compile(r"\b([ABHLV]\d{2,3}|[RG]TX|GeForce|Radeon|Instinct|MI\d{3})\b")
 FIGURE = re.compile(r"\d (ms|s|seconds|minutes|dB|times)\b|^\|.*\| *[\d.,]+ *\|", re.MULTILINE)
 PUBLISHED = "RTX 5090, by 3dgrut's README"
-PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
+PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x[._]")  # as in cl/W/x.cl and x_forward
+FILE = re.compile(r"`((?:\w+/)*\w+\.(?:py|cl|h))`")
+PLACES = ("", "cl", "pp_cl", "pp_cl/engine", "pp_studio")  # that paths in a page begin at
+FUNCTION = re.compile(r"`(?:\w+\.)*(\w+)\([^`\n]*\)`")
+NAME = re.compile(r"`(?:\w+\.)*(\w*_\w*|[A-Z]\w+)`")
+OF_THE_CODE = ("CONTRIBUTING", "architecture", "conventions")  # others have formulas
 
 
 def named_files(text: str, folder: Path) -> list[Path]:
@@ -34,22 +39,40 @@ def test_named_files_exist(path):
     assert not [str(file) for file in files if not file.exists()]
 
 
-def test_files_in_the_architecture_exist():
-    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
-    names = {n for n in re.findall(r"`((?:\w+/)*\w+\.py)`", text) if not PLACEHOLDER.search(n)}
-    assert names
-    assert not [
-        n
-        for n in names
-        if not any((ROOT / top / n).exists() for top in ("", "pp_cl", "pp_cl/engine", "pp_studio"))
-    ]
+def sources() -> list[Path]:
+    folders = [ROOT / name for name in ("pp_cl", "pp_studio", "cl", "tools", "tests")]
+    kinds = ("*.py", "*.pyi", "*.cl", "*.h")
+    return [path for folder in folders for kind in kinds for path in folder.rglob(kind)]
+
+
+def named_code(text: str, *, with_formulas: bool) -> tuple[set[str], set[str]]:
+    """(files, names of functions and, where a page has no formulas, of all else in code)."""
+    names = {*FUNCTION.findall(text), *([] if with_formulas else NAME.findall(text))}
+    files = {file for file in FILE.findall(text) if not PLACEHOLDER.search(file)}
+    return files, {name for name in names if not PLACEHOLDER.search(name)}
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in DOCUMENTS if p.stem != "CHANGELOG"], ids=lambda p: p.stem
+)
+def test_named_code_exists(path):
+    files, names = named_code(path.read_text("utf-8"), with_formulas=path.stem not in OF_THE_CODE)
+    written = " ".join(p.read_text("utf-8") for p in sources() if p != Path(__file__))
+    assert not [file for file in files if not any((ROOT / top / file).exists() for top in PLACES)]
+    assert not names - set(re.findall(r"\w+", written))
+
+
+def test_stale_names_are_found():
+    text = "`two_splits`, `backward_input()`, `scene/target.cl`, `Gone`; `cl/W/x.cl`, `x_forward`"
+    assert named_code(text, with_formulas=False) == (
+        {"scene/target.cl"},
+        {"two_splits", "backward_input", "Gone"},
+    )
+    assert named_code("`c_z`, `scan(a)`", with_formulas=True) == (set(), {"scan"})
 
 
 def test_documents_named_in_the_code_exist():
-    folders = [ROOT / name for name in ("pp_cl", "pp_studio", "cl", "tools", "tests")]
-    kinds = ("*.py", "*.cl", "*.h")
-    sources = [p for folder in folders for kind in kinds for p in folder.rglob(kind)]
-    named = {w for p in sources for w in re.findall(r"\bdocs/\w+\.md", p.read_text("utf-8"))}
+    named = {w for p in sources() for w in re.findall(r"\bdocs/\w+\.md", p.read_text("utf-8"))}
     assert named
     assert not [name for name in named if not (ROOT / name).exists()]
 

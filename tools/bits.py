@@ -1,0 +1,192 @@
+"""Whether a change keeps every bit: compare short trainings by this tree with those by another one,
+on each OpenCL driver that is here, with drivers and kernels working as on CPUs and as on GPUs.
+
+    python -m tools.bits BASE [--driver WORDS] [--form cpu|gpu] [--settings NAMES]
+
+BASE: a commit, or the folder of a checkout. Of each setting there is a digest of the checkpoint in
+the middle of the training and at its end, of the log without times, of config.json, and of a
+rendering; what differs is printed, and the exit status is 1.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+STEPS, SIDE, STOP = 40, 64, 30  # steps; pixels of an image; the step at which a training is resumed
+COMMON = {
+    "train.iterations": STEPS,
+    "train.log_every": 5,
+    "train.crop": 48,
+    "train.prune_every": 15,
+    "train.specular": "off",
+    "points.count": 1500,
+    "network.widths": (16, 32, 32),
+}
+NEVER = {"train.refine_at": (1.0, 1.0)}
+# {name: settings}; the first one alone has the shipped network and a specular layer
+SETTINGS = {
+    "tiny": {"train.specular": "auto", "network.widths": (32, 64, 128)},
+    # beyond 2^16 pixels, where background is skipped; the crop is smaller than the image
+    "tiles": NEVER | {"train.crop": 260, "points.count": 3000},
+    "softmax": NEVER
+    | {
+        "raster.blend": "softmax",
+        "raster.footprint": "disc",
+        "raster.radius": 0.05,
+        "raster.max_tracked": 8,
+        "raster.early_stop": 0.001,
+        "network.blocks": "double",
+        "train.mask_weight": 0.0,
+        "train.distortion_weight": 0.0,
+        "train.offset_rate": (0.0, 0.0),
+    },
+    "gated": NEVER | {"network.blocks": "gated", "network.residual": False},
+    "exposure": NEVER | {"train.exposure": "on"},
+    "ignored": NEVER | {"train.pixel_jitter": False},
+    "refined": {"train.refine_at": (0.5, 1.0)},
+    "supersampled": NEVER | {"train.supersampled": 1.0},
+    "spheres": NEVER | {"raster.footprint": "sphere", "raster.radius": 0.08},
+    "gaussians": NEVER,  # fitted to the run
+}
+
+
+def write_scenes(folder: Path) -> None:
+    """The scenes of all settings, and masks of what is ignored, by this tree alone."""
+    sys.path[:0] = [str(ROOT / "tests")]
+    from support.scenes import write_ball_scene
+
+    write_ball_scene(folder / "ball", size=SIDE)
+    write_ball_scene(folder / "large", views=4, size=4 * SIDE + 32)
+    mask = np.zeros((SIDE, SIDE), np.uint8)
+    mask[:20, :40] = 255
+    (folder / "masks").mkdir()
+    for image in (folder / "ball" / "train").iterdir():
+        Image.fromarray(mask).save(folder / "masks" / image.name)
+
+
+def digest(*arrays) -> str:
+    """Of bytes, or of arrays with their shapes and dtypes."""
+    found = hashlib.sha256()
+    for one in arrays:
+        if isinstance(one, np.ndarray):
+            found.update(f"{one.dtype}{one.shape}".encode())
+        found.update(one if isinstance(one, bytes) else np.ascontiguousarray(one).tobytes())
+    return found.hexdigest()[:16]
+
+
+def log_rows(file: Path) -> bytes:
+    """A run's log without times."""
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    return json.dumps([{k: v for k, v in row.items() if k != "seconds"} for row in rows]).encode()
+
+
+def digests(name: str, scenes: Path, out: Path) -> dict[str, str]:
+    """{what: digest} of a training with a setting, by the pp_cl that is imported."""
+    from pp_cl.session.training import train_scene
+
+    scene = str(scenes / ("large" if name == "tiles" else "ball"))
+    settings = COMMON | SETTINGS[name]
+    if name == "ignored":
+        settings["scene.ignore"] = str(scenes / "masks")
+    step = 0
+
+    def on_step(at, row):
+        nonlocal step
+        step = at
+
+    train_scene(scene, out, settings=settings, on_step=on_step, is_stopped=lambda: step == STOP)
+    found = {"half": digest((out / "checkpoint.npz").read_bytes())}
+    run = train_scene(scene, out, settings=settings)
+    found["checkpoint"] = digest((out / "checkpoint.npz").read_bytes())
+    found["log"] = digest(log_rows(out / "log.jsonl"))
+    found["config"] = digest((out / "config.json").read_bytes())
+    view = run.render(run.cameras("test")[0], features=True)
+    shown = view.colour, view.alpha, view.depth, view.median_depth, view.features
+    found["rendering"] = digest(*shown)
+    if name == "gaussians":
+        from pp_studio.export.gaussians import fit_gaussians
+
+        cloud = fit_gaussians(run, STEPS, cell=0)
+        arrays = [array.get() for array in (cloud.ids, cloud.offset, cloud.opacity, *cloud.sh)]
+        found["fitted"] = digest(*arrays)
+    return found
+
+
+def of_tree(tree: Path, scenes: Path, names: list[str], driver: str, form: str) -> dict:
+    """{setting: its digests} by a tree, in a process of its own."""
+    changed = {"PYTHONPATH": str(tree), "PP_DEVICE": driver, "PP_FORM": form.replace("cpu", "")}
+    with tempfile.TemporaryDirectory() as out:
+        words = [sys.executable, __file__, "--tree", str(tree), "--scenes", str(scenes)]
+        words += ["--out", out, "--settings", *names]
+        done = subprocess.run(
+            words, env=os.environ | changed, cwd=out, stdout=subprocess.PIPE, check=True
+        )
+    return json.loads(done.stdout)
+
+
+def compare(base: Path, drivers: list[str], forms: list[str], names: list[str]) -> int:
+    """Print what differs between the trees; returns how much does."""
+    differing = 0
+    with tempfile.TemporaryDirectory() as folder:
+        write_scenes(Path(folder))
+        for driver in drivers:
+            for form in forms:
+                ours, theirs = (
+                    of_tree(tree, Path(folder), names, driver, form) for tree in (ROOT, base)
+                )
+                for name in names:
+                    both = ours[name], theirs[name]
+                    differs = [what for what in both[0] if both[0][what] != both[1].get(what)]
+                    differing += len(differs)
+                    told = f"differs: {', '.join(differs)}" if differs else "same bits"
+                    print(f"{driver}, {form}: {name:14s}{told}", flush=True)
+    return differing
+
+
+def main() -> int:
+    """Compare, or print the digests of one tree; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("base", nargs="?", help="a commit, or the folder of a checkout")
+    parser.add_argument("--driver", help="words of one driver's name (all)")
+    parser.add_argument("--form", choices=("cpu", "gpu"), help="one of both (both)")
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
+    for name in ("tree", "scenes", "out"):  # of the processes that train
+        parser.add_argument(f"--{name}", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.tree:
+        import pp_cl
+
+        if options.tree not in Path(pp_cl.__file__).parents:
+            raise SystemExit(f"{pp_cl.__file__} is imported, which is not in {options.tree}")
+        found = {n: digests(n, options.scenes, options.out / n) for n in options.settings}
+        print(json.dumps(found))
+        return 0
+    if not options.base:
+        parser.error("say what to compare with: a commit, or a folder")
+    from pp_cl.drivers import list_devices
+
+    works = [device.platform.name for _, device, problem in list_devices() if not problem]
+    drivers = [name for name in works if (options.driver or "").lower() in name.lower()]
+    forms = [options.form] if options.form else ["cpu", "gpu"]
+    if Path(options.base).is_dir():
+        return min(1, compare(Path(options.base).resolve(), drivers, forms, options.settings))
+    with tempfile.TemporaryDirectory() as folder:
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "-q", "--detach", folder, options.base], check=True)
+        try:
+            return min(1, compare(Path(folder), drivers, forms, options.settings))
+        finally:
+            subprocess.run([*git, "remove", "--force", folder], check=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
