@@ -8,7 +8,7 @@ kernel void output_forward(
     const uint channels,  // of the features
     const int residual,
     const float share,
-    global const float *features,  // (H, W, channels) not read without residual
+    global const float *features,  // (H, W, channels) NULL without residual
     global float *image)           // (H, W, 3) the output, overwritten by the colours
 {
     const size_t i = get_global_id(0);

@@ -34,7 +34,7 @@ kernel void avgpool2_backward(
     const int w,
     const int c,
     const int masked,
-    global const float *x,           // (2*h, 2*w, c) read only if masked
+    global const float *x,           // (2*h, 2*w, c) NULL if not masked
     global const float *grad_out,    // (h, w, c)
     global const float *tile_count,  // ((2*h+3)/4, (2*w+3)/4) of grad_x, 0 = not computed
     global float *grad_x)            // (2*h, 2*w, c)

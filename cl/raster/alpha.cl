@@ -27,7 +27,7 @@ kernel void alpha_weights(
     global const uint2 *pair_point_falloff,  // (P, 2) point, bits of d
     global const float *opacity,             // (N)
     global ulong *pixel_weight_point,        // (P) weight << 32 | point, in the order of the keys
-    global float *pixel_derivative,          // (?) alike, P with DERIVATIVES
+    global float *pixel_derivative,          // (P) alike, NULL without DERIVATIVES
     global float *transmittance,             // (HW) of all fragments that are not dropped
     global uchar *point_is_visible)          // (N) 1: has a fragment that is not dropped
 {

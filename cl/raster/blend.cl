@@ -114,7 +114,7 @@ kernel void alpha_gradient(
     global const uint *point_slot,           // (N) row of a visible point
     global const float16 *visible_features,  // (?, 16) of the visible points
     global const float16 *grad_features,     // (H, W, 16) G
-    global const float *grad_alpha,          // (?) g, HW with has_grad_alpha
+    global const float *grad_alpha,          // (HW) g, NULL without has_grad_alpha
     global float2 *pair_gradient,            // (P, 2) b, s dL/db; cleared before
     global float *distortion)                // ((HW+SPAN-1)/SPAN) of each run, without its weight
 {
@@ -189,19 +189,19 @@ kernel void blend_backward(
     global const float *camera,              // (21) camera.h, read with MOVES, as the next five
     global const float4 *point_camera,       // (N, 4) x, y, z, distance
     global const float *point_shape,         // (N, SHAPE) footprint.h
-    global const float *cloud_offset,        // (?, OFFSETS) (N, OFFSETS), read of Gaussians
+    global const float *cloud_offset,        // (N, OFFSETS) read of Gaussians, else may be NULL
     global const float *opacity,             // (N)
     global const uint *pair_point_falloff,   // (P, ?) point, with one sample bits of d
     global const uint *point_offset,         // (N+1)
     global const uint *pair_pixel,           // (P)
     global float *pair_gradient,             // (P, 1+SAMPLES) b, s dL/db of each; s with DL_DB
-    global const float *pixel_blend,         // (?) (HW) G.F, read with DL_DB
+    global const float *pixel_blend,         // (HW) G.F, NULL without DL_DB
     global const float16 *visible_features,  // (?, 16) a row for each, read with CLAMPED, DL_DB
     global const float16 *grad_features,     // (H, W, 16) G
     global float16 *grad_visible_features,   // (?, 16) alike
     global float *grad_opacity,              // (?) alike
-    global float *grad_offset,               // (?, OFFSETS) alike, with MOVES
-    global float *max_weight)                // (N) read and written
+    global float *grad_offset,               // (?, OFFSETS) alike, NULL without MOVES
+    global float *max_weight)                // (N) read and written, NULL if not is_recorded
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;

@@ -131,7 +131,7 @@ kernel void pairs_fill(
     global uint *pair_pixel,            // (P)
     global uint *pair_point_falloff,    // (P, ?) point, with one sample bits of d in [0, 1]
     global ulong *point_key,            // (P) depth << 32 | pair, on GPUs place, by point
-    global float *times_seen,           // (N) accumulates
+    global float *times_seen,           // (N) accumulates, NULL if not is_counted
     global volatile uint *pixel_count)  // (?) (HW) accumulates on GPUs, else untouched
 {
     SHARED(uint, shared, 2 * GROUP);

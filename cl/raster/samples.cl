@@ -28,9 +28,9 @@ kernel void sampled_weights(
     global const uint *pair_point,       // (P, 1)
     global const float *opacity,         // (N)
     global ulong *pixel_weight_point,    // (P) weight << 32 | point, in the order of the keys
-    global float *sample_derivative,     // (?, SAMPLES) alike, P with DERIVATIVES
+    global float *sample_derivative,     // (P, SAMPLES) alike, NULL without DERIVATIVES
     global float *transmittance,         // (HW) mean of those of the samples
-    global float *sample_transmittance,  // (?, SAMPLES) HW with DERIVATIVES
+    global float *sample_transmittance,  // (HW, SAMPLES) NULL without DERIVATIVES
     global uchar *point_is_visible)      // (N) 1: has a fragment that is not dropped
 {
     const uint q = get_global_id(0);
@@ -75,7 +75,7 @@ kernel void sampled_gradient(
     global const uint *point_slot,             // (N) row of a visible point
     global const float16 *visible_features,    // (?, 16) of the visible points
     global const float16 *grad_features,       // (H, W, 16) G
-    global const float *grad_alpha,            // (?) g, HW with has_grad_alpha
+    global const float *grad_alpha,            // (HW) g, NULL without has_grad_alpha
     global float *pair_gradient,               // (P, 1+SAMPLES) b, s dL/db of each; cleared before
     global float *distortion)                  // ((HW+SPAN-1)/SPAN) of each run, without its weight
 {

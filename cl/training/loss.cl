@@ -148,8 +148,8 @@ kernel void loss_gradient(
     global const float *prediction,       // (PH, PW, 3)
     global const float *target,           // (H, W, 3)
     global const float *row_derivatives,  // (V, 3, BLOCKS, LANES)
-    global const float *transmittance,    // (...) (PH * PW) T
-    global const float *target_alpha,     // (...) (H, W) m, below 0 where it is ignored
+    global const float *transmittance,    // (...) (PH * PW) T, NULL without has_mask
+    global const float *target_alpha,     // (...) (H, W) m, below 0 where it is ignored, or NULL
     global float *grad_prediction,        // (PH, PW, 3)
     global float *grad_alpha,             // (...) (PH * PW)
     global float4 *terms)  // (?, 4) rows V to V + PH - 1: shares of the means of smooth L1, |d| and

@@ -67,7 +67,7 @@ kernel void rmsprop_move(
     global const float *camera,  // (21) camera.h
     global const float4 *point_camera,            // (N, 4) x, y, z, distance
     global const float16 *grad_visible_features,  // (?, 16) G, a row for each visible point
-    global const float *grad_offset,              // (?, OFFSETS) alike, unread without MOVES_OFFSET
+    global const float *grad_offset,              // (?, OFFSETS) alike, NULL without MOVES_OFFSET
     global const float *grad_opacity,             // (?) alike
     global uint *last_step,                       // (N) of each point's last gradient, 0: none
     global float16 *v,                            // (N, 16)

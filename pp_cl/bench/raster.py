@@ -117,7 +117,7 @@ class PulsarScene:
             weights.read_visible(dev)
         with dev.stage("blend"):
             features = gather_rows(dev, self.device_features, weights.visible)
-            blend_forward(dev, pairs, weights, features, self.features)
+            blend_forward(dev, b, pairs, weights, features, self.features)
         result = RenderResult(dev, self.camera, (0, 0), size, points, pairs, weights, None)
         result.visible_features, result.features = features, self.features
         return result

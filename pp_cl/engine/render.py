@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +16,6 @@ from pyopencl.array import Array
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.buffers import Buffers, Pending, Table, grown
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import Prepared
 from pp_cl.engine.layers.conv import GradientParts
 from pp_cl.engine.layers.simple import specular_forward
 from pp_cl.engine.layers.tiles import tiles_covered
@@ -165,8 +163,6 @@ class Renderer:
         """Free the buffers; the next view makes them anew."""
         self.model.net.release()
         self._buffers = Buffers(self.dev)
-        stages = "project", "pairs", "weights", "blend"
-        self._launches = {name: Prepared(self.dev) for name in stages}
 
     def forward(
         self,
@@ -208,8 +204,10 @@ class Renderer:
         b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
         dev.send(b.camera_buffer, self.model.packed(padded.enlarged(side), depth_range))
         with dev.stage("project"):
-            points = self._launches["project"].run(
-                partial(project_grid, dev, b, self.settings.footprint),
+            points = project_grid(
+                dev,
+                b,
+                self.settings.footprint,
                 b.camera_buffer,
                 self.model.grid_buffer,
                 point_id=cloud.ids,
@@ -236,8 +234,7 @@ class Renderer:
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
         with dev.stage("blend"):
-            blended = pairs, weights, b.visible_features, b.features
-            self._launches["blend"].run(partial(blend_forward, dev), *blended)
+            blend_forward(dev, b, pairs, weights, b.visible_features, b.features)
         result.visible_features, result.features = b.visible_features, b.features
         if until == "features":
             return result
@@ -261,13 +258,13 @@ class Renderer:
         settings, by_pair, b = self.settings, self._by_pair, self._buffers
         while True:
             with self.dev.stage("pairs"):
-                find = partial(find_pairs, self.dev, b)
                 capacity = self._capacity[by_pair]
-                pairs = self._launches["pairs"].run(find, points, size, capacity, times_seen)
+                pairs = find_pairs(self.dev, b, points, size, capacity, times_seen)
                 pairs.read_count(self.dev)
             with self.dev.stage("weights"):
-                weights = self._launches["weights"].run(
-                    partial(blend_weights, self.dev, b),
+                weights = blend_weights(
+                    self.dev,
+                    b,
                     pairs,
                     points.camera_buffer,
                     points.point_opacity,
@@ -287,7 +284,6 @@ class Renderer:
             if self._capacity[by_pair] == pairs.capacity:
                 return pairs, weights, tile_mask
             del pairs, weights  # else their arrays would stay beside the larger ones
-            self._launches |= {name: Prepared(self.dev) for name in ("pairs", "weights")}
 
     def backward(
         self, result: RenderResult, grad_image: Array, **options: Any
@@ -346,9 +342,8 @@ class Renderer:
         result: of the last forward(training=True).
         """
         self.dev.write(result.visible_features[: len(features)], features)
-        blend_forward(
-            self.dev, result.pairs, result.weights, result.visible_features, result.features
-        )
+        view = result.pairs, result.weights, result.visible_features, result.features
+        blend_forward(self.dev, self._buffers, *view)
         return result.cropped(self.dev.download(result.features))
 
     def gather(self, result: RenderResult, pixels: np.ndarray) -> np.ndarray:

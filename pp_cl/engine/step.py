@@ -136,7 +136,7 @@ class Trainer:
             with_offsets=rates.offset > 0,
             max_weight=self.state.max_weight,
         )
-        if distortion_weight > 0:
+        if gradients.distortion is not None:
             self.loss.add_distortion(gradients.distortion, distortion_weight, 1 / all_depths)
 
         with self.dev.stage("update"):

@@ -141,7 +141,8 @@ class PairedPoints:
         rows[:-1] = np.asarray(point_features)[visible]
         self.visible_features = self.dev.upload(rows, np.float32)
         self.features = self.dev.empty((*self.shape, 16))
-        blend_forward(self.dev, self.pairs, self.weights, self.visible_features, self.features)
+        blended = self.pairs, self.weights, self.visible_features, self.features
+        blend_forward(self.dev, Buffers(self.dev), *blended)
         return self.features.get()
 
     def weight(self) -> np.ndarray:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 import pytest
+from pyopencl.array import Array
 
-from pp_cl.engine.device.device import Device, Memory
+from pp_cl.engine.device.device import Device, Fill, Memory
 
 DATA = Path(
     os.environ.get("PP_DATA") or Path(__file__).parents[2] / ".." / "shared" / "data"
@@ -31,14 +32,37 @@ def slow(*values):
 
 class GuardedDevice(Device):
     """A Device whose fresh buffers hold NaN (0xff bytes) and are followed by canary bytes that
-    check() compares.
+    check() compares; before it replays what a function launched it looks whether the function would
+    launch the same again.
     """
 
-    canary_bytes = CANARY_BYTES
+    canary_bytes, doubts = CANARY_BYTES, True
 
     def __init__(self, device):
         super().__init__(device)
         self._guarded, self._unchecked = [], 0
+        self._is_dry = False
+
+    def compare(self, launches, function):
+        """Fail unless the function would launch and fill what was recorded."""
+        self._is_dry = True
+        try:
+            with self.recording() as again:
+                function()
+        finally:
+            self._is_dry = False
+        assert [*map(facts_of, launches)] == [*map(facts_of, again)]
+
+    def enqueue(self, launch):
+        """As Device.enqueue, but in compare()."""
+        if self._is_dry:
+            self._recording.append(launch)
+        else:
+            super().enqueue(launch)
+
+    def _fill(self, array, value):
+        if not self._is_dry:
+            super()._fill(array, value)
 
     def _memory(self, nbytes):
         if self._unchecked > MOST_UNCHECKED:
@@ -70,6 +94,20 @@ class GuardedDevice(Device):
         self._guarded = [one for one in guarded if one[0]() is not None]
 
 
+def facts_of(launch):
+    """What two launches or fills have alike that do the same."""
+    if isinstance(launch, Fill):
+        return place_of(launch.array), launch.value
+    values = {name: place_of(value) for name, value in launch.arguments.items()}
+    return launch.kernel.label, launch.size, launch.local, launch.offset, values
+
+
+def place_of(value):
+    """Where an array lies, with its shape and dtype; a number is itself."""
+    is_array = isinstance(value, Array)
+    return (value.base_data, value.offset, value.shape, value.dtype) if is_array else value
+
+
 class TracedDevice(GuardedDevice):
     """The guarded device in Oclgrind 21.10's search for reads of what nobody wrote: its reports
     fail the test.
@@ -95,9 +133,8 @@ class TracedDevice(GuardedDevice):
         program = cl.Program(self.context, self.SOURCE).build()
         self._fill_kernel, self._copy_kernel = program.fill, program.copy
 
-    def fill(self, array, value):
-        """As Device.fill."""
-        if array.size:
+    def _fill(self, array, value):
+        if array.size and not self._is_dry:
             value = self.upload(np.full(1, value, array.dtype))
             self._fill_kernel(
                 self.queue, (array.nbytes,), None, array.data, value.data, np.uint32(value.nbytes)

@@ -38,4 +38,13 @@ kernel void formulas(
     global const float *second)    // (B)
 {
 }
+
+// One work-item per element: writes whether there is no x.
+kernel void is_null(
+    const uint n,           // size of y
+    global const float *x,  // (N) or NULL
+    global uint *y)         // (N)
+{
+    if (get_global_id(0) < n) y[get_global_id(0)] = x == 0;
+}
 """

@@ -42,11 +42,13 @@ def grown(capacity: int, needed: int) -> int:
 class Buffers:
     """The device arrays of one stage, as attributes named like the rows of its table.
 
-    An array whose shape and dtype stay the same keeps its memory and its content.
+    An array whose shape and dtype stay the same keeps its memory and its content. calls: of
+    replayed() functions.
     """
 
     def __init__(self, dev: Device):
-        self._dev = dev
+        self.dev = dev
+        self.calls: dict[Any, Any] = {}
         self._arrays: dict[str, Array] = {}
 
     def require(self, table: Table) -> None:
@@ -57,10 +59,12 @@ class Buffers:
         not suffice.
         """
         changed = [name for name, row in table.items() if not self._fits(name, *row)]
+        if changed:
+            self.calls.clear()
         for name in changed:
             self._arrays.pop(name, None)
         for name in changed:
-            self._arrays[name] = self._dev.empty(*table[name])
+            self._arrays[name] = self.dev.empty(*table[name])
 
     def _fits(self, name, shape, dtype):
         array = self._arrays.get(name)

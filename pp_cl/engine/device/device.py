@@ -15,7 +15,6 @@ import weakref
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,6 +180,13 @@ class Launch(NamedTuple):
     own: cl.Kernel | None = None
 
 
+class Fill(NamedTuple):
+    """An array that is set to one value."""
+
+    array: Array
+    value: float
+
+
 def _ignore_full_files():
     """Leave a write beyond what a file may hold to its error, as Python does: LLVM in drivers
     catches its signal, asks for a bug report and ends the program.
@@ -193,9 +199,11 @@ class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
     kernels are launched in parts. launches: so far. waited: CPU seconds of threads that waited for
-    the device; drivers of CPUs have them compute meanwhile. recorded: a list to which launches are
-    added, and functions that repeat fills; None: they are not.
+    the device; drivers of CPUs have them compute meanwhile. doubts: compare() is called before each
+    replay(), which the device of the tests has.
     """
+
+    doubts = False
 
     def __init__(self, device: cl.Device):
         self.device = device
@@ -211,7 +219,7 @@ class Device:
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
         self.bytes = self.peak_bytes = self.launches = 0
         self.waited = 0.0
-        self.recorded: list[Any] | None = None
+        self._recording: list[Any] | None = None
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
@@ -339,8 +347,8 @@ class Device:
 
     def fill(self, array: Array, value: float) -> None:
         """Set all elements of an array of this device to one value."""
-        if self.recorded is not None:
-            self.recorded.append(partial(self._fill, array, value))
+        if self._recording is not None:
+            self._recording.append(Fill(array, value))
         self._fill(array, value)
 
     def _fill(self, array, value):
@@ -397,12 +405,35 @@ class Device:
             launch.offset,
         )
         self.launches += 1
-        if self.recorded is not None:
-            self.recorded.append(launch)
+        if self._recording is not None:
+            self._recording.append(launch)
         if launch.watched:  # what drivers hand to the system together is timed together
             self.queue.flush()
         if self.debug:
             self.observe(kernel, event, launch.arguments)
+
+    @contextmanager
+    def recording(self) -> Iterator[list[Any]]:
+        """Yields a list to which each Launch and Fill inside the block is added."""
+        launches: list[Any] = []
+        self._recording = launches
+        try:
+            yield launches
+        finally:
+            self._recording = None
+
+    def replay(self, launches: list[Any]) -> None:
+        """Enqueue once more what was recorded; a launch gets a kernel of its own, which stays
+        set to its arguments.
+        """
+        for i, launch in enumerate(launches):
+            if isinstance(launch, Fill):
+                self._fill(*launch)
+                continue
+            if launch.own is None:  # many calls would be gone before they are repeated
+                own = launch.kernel.with_arguments(launch.values, for_good=True)
+                launch = launches[i] = launch._replace(own=own)
+            self.enqueue(launch)
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
         """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
@@ -492,8 +523,9 @@ class Device:
         if self.debug < 3:
             return
         for p in kernel.parameters:
-            if p.is_buffer and not p.const and p.dtype is np.float32:
-                values = arguments[p.name].get()
+            array = arguments[p.name]
+            if p.is_buffer and not p.const and p.dtype is np.float32 and array is not None:
+                values = array.get()
                 bad = np.flatnonzero(
                     np.isnan(values) if p.may_be_infinite else ~np.isfinite(values)
                 )

@@ -51,7 +51,7 @@ _FORMULA = re.compile(r"\(*\w+\)*(?: ?[-+*/] ?\(*\w+\)*)*")
 @dataclass(frozen=True)
 class Parameter:
     """One kernel parameter. shape: the dimensions of its comment as text, such as "N+1"; None for
-    a scalar or for `(...)`. may_be_infinite: its comment says "infinite".
+    a scalar or for `(...)`. may_be_infinite, may_be_null: its comment says "infinite", "NULL".
     """
 
     name: str
@@ -61,6 +61,7 @@ class Parameter:
     const: bool  # what it points at
     shape: tuple | None
     may_be_infinite: bool
+    may_be_null: bool
 
     @cached_property
     def limits(self) -> tuple[int, int] | None:
@@ -112,7 +113,7 @@ def _parse_parameter(code, comment, where):
         except ValueError as error:
             raise ValueError(f"{where}: {name}: {error}") from None
     kind = SCALARS[base], int(width or 1), "const" in qualifiers
-    return Parameter(name, bool(space), *kind, shape, "infinite" in comment)
+    return Parameter(name, bool(space), *kind, shape, "infinite" in comment, "NULL" in comment)
 
 
 @functools.cache
@@ -183,8 +184,8 @@ class Kernel:
         self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 
     def arguments(self, values: dict[str, Any]) -> list[Any]:
-        """OpenCL arguments in order, from {name: pyopencl Array or number}. Raises TypeError,
-        ValueError.
+        """OpenCL arguments in order, from {name: pyopencl Array, None for NULL, or number}. Raises
+        TypeError, ValueError.
         """
         if values.keys() != self.names:
             missing = [p.name for p in self.parameters if p.name not in values]
@@ -196,6 +197,10 @@ class Kernel:
         for p, name, dtype, least, largest, letter in self._slots:
             value = values[name]
             if dtype is not None:
+                if value is None and p.may_be_null:
+                    arguments.append(None)
+                    shapes.append(None)
+                    continue
                 if not isinstance(value, cl_array.Array) or value.dtype != dtype:
                     raise TypeError(
                         f"{self.label}: {name} is {_kind(value)}, expected a device array of"
@@ -291,9 +296,9 @@ class Kernel:
         of the other letters are added.
         """
         for p, name, dtype, *_ in self._slots:
-            if dtype is None:
-                continue
             array = values[name]
+            if dtype is None or array is None:
+                continue
             if not _is_contiguous(array.shape, array.strides, dtype.itemsize):
                 raise ValueError(
                     f"{self.label}: {p.name} has shape {array.shape} and strides {array.strides}:"
@@ -305,6 +310,8 @@ class Kernel:
                     f" {len(p.shape)} {p.shape}"
                 )
         for p, axis, word, letter, formula in self._dimensions:
+            if values[p.name] is None:
+                continue
             size = values[p.name].shape[axis]
             if letter:
                 expected = sizes.setdefault(letter, size)

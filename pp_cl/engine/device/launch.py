@@ -1,11 +1,15 @@
-"""How many values a work-item takes and how many work together, on CPUs and on GPUs; and launches
-that are prepared once.
+"""How many values a work-item takes and how many work together, on CPUs and on GPUs; and functions
+whose launches are checked once.
 """
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
-from pp_cl.engine.device.device import Device, Launch
+from pp_cl.engine.device.device import Device
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
 LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
@@ -77,45 +81,48 @@ def launch_groups(
     program.launch(kernel, groups * items, items, **arguments)
 
 
-class Prepared:
-    """The launches and fills of a function, which are checked when it runs and repeated as they
-    were from then on, by kernels whose arguments stay set.
+class Call(NamedTuple):
+    """A call of a function: its arguments, what it launched and filled, and what it returned."""
+
+    given: tuple[Any, ...]
+    launches: list[Any]
+    result: Any
+
+
+def replayed(function: Callable[P, R]) -> Callable[P, R]:
+    """Make a function check its launches once: called again with the same objects and numbers, it
+    enqueues the same launches and fills, by kernels whose arguments stay set, and returns what it
+    returned before.
+
+    What the function does must follow from its arguments alone, and what else it does to the
+    device must last; the device of the tests checks every replay. Its second argument keeps the
+    call: a Workspace or Buffers, which forget it before they allocate.
     """
 
-    def __init__(self, dev: Device):
-        self._dev = dev
-        self._given: tuple[Any, ...] = ()
-        self._launches: list[Any] | None = None
-        self._result: Any = None
+    @functools.wraps(function)
+    def replaying(*args: P.args, **named: P.kwargs) -> R:
+        place: Any = args[1]
+        dev, given = place.dev, (args[0], *args[2:], *named, *named.values())
+        call = place.calls.get(function)
+        if call is None or not _are_same(given, call.given):
+            call = None
+            place.calls.pop(function, None)  # frees its arrays
+            with dev.recording() as launches:
+                result = function(*args, **named)
+            place.calls[function] = Call(given, launches, result)
+            return result
+        if dev.doubts:
+            dev.compare(call.launches, lambda: function(*args, **named))
+        dev.replay(call.launches)
+        return call.result
 
-    def run(self, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
-        """Enqueue what function(*given, **named) launches and fills, and return what it returns,
-        all of which depends on these objects and numbers alone; what else it does to the device
-        must last.
-        """
-        asked = *given, *named.values()
-        if self._launches is None or not all(map(_is_same, asked, self._given)):
-            self._launches = self._result = None  # frees their arrays
-            self._given = asked
-            launches: list[Any] = []
-            self._dev.recorded = launches
-            try:
-                self._result = function(*given, **named)
-            finally:
-                self._dev.recorded = None
-            self._launches = launches
-            return self._result
-        for i, launch in enumerate(self._launches):
-            if not isinstance(launch, Launch):
-                launch()
-                continue
-            if launch.own is None:  # many would be gone before they are repeated
-                own = launch.kernel.with_arguments(launch.values, for_good=True)
-                launch = self._launches[i] = launch._replace(own=own)
-            self._dev.enqueue(launch)
-        return self._result
+    return replaying
+
+
+def _are_same(given, before):
+    """Whether these are the same objects, or equal numbers."""
+    return len(given) == len(before) and all(map(_is_same, given, before))
 
 
 def _is_same(a, b):
-    """Whether they are one object, or equal numbers."""
     return a is b or (isinstance(a, int | float | str | tuple) and a == b)

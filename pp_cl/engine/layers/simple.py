@@ -50,7 +50,7 @@ def avgpool2_backward(
     mask: what was pooled, where it is a ReLU's output, else None; grad_x: gradient of its other
     use; grad_out: (H, W, C).
     """
-    masking = {"masked": mask is not None, "x": grad_x if mask is None else mask}
+    masking = {"masked": mask is not None, "x": mask}
     arrays, of_items = {"grad_out": grad_out, "grad_x": grad_x}, grad_x.shape
     shape = grad_out.shape
     _launch(dev, RESAMPLE, "avgpool2_backward", shape, grad_x, tiles, of_items, **masking, **arrays)
@@ -98,9 +98,9 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
     - the background's 1), if they are given: a residual connection past the network. For the
     gradient see Conv.is_halved and residual_backward().
     """
-    known = image if features is None else features
-    named = {"residual": features is not None, "share": SHARE, "features": known, "image": image}
-    _per_pixel(dev, "output_forward", known.shape, **named)
+    named = {"residual": features is not None, "share": SHARE, "features": features}
+    shape = image.shape if features is None else features.shape
+    _per_pixel(dev, "output_forward", shape, image=image, **named)
 
 
 def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:

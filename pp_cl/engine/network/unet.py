@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import PackedArrays, Table, packed_arrays, table_bytes
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import Prepared
+from pp_cl.engine.device.launch import replayed
 from pp_cl.engine.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out, work_table
 from pp_cl.engine.layers.conv import (
     DIRECTIONS,
@@ -70,12 +69,13 @@ class Workspace:
     size: of the images. arrays: {name: feature map} without "x", the caller's, gradients by
     gradient_of(name); some share a buffer, one after the other. convs: what computes the
     convolutions, with their arrays, all of which lie in `work`. all_tiles: the plan that skips
-    nothing. is_laid_out: whether the weights in `work` are the network's. launches: of laying these
-    out, and of the two passes.
+    nothing. is_laid_out: whether the weights in `work` are the network's. calls: of replayed()
+    functions; they keep the caller's arrays alive.
     """
 
     def __init__(self, dev: Device) -> None:
-        self._dev = dev
+        self.dev = dev
+        self.calls: dict[Any, Any] = {}
         self.size: Size = (0, 0)
         self.arrays: dict[str, Array] = {}
         self.convs: Convs = {}
@@ -84,11 +84,6 @@ class Workspace:
         self.is_laid_out = False
         self._buffers: list[Any] = []
         self.part_table = PackedArrays(dev)
-        self.release()
-
-    def release(self) -> None:
-        """Forget the launches, which keep the caller's arrays alive."""
-        self.launches = {name: Prepared(self._dev) for name in ("weights", "forward", "backward")}
 
     def plan(self, net: "Network", size: Size, training: bool) -> None:
         """Make room for images of this size, in the same buffers where they are large enough. The
@@ -97,7 +92,7 @@ class Workspace:
         self.size, self.is_laid_out = (0, 0), False
         # frees the old arrays first
         self.arrays, self.convs, self.work, self.all_tiles = {}, {}, None, None
-        self.release()
+        self.calls.clear()
         maps = array_shapes(net.layers, size)
         shared = share_buffers(lifetimes(net.layers, training), maps)
         self._buffers += [None] * (len(shared) - len(self._buffers))
@@ -193,7 +188,7 @@ class Network:
     def release(self) -> None:
         """Hold the arrays of past passes no longer."""
         for space in self._workspaces.values():
-            space.release()
+            space.calls.clear()
 
     def freeze(self) -> None:
         """From now on the parameters do not change: their weights are laid out for the kernels
@@ -264,17 +259,19 @@ class Network:
         if space.size != (height, width):
             space.plan(self, (height, width), training)
         if not (self._is_frozen and space.is_laid_out):
-            convs = space.convs.values()
-            space.launches["weights"].run(
-                partial(lay_out, self.dev, convs), self.all_parameters, space.work
-            )
+            self._lay_out(space)
             space.is_laid_out = True
         plan = plan or space.all_tiles
-        space.launches["forward"].run(partial(self._forward, space), plan, x)
+        self._forward(space, plan, x)
         if training:
             self._trained = plan, x
         return space.arrays[self.layers[-1].name]
 
+    @replayed
+    def _lay_out(self, space):
+        lay_out(self.dev, space.convs.values(), self.all_parameters, space.work)
+
+    @replayed
     def _forward(self, space, plan, x):
         arrays = space.arrays | {"x": x}
         for layer in self.layers:
@@ -300,7 +297,7 @@ class Network:
             raise RuntimeError("Network.backward needs a forward(training=True) before it")
         space, (plan, x), self._trained = self._workspaces[True], self._trained, None
         plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
-        parts = space.launches["backward"].run(partial(self._backward, space), plan, x, grad_y)
+        parts = self._backward(space, plan, x, grad_y)
         return space.arrays[gradient_of("x")], parts
 
     def sum_gradients(self, parts: GradientParts) -> dict[str, Array]:
@@ -311,6 +308,7 @@ class Network:
         sum_parts(self.dev, parts, whole, whole)
         return gradients
 
+    @replayed
     def _backward(self, space, plan, x, grad_y):
         dev, arrays, convs = self.dev, space.arrays | {"x": x}, space.convs
         last = self.layers[-1]

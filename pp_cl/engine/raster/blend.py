@@ -12,7 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import group_items, lanes, launch_groups, row_parts
+from pp_cl.engine.device.launch import group_items, lanes, launch_groups, replayed, row_parts
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.points import four_blocks, offset_width, stored_degree
 from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
@@ -53,14 +53,18 @@ def shade_forward(
     )
 
 
+@replayed
 def blend_forward(
     dev: Device,
+    b: Buffers,
     pairs: Pairs,
     weights: BlendWeights,
     visible_features: Array,
     features: Array,
 ) -> None:
-    """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32."""
+    """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32. b: keeps
+    the call, see replayed().
+    """
     dev.program("raster/blend", **_defines(dev)).launch(
         "blend_forward",
         pairs.pixels * row_parts(dev, ON_GPU),
@@ -79,13 +83,16 @@ def blend_backward_table(
     """The buffers of the backward pass for a number of pixels of side x side samples, and
     capacities for numbers of visible points and of pairs. blend: one of BLENDS.
     """
-    return {
+    table: Table = {
         "pair_gradient": ((pairs, 1 + side**2), np.float32),
-        "distortion": ((-(-pixels // SPAN) if blend == "alpha" else 1,), np.float32),
-        "pixel_blend": ((pixels if blend == "softmax" else 1,), np.float32),
         "grad_visible_features": ((visible, 16), np.float32),
         "grad_opacity": ((visible,), np.float32),
-        "grad_offset": ((visible if blend == "alpha" else 1, offset_width(footprint)), np.float32),
+    }
+    if blend == "softmax":
+        return table | {"pixel_blend": ((pixels,), np.float32)}
+    return table | {
+        "distortion": ((-(-pixels // SPAN),), np.float32),
+        "grad_offset": ((visible, offset_width(footprint)), np.float32),
     }
 
 
@@ -96,7 +103,8 @@ class BlendGradients:
 
     visible_features: (S, 16). opacity: (S,). offset: (S, 4) of soft points composited by alpha, (S,
     16) of Gaussians, through the falloff of their fragments; None if not asked for.
-    distortion: (ceil(HW/SPAN),) of so many pixels each, undefined without its weight.
+    distortion: (ceil(HW/SPAN),) of so many pixels each; None without its
+    weight.
     pair_gradient: (P, 1 + samples), by pair of a visible point the blend weight b and what each
     sample of the fragment adds to dL/dopacity, 0 where it is dropped or not tracked.
     """
@@ -104,7 +112,7 @@ class BlendGradients:
     visible_features: Array
     opacity: Array
     offset: Array | None
-    distortion: Array
+    distortion: Array | None
     pair_gradient: Array
 
 
@@ -180,7 +188,7 @@ def blend_backward(
             distortion_weight=distortion_weight,
             point_slot=weights.point_slot,
             visible_features=visible_features,
-            grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
+            grad_alpha=grad_alpha,
             distortion=b.distortion,
             **of_fragments,
         )
@@ -203,19 +211,19 @@ def blend_backward(
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         point_shape=points.point_shape,
-        cloud_offset=b.grad_offset if points.cloud_offset is None else points.cloud_offset,
+        cloud_offset=points.cloud_offset,
         opacity=opacity,
         pair_point_falloff=pairs.pair_point_falloff,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_gradient=b.pair_gradient,
-        pixel_blend=b.pixel_blend,
+        pixel_blend=None if is_alpha else b.pixel_blend,
         visible_features=visible_features,
         grad_features=grad_features,
         grad_visible_features=b.grad_visible_features,
         grad_opacity=b.grad_opacity,
-        grad_offset=b.grad_offset,
-        max_weight=opacity if max_weight is None else max_weight,
+        grad_offset=b.grad_offset if moves else None,
+        max_weight=max_weight,
     )
     if moves and pairs.side > 1:
         dev.program("raster/sampled_offsets", **sample_macros(dev, pairs)).launch(
@@ -237,7 +245,7 @@ def blend_backward(
         b.grad_visible_features,
         b.grad_opacity,
         b.grad_offset if moves else None,
-        b.distortion,
+        b.distortion if distortion_weight > 0 else None,
         b.pair_gradient,
     )
 

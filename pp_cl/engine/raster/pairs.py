@@ -12,7 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table, grown
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes, launch_groups
+from pp_cl.engine.device.launch import lanes, launch_groups, replayed
 from pp_cl.engine.device.scan import BLOCK, blocks_of, exclusive_scan, read_total
 from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.errors import UserError
@@ -87,6 +87,7 @@ def pairs_table(n: int, pixels: int, pairs: int, side: int = 1) -> Table:
     }
 
 
+@replayed
 def find_pairs(
     dev: Device,
     b: Buffers,
@@ -124,7 +125,7 @@ def find_pairs(
         pair_pixel=b.pair_pixel,
         pair_point_falloff=b.pair_point_falloff,
         point_key=b.pair_key if dev.is_cpu else b.pair_scratch,
-        times_seen=points.point_opacity if times_seen is None else times_seen,
+        times_seen=times_seen,
         pixel_count=b.pixel_offset if dev.is_cpu else b.pixel_count,
     )
     if dev.is_cpu:

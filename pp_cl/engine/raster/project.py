@@ -13,7 +13,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes, launch_groups
+from pp_cl.engine.device.launch import lanes, launch_groups, replayed
 from pp_cl.engine.device.scan import BLOCK, blocks_of
 from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
 
@@ -111,6 +111,7 @@ def launch_projection(
     )
 
 
+@replayed
 def project_grid(
     dev: Device,
     b: Buffers,

@@ -12,7 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import lanes
+from pp_cl.engine.device.launch import lanes, replayed
 from pp_cl.engine.device.scan import nonzero, read_total
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
@@ -69,20 +69,22 @@ def weights_table(n: int, pixels: int, derivatives: int, side: int = 1) -> Table
     """The buffers for n points and a number of pixels of side x side samples, with a capacity for
     a number of derivatives, 0: none; pixel_weight_point lies in pairs_table()'s pair_scratch.
     """
-    rows, samples = max(derivatives, 1), side**2
-    by_sample: Table = {
-        "pixel_derivative": ((rows, samples), np.float32),
-        "sample_transmittance": ((pixels if derivatives else 1, samples), np.float32),
-    }
-    return (by_sample if side > 1 else {"pixel_derivative": ((rows,), np.float32)}) | {
+    table: Table = {
         "transmittance": ((pixels,), np.float32),
         "point_is_visible": ((n,), np.uint8),
         "visible": ((n,), np.uint32),
         "point_slot": ((n,), np.uint32),
         "visible_count": ((1,), np.uint32),
     }
+    if derivatives and side > 1:
+        table["sample_transmittance"] = (pixels, side**2), np.float32
+    if derivatives:
+        by_sample = (side**2,) if side > 1 else ()
+        table["pixel_derivative"] = (derivatives, *by_sample), np.float32
+    return table
 
 
+@replayed
 def blend_weights(
     dev: Device,
     b: Buffers,
@@ -119,10 +121,9 @@ def blend_weights(
         "pixel_weight_point": b.pair_scratch,
         "point_is_visible": b.point_is_visible,
     }
-    of_one = {
-        "pair_point_falloff": pairs.pair_point_falloff,
-        "pixel_derivative": b.pixel_derivative,
-    }
+    derivative = b.pixel_derivative if derivatives else None
+    transmittances = b.sample_transmittance if derivatives and side > 1 else None
+    of_one = {"pair_point_falloff": pairs.pair_point_falloff, "pixel_derivative": derivative}
     if points and side > 1:
         program = dev.program("raster/samples", **sample_macros(dev, pairs, derivatives))
         program.launch(
@@ -132,9 +133,9 @@ def blend_weights(
             point_camera=points.point_camera,
             point_shape=points.point_shape,
             pair_point=pairs.pair_point_falloff,
-            sample_derivative=b.pixel_derivative,
+            sample_derivative=derivative,
             transmittance=b.transmittance,
-            sample_transmittance=b.sample_transmittance,
+            sample_transmittance=transmittances,
             **shared,
         )
     elif blend == "alpha":
@@ -152,13 +153,13 @@ def blend_weights(
         early_stop,
         max_tracked or ALL,
         b.pair_scratch,
-        b.pixel_derivative if derivatives else None,
+        derivative,
         b.point_is_visible,
         b.point_slot,
         b.transmittance if blend == "alpha" else None,
         b.visible,
         b.visible_count,
-        b.sample_transmittance if side > 1 else None,
+        transmittances,
     )
 
 

@@ -94,7 +94,7 @@ class Loss:
             derivatives=b.derivatives,
             **shared,
         )
-        transmittance, target_alpha = alphas or (b.grad_alpha, b.grad_alpha)
+        transmittance, target_alpha = alphas or (None, None)
         self._launch(
             "loss_gradient",
             ph,

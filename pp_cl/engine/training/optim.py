@@ -257,7 +257,7 @@ def rmsprop_update(
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         grad_visible_features=grad_visible_features,
-        grad_offset=v["offset"] if grad_offset is None else grad_offset,
+        grad_offset=grad_offset,
         grad_opacity=grad_opacity,
         last_step=state.last_step,
         v=v["sh"],

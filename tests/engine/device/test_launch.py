@@ -4,7 +4,9 @@ import pytest
 from support.toy_kernels import SOURCE
 
 from pp_cl.engine.device import device as device_module
+from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.device.kernel import SCALARS, parse_signatures
+from pp_cl.engine.device.launch import replayed
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
@@ -261,3 +263,57 @@ def test_work_groups_may_have_one_dimension_alone(program, monkeypatch, given):
 def test_heads_that_are_refused(parameters, message):
     with pytest.raises(ValueError, match=message):
         parse_signatures(f"kernel void f(\n{parameters}\n{{}}", "f.cl")
+
+
+@replayed
+def scaled(program, place, x, scale, wrong=()):
+    """Fill and launch; `wrong` is what a replayed function must not depend on."""
+    place.require({"y": ((33, 1), np.float32)})
+    place.dev.fill(place.y, 7 if len(wrong) == 1 else -1)
+    k = place.dev.constant([(0,), (0,), (0,)]).view(np.uint32).reshape(3)
+    program.launch("rows", 65 if len(wrong) > 1 else 33, n=33, scale=scale, x=x, k=k, y=place.y)
+    return [place.y]
+
+
+def test_a_call_is_replayed_while_its_arguments_are_the_same(program, dev, rows, monkeypatch):
+    b, x, called = Buffers(dev), rows["x"], []
+    launch = program.__class__.launch
+    monkeypatch.setattr(program.__class__, "launch", lambda *a, **n: called.append(launch(*a, **n)))
+    monkeypatch.setattr(dev, "doubts", False)
+    first = scaled(program, b, x, 2.0)
+    expected = first[0].get()
+    for _ in range(2):
+        dev.fill(b.y, np.nan)
+        assert scaled(program, b, x, 2.0) is first
+        np.testing.assert_array_equal(b.y.get(), expected)
+    assert len(called) == 1
+    for again in ((x, 3.0), (x[:], 3.0)):
+        scaled(program, b, *again)
+    assert len(called) == 3
+    np.testing.assert_allclose(b.y.get(), 1.5 * expected, rtol=1e-6)
+    b.require({"y": ((34, 1), np.float32)})  # forgets what holds the old one
+    assert not b.calls
+
+
+@pytest.mark.parametrize("wrong", [[0], [0, 0]])
+def test_a_function_that_depends_on_more_than_its_arguments_fails(program, dev, rows, wrong):
+    b, changing = Buffers(dev), []
+    scaled(program, b, rows["x"], 2.0, changing)
+    scaled(program, b, rows["x"], 2.0, changing)
+    changing += wrong
+    with pytest.raises(AssertionError):
+        scaled(program, b, rows["x"], 2.0, changing)
+
+
+def test_none_is_null_where_the_signature_says_so(dev, tmp_path, monkeypatch):
+    (tmp_path / "toy.cl").write_text(SOURCE)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    program, y = dev.program("toy", WIDTH=5), dev.zeros((33,), np.uint32)
+    program.launch("is_null", 33, n=33, x=None, y=y)
+    assert (y.get() == 1).all()
+    program.launch("is_null", 33, n=33, x=dev.zeros((33,)), y=y)
+    assert (y.get() == 0).all()
+    with pytest.raises(TypeError, match="y is a NoneType, expected a device array"):
+        program.launch("is_null", 33, n=33, x=None, y=None)
+    with pytest.raises(ValueError, match=r"x has shape \(32,\), expected"):
+        program.launch("is_null", 33, n=33, x=dev.zeros((32,)), y=y)
