@@ -45,7 +45,7 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     trainer.step = max(0, config.train.iterations - 1 - 2 * STEPS)
     if trainer.exposure and not trainer.exposure.is_applied:
         trainer.exposure = None  # it has been decided by then
-    trainer.take_plan()
+    trainer.follow(config)
     trainer.train_step()
     host = host_cost(trainer, STEPS)
     with dev.timed_stages() as seconds:

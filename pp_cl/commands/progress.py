@@ -22,7 +22,7 @@ class TrainingProgress:
     def __init__(self, training: Training, stream: TextIO | None = None) -> None:
         self._dev, self._stream = training.trainer.dev, stream
         self._built = training.trainer.step + BUILDING
-        self._config, self._steps = training.config, training.config.train.iterations
+        self._training, self._steps = training, training.config.train.iterations
         self._is_told = False  # how many steps train.minutes allow
         self._test, self._stages = "", ExitStack()
 
@@ -37,7 +37,7 @@ class TrainingProgress:
 
     def __call__(self, step: int, row: dict[str, Any] | None) -> None:
         """Move on to a step."""
-        if self._config.train.iterations != self._steps:
+        if self._training.config.train.iterations != self._steps:
             self._replan()
         if step == self._built:
             self._stages.close()
@@ -56,7 +56,7 @@ class TrainingProgress:
 
     def _replan(self):
         """Take up the steps that train.minutes allow; the first time, tell of them."""
-        name, train = self._config.preset, self._config.train
+        name, train = self._training.config.preset, self._training.config.train
         if not self._is_told:
             own, steps, few = preset(name).train.iterations, train.iterations, FEW[name]
             text = f"{train.minutes:g} min: {name}, about {steps} steps (its own are {own})"

@@ -90,26 +90,27 @@ def _train(folder, config, options, chosen):
     dev = open_device(options.device)
     print(device_line(dev, options.device))
     training = open_training(dev, folder, config, stored)
+    train = training.config.train
     print(_images_line(training, chosen))
     print(_first_line(training))
     if begun := training.trainer.begun:
         print(
-            f"extends a finished training of {begun} steps; {config.train.iterations} from the"
+            f"extends a finished training of {begun} steps; {train.iterations} from the"
             " start would differ, as all schedules end at the last step and the optimiser's"
             " moments start again"
         )
-    wanted = sum(0 < share < 1 for share in config.train.refine_at)
-    if training.hull and (made := len(refine_steps(config.train))) < wanted:
+    wanted = sum(0 < share < 1 for share in train.refine_at)
+    if training.hull and (made := len(refine_steps(train))) < wanted:
         print(
             f"refinements: {made} of the {wanted} of train.refine_at, since in"
-            f" {config.train.iterations} iterations nothing is pruned between them"
+            f" {train.iterations} iterations nothing is pruned between them"
         )
     print(memory_line(training.memory_plan), flush=True)
     seconds = _run(training, options)
     if fitted := training.trainer.fitted:
         print(_specular_line(fitted))
     print(
-        f"trained {config.train.iterations} steps in {seconds:.1f} s;"
+        f"trained {training.config.train.iterations} steps in {seconds:.1f} s;"
         f" {training.trainer.model.cloud.count} points"
         f" ({training.info['initial_points']} at the start);"
         f" wrote {folder.checkpoint}"

@@ -71,9 +71,11 @@ class Trainer:
         self.crops = Crops(views, train, self.refinements_to_come)
         self.fitted: Fitted | None = None  # by finish()
 
-    def take_plan(self) -> None:
-        """Follow config.train.iterations and refine_at, which a plan for some minutes changes."""
-        self._refine_steps = refine_steps(self.config.train)
+    def follow(self, config: Config) -> None:
+        """Go on with settings whose iterations, refine_at, supersampled and radius are others."""
+        self.config = config
+        self.renderer.settings = config.raster
+        self._refine_steps = refine_steps(config.train)
         if self.refinements_to_come != self.crops.halvings:
             self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
 

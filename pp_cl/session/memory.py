@@ -73,7 +73,7 @@ class MemoryPlan:
     def __init__(self, config: Config, net: UNet, image_files: Sequence[ImageFile]):
         self.dev, self._net = net.dev, net
         self.need: Need
-        self._raster, self._train, self._points = config.raster, config.train, config.points
+        self.follow(config)
         self.budget = config.train.memory_gib
         self._downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
         cameras = [one.camera for one in image_files]
@@ -91,6 +91,10 @@ class MemoryPlan:
         self._reading_bytes = 0 if is_demo else reading_cost(image_files, config.scene, factor)[1]
         held = self.dev.bytes if self.dev.is_cpu else 0  # which `need` counts
         self._program = resident_bytes() - held + compiler_bytes(self.dev.info)
+
+    def follow(self, config: Config) -> None:
+        """Check from now on what a training with these settings takes, of the same scene."""
+        self._raster, self._train, self._points = config.raster, config.train, config.points
 
     @property
     def host_bytes(self) -> int:

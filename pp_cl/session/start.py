@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pp_cl.checkpoint import opened_run
-from pp_cl.config import AUTOMATIC, RANDOM, load_config, text_of
+from pp_cl.config import RANDOM, load_config, text_of
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.engine.views import View
@@ -27,17 +26,13 @@ from pp_cl.scene.hull import (
 from pp_cl.scene.load import DEMO, scene_box
 from pp_cl.scene.outline import outline_sheet
 from pp_cl.scene.verdict import judged
-from pp_cl.session.budget import NEVER
 from pp_cl.session.memory import MemoryPlan
+from pp_cl.session.plan import NEVER, UNSET, Plan
 from pp_cl.settings import Config, NetworkConfig
 
-UNSET = (0.0, 0.0)  # train.refine_at
 # train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
-# raster.radius where it is automatic, in point spacings: one pixel within these bounds; less is no
-# better where points lie farther apart
-LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
 # what `make network` keeps: {"net.NAME": as Network.parameters, float16}
 DEMO_NETWORK = Path(__file__).with_name("demo.npz")
@@ -95,53 +90,42 @@ def first_hull(
     return hull, REFINE_AT[times]
 
 
-def automatic_radius(grid: Grid, views: list[View], refinements_to_come: int) -> float:
-    """raster.radius of a grid to be refined so often: one pixel of the images, within bounds."""
-    spacing = spacing_pixels(grid, [view.camera for view in views]) / 2**refinements_to_come
-    return round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
-
-
 def fitting_hull(
     dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
-) -> tuple[Agreement, Hull, tuple[float, float], str]:
-    """(which views' masks agree, first_hull() of them, its (near, far), what it gives up);
-    automatic settings in config are chosen. Where memory is too small, nothing is supersampled;
-    where that does not suffice and the refinements are automatic, there are as many of these, and
-    the points as close as memory allows. Raises UserError as MemoryPlan.check_points() does, and
-    for an automatic radius of footprints that are not soft.
+) -> tuple[Agreement, Hull, tuple[float, float], str, Plan]:
+    """(which views' masks agree, first_hull() of them, its (near, far), what it gives up, the plan
+    of the training). Where memory is too small, nothing is supersampled; where that does not
+    suffice and the refinements are automatic, there are as many of these, and the points as close
+    as memory allows. Raises UserError as MemoryPlan.check_points() does, and for an automatic
+    radius of footprints that are not soft.
     """
-    is_automatic, train = config.train.refine_at == UNSET, config.train
     given_up: list[str] = []
-    raster, is_radius_automatic = config.raster, config.raster.radius == 0
-    is_view_opacity_automatic = train.view_opacity == "auto"
-    left_open = (is_automatic, is_radius_automatic, is_view_opacity_automatic)
-    config.automatic = [key for key, one in zip(AUTOMATIC, left_open, strict=True) if one]
-    if is_radius_automatic and raster.footprint != "soft":
+    if config.raster.radius == 0 and config.raster.footprint != "soft":
         raise UserError(
-            f"raster.radius: is automatic, which raster.footprint={raster.footprint}"
+            f"raster.radius: is automatic, which raster.footprint={config.raster.footprint}"
             " cannot be; give it in world units at a depth range of 4 (0.0015 in the paper)"
         )
     agreement, _ = judged(dev, config, views)
     views, _, forgiven = agreement
-    if is_view_opacity_automatic:
-        train.view_opacity = "off" if forgiven else "on"
-    hull, train.refine_at = first_hull(dev, config, agreement)
-    to_come, cameras = len(refine_steps(train)), [view.camera for view in views]
+    hull, refine_at = first_hull(dev, config, agreement)
+    plan = Plan.of(config, hull, agreement, refine_at)
+    to_come = len(refine_steps(plan.train(config.train)))
+    cameras = [view.camera for view in views]
     last = math.inf  # points of the try before
     while True:
-        if is_radius_automatic:
-            raster.radius = automatic_radius(hull.grid, views, to_come)
+        memory_plan.follow(plan.settings(config))
         found = hull.grid, len(hull.ids), depth_range(views, hull)
         fault = memory_plan.fault_of(*found)
-        if fault and train.supersampled > 0:
-            train.supersampled = 0.0
+        if fault and plan.supersampled > 0:
+            plan = plan.for_memory()
+            memory_plan.follow(plan.settings(config))
             given_up.append(f"features: of one sample a pixel in the end ({fault[0]})")
             fault = memory_plan.fault_of(*found)
-        can_be_fewer = is_automatic and len(hull.ids) < last
+        can_be_fewer = config.train.refine_at == UNSET and len(hull.ids) < last
         fewer = memory_plan.coarser_points(*found) if fault and can_be_fewer else 0
         if not (fault and fewer):
             memory_plan.check_points(*found)
-            return agreement, hull, found[-1], "\n".join(given_up)
+            return agreement, hull, found[-1], "\n".join(given_up), plan
         if last == math.inf:
             spacing = spacing_pixels(hull.grid, cameras) / 2**to_come
             given_up.append(
@@ -150,6 +134,7 @@ def fitting_hull(
             )
         last = len(hull.ids)
         hull = build_grid(dev, views, max(1, int(fewer / TOLERANCE)), scene_box(config), forgiven)
+        plan = plan.for_grid(config.train, hull.grid, views)
 
 
 def sheet_of_masks(

@@ -32,9 +32,10 @@ from pp_cl.progress import Progress
 from pp_cl.run import Run, load
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import list_split, measured_split, open_scene
-from pp_cl.session.budget import NEVER, Budget
+from pp_cl.session.budget import Budget
 from pp_cl.session.memory import MemoryPlan
-from pp_cl.session.start import automatic_radius, begin_network, fitting_hull, sheet_of_masks
+from pp_cl.session.plan import NEVER, Plan
+from pp_cl.session.start import begin_network, fitting_hull, sheet_of_masks
 from pp_cl.settings import Config
 
 PREVIEWS = 4  # of a training, besides an early one
@@ -59,7 +60,8 @@ class HullFacts(NamedTuple):
 
 @dataclass
 class Training:
-    """A training that is ready to begin or to go on. info: what a checkpoint's header holds beside
+    """A training that is ready to begin or to go on. config: its settings, which another plan
+    replaces. info: what a checkpoint's header holds beside
     the model's. hull: None if it resumes. measured: the views on which train.eval_every measures
     PSNR. began: time.monotonic() when it was opened, from which train.minutes count.
     """
@@ -116,35 +118,32 @@ class Training:
             )
 
     def _run(self, on_step, is_stopped):
-        trainer, train = self.trainer, self.config.train
+        trainer = self.trainer
         with self.folder.open_log(trainer.step) as log:
             pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
-            budget = Budget(train, pixels, self._is_automatic("train.refine_at"))
+            may_stay_coarse = "train.refine_at" in self.config.automatic
+            budget = Budget(self.config, pixels, may_stay_coarse)
             seconds = earlier = log.seconds
             first = trainer.step + 1
             self._expect_save()
-            while trainer.step < train.iterations:
+            while trainer.step < self.config.train.iterations:
                 if self.memory_plan.grows_after(trainer.step):
                     self._fit_memory()
                 start = time.perf_counter()
                 terms = trainer.train_step()
                 took = time.perf_counter() - start
                 seconds += took
-                is_planned = train.minutes and not trainer.begun
-                passed = earlier + time.monotonic() - self.began
-                if is_planned and budget.plan(trainer.step, passed):
-                    trainer.take_plan()
-                    if self._is_automatic("raster.radius"):
-                        self.config.raster.radius = automatic_radius(
-                            trainer.model.grid, trainer.views, trainer.refinements_to_come
-                        )
-                    self.folder.configure(self.config.to_json())
+                if self.config.train.minutes and not trainer.begun:
+                    passed = earlier + time.monotonic() - self.began
+                    if plan := budget.plan(self.config, trainer.step, passed):
+                        place = trainer.model.grid, trainer.views, trainer.step
+                        self._follow(plan.for_grid(self.config.train, *place))
                 if trainer.step == first and not any(self.folder.previews.glob("*.png")):
                     self._preview_by = time.monotonic() + FIRST_PREVIEW  # the kernels are built
                 row = self._after_step(log, terms, seconds)
                 if on_step:
                     on_step(trainer.step, row)
-                if is_stopped() and trainer.step < train.iterations:
+                if is_stopped() and trainer.step < self.config.train.iterations:
                     self._save(finished=False)
                     return seconds
             check_finite(trainer.arrays())  # before the EMA replaces the parameters
@@ -158,6 +157,13 @@ class Training:
             self._save(finished=True)
         return seconds
 
+    def _follow(self, plan):
+        """Go on by another plan, and keep it in config.json."""
+        self.config = plan.settings(self.config)
+        for follower in (self.memory_plan, self.trainer):
+            follower.follow(_followed(self.config, self.trainer.begun))
+        self.folder.configure(self.config.to_json())
+
     def _fit_memory(self):
         """Give up supersampling that has not begun, then points, where memory is too small for them
         from the next step on.
@@ -166,9 +172,7 @@ class Training:
         count, step = model.cloud.count, trainer.step
         may_stop = train.supersampled > 0 and supersampling_at(step, train) == 1
         if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, step):
-            for settings in (self.config, trainer.config):  # an extended training has its own
-                settings.train.supersampled = 0.0
-            self.folder.configure(self.config.to_json())
+            self._follow(Plan.given(self.config).for_memory())
             told = f"step {step}: for lack of memory, features are of one sample a pixel"
             warnings.warn(told, stacklevel=2)
         try:
@@ -185,9 +189,6 @@ class Training:
                 stacklevel=2,
             )
             trainer.keep_most_visible(most)
-
-    def _is_automatic(self, key):
-        return key in self.config.automatic
 
     def _after_step(self, log, terms, seconds):
         """Write the log's row, which it returns, the preview and then the checkpoint, as due."""
@@ -252,19 +253,24 @@ class Training:
 # ---- to begin and to resume: nothing is written
 
 
+def _followed(config, begun):
+    """What the engine follows: an extended training is not refined."""
+    return replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
+
+
 def open_training(
     dev: Device, folder: RunFolder, config: Config, stored: Stored | None
 ) -> Training:
     """The training in `folder` from its checkpoint `stored` on, a finished one extended with new
-    moments and without refinements; without one from its beginning, where the automatic settings in
-    config are chosen. Raises UserError for a broken scene or another one than the checkpoint's, too
-    little memory, and a folder that may not be written.
+    moments and without refinements; without one from its beginning, by the plan that its hull and
+    memory make of config. Raises UserError for a broken scene or another one than the checkpoint's,
+    too little memory, and a folder that may not be written.
     """
     began, (header, arrays) = time.monotonic(), stored or ({"step": 0}, {})
     check_target(folder.config)
     folder.check_sheets(header["step"])
     begun = header["step"] if header.get("finished") else header.get("extended_from", 0)
-    followed = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
+    followed = _followed(config, begun)
 
     net = UNet.of_settings(dev, config.network) if stored else begin_network(dev, config)
     split_files = list_split(config.scene.path)
@@ -286,7 +292,9 @@ def open_training(
     else:
         start = time.perf_counter()
         with Progress("carving the visual hull"):
-            agreement, hull, depth_range, given_up = fitting_hull(dev, config, views, memory_plan)
+            fitting = fitting_hull(dev, config, views, memory_plan)
+            agreement, hull, depth_range, given_up, plan = fitting
+            config = followed = plan.settings(config)
             seconds = time.perf_counter() - start
             sheet = sheet_of_masks(dev, views, hull, agreement)
             facts = HullFacts(hull.capped, seconds, agreement.forgiven, given_up, sheet)
@@ -372,10 +380,12 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
 
 
 def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Config]]:
-    """The run in a folder, then its further members, each as the first one is by then: with the
-    settings that it has chosen, and the next seed.
+    """The run in a folder, then its further members, each as the first one is by then: by its plan,
+    with the next seed.
     """
     yield folder, config
+    if config.train.members > 1:
+        config = Plan.given(load_config(folder.config)).settings(config)
     for i in range(1, config.train.members):
         seed = (config.train.seed + i) % 2**32
         train = replace(config.train, seed=seed, members=1, minutes=0.0)

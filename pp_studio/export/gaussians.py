@@ -5,7 +5,6 @@ window of another size. It is the trainer's, with the footprint "gaussian" and m
 place of the network.
 """
 
-import copy
 import hashlib
 import json
 import math
@@ -143,7 +142,9 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
             if trainer.step == TIMED and minutes < math.inf:
                 now = time.monotonic()
                 fitting = TIMED + int((end - now) * (TIMED - BUILDING) / (now - first))
-                progress.total = config.train.iterations = min(max(fitting, FEWEST), steps)
+                progress.total = min(max(fitting, FEWEST), steps)
+                config = replace(config, train=replace(config.train, iterations=progress.total))
+                trainer.follow(config)
     trainer.check()
     trainer.finish()
     return cloud
@@ -297,20 +298,34 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
 
 def config_of(run: Run, steps: int) -> Config:
     """What the trainer follows here, and how the Gaussians are drawn."""
-    config = copy.deepcopy(run.config)
-    raster, train = config.raster, config.train
-    raster.footprint, raster.early_stop, raster.max_tracked = "gaussian", EARLY_STOP, 0
-    raster.radius *= DEVIATION
-    train.iterations = steps
-    train.crop, train.refine_at, train.ema = CROP, (), True
-    train.mask_weight = train.distortion_weight = train.sh_smoothing = train.supersampled = 0.0
-    train.exposure, train.ssim_weight = "off", 0.0
-    train.prune_weight = 0.0  # points are judged in images, where larger windows show more
     # Colours, which begin nearly right, would diverge with their default rates, many times these;
     # shapes have the longest way. In few steps both must go faster.
     faster = (QUALITIES[BEST][0] / steps) ** 0.25
-    train.rate_steps = 0
-    train.sh_rate = (1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster)
-    train.opacity_rate, train.offset_rate = (2.3e-2, 6.8e-3), (4e-2 * faster, 4e-3 * faster)
-    train.view_opacity = train.specular = "off"  # splats have neither
-    return config
+    raster = replace(
+        run.config.raster,
+        footprint="gaussian",
+        radius=run.config.raster.radius * DEVIATION,
+        early_stop=EARLY_STOP,
+        max_tracked=0,
+    )
+    train = replace(
+        run.config.train,
+        iterations=steps,
+        crop=CROP,
+        refine_at=(),
+        supersampled=0.0,
+        ema=True,
+        ssim_weight=0.0,
+        mask_weight=0.0,
+        distortion_weight=0.0,
+        exposure="off",
+        sh_smoothing=0.0,
+        prune_weight=0.0,  # points are judged in images, where larger windows show more
+        rate_steps=0,
+        sh_rate=(1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster),
+        opacity_rate=(2.3e-2, 6.8e-3),
+        offset_rate=(4e-2 * faster, 4e-3 * faster),
+        view_opacity="off",  # splats have neither this
+        specular="off",  # nor this
+    )
+    return replace(run.config, raster=raster, train=train)

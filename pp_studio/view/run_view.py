@@ -105,7 +105,7 @@ def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
 
         def on_step(step: int, row: dict[str, Any] | None) -> None:
             nonlocal free, renewed
-            run.header["step"], start = step, time.monotonic()
+            run.config, run.header["step"], start = training.config, step, time.monotonic()
             if row:
                 rows.append(row)
                 page.set_rows(rows)

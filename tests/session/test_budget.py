@@ -10,8 +10,9 @@ from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
 from pp_cl.engine.training.schedule import refine_steps, supersampling_at
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.session.budget import FITTING, NEVER, Budget
-from pp_cl.settings import TrainConfig
+from pp_cl.session.budget import FITTING, Budget
+from pp_cl.session.plan import NEVER
+from pp_cl.settings import Config, TrainConfig
 
 SMALL = {key: value for key, value in SETTINGS.items() if key != "train.iterations"}
 
@@ -23,13 +24,16 @@ def simulated(minutes, refine_at, seconds_of, built=0.0, supersampled=0.0):
     train = TrainConfig(
         iterations=8000, minutes=minutes, refine_at=refine_at, supersampled=supersampled
     )
-    budget, step, total, refined = Budget(train, 48 * 200**2), 0, 0.0, []
+    config, step, total, refined = Config(train=train), 0, 0.0, []
+    budget = Budget(config, 48 * 200**2)
     while step < train.iterations:
         took = seconds_of(step / train.iterations, len(refined)) + built * (step == 0)
         took *= supersampling_at(step, train)
         step, total = step + 1, total + took
         refined += [step] if step in refine_steps(train) else []
-        budget.plan(step, total)
+        if plan := budget.plan(config, step, total):
+            config = plan.settings(config)
+            train = config.train
         assert [at for at in refine_steps(train) if at <= step] == refined
     return total + FITTING + 53 * seconds_of(1.0, len(refined)), train, refined
 
@@ -56,22 +60,24 @@ def test_the_promise_is_kept_as_fog_clears_and_grids_are_refined(
 
 
 def test_what_comes_before_the_first_step_is_in_the_minutes():
-    train = TrainConfig(iterations=8000, minutes=2, refine_at=(1.0, 1.0))
-    budget = Budget(train, 0)
+    config = Config(train=TrainConfig(iterations=8000, minutes=2, refine_at=(1.0, 1.0)))
+    budget = Budget(config, 0)
     for step in range(1, 11):
-        budget.plan(step, 60 + 0.1 * step)  # of reading, carving and building
-    assert 600 < train.iterations < 1000  # clearing fog makes later ones shorter
+        plan = budget.plan(config, step, 60 + 0.1 * step)  # of reading, carving and building
+    assert 600 < plan.iterations < 1000  # clearing fog makes later ones shorter
+    assert config.train.iterations == 8000
 
 
 @pytest.mark.parametrize("step, is_refined", [(0.05, True), (1.0, False)])
 def test_few_steps_are_better_without_refinement(step, is_refined):
-    train = TrainConfig(iterations=6000, minutes=5, refine_at=(0.35, 1.0))
-    budget = Budget(train, 48 * 200**2, may_stay_coarse=True)
+    config = Config(train=TrainConfig(iterations=6000, minutes=5, refine_at=(0.35, 1.0)))
+    budget = Budget(config, 48 * 200**2, may_stay_coarse=True)
     for number in range(1, 200):
-        if budget.plan(number, number * step) and not is_refined:
-            assert train.refine_at == NEVER
-    assert bool(refine_steps(train)) == is_refined
-    assert train.iterations < 1000 or is_refined
+        if plan := budget.plan(config, number, number * step):
+            config = plan.settings(config)
+            assert is_refined or plan.refine_at == NEVER
+    assert bool(refine_steps(config.train)) == is_refined
+    assert config.train.iterations < 1000 or is_refined
 
 
 def test_a_training_without_time_ends_soon_and_in_order():

@@ -4,7 +4,10 @@ from support.runs import spoken
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import load_config
+from pp_cl.config import load_config, run_config
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.session.plan import Plan
+from pp_cl.session.training import open_training
 
 
 @pytest.mark.parametrize(
@@ -33,3 +36,16 @@ def test_opacity_has_no_direction_where_masks_contradict(tmp_path, capsys, wrong
     assert main(words) == 0
     assert ("masks: they contradict each other" in capsys.readouterr().out) == (wrong > 0)
     assert load_config(out / "config.json").train.view_opacity == opacity
+
+
+def test_settings_never_change(dev, tmp_path, scene):
+    """What a training decides is in settings of its own, which config.json has."""
+    folder, given = RunFolder(tmp_path / "run"), [("points.count", 500, "test")]
+    config = run_config(folder, scene, "tiny", [*given, ("train.iterations", 2, "test")])
+    asked, chosen = config.to_json(), open_training(dev, folder, config, None)
+    assert config.to_json() == asked and config.raster.radius == 0
+    chosen.run()
+    assert load_config(folder.config) == chosen.config != config
+    assert chosen.trainer.config == chosen.config
+    plan = Plan.given(chosen.config)
+    assert plan.settings(config) == chosen.config and plan.radius > 0

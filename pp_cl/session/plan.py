@@ -1,0 +1,125 @@
+"""What a training decides itself: at first by its hull, then by its memory and minutes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from pp_cl.config import AUTOMATIC
+from pp_cl.engine.grid import Grid
+from pp_cl.engine.training.schedule import refine_steps, supersampling_at
+from pp_cl.engine.views import View
+from pp_cl.scene.hull import Hull, spacing_pixels
+from pp_cl.scene.verdict import Agreement
+from pp_cl.settings import Config, TrainConfig
+
+UNSET = (0.0, 0.0)  # train.refine_at
+NEVER = (1.0, 1.0)  # train.refine_at of a grid that is not refined
+# raster.radius where it is automatic, in point spacings: one pixel within these bounds; less is no
+# better where points lie farther apart
+LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
+FIXED = 0.8  # share of the steps after which their number rises no more: soon the averages begin
+DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
+SUPERSAMPLED = 1.3  # times that a step takes longer once it is supersampled
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The settings that a training chooses or changes: iterations, refine_at, supersampled and
+    view_opacity of TrainConfig, radius of RasterConfig, automatic of Config. A decision makes
+    another plan; settings() are what the engine follows and config.json says.
+    """
+
+    iterations: int
+    refine_at: tuple[float, ...]
+    supersampled: float
+    view_opacity: str
+    radius: float
+    automatic: tuple[str, ...]
+
+    @classmethod
+    def given(cls, config: Config) -> "Plan":
+        """The plan that settings have."""
+        train = config.train
+        steps = train.iterations, train.refine_at, train.supersampled, train.view_opacity
+        return cls(*steps, config.raster.radius, tuple(config.automatic))
+
+    @classmethod
+    def of(
+        cls, config: Config, hull: Hull, agreement: Agreement, refine_at: tuple[float, ...]
+    ) -> "Plan":
+        """The plan that a training begins with: automatic settings are chosen, refine_at as
+        first_hull() returns it with the hull.
+        """
+        given = cls.given(config)
+        is_open = given.refine_at == UNSET, given.radius == 0, given.view_opacity == "auto"
+        automatic = tuple(key for key, one in zip(AUTOMATIC, is_open, strict=True) if one)
+        plan = replace(given, refine_at=refine_at, automatic=automatic)
+        if "train.view_opacity" in automatic:
+            plan = replace(plan, view_opacity="off" if agreement.forgiven else "on")
+        return plan.for_grid(config.train, hull.grid, agreement.views)
+
+    def settings(self, config: Config) -> Config:
+        """A copy of the settings that has the plan's."""
+        raster, train = replace(config.raster, radius=self.radius), self.train(config.train)
+        return replace(config, automatic=[*self.automatic], raster=raster, train=train)
+
+    def train(self, train: TrainConfig) -> TrainConfig:
+        """The part of settings() that schedules take."""
+        return replace(
+            train,
+            iterations=self.iterations,
+            refine_at=self.refine_at,
+            supersampled=self.supersampled,
+            view_opacity=self.view_opacity,
+        )
+
+    def for_grid(
+        self, train: TrainConfig, grid: Grid, views: Sequence[View], step: int = 0
+    ) -> "Plan":
+        """An automatic radius becomes one pixel of the images, within bounds, once the grid after
+        a step has been refined as is planned. train: what else the schedules need.
+        """
+        if "raster.radius" not in self.automatic:
+            return self
+        to_come = sum(step < at for at in refine_steps(self.train(train)))
+        spacing = spacing_pixels(grid, [view.camera for view in views]) / 2**to_come
+        radius = round(min(max(1 / spacing, LEAST_RADIUS), MOST_RADIUS), 3)
+        return replace(self, radius=radius)
+
+    def for_memory(self) -> "Plan":
+        """Nothing is supersampled."""
+        return replace(self, supersampled=0.0)
+
+    def for_minutes(
+        self, train: TrainConfig, step: int, left: float, ending: float = 0.0
+    ) -> "Plan":
+        """The iterations of a training that has time for `left` more steps without refinements
+        after a step; refine_at and supersampled are such that what is past stays where it was.
+        train: what else the schedules need. ending: steps that its end is worth.
+        """
+        train = self.train(train)
+        steps, shares = self.iterations, [share for share in self.refine_at if 0 < share < 1]
+        is_late = step >= FIXED * steps
+        past = {share: at for share in shares if (at := max(1, round(share * steps))) <= step}
+        to_come = [at / steps for at in refine_steps(train) if at > step]
+        dearer = [(share, DEARER) for share in to_come]
+        begun, begins = supersampling_at(step, train) > 1, 1 - self.supersampled
+        if not begun:
+            dearer.append((begins, SUPERSAMPLED))
+        all_as_one, start, cost = 0.0, 0.0, 1.0
+        for end, times in [*sorted(dearer), (1.0, 1.0)]:
+            all_as_one += (end - start) * cost
+            start, cost = end, cost * times
+        # is not jumped over
+        soonest = [1.0 if is_late else FIXED, *(share for share in shares if share not in past)]
+        soonest += [] if begun else [begins]
+        left -= ending * DEARER ** len(to_come)
+        planned = max(round((step + left) / all_as_one), math.ceil((step + 1) / min(soonest)))
+        if is_late and planned > steps:  # else averages would begin anew
+            return self
+        return replace(
+            self,
+            iterations=planned,
+            refine_at=tuple(past[s] / planned if s in past else s for s in self.refine_at),
+            supersampled=1 - begins * steps / planned if begun else self.supersampled,
+        )
