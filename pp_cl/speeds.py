@@ -12,7 +12,8 @@ from contextlib import suppress
 import pyopencl as cl
 from filelock import FileLock
 
-from pp_cl.engine.device.device import INTEL_PLATFORM, Device
+from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.quirks import INTEL_PLATFORM
 from pp_cl.engine.layers.choice import VARIANTS, prepared
 from pp_cl.engine.layers.conv import ConvShape, packed_shape
 from pp_cl.engine.layers.tiles import all_tiles

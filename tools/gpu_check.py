@@ -31,14 +31,8 @@ from unittest.mock import patch
 
 from pp_cl.cli import main as pp_cl
 from pp_cl.drivers import open_device
-from pp_cl.engine.device.device import (
-    INTEL_PLATFORM,
-    STANDARD,
-    Device,
-    Program,
-    kernel_folder,
-    vendor_options,
-)
+from pp_cl.engine.device.device import STANDARD, Device, Program, kernel_folder
+from pp_cl.engine.device.quirks import INTEL_PLATFORM, vendor_options
 from pp_cl.scene.demo import demo_views
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.selftest.run import CASES, run_cases

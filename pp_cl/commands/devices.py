@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Print the devices, and which one is taken. Raises UserError if none works."""
     from pp_cl.drivers import list_devices, list_left_out, mend
-    from pp_cl.engine.device.device import describe
+    from pp_cl.engine.device.quirks import describe
     from pp_cl.speeds import by_speed
 
     found, harmful = list_devices(again=True), list_left_out()

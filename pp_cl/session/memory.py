@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pp_cl.engine.device.buffers import PIECE_BYTES, Table, grown, table_bytes
-from pp_cl.engine.device.device import compiler_bytes
 from pp_cl.engine.device.host import available_bytes, resident_bytes
+from pp_cl.engine.device.quirks import compiler_bytes
 from pp_cl.engine.grid import MOST_IDS, Grid
 from pp_cl.engine.model import REFINING_BYTES
 from pp_cl.engine.network.specular import Specular

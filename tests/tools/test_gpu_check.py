@@ -3,7 +3,7 @@ import pytest
 from pp_cl.drivers import open_device
 from pp_cl.engine.device.buffers import gather_rows
 from pp_cl.engine.device.device import Device, kernel_folder
-from pp_cl.engine.device.kernel import parse_signatures
+from pp_cl.engine.device.signature import parse_signatures
 from tools import gpu_check
 from tools.gpu_check import complaints
 

@@ -1,15 +1,10 @@
-"""An OpenCL device: builds programs, allocates and copies buffers, times stages and kernels, and
-works around the faults of drivers.
-"""
+"""An OpenCL device: builds programs, launches kernels, allocates and copies buffers."""
 
 from __future__ import annotations
 
 import atexit
 import math
-import os
-import signal
 import sys
-import threading
 import time
 import weakref
 from collections import defaultdict, deque
@@ -24,7 +19,16 @@ from numpy.typing import ArrayLike, DTypeLike
 from pyopencl.array import Array
 
 from pp_cl.engine.device.host import ask_for_huge_pages
-from pp_cl.engine.device.kernel import Kernel, cut, parse_signatures, quiet_compiler
+from pp_cl.engine.device.kernel import Kernel, cut, quiet_compiler
+from pp_cl.engine.device.observe import check_outputs, debug_level, print_times
+from pp_cl.engine.device.quirks import (
+    acts_as_cpu,
+    describe,
+    has_watchdog,
+    ignore_full_files,
+    vendor_options,
+)
+from pp_cl.engine.device.signature import parse_signatures
 from pp_cl.errors import BuildError, UserError
 
 SMALLER = "lower --points or raise --downscale"
@@ -34,114 +38,12 @@ HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
 MOST_MULTIPLY_ADDS = 25e9
 UNTIMED = nullcontext()  # a stage
 STANDARD = ("-cl-std=CL1.2",)  # options of every build
-# Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
-INTEL_PLATFORM = "Intel(R) OpenCL"
-# Files with a kernel that spills, or becomes narrow, with the 128 registers that a thread has there
-# by default, and not with 256, of which half as many threads run (docs/devices.md).
-SPILLING_ON_INTEL = frozenset(
-    (
-        "layers/conv_backward",
-        "layers/conv_local",
-        "layers/conv_local_backward_weights",
-    )
-)
-
-# bytes of the host that a driver's compiler takes until all kernels of a training are built, by
-# platform; one that is not listed is taken for the one that takes the most
-COMPILER_BYTES = {"Portable Computing Language": 80 * 2**20, "Intel(R) OpenCL": 620 * 2**20}
-
-
-def compiler_bytes(info: dict[str, Any]) -> int:
-    """Of the host, which the driver's compiler takes in a training. info: of describe()."""
-    return COMPILER_BYTES.get(info["platform"], max(COMPILER_BYTES.values()))
-
-
-def vendor_options(info: dict[str, Any], name: str) -> tuple[str, ...]:
-    """Options of cl/<name>.cl on devices of one vendor. info: of describe()."""
-    intel_gpu = info["type"] == "GPU" and info["platform"].startswith(INTEL_PLATFORM)
-    large = intel_gpu and name in SPILLING_ON_INTEL
-    return ("-cl-intel-256-GRF-per-thread",) if large else ()
-
-
-def has_watchdog(device: cl.Device) -> bool:
-    """Whether the system may stop a kernel that takes long: only NVIDIA's driver says so."""
-    try:
-        return bool(device.kernel_exec_timeout_nv)
-    except (cl.Error, AttributeError):
-        return True
-
-
-def acts_as_cpu(device: cl.Device) -> bool:
-    """Whether drivers and kernels work as they do on CPUs: on CPUs, unless PP_FORM=gpu.
-
-    Raises UserError for another PP_FORM.
-    """
-    asked = os.environ.get("PP_FORM")
-    if asked not in (None, "", "gpu"):
-        raise UserError(f"PP_FORM={asked}: must be gpu, or unset")
-    return not asked and bool(device.type & cl.device_type.CPU)
 
 
 def kernel_folder() -> Path:
     """The folder of the .cl files: inside the installed package, or beside it in a checkout."""
     inside = Path(__file__).parents[2] / "cl"
     return inside if inside.is_dir() else Path(__file__).parents[3] / "cl"
-
-
-def describe(device: cl.Device) -> dict[str, Any]:
-    """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units",
-    "memory_bytes", "max_allocation_bytes" in a dictionary.
-    """
-    return {
-        "name": device.name.strip(),
-        "platform": device.platform.name.strip(),
-        "version": device.version.strip(),
-        "driver": device.driver_version.strip(),
-        "type": _type_name(device),
-        "compute_units": device.max_compute_units,
-        "memory_bytes": _memory_bytes(device),
-        "max_allocation_bytes": _max_allocation_bytes(device),
-    }
-
-
-def _type_name(device):
-    return next(
-        (t for t in ("GPU", "CPU", "ACCELERATOR") if device.type & getattr(cl.device_type, t)),
-        "OTHER",
-    )
-
-
-def _memory_bytes(device):
-    """A GPU's memory; for a CPU the machine's or its container's, as PoCL reports a fraction that
-    it does not keep to.
-    """
-    if not (device.type & cl.device_type.CPU and hasattr(os, "sysconf")):
-        return device.global_mem_size
-    sizes = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
-    for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        if os.path.exists(limit):
-            text = Path(limit).read_text().strip()
-            sizes += [int(text)] if text.isdigit() else []  # "max": no limit
-    return min(sizes)
-
-
-def _max_allocation_bytes(device):
-    """What the device allocates at once, or PP_MAX_ALLOCATION (MiB) if that is less."""
-    text = os.environ.get("PP_MAX_ALLOCATION") or "inf"
-    try:
-        mebibytes = float(text)
-    except ValueError:
-        mebibytes = 0.0
-    if not mebibytes > 0:
-        raise UserError(f"PP_MAX_ALLOCATION={text}: must be a number of MiB above 0")
-    return int(min(device.max_mem_alloc_size, mebibytes * 2**20))
-
-
-def _debug_level():
-    text = os.environ.get("PP_DEBUG") or "0"
-    if text not in ("0", "1", "2", "3"):
-        raise UserError(f"PP_DEBUG={text}: must be 0, 1, 2 or 3")
-    return int(text)
 
 
 def _released(device, nbytes):
@@ -187,14 +89,6 @@ class Fill(NamedTuple):
     value: float
 
 
-def _ignore_full_files():
-    """Leave a write beyond what a file may hold to its error, as Python does: LLVM in drivers
-    catches its signal, asks for a bug report and ends the program.
-    """
-    if hasattr(signal, "SIGXFSZ") and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-
-
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
@@ -211,11 +105,11 @@ class Device:
         self.info = describe(device)
         self.is_cpu = acts_as_cpu(device)
         self.has_watchdog = not self.is_cpu and has_watchdog(device)
-        self.debug = _debug_level()
+        self.debug = debug_level()
         self.context = cl.Context([device])
         profiling: Any = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=profiling)
-        _ignore_full_files()
+        ignore_full_files()
         self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
         self.bytes = self.peak_bytes = self.launches = 0
         self.waited = 0.0
@@ -520,34 +414,14 @@ class Device:
         """
         event.wait()
         self._seconds[kernel.label].append((event.profile.end - event.profile.start) * 1e-9)
-        if self.debug < 3:
-            return
-        for p in kernel.parameters:
-            array = arguments[p.name]
-            if p.is_buffer and not p.const and p.dtype is np.float32 and array is not None:
-                values = array.get()
-                bad = np.flatnonzero(
-                    np.isnan(values) if p.may_be_infinite else ~np.isfinite(values)
-                )
-                if bad.size:
-                    raise FloatingPointError(
-                        f"{kernel.label}: {p.name} has {bad.size} NaN or Inf, first at {bad[0]}"
-                    )
+        if self.debug >= 3:
+            check_outputs(kernel, arguments)
 
     def print_profile(self) -> None:
         """A table on stderr, longest first: passes, median and total time of stages and, at
         PP_DEBUG 1, of kernel files, else of kernels.
         """
-        rows: dict[str, list[float]] = defaultdict(list)
-        rows |= {f"stage {name}": seconds for name, seconds in (self._stage_seconds or {}).items()}
-        for label, seconds in self._seconds.items():
-            rows[label if self.debug >= 2 else label.partition(":")[0]] += seconds
-        for label, seconds in sorted(rows.items(), key=lambda r: -sum(r[1])):
-            median, total = np.median(seconds) * 1e3, sum(seconds)
-            print(
-                f"{label:40s} {len(seconds):7d} x {median:9.3f} ms, {total:9.3f} s in all",
-                file=sys.stderr,
-            )
+        print_times(self._stage_seconds or {}, self._seconds, by_file=self.debug < 2)
 
 
 class Program:

@@ -1,23 +1,20 @@
 """Kernels called with named arguments, whose shapes are checked against the comments of their
-signatures, which are parsed from the source.
+signatures.
 """
 
 import functools
 import math
 import operator
-import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
-from types import CodeType
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
+from pp_cl.engine.device.signature import Parameter, compile_formula
 from pp_cl.errors import UserError
 
 # Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to
@@ -27,108 +24,6 @@ DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 # Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once: more
 # than a network's layers have. The numbers of visible points, new in each step, would fill memory.
 REMEMBERED = 64
-
-
-SCALARS = {
-    "uchar": np.uint8,
-    "ushort": np.uint16,
-    "int": np.int32,
-    "uint": np.uint32,
-    "ulong": np.uint64,
-    "half": np.float16,
-    "float": np.float32,
-}
-
-_KERNEL = re.compile(r"^kernel\s+void\s+(\w+)\s*\(", re.MULTILINE)
-_PARAMETER = re.compile(
-    r"^(?:(global)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
-    r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$"
-)
-_SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
-_FORMULA = re.compile(r"\(*\w+\)*(?: ?[-+*/] ?\(*\w+\)*)*")
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One kernel parameter. shape: the dimensions of its comment as text, such as "N+1"; None for
-    a scalar or for `(...)`. may_be_infinite, may_be_null: its comment says "infinite", "NULL".
-    """
-
-    name: str
-    is_buffer: bool  # a global pointer
-    dtype: type
-    width: int  # of the OpenCL vector
-    const: bool  # what it points at
-    shape: tuple | None
-    may_be_infinite: bool
-    may_be_null: bool
-
-    @cached_property
-    def limits(self) -> tuple[int, int] | None:
-        """The least and the largest integer of its type, None for a float."""
-        if not issubclass(self.dtype, np.integer):
-            return None
-        return int(np.iinfo(self.dtype).min), int(np.iinfo(self.dtype).max)
-
-
-def parse_signatures(source: str, file: str) -> dict[str, list[Parameter]]:
-    """{kernel name: [Parameter, ...]} of an OpenCL C source that follows docs/conventions.md.
-
-    Raises ValueError naming the file, kernel and line of a parameter that does not.
-    """
-    signatures = {}
-    for match in _KERNEL.finditer(source):
-        parameters = []
-        for line in source[match.end() :].split("\n"):
-            code, _, comment = line.partition("//")
-            code = code.strip()
-            last = code.rstrip(" {").endswith(")")
-            code = code.rstrip(" {").rstrip(")").rstrip(",").strip()
-            if code:
-                parameters.append(
-                    _parse_parameter(code, comment.strip(), f"{file}: {match.group(1)}")
-                )
-            if last:
-                break
-        signatures[match.group(1)] = parameters
-    return signatures
-
-
-def _parse_parameter(code, comment, where):
-    found = _PARAMETER.match(code)
-    if not found or found.group(3) not in SCALARS:
-        raise ValueError(f"{where}: cannot read parameter {code!r}; one parameter per line")
-    space, qualifiers, base, width, star, name = found.groups()
-    if bool(space) != bool(star) or (width and not star):
-        raise ValueError(f"{where}: {code!r} is neither a global pointer nor a scalar")
-    shape = None
-    if star:
-        words = _SHAPE.match(comment)
-        if not words:
-            raise ValueError(f"{where}: buffer {name!r} has no shape in its comment")
-        shape = tuple(w.strip() for w in words.group(1).split(",") if w.strip())
-        shape = None if shape == ("...",) else shape
-        try:
-            [compile_formula(word) for word in shape or () if word != "?"]
-        except ValueError as error:
-            raise ValueError(f"{where}: {name}: {error}") from None
-    kind = SCALARS[base], int(width or 1), "const" in qualifiers
-    return Parameter(name, bool(space), *kind, shape, "infinite" in comment, "NULL" in comment)
-
-
-@functools.cache
-def compile_formula(text: str) -> CodeType:
-    """A dimension in a buffer's comment, such as `N+1`, `c1 + c2` or `(H-1)/2`, for eval().
-    co_names are the names in it; the division is one of whole numbers.
-
-    Raises ValueError for what is no formula of integers, names, brackets and + - * /.
-    """
-    try:
-        if not _FORMULA.fullmatch(text):
-            raise SyntaxError
-        return compile(text.replace("/", "//"), text, "eval")
-    except SyntaxError:
-        raise ValueError(f"{text!r} is no formula of integers, names and + - * /") from None
 
 
 class Kernel:

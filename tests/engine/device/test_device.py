@@ -12,7 +12,9 @@ from support.guarded import GuardedDevice
 
 from pp_cl.drivers import open_device
 from pp_cl.engine.device import device as device_module
-from pp_cl.engine.device.device import Device, acts_as_cpu, kernel_folder
+from pp_cl.engine.device import quirks
+from pp_cl.engine.device.device import Device, kernel_folder
+from pp_cl.engine.device.quirks import acts_as_cpu
 from pp_cl.errors import BuildError, UserError
 
 TINY = """
@@ -174,9 +176,9 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
 def test_intels_gpus_take_more_registers_for_files_that_spill(platform, kind, large):
     info = {"platform": platform, "type": kind}
     expected = ("-cl-intel-256-GRF-per-thread",) if large else ()
-    assert device_module.vendor_options(info, "layers/conv_backward") == expected
-    assert device_module.vendor_options(info, "raster/shade") == ()
-    files = device_module.SPILLING_ON_INTEL
+    assert quirks.vendor_options(info, "layers/conv_backward") == expected
+    assert quirks.vendor_options(info, "raster/shade") == ()
+    files = quirks.SPILLING_ON_INTEL
     assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)
 
 
@@ -189,7 +191,7 @@ def test_only_nvidias_driver_rules_out_a_watchdog(said, expected):
                 raise cl.LogicError("clGetDeviceInfo failed: INVALID_VALUE")
             return said
 
-    assert device_module.has_watchdog(Driver()) is expected
+    assert quirks.has_watchdog(Driver()) is expected
 
 
 def test_a_kernel_folder_with_a_space_is_refused(plain, tmp_path, monkeypatch):

@@ -5,8 +5,8 @@ from support.toy_kernels import SOURCE
 
 from pp_cl.engine.device import device as device_module
 from pp_cl.engine.device.buffers import Buffers
-from pp_cl.engine.device.kernel import SCALARS, parse_signatures
 from pp_cl.engine.device.launch import replayed
+from pp_cl.engine.device.signature import SCALARS, parse_signatures
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
