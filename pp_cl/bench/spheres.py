@@ -26,8 +26,18 @@ def project_spheres(
     """
     n = len(positions)
     b.require(projection_table(n, footprint))
-    arrays = {"camera": camera_buffer, "positions": positions, "point_radius": point_radius}
-    launch_projection(dev, b, "project_spheres", n, footprint, side, **arrays)
+    launch_projection(
+        dev,
+        b,
+        "bench/project_spheres",
+        "project_spheres",
+        n,
+        footprint,
+        side,
+        camera=camera_buffer,
+        positions=positions,
+        point_radius=point_radius,
+    )
     return ProjectedPoints(
         footprint,
         camera_buffer,

@@ -13,7 +13,8 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.render import Renderer, RenderResult
 from pp_cl.engine.training.crops import Crop, Crops
 from pp_cl.engine.training.exposure import Exposure, decided_at
-from pp_cl.engine.training.loss import Loss, ignore_gradient, ignore_target
+from pp_cl.engine.training.ignored import ignore_gradient, ignore_target
+from pp_cl.engine.training.loss import Loss
 from pp_cl.engine.training.optim import Optimiser
 from pp_cl.engine.training.prune import (
     most_visible,

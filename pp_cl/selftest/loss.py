@@ -5,7 +5,8 @@ from functools import partial
 import numpy as np
 
 from pp_cl.engine.training.exposure import DECAY, PRIOR, Exposure
-from pp_cl.engine.training.loss import Loss, ignore_gradient, ignore_target
+from pp_cl.engine.training.ignored import ignore_gradient, ignore_target
+from pp_cl.engine.training.loss import Loss
 from pp_cl.reference import loss as reference_loss
 from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 

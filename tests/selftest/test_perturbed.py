@@ -23,7 +23,7 @@ FLIPS = [
     ("scene/lens", "2.0f * p2 * xy", "-2.0f * p2 * xy", "scene: lens"),
     ("scene/hull", "counts & ~(in", "counts & (in", "scene: hull"),
     ("training/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
-    ("raster/project", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
+    ("raster/project.h", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
     ("raster/footprint/disc.h", "1.0f), f->t", "1.0f), f->z", "raster: pairs, disc"),
     ("raster/footprint/soft.h", "1.0f - sqrt(dis", "1.0f + sqrt(dis", "raster: pairs, soft"),
     ("raster/footprint/sphere.h", "along - half", "along + half", "raster: pairs, sphere"),
@@ -53,6 +53,7 @@ FLIPS = [
     ("raster/samples", "front - behind", "front + behind", "alpha: samples of a pixel"),
     ("raster/blend", "front.x - behind.x", "front.x + behind.x", "alpha: distortion loss"),
     ("raster/blend", "d, opacity[i]", "d, -opacity[i]", "alpha: offsets of points"),
+    ("bench/project_spheres", "j] = positions[3 * i]", "j] = -positions[3 * i]", "raster: project"),
     ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "bias, relu", "bias, !relu", "conv: direct, hard inputs"),
     ("layers/direct.h", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
@@ -70,6 +71,8 @@ FLIPS = [
     ("layers/tiles", "line[i] != background", "line[i] == background", "layers: tiles"),
     ("training/loss", "e + derivative_0", "e - derivative_0", "loss: L1 and SSIM"),
     ("training/loss", "1.0f - transmittance", "1.0f + transmittance", "loss: mask"),
+    ("training/ignored", "= -1.0f;", "= +1.0f;", "loss: ignored pixels"),
+    ("raster/softmax_gradient", "= dot16(", "= -dot16(", "softmax: backward, soft"),
     ("training/exposure", "b[c][c] += prior", "b[c][c] -= prior", "loss: exposure"),
     ("training/exposure", "(r, gb) + white", "(r, gb) - white", "loss: exposure"),
     ("training/exposure", "m[i] -= a[k][i]", "m[i] += a[k][i]", "loss: colours of a view"),
@@ -134,13 +137,12 @@ def test_a_fault_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped,
     case = next(case for case in CASES if case.name == name)
     monkeypatch.setattr(dev, "is_cpu", acts_as_cpu(dev, file, text))
     assert [row.passed for row in run_cases(dev, [case])] == [True]
-    if path_of(file) == KERNELS / file:  # a header, which kernels of its wing include
+    if path_of(file) == KERNELS / file:  # a header, which kernels of its wing and bench/ include
         folder = shutil.copytree(KERNELS, tmp_path / "cl")
         (folder / file).write_text((folder / file).read_text().replace(text, flipped))
         monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)
-        others = {
-            k: v for k, v in dev._programs.items() if k[0].split("/")[0] != file.split("/")[0]
-        }
+        wings = file.split("/")[0], "bench"
+        others = {k: v for k, v in dev._programs.items() if k[0].split("/")[0] not in wings}
     else:
         monkeypatch.setattr(device_module, "Program", flipping(file, text, flipped))
         others = {key: program for key, program in dev._programs.items() if key[0] != file}

@@ -16,6 +16,7 @@ from pp_cl.engine.device.launch import group_items, lanes, launch_groups, replay
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.points import four_blocks, offset_width, stored_degree
 from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.softmax import softmax_gradient
 from pp_cl.engine.raster.weights import BlendWeights, clear_pairs, sample_macros
 
 ON_GPU = 4  # lanes there: each work-item reads vectors
@@ -193,13 +194,8 @@ def blend_backward(
             **of_fragments,
         )
     else:
-        program.launch(
-            "softmax_gradient",
-            pairs.pixels,
-            features=features,
-            pixel_blend=b.pixel_blend,
-            **of_fragments,
-        )
+        blended = {"features": features, "pixel_blend": b.pixel_blend}
+        softmax_gradient(dev, pairs.pixels, **blended, **of_fragments)
     program.launch(
         "blend_backward",
         count * row_parts(dev, ON_GPU),

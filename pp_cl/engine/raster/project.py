@@ -85,14 +85,21 @@ def footprint_macros(footprint: str, side: int = 1) -> dict[str, int]:
 
 
 def launch_projection(
-    dev: Device, b: Buffers, kernel: str, n: int, footprint: str, side: int = 1, **arguments: Any
+    dev: Device,
+    b: Buffers,
+    file: str,
+    kernel: str,
+    n: int,
+    footprint: str,
+    side: int = 1,
+    **arguments: Any,
 ) -> None:
-    """Launch a kernel that projects n points of one of FOOTPRINTS into the buffers b of
-    projection_table().
+    """Launch a kernel of cl/<file>.cl that projects n points of one of FOOTPRINTS into the buffers
+    b of projection_table().
     """
     launch_groups(
         dev,
-        "raster/project",
+        file,
         kernel,
         blocks_of(n),
         defines={
@@ -137,6 +144,7 @@ def project_grid(
     launch_projection(
         dev,
         b,
+        "raster/project",
         "project_grid",
         n,
         footprint,

@@ -16,6 +16,7 @@ from pp_cl.engine.device.launch import lanes, replayed
 from pp_cl.engine.device.scan import nonzero, read_total
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.softmax import softmax_weights
 
 BLENDS = ("softmax", "alpha")
 NO_POINT = 0xFFFFFFFF  # in pixel_weight_point, behind which fragments were dropped
@@ -143,9 +144,8 @@ def blend_weights(
         shared |= {"transmittance": b.transmittance, **of_one}
         program.launch("alpha_weights", pairs.pixels, **shared)
     else:
-        program = dev.program("raster/softmax", DROPS=int(early_stop > 0), **defines)
-        shared |= {"sharpness": 1 / gamma, "camera": camera_buffer, **of_one}
-        program.launch("softmax_weights", pairs.pixels, **shared)
+        shared |= {"camera": camera_buffer, **of_one}
+        softmax_weights(dev, pairs.pixels, gamma, defines, **shared)
     nonzero(dev, b.point_is_visible, b.visible, b.point_slot, b.visible_count)
     return BlendWeights(
         blend,

@@ -10,7 +10,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Buffers, Pending, Table, read_later
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import group_items, lanes, launch_groups
+from pp_cl.engine.device.launch import lanes, launch_groups
 from pp_cl.errors import Diverged
 
 TAPS = 11  # pixels, the side of an SSIM window
@@ -179,48 +179,3 @@ def corner_of(
             f" {prediction_shape}"
         )
     return 3 * (top * pw + left)
-
-
-def ignore_target(
-    dev: Device,
-    ignored: Array,
-    prediction: Array,
-    target: Array,
-    target_alpha: Array,
-    offset: tuple[int, int],
-) -> None:
-    """Make a target (H, W, 3) what the prediction (PH, PW, 3) is, and target_alpha (H, W) -1, where
-    a pixel is ignored.
-
-    ignored: (H, W) uint8, 1 where it is. offset: (left, top) of the target in the prediction.
-    """
-    height, width = ignored.shape
-    dev.program("training/loss", GROUP=group_items(dev), **_defines(dev)).launch(
-        "ignore_target",
-        (width, height),
-        w=width,
-        h=height,
-        pw=prediction.shape[1],
-        corner=corner_of(prediction.shape, target.shape, *offset),
-        ignored=ignored,
-        prediction=prediction,
-        target=target,
-        target_alpha=target_alpha,
-    )
-
-
-def ignore_gradient(
-    dev: Device, ignored: Array, grad_prediction: Array, offset: tuple[int, int]
-) -> None:
-    """Make dL/dprediction (PH, PW, 3) 0 where a pixel is ignored; as ignore_target() takes it."""
-    height, width = ignored.shape
-    dev.program("training/loss", GROUP=group_items(dev), **_defines(dev)).launch(
-        "ignore_gradient",
-        (width, height),
-        w=width,
-        h=height,
-        pw=grad_prediction.shape[1],
-        corner=corner_of(grad_prediction.shape, (height, width, 3), *offset),
-        ignored=ignored,
-        grad_prediction=grad_prediction,
-    )
