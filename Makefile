@@ -79,8 +79,9 @@ format: $(MADE) ## format the Python files and the kernels
 	@$(BIN)/ruff format
 	@$(BIN)/clang-format -i $(KERNELS)
 
-docs: $(READY) ## write the tables, settings and commands in README.md and docs/
+docs: $(READY) ## write the tables, settings and commands in README.md and docs/, and docs/road.md
 	@$(BIN)/python -m tools.docs_tables
+	@$(BIN)/python -m tools.road
 
 # Links that leave docs/ are those of the repository's root; there docs/ is the root of the pages.
 site: $(MADE) ## build README.md and docs/ as a site in build/site; fails on a dead link

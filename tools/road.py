@@ -1,0 +1,159 @@
+"""Write docs/road.md: what a default step of a training calls, in the order in which it is read.
+
+    python -m tools.road            # or make docs
+
+A step is traced on a CPU. Functions and kernel files stand where they come first; a minute is 40
+lines of code, without blank lines, comments and docstrings.
+"""
+
+import ast
+import gc
+import io
+import re
+import sys
+import tempfile
+import tokenize
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+from pp_cl.config import run_config
+from pp_cl.drivers import open_device
+from pp_cl.engine.device.device import Device, kernel_folder
+from pp_cl.engine.step import Trainer
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.session.training import open_training
+from tools.provenance import ROOT
+
+FILE = ROOT / "docs" / "road.md"
+ENGINE = ROOT / "pp_cl" / "engine"
+LINES_A_MINUTE = 40
+SETTINGS = {
+    "points.count": 2000,
+    "scene.downscale": 4,
+    "train.iterations": 1000,
+    "train.refine_at": (1.0, 1.0),
+}
+WARM = 4  # steps in which buffers grow and kernels are built
+LEAST_LINES = 5  # of a function: what shorter ones do is in their names
+HEAD = """# The road: one step, in the order to read it
+
+What `Trainer.train_step` calls in a default training on a CPU, once its buffers are there:
+functions of `pp_cl/engine/` from {least} lines of code on and files of `cl/`, where they come
+first, after the minutes of reading up to their end, at {pace} lines a minute. `make docs` traces a
+step and writes this page; [architecture.md](architecture.md#a-training-step) says what the parts
+do.
+
+"""
+Step = tuple[Path, str]  # (a file, a function in it; "" for a file of kernels)
+
+
+def traced(dev: Device) -> list[Step]:
+    """What one step calls and launches, in the order of the first time."""
+    given = [(*item, "road") for item in SETTINGS.items()]
+    with tempfile.TemporaryDirectory() as folder:
+        run = RunFolder(Path(folder) / "run")
+        trainer = open_training(dev, run, run_config(run, "demo", None, given), None).trainer
+        for _ in range(WARM):
+            trainer.train_step()
+        forget_calls(trainer)
+        return called(trainer.train_step)
+
+
+def forget_calls(trainer: Trainer) -> None:
+    """Let the next step call what it would replay."""
+    trainer.renderer._buffers.calls.clear()
+    trainer.model.net.release()
+
+
+def called(function: Callable[[], object]) -> list[Step]:
+    """The functions of the engine, and kernel files, of a call."""
+    found: dict[Step, None] = {}
+
+    def watch(frame, event, _):
+        code = frame.f_code
+        path = Path(code.co_filename)
+        if event == "call" and ENGINE in path.parents and not code.co_name.startswith("<"):
+            found[path, code.co_name] = None
+            if code.co_name == "program":
+                found[kernel_folder() / f"{frame.f_locals['name']}.cl", ""] = None
+
+    gc.disable()  # which calls back for arrays of others
+    sys.setprofile(watch)
+    try:
+        function()
+    finally:
+        sys.setprofile(None)
+        gc.enable()
+    return [*found]
+
+
+@cache
+def python_lines(path: Path) -> dict[str, int]:
+    """{function or method: its lines of code}, of the first of a name."""
+    text = path.read_text("utf-8")
+    skipped = {getattr(tokenize, kind) for kind in ("COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT")}
+    code = {
+        line
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type not in skipped
+        for line in range(token.start[0], token.end[0] + 1)
+    }
+    found: dict[str, int] = {}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            doc = node.body[0] if ast.get_docstring(node) else None
+            told = range(doc.lineno, (doc.end_lineno or 0) + 1) if doc else ()
+            lines = code & {*range(node.lineno, (node.end_lineno or 0) + 1)} - {*told}
+            found.setdefault(node.name, len(lines))
+    return found
+
+
+def kernel_files(path: Path) -> list[Path]:
+    """A kernel's file, after the headers that it includes."""
+    includes = re.findall(r'(?m)^#include "(.+)"', path.read_text("utf-8"))
+    headers = [file for name in includes for file in kernel_files(kernel_folder() / name)]
+    return [*dict.fromkeys([*headers, path])]
+
+
+def kernel_lines(path: Path) -> int:
+    """Its lines of code."""
+    lines = path.read_text("utf-8").splitlines()
+    return sum(bool(line.partition("//")[0].strip()) for line in lines)
+
+
+def page(steps: list[Step]) -> str:
+    """The text of docs/road.md."""
+    rows: list[tuple[Path, list[str], int]] = []
+    read: set[Path] = set()
+    for path, function in steps:
+        if function:
+            lines = python_lines(path).get(function, 0)
+            if lines < LEAST_LINES:
+                continue
+            if rows and rows[-1][0] == path:
+                rows[-1] = path, [*rows[-1][1], function], rows[-1][2] + lines
+            else:
+                rows.append((path, [function], lines))
+            continue
+        for file in kernel_files(path):
+            if file not in read:
+                rows.append((file, [], kernel_lines(file)))
+                read.add(file)
+    text, total = HEAD.format(least=LEAST_LINES, pace=LINES_A_MINUTE), 0
+    for path, functions, lines in rows:
+        total += lines
+        name = path.relative_to(ROOT).as_posix().removeprefix("pp_cl/engine/")
+        told = f": {', '.join(functions)}" if functions else ""
+        text += f"    {total / LINES_A_MINUTE:5.1f}  {name}{told}\n"
+    return text
+
+
+def main() -> int:
+    """Write the page; returns the exit status."""
+    FILE.write_text(page(traced(open_device())), "utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
