@@ -225,7 +225,7 @@ class Renderer:
         if until == "weights":
             return result
         with dev.stage("shade"):
-            visible, count = weights.visible_rows, weights.total.get()
+            visible, count = weights.visible_rows, weights.total
             capacity = self._visible_capacity[by_pair] = grown(
                 self._visible_capacity[by_pair], count
             )
@@ -279,7 +279,7 @@ class Renderer:
             tile_mask = None
             if is_planned:
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
-            (tile_mask or weights.total).get()  # the host's one wait for the device
+            (tile_mask or weights.count).get()  # the host's one wait for the device
             self._capacity[by_pair] = capacity_needed(pairs)
             if self._capacity[by_pair] == pairs.capacity:
                 return pairs, weights, tile_mask

@@ -150,7 +150,7 @@ class Trainer:
                 network_parts,
                 points=rendered.points,
                 visible=rendered.weights.visible_rows,
-                count=rendered.weights.total.get(),
+                count=rendered.weights.total,
                 sh_eps=train.sh_eps / target.size,
             )
         self.step += 1

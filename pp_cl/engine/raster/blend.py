@@ -152,7 +152,7 @@ def blend_backward(
         raise ValueError(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )
-    count = weights.total.get()
+    count = weights.total
     rows = len(visible_features), pairs.pixels, pairs.capacity
     b.require(blend_backward_table(*rows, weights.blend, points.footprint, pairs.side))
     clear_pairs(dev, pairs, weights, b.pair_gradient)

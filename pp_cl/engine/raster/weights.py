@@ -29,15 +29,15 @@ class BlendWeights:
 
     blend: one of BLENDS. opacity, early_stop: of blend_weights(). tracked: how many nearest
     fragments of a pixel get gradients. pixel_weight_point: (P,) uint64, weight bits << 32 | point,
-    each pixel's fragments by depth;
-    where fragments are dropped, a number without a point ends the pixel's list. pixel_derivative:
-    (P,) float32 alike, the factor s of the backward pass, dL/dopacity = s * dL/db
-    (cl/raster/blend.cl), with several samples of a pixel (P, samples); None without derivatives.
+    each pixel's fragments by depth; where fragments are dropped, a number without a point ends the
+    pixel's list. pixel_derivative: (P,) float32 alike, the factor s of the backward pass,
+    dL/dopacity = s * dL/db (cl/raster/blend.cl), with several samples of a pixel (P, samples); None
+    without derivatives.
     point_is_visible: (N,) uint8, 1 for visible points. point_slot: (N,) uint32, where a visible
     point stands in `visible`, undefined for others. transmittance: (HW,) float32 behind all
     fragments, None with the softmax; sample_transmittance: (HW, samples) of each sample, where
     there are several. visible_rows: (N,) uint32, `visible` at its front; found: (1,) uint32, how
-    many; total: the same, of read_visible().
+    many; count: the same, of read_visible().
     """
 
     blend: str
@@ -52,18 +52,23 @@ class BlendWeights:
     visible_rows: Array
     found: Array
     sample_transmittance: Array | None = None
-    total: Any = None
+    count: Any = None
 
     def read_visible(self, dev: Device) -> None:
         """Enqueue the download of the number of visible points."""
-        self.total = read_total(dev, self.found)
+        self.count = read_total(dev, self.found)
+
+    @property
+    def total(self) -> int:
+        """The number of visible points, S; waits until it is known."""
+        return self.count.get()
 
     @property
     def visible(self) -> Array:
         """(S,) uint32, ascending: the visible points, those with a fragment that is not dropped.
         Only they are shaded and get gradients. Waits until their number is known.
         """
-        return self.visible_rows[: self.total.get()]
+        return self.visible_rows[: self.total]
 
 
 def weights_table(n: int, pixels: int, derivatives: int, side: int = 1) -> Table:
@@ -191,7 +196,7 @@ def listed_fragments(
 
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
     """Set (P, 1 + samples) float32 to 0 at the pairs of visible points."""
-    count = weights.total.get()
+    count = weights.total
     dev.program("raster/weights", SAMPLES=pairs.side**2).launch(
         "clear_pairs",
         count,
