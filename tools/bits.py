@@ -32,9 +32,13 @@ COMMON = {
     "network.widths": (16, 32, 32),
 }
 NEVER = {"train.refine_at": (1.0, 1.0)}
-# {name: settings}; the first one alone has the shipped network and a specular layer
+# {name: settings}; the first one alone has the shipped network, smoothing and a specular layer
 SETTINGS = {
-    "tiny": {"train.specular": "auto", "network.widths": (32, 64, 128)},
+    "tiny": {
+        "train.iterations": 70,  # the field is smoothed after 64
+        "train.specular": "auto",
+        "network.widths": (32, 64, 128),
+    },
     # beyond 2^16 pixels, where background is skipped; the crop is smaller than the image
     "tiles": NEVER | {"train.crop": 260, "points.count": 3000},
     "softmax": NEVER

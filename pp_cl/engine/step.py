@@ -1,5 +1,5 @@
-"""One step of training: draw a crop of a view, render it, loss, backward, optimiser; then
-smoothing, EMA, pruning and refining where they are due. session.py has the loop around it.
+"""One step of training: draw a crop of a view, render it, loss, backward, optimiser.
+training/between.py has what is due then, session/training.py the loop around it.
 """
 
 from __future__ import annotations
@@ -11,30 +11,23 @@ from pp_cl.engine.device.buffers import Buffers, DeviceRows, Pending
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.model import Model
 from pp_cl.engine.render import Renderer, RenderResult
+from pp_cl.engine.training import between
 from pp_cl.engine.training.crops import Crop, Crops
-from pp_cl.engine.training.exposure import Exposure, decided_at
+from pp_cl.engine.training.exposure import Exposure
 from pp_cl.engine.training.ignored import ignore_gradient, ignore_target
 from pp_cl.engine.training.loss import Loss
 from pp_cl.engine.training.optim import Optimiser
-from pp_cl.engine.training.prune import (
-    most_visible,
-    points_of_large_parts,
-    points_that_views_show,
-    points_to_keep,
-)
 from pp_cl.engine.training.schedule import (
-    SMOOTHING_EVERY,
     Rates,
     ema_start,
-    ema_weight,
     gamma_at,
     refine_steps,
     rising_weight,
     supersampling_at,
 )
 from pp_cl.engine.training.smooth import Smoother
-from pp_cl.engine.training.specular import Fitted, SpecularFit
-from pp_cl.engine.training.state import PointState, split_opacity
+from pp_cl.engine.training.specular import Fitted
+from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import Target
 from pp_cl.engine.views import View
 from pp_cl.settings import Config
@@ -63,12 +56,12 @@ class Trainer:
             self.exposure = Exposure(dev, len(views), train.exposure == "on")
         self.state = PointState(dev, model.cloud)
         self.optimiser = Optimiser(dev, model, self.state)
-        self._composited = config.raster.blend == "alpha"
-        self._target = Target(dev)
+        self.composited = config.raster.blend == "alpha"
+        self.targets = Target(dev)
         self._buffers = Buffers(dev)
         self._terms: Pending[dict[str, float]] | None = None  # of the loss of the last step
-        self._smoother: Smoother | None = None  # made when it is due, anew when the points change
-        self._refine_steps = refine_steps(train)
+        self.smoother: Smoother | None = None  # made when it is due, anew when the points change
+        self.refine_steps = refine_steps(train)
         self.crops = Crops(views, train, self.refinements_to_come)
         self.fitted: Fitted | None = None  # by finish()
 
@@ -76,14 +69,14 @@ class Trainer:
         """Go on with settings whose iterations, refine_at, supersampled and radius are others."""
         self.config = config
         self.renderer.settings = config.raster
-        self._refine_steps = refine_steps(config.train)
+        self.refine_steps = refine_steps(config.train)
         if self.refinements_to_come != self.crops.halvings:
             self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
 
     @property
     def refinements_to_come(self) -> int:
         """How often the grid will still be refined; the images are halved as often."""
-        return sum(self.step < step for step in self._refine_steps)
+        return sum(self.step < step for step in self.refine_steps)
 
     @property
     def exposed(self) -> str:
@@ -105,7 +98,7 @@ class Trainer:
         rates = Rates.at(self.step, config.network, train)
         crop = self.crops.draw(self.step)
         with self.dev.stage("target"):
-            image, alpha = self._target.crop(crop.view, crop.box, crop.jitter)
+            image, alpha = self.targets.crop(crop.view, crop.box, crop.jitter)
             target = image
             if self.exposure and self.exposure.is_applied:
                 target = self.exposure.target(crop.view_index, image, alpha)
@@ -130,7 +123,7 @@ class Trainer:
             grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
         # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * rendered.supersampling**2 * self.model.grid.diagonal
-        distortion_weight = self._rising(train.distortion_weight if self._composited else 0.0)
+        distortion_weight = self._rising(train.distortion_weight if self.composited else 0.0)
         gradients, network_parts = self.renderer.backward(
             rendered,
             grad_image,
@@ -158,7 +151,7 @@ class Trainer:
         self._terms = self.loss.read(self.step)
         # the renderer may release them now
         del rendered, gradients
-        self._after_update(rates)
+        between.after_update(self, rates)
         return self._terms
 
     def _losses(
@@ -201,97 +194,11 @@ class Trainer:
         if self._terms:
             self._terms.get()
 
-    # ---- between steps ---------------------------------------------------------------------------
-
-    def _after_update(self, rates):
-        """Smooth the SH coefficients, update the EMA, prune and refine, each if due after this
-        step.
-        """
-        train, step = self.config.train, self.step
-        for is_last in (False, True):
-            due = step == decided_at(self.begun, len(self.views), is_last=is_last)
-            if self.exposure and due:
-                self.exposure.decide(is_last)
-                if is_last and not self.exposure.is_applied:
-                    self.exposure = None
-        if train.sh_smoothing > 0 and step % SMOOTHING_EVERY == 0:
-            with self.dev.stage("smoothing"):
-                self._smooth(rates)
-        weight = ema_weight(step, train.iterations) if train.ema else 0
-        if weight > 0:
-            with self.dev.stage("averages"):
-                self.optimiser.update_ema(weight)
-        is_judged = train.prune_weight > 0 and step % train.prune_every == 0
-        if is_judged and step < train.iterations:
-            with self.dev.stage("pruning"):
-                self.prune()
-        if step in self._refine_steps:
-            with self.dev.stage("refining"):
-                self._refine()
-
-    def _smooth(self, rates):
-        """Pull every SH coefficient towards the mean of its grid neighbours."""
-        train, cloud = self.config.train, self.model.cloud
-        if self._smoother is None:
-            self._smoother = Smoother(self.dev, self.model.grid_buffer, cloud.ids)
-        pull = train.sh_smoothing * SMOOTHING_EVERY
-        for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
-            if rates.sh[block.degree] > 0:
-                self._smoother.smooth(sh, min(1.0, pull * rates.sh[block.degree]))
-
-    def prune(self) -> None:
-        """Drop the points that were in enough images and had too low a blend weight or opacity."""
-        opacity, train = self.model.cloud.opacity, self.config.train
-        self._keep(points_to_keep(self.dev, self.state, opacity, train))
-
-    def keep_most_visible(self, count: int) -> None:
-        """Drop all points but the `count` that images show most."""
-        self._keep(most_visible(self.dev, self.state, self.model.cloud.opacity, count))
-
-    def _keep(self, rows):
-        """Drop all points but `rows`, with their training state."""
-        if len(rows) < self.model.cloud.count:
-            self._smoother = None
-            self.renderer.release()  # rows are moved through scratch memory
-            self.model.cloud.compact(self.dev, rows)
-            self.state.compact(self.dev, rows)
-
-    def _refine(self):
-        """Densify: replace each point by eight at half the spacing, and double the images."""
-        self._smoother = None
-        self.renderer.release()
-        self.state.refine(self.dev, self.model.refine())
-        if self._composited:
-            split_opacity(self.dev, self.model.cloud.opacity)
-            if "opacity" in self.state.averages:
-                split_opacity(self.dev, self.state.averages["opacity"])
-        self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
-
     def finish(self) -> None:
-        """End the training: take the EMA as parameters, and drop the points whose opacity is too
-        low or that too few training views show, and those that then hang in the air by few.
+        """End the training: take the EMA as parameters, drop points that training views do not
+        show, and fit the specular layer.
         """
-        self.optimiser.apply_ema()
-        if self.config.train.prune_weight > 0:
-            self.renderer.release()  # for whole views with weights by pair
-            self._keep(points_that_views_show(self.renderer, self.views, self.config))
-            self._keep(points_of_large_parts(self.model))
-        if self.config.train.specular == "auto" and self._composited:
-            self._fit_specular()
-
-    def _fit_specular(self):
-        """Give the model its specular layer, if it is worth having."""
-        train = self.config.train
-        self.renderer.supersampling = supersampling_at(self.step, train)
-        fit = SpecularFit(self.renderer, self.views, self._whole_target, self.gamma, train.seed)
-        self.fitted = fit.fitted()
-        self.model.specular = self.fitted.layer
-
-    def _whole_target(self, index):
-        """(h, w, 3) on the device: what the image of a view, by index, should be."""
-        camera = self.views[index].camera
-        image, alpha = self._target.crop(self.views[index], (0, 0, camera.width, camera.height))
-        return self.exposure.target(index, image, alpha) if self.exposed else image
+        between.finish(self)
 
     # ---- what the session shows and stores -------------------------------------------------------
 
@@ -305,7 +212,7 @@ class Trainer:
 
     def target(self, view: View) -> np.ndarray:
         """(H, W, 3) float32 in [0, 1]: what render(view) should be."""
-        return self._target.whole(view)
+        return self.targets.whole(view)
 
     def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array} of the model and of the training's state. Raises UserError

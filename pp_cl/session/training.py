@@ -19,6 +19,7 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 from pp_cl.engine.step import Trainer
+from pp_cl.engine.training.between import keep_most_visible
 from pp_cl.engine.training.schedule import supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
@@ -188,7 +189,7 @@ class Training:
                 " those that images show least",
                 stacklevel=2,
             )
-            trainer.keep_most_visible(most)
+            keep_most_visible(trainer, most)
 
     def _after_step(self, log, terms, seconds):
         """Write the log's row, which it returns, the preview and then the checkpoint, as due."""

@@ -12,6 +12,7 @@ import pp_cl.engine.network.unet
 from pp_cl.config import configure, preset
 from pp_cl.engine.device.buffers import Pending
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.training import between
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session.training import open_training
 
@@ -108,12 +109,12 @@ def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypat
 def test_the_end_holds_no_view_beside_another(dev, scene, tmp_path, monkeypatch):
     """Nor when rows of points are moved: their arrays are the largest of a training."""
     trainer = make_trainer(dev, scene, tmp_path / "run", "tiny")
-    drawn, keep = drawn_alone(monkeypatch, trainer.renderer), trainer._keep
+    drawn, keep = drawn_alone(monkeypatch, trainer.renderer), between.keep
 
-    def keeping(rows):
+    def keeping(trainer, rows):
         assert not any(view() for view in drawn)
-        keep(rows)
+        keep(trainer, rows)
 
-    monkeypatch.setattr(trainer, "_keep", keeping)
+    monkeypatch.setattr(between, "keep", keeping)
     trainer.finish()
     assert len(drawn) == 2 * len(trainer.views)  # to prune, and to fit the specular layer

@@ -5,6 +5,7 @@ from support.models import fetched, make_model
 from pp_cl.config import configure, preset
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.training.between import refine
 from pp_cl.engine.training.prune import final_points_to_keep, most_visible, points_to_keep
 from pp_cl.engine.training.state import PointState
 from pp_cl.errors import Diverged
@@ -125,7 +126,7 @@ def test_refined_points_let_as_much_light_through(dev, scene, tmp_path, blend):
     trainer.optimiser.update_ema(1.0)
     opacities = trainer.model.cloud, trainer.state.averages
     before = opacities[0].opacity.get(), opacities[1]["opacity"].get()
-    trainer._refine()
+    refine(trainer)
     for old, new in zip(before, (opacities[0].opacity, opacities[1]["opacity"]), strict=True):
         expected = old[0] / (1 + np.sqrt(1 - old[0, 0])) if blend == "alpha" else old[0]
         np.testing.assert_allclose(new.get(), np.tile(expected, (len(new), 1)), rtol=1e-5)
