@@ -145,7 +145,7 @@ def page(steps: list[Step]) -> str:
         total += lines
         name = path.relative_to(ROOT).as_posix().removeprefix("pp_cl/engine/")
         told = f": {', '.join(functions)}" if functions else ""
-        text += f"    {total / LINES_A_MINUTE:5.1f}  {name}{told}\n"
+        text += f"    {total / LINES_A_MINUTE:3.0f}  {name}{told}\n"
     return text
 
 
