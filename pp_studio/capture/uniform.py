@@ -23,7 +23,7 @@ FITTED = 4  # times, to what of the border is near to the fit before
 
 def is_uniform(image: np.ndarray) -> bool:
     """Whether the border of an image (H, W, 3) uint8 shows one colour, but for noise."""
-    return (_levelled(image)[1] < PLAIN).mean() >= SHARE
+    return bool((_levelled(image)[1] < PLAIN).mean() >= SHARE)
 
 
 def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
