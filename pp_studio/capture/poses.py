@@ -55,11 +55,6 @@ def place(
             best = found[-1]
             with Progress("refining all poses"):
                 refine(best)
-                if turns and any(one.lens.folds(one.camera) for one in image_files(best)):
-                    # the object, in the middle of all images, does not tell the lens
-                    for lens in best.cameras.values():
-                        lens.params = [*lens.params[:3], 0.0]
-                    refine(best, of_lens=False)
             if (error := best.compute_mean_reprojection_error()) < MOST_ERROR:
                 best.write(unfinished)
                 break
@@ -103,14 +98,14 @@ def _mapped(database, images, folder, count, turns):
             return list(models.values())
 
 
-def refine(model: Any, of_lens: bool = True) -> None:
+def refine(model: Any) -> None:
     """Adjust all cameras and points once more, with a loss by which the few wrong matches, mostly
-    of patterns that repeat, no longer pull at the cameras. of_lens: their distortion, too.
+    of patterns that repeat, no longer pull at the cameras.
     """
     colmap = needed("pycolmap")
     model.update_point_3d_errors()
     error = np.median([point.error for point in model.points3D.values()])
-    options = colmap.BundleAdjustmentOptions(print_summary=False, refine_extra_params=of_lens)
+    options = colmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = BELIEVED * error
     options.ceres.solver_options.function_tolerance = CONVERGED

@@ -16,14 +16,16 @@ cv2 = needed("cv2")
 
 SIDE = 1600  # pixels of what a background is told from
 SHARE = 0.9  # of a border, that shows the background alone
-PLAIN = 4.0  # CIELAB: noise is less once an image is reduced; texture that has features is more
+PLAIN = 4.0  # CIELAB: noise is less once it is smoothed; texture that has features is more
+GRAIN = 3  # pixels over which noise is smoothed
 NOISY = 10.0  # of the border's median distance: what is so far from the background is none of it
 FITTED = 4  # times, to what of the border is near to the fit before
 
 
 def is_uniform(image: np.ndarray) -> bool:
     """Whether the border of an image (H, W, 3) uint8 shows one colour, but for noise."""
-    return bool((_levelled(image)[1] < PLAIN).mean() >= SHARE)
+    smooth = cv2.blur(image, (GRAIN, GRAIN))
+    return bool((_levelled(smooth)[1] < PLAIN).mean() >= SHARE)
 
 
 def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
