@@ -1,8 +1,12 @@
 import numpy as np
 import pytest
+from PIL import Image
+
+from pp_cl.files.image import read_mask
 
 pytest.importorskip("cv2")
 
+from pp_studio.capture.masks import write_inside
 from pp_studio.capture.uniform import is_uniform, uniform_mask
 
 SIDE = 160
@@ -44,3 +48,21 @@ def test_texture_is_not_uniform(behind):
 def test_an_object_that_reaches_the_border_leaves_no_mask():
     wide = np.where(abs(Y) < 0.3, 90.0, WHITE)
     assert not is_uniform(image(wide)) and uniform_mask(image(wide), "") is None
+
+
+@pytest.mark.parametrize("is_uniform", [False, True])
+def test_all_images_have_a_mask_where_some_have_alpha(tmp_path, is_uniform):
+    """As features are looked for within them; nothing is left out of those without."""
+    shown = image(WHITE)
+    Image.fromarray(shown).save(tmp_path / "a.jpg")
+    Image.fromarray(np.dstack([shown, np.uint8(255 * (Y < 0))])).save(tmp_path / "b.png")
+    write_inside(tmp_path, ["a.jpg", "b.png"], tmp_path / "inside", is_uniform)
+    one, other = (read_mask(tmp_path / "inside" / f"{name}.png") for name in ("a.jpg", "b.png"))
+    np.testing.assert_array_equal(other > 127, Y < 0)
+    assert ((one > 127) == BALL).mean() > 0.98 if is_uniform else one.min() == 255
+
+
+def test_no_image_has_a_mask_where_none_tells_the_object(tmp_path):
+    Image.fromarray(image(PLANKS)).save(tmp_path / "a.png")
+    write_inside(tmp_path, ["a.png"], tmp_path / "inside", False)
+    assert not any((tmp_path / "inside").iterdir())
