@@ -19,6 +19,7 @@ SHARE = 0.9  # of a border, that shows the background alone
 PLAIN = 4.0  # CIELAB: noise is less once it is smoothed; texture that has features is more
 GRAIN = 3  # pixels over which noise is smoothed
 NOISY = 10.0  # of the border's median distance: what is so far from the background is none of it
+SPECK = 5e-5  # of the image: smaller regions of a mask are none
 FITTED = 4  # times, to what of the border is near to the fit before
 
 
@@ -44,6 +45,9 @@ def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.n
         return None
     if (mask[_border(mask)] < 128).mean() < SHARE:
         return None
+    # what compression leaves beside edges, in single pixels
+    _, regions, facts, _ = cv2.connectedComponentsWithStats((mask > 0).astype(np.uint8))
+    mask[(facts[:, cv2.CC_STAT_AREA] < SPECK * mask.size)[regions]] = 0
     return cv2.resize(mask, (width, height))
 
 
