@@ -206,8 +206,8 @@ def _uniform(scene, image_files, windows, box, points):
     if len(found) < UNIFORM * len(left):
         if len(held) >= UNIFORM * len(left) and np.concatenate([*held.values()]).mean() < ON_MASK:
             raise UserError(
-                f"{scene}: what is behind the object has one colour, and so have parts of the"
-                " object; take the photographs before another colour, or give masks with --masks"
+                f"{scene}: what is behind the object has one colour, and so have parts of"
+                " it; take the photographs before another colour, or give masks with --masks"
             )
         return 0
     for i, mask in found.items():
