@@ -30,6 +30,7 @@ from pp_cl.files import (
 )
 from pp_cl.scene import MASK_FOLDERS, ImageFile, undistort
 from pp_studio.capture.packages import needed
+from pp_studio.capture.uniform import is_uniform
 
 ENDINGS = (
     *(".jpg", ".jpeg", ".jfif", ".png", ".webp", ".tif", ".tiff", ".bmp"),
@@ -77,9 +78,10 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
     """Write the photographs of a folder, or the sharpest frame of each of FRAMES intervals of a
     video, to the new folder `images`, upright, as JPEG or PNG.
 
-    Returns {"images": [{name, source, lens, focal, size, sharpness}], "left_out": [{source,
-    reason}]}; lens is equal for photographs of one camera at one focal length; focal, in pixels, is
-    None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
+    Returns {"images": [{name, source, lens, focal, size, sharpness, uniform}], "left_out":
+    [{source, reason}]}; lens is equal for photographs of one camera at one focal length; focal, in
+    pixels, is None where COLMAP may guess it by EXIF; uniform: whether the background is. Raises
+    UserError where too few are usable.
     """
     with atomic_folder(images) as unfinished:
         take = _photographs if source.is_dir() else _frames
@@ -181,8 +183,8 @@ def _take(folder, file, target):
         return facts | {"reason": f"is no image of a known kind ({', '.join(FORMATS)})"}
     except Exception as error:  # decoders meet broken bytes with whatever comes up
         return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
-    facts |= _look(upright)
     has_alpha = upright.has_transparency_data
+    facts |= _look(upright) | {"uniform": not has_alpha and _is_uniform(upright)}
     suffix = COPIED[image.format] if is_copied else ".png" if has_alpha else ".jpg"
     facts["name"] = target.name + suffix
     with atomic_file(target.with_name(facts["name"])) as copy:
@@ -231,7 +233,7 @@ def _frames(video, images):
         with atomic_file(images / name) as file:
             image.save(file, "JPEG", **QUALITY)
         facts = {"name": name, "source": f"frame {number}", "lens": "video", "focal": None}
-        yield _look(image) | facts
+        yield _look(image) | {"uniform": _is_uniform(image)} | facts
 
 
 def _sharpest(video):
@@ -289,6 +291,13 @@ def _look(image):
     sharpness = float(cv2.Laplacian(np.array(gray), cv2.CV_64F).var())
     small = np.array(gray.resize((SMALL, SMALL), Image.Resampling.BOX), np.float32)
     return {"sharpness": round(sharpness, 2), "size": image.size, "small": small}
+
+
+def _is_uniform(image):
+    """Whether the border of an image shows one colour, that of what is behind the object."""
+    small = image.convert("RGB")
+    small.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
+    return is_uniform(np.array(small))
 
 
 def _leave_out(found):

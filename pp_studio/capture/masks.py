@@ -14,13 +14,12 @@ from scipy.ndimage import binary_fill_holes
 from skimage.measure import label
 from skimage.segmentation import find_boundaries
 
-from pp_cl import Config, track
+from pp_cl import track
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, few_names, shown
 from pp_cl.files import atomic_folder, contact_sheet, read_mask, read_rgba, write_png
 from pp_cl.scene import (
     ImageFile,
-    cut_out,
     disagreements,
     named_mask,
     read_mask_of_size,
@@ -28,13 +27,14 @@ from pp_cl.scene import (
 )
 from pp_studio.capture import cut
 from pp_studio.capture.packages import needed
+from pp_studio.capture.uniform import uniform_mask
 
 cv2 = needed("cv2")
 
 OPAQUE = (".jpg", ".jpeg")  # files that have no alpha need not be read for it
-KEYED_SIDE = 1600  # pixels of what a uniform background is told from
-UNIFORM = 0.9  # of a photograph's border, and of the photographs, that show the background alone
-SPOT = 0.5  # of a region that a mask encloses, behind which others see the object
+GLANCED_SIDE = 640  # pixels of a uniform background that only features are looked for within
+UNIFORM = 0.9  # of the photographs that have a uniform background
+SPOT = 0.9  # of a region that a mask encloses, behind which others see the object
 ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
 CHECKED_SIDE = 200  # pixels of the masks that are compared
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of an image, and their longer side in pixels
@@ -73,7 +73,7 @@ def write_masks(
     masks, which {image} and {mask} stand for. turns: the object turns before a background that
     stands still. grows: whether the box is enlarged where it cuts off what is cut out. Raises
     UserError for masks that are given and missing or broken, a program that fails, a box in which
-    nothing is seen.
+    nothing is seen, an object of the colour of its uniform background.
     """
     words = None if command is None else program_words(command)
     (scene / "masks").mkdir(exist_ok=True)
@@ -191,15 +191,24 @@ def _window(scene, image_file, box):
 def _uniform(scene, image_files, windows, box, points):
     """Write the masks of photographs where nearly all have a uniform background; their number."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
+    held = {}  # of each mask, whether it holds the points of the object that its view shows
     with_holes = len(windows) * cut.FORGIVEN >= 1  # as one that is a spot has one view against it
     found = {}
     for i in left:
         mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
         if mask is not None:
             mask, (_, rows, columns) = mask > 127, windows[i].inside(points[i])
-            held = mask[rows, columns].mean() if len(rows) else mask.any()
-            found |= {i: mask} if held >= ON_MASK else {}
+            # features of thin parts lie in gaps between them, too
+            held[i] = (
+                binary_fill_holes(mask)[rows, columns] if len(rows) else np.array([mask.any()])
+            )
+            found |= {i: mask} if held[i].mean() >= ON_MASK else {}
     if len(found) < UNIFORM * len(left):
+        if len(held) >= UNIFORM * len(left) and np.concatenate([*held.values()]).mean() < ON_MASK:
+            raise UserError(
+                f"{scene}: what is behind the object has one colour, and so have parts of"
+                " it; take the photographs before another colour, or give masks with --masks"
+            )
         return 0
     for i, mask in found.items():
         windows[i].mask = mask
@@ -220,55 +229,42 @@ def _uniform(scene, image_files, windows, box, points):
 
 def _spots(windows, numbers, box):
     """{number of a window: (H, W) bool, holes of its mask where other views see the object}."""
-    hull, *_, voxel_size = cut.forgiving_hull([one for one in windows if one.mask is not None], box)
+    masked = [one for one in windows if one.mask is not None]
+    hull, rejections, _, voxel_size = cut.forgiving_hull(masked, box)
     found = {}
     for i in numbers:
         one = windows[i]
         regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
-        held = cut.silhouette(one, hull, cut.gap_of(one, hull, voxel_size))
+        # behind a gap all is rejected by views beside this, too
+        shown, rows, columns = one.inside(hull)
+        others = rejections[shown] - ~one.mask[rows, columns]
+        held = cut.silhouette(one, hull[shown[others == 0]], cut.gap_of(one, hull, voxel_size))
         is_spot = np.bincount(regions.ravel(), held.ravel()) > SPOT * np.bincount(regions.ravel())
         is_spot[0] = False
         found[i] = cut.dilated(is_spot[regions], 1)
     return found
 
 
-def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
-    """(H, W) uint8 mask of a photograph (H, W, 3 or 4), None where its border shows more than one
-    colour. with_holes: as cut_out() takes it.
-    """
-    height, width = image.shape[:2]
-    scale = min(1, KEYED_SIDE / max(height, width))
-    size = max(1, round(scale * width)), max(1, round(scale * height))
-    small = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    try:
-        mask = cut_out(small, name, Config().scene.mask_tolerance, with_holes)[..., 3]
-    except UserError:
-        return None
-    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    return cv2.resize(mask, (width, height)) if (border < 128).mean() >= UNIFORM else None
-
-
-def write_inside(frames: Path, names: Sequence[str], folder: Path, is_turntable: bool) -> None:
+def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: bool) -> None:
     """Write to the new folder NAME.png, 8-bit gray, of each photograph, white where it shows the
-    object by its alpha, which may hide a wall, or on a turntable by its uniform background; of a
-    turntable none where one of them is not uniform.
+    object: by its alpha, which may hide a wall, or by its uniform background, if nearly all have
+    one; all white where neither is there. Nothing where no photograph has either.
     """
     with atomic_folder(folder) as unfinished:
-        for name in names:
-            if name.lower().endswith(OPAQUE) and not is_turntable:
-                continue
-            image = read_rgba(frames / name)
-            alpha, mask = image[..., 3], None
+        left = list(names)
+        for name in (one for one in names if not one.lower().endswith(OPAQUE)):
+            alpha = read_rgba(frames / name)[..., 3]
             if (alpha < 255).any():
-                mask = np.where(alpha > 127, np.uint8(255), np.uint8(0))
-            elif is_turntable:
-                mask = uniform_mask(image, name)
-            if mask is not None:
-                write_png(unfinished / f"{name}.png", mask)
-            elif is_turntable:
-                for file in unfinished.iterdir():
-                    file.unlink()
-                return
+                write_png(unfinished / f"{name}.png", np.where(alpha > 127, np.uint8(255), 0))
+                left.remove(name)
+        if len(left) == len(names) and not is_uniform:
+            return
+        for name in track(left, "backgrounds", "image"):
+            image = read_rgba(frames / name)
+            image = shrink(image, fitting_downscale(image.shape[:2], GLANCED_SIDE))
+            mask = uniform_mask(image, name) if is_uniform else None
+            mask = np.full(image.shape[:2], 255, np.uint8) if mask is None else mask
+            write_png(unfinished / f"{name}.png", mask)
 
 
 def outline_sheet(

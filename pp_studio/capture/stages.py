@@ -56,7 +56,7 @@ CHANGING = (*LEFT["features"][1:], *LEFT["matches"])  # in place
 # {option: (the stage that depends on it, what it is where it is not given)}
 OPTIONS: dict[str, tuple[str, Any]] = {
     "source": ("frames", None),
-    "turntable": ("features", False),
+    "turntable": ("matches", False),
     "box": ("box", None),
     "masks": ("masks", None),
     "mask_command": ("masks", None),
@@ -235,14 +235,16 @@ class Capture:
         shown = [shrink(one, fitting_downscale(one.shape[:2], masks.SHOWN_SIZE)) for one in shown]
         write_png(self._file("frames", ".png"), contact_sheet(shown, names))
         left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
-        return {"line": f"{len(found['images'])} images{_but(left_out, 'left out')}", **found}
+        line = f"{len(found['images'])} images{_but(left_out, 'left out')}"
+        if _is_uniform(found["images"]):
+            line += "; the background is uniform: colour tells the object from it"
+        return {"line": line, **found}
 
     def _features(self):
         taken, folder = self._found("frames")["images"], self.work / "inside"
         if not (folder.is_dir() and any(folder.iterdir())):  # else it was stopped, and goes on
-            masks.write_inside(
-                self.frames, [one["name"] for one in taken], folder, self.options["turntable"]
-            )
+            names = [one["name"] for one in taken]
+            masks.write_inside(self.frames, names, folder, _is_uniform(taken))
         inside = folder if folder.is_dir() and any(folder.iterdir()) else None
         counts = isolated(
             self.work, features.find_features, self.database, self.frames, taken, inside
@@ -255,9 +257,10 @@ class Capture:
             isolated(self.work, features.forget_matches, self.database)
             begun.unlink()
         pairs = isolated(self.work, features.match, self.database)
-        turns = isolated(self.work, features.remove_still, self.database, begun, turntable)
         line = f"{pairs} pairs of images"
-        if turns:
+        if _is_uniform(self._found("frames")["images"]):  # it has no features that stand still
+            turns, line = True, f"{line}, all of the object: placed as on a turntable"
+        elif turns := isolated(self.work, features.remove_still, self.database, begun, turntable):
             line += "; the object turns before a background that stands still, which is left out"
         return {"line": line, "turns": turns}
 
@@ -369,6 +372,11 @@ class Capture:
             return model, edited
         grown = self._found("masks").get("box") if self._is_done("masks") else None
         return model, np.array(grown or found["box"])
+
+
+def _is_uniform(taken):
+    """Whether nearly all images have a uniform background, by take_images()."""
+    return float(np.mean([one.get("uniform", False) for one in taken])) >= masks.UNIFORM
 
 
 def _size(corners):

@@ -14,13 +14,13 @@ from support.runs import spoken
 from pp_cl.cli import main
 from pp_cl.drivers import open_device
 from pp_cl.engine.camera import Camera
-from pp_cl.files.image import read_rgba, to_8bit, write_png
+from pp_cl.files.image import read_mask, read_rgba, to_8bit, write_png
 from pp_cl.scene.demo import render
 from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.scene.load import load_scene, scene_format, scene_frames
 from pp_studio.capture import poses
 from pp_studio.capture.features import quiet, verification
-from pp_studio.capture.frames import take_images
+from pp_studio.capture.frames import take_images, undistorted_mask
 from pp_studio.video import write_video
 from tools.capture_demo import align, cameras, room
 
@@ -380,25 +380,38 @@ def turned(dev, folder, steps, wall=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wall", [None, 0.8])
-def test_an_object_that_turns(dev, tmp_path, wall):
-    """Its cameras are found though its pattern is that of other steps, too. It is noticed, but for
-    a uniform wall.
-    """
+def test_an_object_that_turns(dev, tmp_path):
+    """Its cameras are found though its pattern is that of other steps, too, and it is noticed."""
     scene = tmp_path / "scene"
-    photographs, masks = turned(dev, tmp_path, range(14), wall)
-    told = ["--turntable"] if wall else []
-    if wall:  # it is only told when it goes on
-        capture(photographs, scene, "--masks", masks)
-        assert not any((scene / "capture/inside").iterdir())
-    assert capture(photographs, scene, "--masks", masks, *told) == (0, [])
-    assert any((scene / "capture/inside").iterdir()) == bool(wall)
+    photographs, masks = turned(dev, tmp_path, range(14))
+    assert capture(photographs, scene, "--masks", masks) == (0, [])
+    assert not any((scene / "capture/inside").iterdir())
     assert found(scene, "matches")["turns"] and found(scene, "poses")["placed"] == 14
     assert off(scene, cameras(SIZE, "turntable")).position < 0.01
     before = found(scene, "matches")["line"]
     (scene / "capture/matches.json").unlink()  # as where it is stopped while matches are removed
-    assert capture(photographs, scene, "--masks", masks, *told) == (0, [])
+    assert capture(photographs, scene, "--masks", masks) == (0, [])
     assert found(scene, "matches")["line"] == before and found(scene, "poses")["placed"] == 14
+
+
+def test_a_film_on_white_is_placed_and_cut_out_by_itself(dev, tmp_path):
+    """Nothing stands out from behind, so that colour decides; that is said."""
+    scene = tmp_path / "scene"
+    photographs, masks = turned(dev, tmp_path, range(14), 1.0)
+    film = [read_rgba(file)[..., :3] for file in sorted(photographs.iterdir())]
+    write_video(tmp_path / "film.mp4", film, 24)
+    assert capture(tmp_path / "film.mp4", scene) == (0, [])
+    assert "the background is uniform" in found(scene, "frames")["line"]
+    assert "as on a turntable" in found(scene, "matches")["line"]
+    assert found(scene, "poses")["placed"] == 14
+    assert "14 before a uniform background" in found(scene, "masks")["line"]
+    shares = []
+    for one in poses.image_files(colmap.Reconstruction(scene / "capture" / "model")):
+        number = int(Path(one.name).stem)
+        true = undistorted_mask(dev, read_mask(masks / f"{number:03d}.png"), one) > 127
+        mask = read_mask(scene / "masks" / f"{number:06d}.png") > 127
+        shares.append((mask & true).sum() / (mask | true).sum())
+    assert np.mean(shares) > 0.95
 
 
 @pytest.mark.slow

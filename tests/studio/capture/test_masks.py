@@ -290,6 +290,18 @@ def test_a_uniform_background_shows_through_gaps(dev, tmp_path):
     assert capture.agreement().min() > 0.9
 
 
+def test_an_object_of_the_backgrounds_colour_is_refused(capture):
+    """Its points say where it is, and its mask would not hold them."""
+    before_a_screen(capture)
+    for one, mask in zip(capture.image_files, capture.truth, strict=True):
+        rgb = np.array(Image.open(capture.folder / one.name))
+        rows, columns = np.nonzero(mask)
+        rgb[rows[: -len(rows) // 3], columns[: -len(rows) // 3]] = SCREEN
+        Image.fromarray(rgb).save(capture.folder / one.name)
+    with pytest.raises(UserError, match="another colour, or give masks with --masks"):
+        capture.write()
+
+
 def test_spots_of_the_backgrounds_colour_are_no_gaps(capture):
     """One on the ball is seen from a few sides, but the others see the ball behind it."""
     before_a_screen(capture)
