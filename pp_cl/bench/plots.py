@@ -55,8 +55,10 @@ def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
     frontier.measured(): a curve for each knob through the default, and the frontier; write the
     matplotlib figure, and return it.
     """
+    from matplotlib import rcParams
     from matplotlib.figure import Figure
 
+    ink = rcParams["text.color"]
     figure = Figure(figsize=(13, 7), layout="constrained")
     figure.suptitle(title)
     left, right = figure.subplots(1, 2)
@@ -84,8 +86,8 @@ def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
             if some and knob in CURVES:
                 some = sorted([*some, default], key=lambda row: row["setting"][knob])
             draw(some, "o-" if knob in CURVES else "D", label=name if some else None)
-        draw([default], "k*", markersize=14, label="default", zorder=3)
-    draw(front, "k--", alpha=0.5, label="frontier")  # on the right
+        draw([default], "*", color=ink, markersize=14, label="default", zorder=3)
+    draw(front, "--", color=ink, alpha=0.5, label="frontier")  # on the right
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())

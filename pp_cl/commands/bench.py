@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="all",
         type=_what,
         metavar="|".join(("RUN", *OPTIONS)),
-        help="RUN: the folder of a finished run, rendered at settings that trade time for error;"
+        help="RUN: a finished run, by settings that trade time for error;"
         " all (default): each of the others at small sizes; conv: every layer of the network;"
         " unet: all of it; raster: points; train: the last steps of a training",
     )
@@ -61,8 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scene",
         metavar="SCENE",
         help="what is timed. raster: made points, grid (discs on a grid, the default) or pulsar"
-        " (Pulsar's spheres); train: the folder of a scene, or the word demo (default); of a run:"
-        " where its scene is now, if it has moved",
+        " (Pulsar's spheres); train: the folder of a scene, or the word demo (default); of a"
+        " run: where its scene is now",
     )
     add(
         "--points",

@@ -27,8 +27,8 @@ MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews, frontier (what bench.frontier has
-    measured): paths in it, which need not exist.
+    """path: the folder; config, checkpoint, log, previews, frontier (of `pp-cl bench RUN`): paths
+    in it, which need not exist.
     """
 
     def __init__(self, path: Path | str) -> None:
