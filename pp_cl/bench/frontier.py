@@ -152,6 +152,7 @@ def visibility(run: Run) -> np.ndarray:
         drawn = renderer.forward(camera, run.gamma, until="weights")
         renderer.record_weights(drawn, weight, seen)
         del drawn  # else its arrays would stay beside the larger ones of the next view
+    renderer.release()
     return dev.download(weight)
 
 
@@ -332,8 +333,7 @@ def fastest(run: Run) -> tuple[Run, str]:
     bench RUN` does, and kept in the run's folder. Raises UserError as measured() does.
     """
     renderings = Renderings(run)
-    kept = _kept(renderings) or _chosen(renderings, measured(run))
-    setting, line = kept
+    setting, line = _kept(renderings) or _chosen(renderings, measured(run))
     return (run if setting == renderings.default else renderings.varied(setting)), line
 
 

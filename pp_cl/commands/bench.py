@@ -128,7 +128,7 @@ def _bench_run(options):
     from pp_cl.run import load
 
     run = load(options.what, options.device, scene=options.scene)
-    result = measured(run, options.metrics or ("psnr",))
+    result = measured(run, ("psnr", *(name for name in options.metrics or () if name != "psnr")))
     rows, where = result["rows"], f"{run.folder}, {result['views']} views"
     print(f"{where}; {result['device']} [{result['platform']}]\n{HEAD}")
     print("\n".join(map(line, rows)))
