@@ -44,8 +44,8 @@ MOST_KEPT = 2**20  # bytes of the file; a row takes some 600
 class Setting:
     """How a run is rendered.
 
-    early_stop: of raster. samples: of a pixel, 1 or 4. points: share that is kept, of the highest
-    blend weight in a training view. specular: whether that layer is applied. members: of how many
+    early_stop: of raster. samples: of a pixel, 1 or 4. points: share that is kept, those of the
+    highest visibility(). specular: whether that layer is applied. members: of how many
     the mean is shown. convolutions: what computes them, of choice.VARIANTS or AUTO.
     """
 
@@ -119,9 +119,7 @@ class Renderings:
 
     @cached_property
     def _ranked(self):
-        """Of each member, its points by the highest blend weight that they have in a training view,
-        highest first.
-        """
+        """Of each member, its points by visibility(), the highest first."""
         return [np.argsort(-visibility(one), kind="stable") for one in self._members]
 
     def words(self, setting: Setting) -> str:
@@ -143,17 +141,20 @@ class Renderings:
 
 
 def visibility(run: Run) -> np.ndarray:
-    """(N,) float32: the highest sum over an image's pixels of each point's blend weights, of all
-    training views.
+    """(N,) float64: the sum of each point's blend weights over the pixels of all training views.
+    Leaving out a fifth of the points by it costs the demo 1.1 dB, by the highest sum of one view
+    1.6 dB.
     """
     dev, renderer, n = run.dev, run.renderer, run.model.cloud.count
-    weight, seen = dev.zeros((n,)), dev.zeros((n,))
+    weight, seen, total = dev.zeros((n,)), dev.zeros((n,)), np.zeros(n)
     for camera in run.cameras("train"):
         drawn = renderer.forward(camera, run.gamma, until="weights")
+        dev.fill(weight, 0)
         renderer.record_weights(drawn, weight, seen)
+        total += dev.download(weight)
         del drawn  # else its arrays would stay beside the larger ones of the next view
     renderer.release()
-    return dev.download(weight)
+    return total
 
 
 # ---- measuring

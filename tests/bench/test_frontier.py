@@ -8,9 +8,10 @@ from support.runs import train_and_interrupt
 
 from pp_cl import fastest
 from pp_cl.bench import frontier
-from pp_cl.bench.frontier import Renderings, fastest_row, frame, measured
+from pp_cl.bench.frontier import Renderings, fastest_row, frame, measured, visibility
 from pp_cl.bench.plots import plot_frontier
 from pp_cl.cli import main
+from pp_cl.engine.raster.weights import listed_fragments
 from pp_cl.errors import UserError
 from pp_cl.evaluate import evaluate_run
 from pp_cl.run import load
@@ -157,6 +158,15 @@ def test_each_setting_changes_what_it_says(run, dev):
         assert varied.renderer.supersampling**2 == setting.samples
         assert varied.model.net.variant == setting.convolutions
         assert varied.model.cloud.count == round(setting.points * run.model.cloud.count)
+
+
+def test_visibility_is_the_sum_of_the_blend_weights(run):
+    expected = np.zeros(run.model.cloud.count)
+    for camera in run.cameras("train"):
+        drawn = run.renderer.forward(camera, run.gamma, until="weights")
+        _, point, weight = listed_fragments(drawn.pairs, drawn.weights)
+        np.add.at(expected, point, weight)
+    np.testing.assert_allclose(visibility(run), expected, rtol=1e-5)
 
 
 def test_members_are_dropped_one_after_the_other(run, dev):
