@@ -56,6 +56,44 @@ class Run:
         supersampling = supersampling_at(self._last_step, self.config.train)
         return Renderer(self.dev, self.model, self.config.raster, supersampling)
 
+    def varied(
+        self,
+        *,
+        rows: np.ndarray | None = None,
+        early_stop: float | None = None,
+        supersampling: int | None = None,
+        has_specular: bool = True,
+        net: UNet | None = None,
+        others: Sequence["Run"] | None = None,
+    ) -> "Run":
+        """A run that shows the same but for what is given. rows: (M,) uint32, ascending, its only
+        points. early_stop: of raster. supersampling: of Renderer. has_specular: whether the
+        specular layer is applied, where there is one. net: computes the same by other kernels.
+        others: in place of the further members.
+        """
+        dev, model, raster = self.dev, self.model, self.config.raster
+        cloud = model.cloud if rows is None else model.cloud.rows(dev, dev.upload(rows))
+        if early_stop is not None:
+            raster = replace(raster, early_stop=early_stop)
+        shown = Model(
+            dev,
+            model.grid,
+            model.depth_range,
+            cloud,
+            net=net or model.net,
+            specular=model.specular if has_specular else None,
+        )
+        members = self.others if others is None else [*others]
+        config = replace(self.config, raster=raster)
+        found = replace(self, model=shown, config=config, others=members)
+        # what a member shows of a view does not depend on which points are left out
+        found.ball = self.ball
+        samples = supersampling or self.renderer.supersampling
+        found.renderer = Renderer(dev, shown, raster, samples)
+        if net:
+            net.freeze()
+        return found
+
     @property
     def _last_step(self):
         # the settings of a finished run that is extended say where it goes, not where it is

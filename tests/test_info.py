@@ -12,7 +12,11 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.engine.network.layers import multiplications
+from pp_cl.engine.raster.weights import listed_fragments
+from pp_cl.engine.views import evenly
 from pp_cl.files.image import read_rgba
+from pp_cl.run import load
 from pp_cl.scene.outline import OUTLINE
 
 BALL = 0.8  # its radius, support.scenes
@@ -40,10 +44,20 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
     log = [json.loads(line) for line in (finished / "log.jsonl").read_text().splitlines()]
     assert found["preset"] == "tiny" and found["scene"] == scene and found["downscale"] == 2
     assert (found["step"], found["iterations"], found["finished"]) == (60, 60, True)
-    assert found["points"] == {
-        "initial": header["initial_points"],
-        "left": len(arrays["points.ids"]),
+    initial, left = header["initial_points"], len(arrays["points.ids"])
+    pruned = found["points"].pop("pruned")
+    assert found["points"] == {"initial": initial, "left": left}
+    assert sorted(pruned, reverse=True) == pruned and pruned[-1] == left and pruned[0] < initial
+    whole, size = math.prod(header["grid"]["dims"]), (finished / "checkpoint.npz").stat().st_size
+    bytes_of_point = 4 + 4 * 4 + 4 * 9 + 2 * 9 * 16
+    assert found["cells"] == {
+        "box": whole,
+        "hull": initial,
+        "left": left,
+        "checkpoint_bytes": size,
+        "box_bytes": size + (whole - left) * bytes_of_point,
     }
+    assert found["work"] is None
     assert found["grid"]["dims"] == header["grid"]["dims"]
     # 24 pixels across, angle of view 0.7, from a distance of 4
     pixels = 12 / math.tan(0.35) * header["grid"]["voxel_size"] / 4
@@ -58,6 +72,29 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
         "blocks": "single",
         "parameters": parameters,
     }
+
+
+def test_work_is_what_a_view_and_a_step_compute(finished, facts, capsys, dev):
+    found = facts(finished, "--work")["work"]
+    run = load(finished, dev)
+    counted = []
+    for camera in evenly(run.cameras("train"), 8):
+        result = run.renderer.forward(camera, run.gamma, until="weights")
+        dropped = result.fragments().sum() - listed_fragments(result.pairs, result.weights)[0].sum()
+        counted.append([result.fragments().sum(), dropped, len(result.weights.visible)])
+    fragments, dropped, drawn = np.mean(counted, 0)
+    assert found["views"] == 8 and found["drawn"] == drawn
+    assert found["fragments"] == {"found": fragments, "blended": fragments - dropped}
+    # crops are as large as these images, and no fragment is without gradients
+    step = {"side": 24, "touched": drawn, "with_gradients": fragments - dropped}
+    assert found["step"] == step and 0 < dropped < fragments
+    network = found["network"]
+    assert 0 < network["tiles"] < 1 and network["whole"] == network["multiplications"]
+    assert network["whole"] == multiplications(run.model.net.layers, 24, 24)
+    assert main(["info", str(finished), "--work"]) == 0
+    text = capsys.readouterr().out
+    assert f"{fragments:.0f} fragments, {1 - dropped / fragments:.1%} of them blended" in text
+    assert "--work: only of a run" in failure("info", "demo", "--work")
 
 
 def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, monkeypatch):

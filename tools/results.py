@@ -29,6 +29,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from pp_cl.bench.plots import plot_frontier
+from pp_cl.commands.info import MIB
 from pp_cl.drivers import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -186,6 +188,18 @@ STABILITY = [
     {"head": "gives", "cell": "{naive}"},
     {"head": "ours", "cell": "{error}"},
     {"head": "bound", "cell": "{bound}"},
+]
+# what of a scene runs compute, and of whose views time is drawn against error: trainings' parts
+WORKED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_15000": "lego 800x800"}
+TRADED = "lego_8000"
+WORK = [
+    {"head": "run", "cell": "{name}"},
+    {"head": "cells of the box", "cell": "{box:,}"},
+    {"head": "in the hull, with a point", "cell": "{hull:.1%}, {left:.1%}"},
+    {"head": "checkpoint; with all cells", "cell": "{stored:.0f} MiB; {whole:.0f} MiB"},
+    {"head": "fragments a view, blended", "cell": "{fragments:,.0f}, {blended:.0%}"},
+    {"head": "network of a whole image's", "cell": "{computed:.0%}"},
+    {"head": "points drawn, with gradients in a step", "cell": "{drawn:.0%}, {touched:.0%}"},
 ]
 DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
 
@@ -346,6 +360,37 @@ def stability(store: Path) -> list[dict]:
     return rows
 
 
+def work(store: Path) -> list[dict]:
+    """Rows of WORK."""
+    rows = []
+    for name, label in WORKED.items():
+        found = read_found(store, *PP_CL, "info", store / name, "--work")
+        cells, counted = found["cells"], found["work"]
+        fragments, network = counted["fragments"], counted["network"]
+        rows.append(
+            {
+                "name": label,
+                "box": cells["box"],
+                "hull": cells["hull"] / cells["box"],
+                "left": cells["left"] / cells["box"],
+                "stored": cells["checkpoint_bytes"] / MIB,
+                "whole": cells["box_bytes"] / MIB,
+                "fragments": fragments["found"],
+                "blended": fragments["blended"] / fragments["found"],
+                "computed": network["multiplications"] / network["whole"],
+                "drawn": counted["drawn"] / cells["left"],
+                "touched": counted["step"]["touched"] / cells["left"],
+            }
+        )
+    return rows
+
+
+def frontier(store: Path) -> list[dict]:
+    """Rows of `pp-cl bench RUN`."""
+    scene = ("--scene", scene_of(LEGO))
+    return read_found(store, *PP_CL, "bench", store / TRADED, *scene)["rows"]
+
+
 PARTS: dict[str, Callable[[Path], Found]] = {
     **{key_of(training): partial(train, training) for training in (*TRAININGS, *CURVES)},
     "demo": demo,
@@ -355,6 +400,8 @@ PARTS: dict[str, Callable[[Path], Found]] = {
     "memory": memory,
     "splats": splats,
     "stability": stability,
+    "work": work,
+    "frontier": frontier,
 }
 
 
@@ -458,22 +505,23 @@ def trained(found: dict[str, Found], trainings: list[Training]) -> list[dict]:
 
 
 def timed(found: dict[str, Found]) -> list[dict]:
-    """What plot_speed() draws."""
-    raster = (
-        {"label": f"rasteriser, {r['blend']}", "ms": r["ms"], "error": r["max_err"]}
-        for r in found["rasteriser"]
-    )
-    # of the same network as PyTorch's
-    net = (
-        {"label": f"network, {r['variant']}", "ms": r["forward_ours_ms"], "error": r["rel_l2"]}
-        for r in found["pytorch"]
-    )
-    torch = (
-        {"label": "network, PyTorch", "ms": r["forward_torch_ms"], "error": r["torch_rel_l2"]}
-        for r in found["pytorch"]
-        if r["variant"] == "direct"
-    )
-    return [*raster, *net, *torch]
+    """What plot_speed() draws: {"panel", "kind", "label", "ms", "error"}."""
+    rows: list[dict] = []
+    for r in found["rasteriser"]:
+        points = f"{r['points'] / 1e6:.2g} M" if r["points"] >= 1e6 else f"{r['points'] // 1000} k"
+        label = f"{r['scene']}, {points} points,\n{r['size']}x{r['size']} pixels"
+        own = {"panel": "rasteriser", "kind": r["blend"], "label": label}
+        rows.append(own | {"ms": r["ms"], "error": r["max_err"]})
+    for r in found["pytorch"]:  # of the same network
+        widths, side = r["widths"].replace(",", ", "), r["size"]
+        panel = {"panel": f"network of {widths} channels, {side}x{side}"}
+        ratio, ours = r["forward_ratio"], {"ms": r["forward_ours_ms"], "error": r["rel_l2"]}
+        label = f"pp-cl, {r['variant']}\n({ratio:.2f} times PyTorch's speed)"
+        rows.append(panel | ours | {"kind": r["variant"], "label": label})
+        if r["variant"] == "direct":
+            torch = {"ms": r["forward_torch_ms"], "error": r["torch_rel_l2"]}
+            rows.append(panel | torch | {"kind": "PyTorch", "label": "PyTorch"})
+    return rows
 
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
@@ -501,6 +549,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
         "demo": ("runs of the demo", DEMO),
         "splats": (fitted, SPLATS),
         "stability": ("errors against float64", STABILITY),
+        "work": ("what runs compute; means over eight training views", WORK),
     }
     return {
         name: {"measured": measured, "columns": columns, "rows": rows[name]}
@@ -509,23 +558,22 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     }
 
 
-def draw(curves: list[dict], timed: list[dict], machine: str, folder: Path) -> None:
-    """quality.png and speed.png, and the same for dark pages."""
+def draw(found: dict[str, Found], machine: str, folder: Path) -> None:
+    """quality.png, speed.png and frontier.png, and the same for dark pages."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
     for suffix, look in (("", "default"), ("_dark", "dark_background")):
         with style.context(look):
             figure = Figure(figsize=(11, 4), layout="constrained")
-            plot_quality(figure, curves)
+            plot_quality(figure, trained(found, CURVES))
             figure.supxlabel(f"minutes of training on {machine}", fontsize=9)
             figure.savefig(folder / f"quality{suffix}.png", dpi=120)
-            figure = Figure(figsize=(8, 4), layout="constrained")
-            axes = figure.subplots()
-            plot_speed(axes, timed)
-            axes.grid(alpha=0.3)
-            figure.legend(loc="outside upper center", ncols=5, fontsize=8)
+            figure = Figure(figsize=(13, 4), layout="constrained")
+            plot_speed(figure, timed(found))
             figure.savefig(folder / f"speed{suffix}.png", dpi=120)
+            title = f"{WORKED[TRADED]}, on {machine}"
+            plot_frontier(found["frontier"], str(folder / f"frontier{suffix}.png"), title)
 
 
 def plot_quality(figure: "Figure", rows: list[dict]) -> None:
@@ -564,13 +612,29 @@ def plot_quality(figure: "Figure", rows: list[dict]) -> None:
     figure.supylabel("PSNR of test views, dB", fontsize=9)
 
 
-def plot_speed(axes: "Axes", timed: list[dict]) -> None:
-    """Time against error, a colour for each variant. timed: {"label", "ms", "error"}."""
-    axes.set(xscale="log", yscale="log", xlabel="milliseconds", ylabel="error against float64")
-    for i, label in enumerate(dict.fromkeys(row["label"] for row in timed)):
-        some = [row for row in timed if row["label"] == label]
-        axes.plot([r["ms"] for r in some], [r["error"] for r in some], "os^Dv"[i % 5], label=label)
-    label_logarithmic(axes)
+def plot_speed(figure: "Figure", timed: list[dict]) -> None:
+    """Time against error, a panel for the rasteriser and each network, each point with its name."""
+    names = dict.fromkeys(row["panel"] for row in timed)
+    panels = figure.subplots(1, len(names))
+    for axes, name in zip(panels, names, strict=True):
+        rows = [row for row in timed if row["panel"] == name]
+        axes.set_title(name, fontsize=10)
+        axes.set(xlabel="milliseconds", ylabel="error against float64")
+        most_ms, most_error = (max(row[key] for row in rows) for key in ("ms", "error"))
+        if name == "rasteriser":
+            axes.set(xscale="log", yscale="log")
+            label_logarithmic(axes)
+            axes.margins(0.25)
+        else:
+            axes.set(xlim=(0, 1.3 * most_ms), ylim=(0, 1.3 * most_error))
+        for i, kind in enumerate(dict.fromkeys(row["kind"] for row in rows)):
+            some = [row for row in rows if row["kind"] == kind]
+            axes.plot([r["ms"] for r in some], [r["error"] for r in some], "os^"[i], label=kind)
+        for row in rows:
+            place = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
+            axes.annotate(row["label"], (row["ms"], row["error"]), fontsize=7, **place)
+        axes.grid(alpha=0.3)
+    panels[0].legend(fontsize=8, loc="center right")
 
 
 def label_logarithmic(axes: "Axes") -> None:
@@ -608,7 +672,7 @@ def main() -> int:
         if options.kind or found.keys() >= OF_TABLE.get(name, {name}):
             write_json(folder / f"{name}.json", about | contents)
     if found.keys() == PARTS.keys() and not options.kind:
-        draw(trained(found, CURVES), timed(found), about["machine"], ROOT / "docs")
+        draw(found, about["machine"], ROOT / "docs")
     return 0
 
 

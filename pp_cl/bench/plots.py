@@ -1,4 +1,4 @@
-"""The plot of the benches; matplotlib is an extra."""
+"""The plots of the benches; matplotlib is an extra."""
 
 from pathlib import Path
 from typing import Any
@@ -6,6 +6,22 @@ from typing import Any
 from pp_cl.files.atomic import atomic_file
 
 LEAST_ERROR = 1e-9  # an error of 0 has no logarithm: drawn there, far below float32's
+
+
+# Of a run's renderings: mean errors below a thousandth of a step of 8 bits are drawn there, and
+# PSNR this many dB below the default's and above it.
+LEAST_SEEN, BELOW, ABOVE = 4e-6, 4.0, 0.3
+# {knob of a row: its name, and how its values are written}
+KNOBS = {
+    "early_stop": ("early stop", "{:g}"),
+    "samples": ("samples a pixel", "{}"),
+    "points": ("points kept, by visibility", "{:.0%}"),
+    "specular": ("specular layer off", ""),
+    "members": ("members", "{}"),
+    "convolutions": ("convolutions", "{}"),
+    "together": ("several of these", ""),
+}
+CURVES = ("early_stop", "samples", "points", "members")  # those whose values have an order
 
 
 def plot_time_and_error(rows: list[dict], path: str, title: str = "") -> Any:
@@ -29,6 +45,50 @@ def plot_time_and_error(rows: list[dict], path: str, title: str = "") -> Any:
         axes.plot([row["ms"] for row in some], errors, marker, label=label)
     axes.grid(True, which="both", alpha=0.3)
     axes.legend(fontsize="small")
+    with atomic_file(path) as file:
+        figure.savefig(file, format=Path(path).suffix[1:].lower())
+    return figure
+
+
+def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
+    """Draw the milliseconds of a frame against the mean error and against PSNR, of the rows of
+    frontier.measured(): a curve for each knob through the default, and the frontier; write the
+    matplotlib figure, and return it.
+    """
+    from matplotlib import rcParams
+    from matplotlib.figure import Figure
+
+    ink = rcParams["text.color"]
+    figure = Figure(figsize=(13, 7), layout="constrained")
+    figure.suptitle(title)
+    left, right = figure.subplots(1, 2)
+    left.set(ylabel="mean error against the exact rendering (colours in 0 to 1)", yscale="log")
+    right.set(ylabel="PSNR against the photographs, dB")
+    (default,) = (row for row in rows if row["is_default"])
+    front = sorted((row for row in rows if row["is_frontier"]), key=lambda row: row["ms"])
+    right.set_ylim(default["psnr"] - BELOW, default["psnr"] + ABOVE)
+
+    def error(row):
+        return max(row["mean_err"], LEAST_SEEN)
+
+    for axes, value in (left, error), (right, lambda row: row["psnr"]):
+        axes.set(xlabel="milliseconds a frame", xlim=(0, 1.1 * max(row["ms"] for row in rows)))
+        axes.grid(True, which="both", alpha=0.3)
+
+        def draw(some, *style, axes=axes, value=value, **options):
+            axes.plot([row["ms"] for row in some], [*map(value, some)], *style, **options)
+
+        for knob, (name, form) in KNOBS.items():
+            some = [row for row in rows if row["knob"] == knob]
+            for row in some if form else ():
+                words, place = form.format(row["setting"][knob]), (row["ms"], value(row))
+                axes.annotate(words, place, fontsize="x-small", clip_on=True)
+            if some and knob in CURVES:
+                some = sorted([*some, default], key=lambda row: row["setting"][knob])
+            draw(some, "o-" if knob in CURVES else "D", label=name if some else None)
+        draw([default], "*", color=ink, markersize=14, label="default", zorder=3)
+    draw(front, "--", color=ink, alpha=0.5, label="frontier")  # on the right
+    figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())
     return figure

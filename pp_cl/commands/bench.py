@@ -1,14 +1,17 @@
-"""`pp-cl bench`: time and error of convolutions, network, rasteriser and training steps."""
+"""`pp-cl bench`: time and error of a run's renderings, and of convolutions, network, rasteriser and
+training steps.
+"""
 
 import argparse
+import os
 from itertools import chain
 from typing import Any
 
 from pp_cl.commands import options as shared
-from pp_cl.errors import UserError, require
+from pp_cl.errors import UserError, quoted, require, suggestion
 from pp_cl.settings import BLOCKS
 
-HELP = "time against error of the convolutions, the network, the rasteriser, a training"
+HELP = "time against error of a run's renderings, or of the kernels and a training"
 # the options that only some benches have
 OPTIONS = {
     "conv": ("size", "widths", "blocks", "plot"),
@@ -17,6 +20,7 @@ OPTIONS = {
     "train": ("scene", "points", "widths"),
     "all": ("plot",),
 }
+OF_RUN = ("scene", "metrics", "plot")  # those of a run
 # what `all` measures: about two minutes on two cores
 SMALL: dict[str, dict[str, Any]] = {
     "conv": {"size": [128], "widths": (32, 64, 128)},
@@ -34,8 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "what",
         nargs="?",
         default="all",
-        choices=OPTIONS,
-        help="all (default): each of the others at small sizes; conv: every layer of the network;"
+        type=_what,
+        metavar="|".join(("RUN", *OPTIONS)),
+        help="RUN: a finished run, by settings that trade time for error;"
+        " all (default): each of the others at small sizes; conv: every layer of the network;"
         " unet: all of it; raster: points; train: the last steps of a training",
     )
     add(
@@ -55,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scene",
         metavar="SCENE",
         help="what is timed. raster: made points, grid (discs on a grid, the default) or pulsar"
-        " (Pulsar's spheres); train: the folder of a scene, or the word demo (default)",
+        " (Pulsar's spheres); train: the folder of a scene, or the word demo (default); of a"
+        " run: where its scene is now",
     )
     add(
         "--points",
@@ -69,6 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="B,...",
         help="raster: of alpha,softmax (both)",
     )
+    shared.add_metrics(parser)
+    parser.set_defaults(metrics=None)  # which only a run has
     shared.add_json(parser, OPTIONS)
     add(
         "--plot",
@@ -87,10 +96,15 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.bench.timing import HEAD, line
     from pp_cl.drivers import open_device
 
-    foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
-    shared.refuse(options, foreign, f"bench {options.what} has no such option")
+    is_run = options.what not in OPTIONS
+    own = OF_RUN if is_run else OPTIONS[options.what]
+    foreign = {"metrics", *chain(*OPTIONS.values())} - {*own}
+    of = "a run" if is_run else options.what
+    shared.refuse(options, foreign, f"bench {of} has no such option")
     if options.plot:
         require("--plot", "matplotlib")
+    if is_run:
+        return _bench_run(options)
     given = {options.what: vars(options)}
     if options.what == "all":
         given = {name: vars(options) | changes for name, changes in SMALL.items()}
@@ -105,6 +119,32 @@ def run(options: argparse.Namespace) -> None:
     shared.write_json_option(options.json, result)
     if options.plot:
         plot_time_and_error(rows, options.plot, dev.name)
+
+
+def _bench_run(options):
+    """run() of a run."""
+    from pp_cl.bench.frontier import HEAD, line, measured
+    from pp_cl.bench.plots import plot_frontier
+    from pp_cl.run import load
+
+    run = load(options.what, options.device, scene=options.scene)
+    result = measured(run, ("psnr", *(name for name in options.metrics or () if name != "psnr")))
+    rows, where = result["rows"], f"{run.folder}, {result['views']} views"
+    print(f"{where}; {result['device']} [{result['platform']}]\n{HEAD}")
+    print("\n".join(map(line, rows)))
+    shared.write_json_option(options.json, result)
+    if options.plot:
+        plot_frontier(rows, options.plot, f"{where}\n{result['device']}")
+
+
+def _what(text):
+    """The type of what is timed: a key of OPTIONS, or the folder of a run."""
+    if text in OPTIONS or os.path.isdir(text):
+        return text
+    near = suggestion(text, OPTIONS)
+    raise UserError(
+        f"{quoted(text)}: {near}choose from {', '.join(OPTIONS)}, or name the folder of a run"
+    )
 
 
 def _prepared(name, options):

@@ -23,6 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="write photographs with outlines of points and masks (PNG)",
     )
+    add(
+        "--work",
+        action="store_true",
+        help="of a run: count in some views what is computed, beside all of a dense grid and image",
+    )
     add("--preset", choices=PRESETS, help="of a scene: preset of the hull (tiny)")
     shared.add_short(parser, MASKS)
     shared.add_set(parser, "of a scene: another setting, such as scene.box")
@@ -34,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     """Print the facts, write the image. Raises UserError for options that do not fit, and of a
     scene whose cameras are wrong.
     """
-    from pp_cl.commands.info_facts import describe_scene, run_facts, run_sheet
+    from pp_cl.commands.info_facts import describe_scene, run_facts, run_sheet, run_work
     from pp_cl.config import nearby_run
     from pp_cl.drivers import open_device
     from pp_cl.files.image import write_png
@@ -46,11 +51,13 @@ def run(options: argparse.Namespace) -> None:
     if folder.config.exists() or is_misspelt:
         shared.refuse(options, (*MASKS, "set", "preset"), "only of a scene")
         facts = run_facts(folder, options.scene)
+        if options.work:
+            facts["work"] = run_work(open_device(options.device), folder)
         if options.picture:
             image = run_sheet(open_device(options.device), folder, options.scene)
         rows = _run_rows(facts)
     else:
-        shared.refuse(options, ("scene",), "only of a run")
+        shared.refuse(options, ("scene", "work"), "only of a run")
         dev = open_device(options.device)
         given = shared.read_short(options, MASKS) + options.set
         preset_name = options.preset or "tiny"
@@ -91,13 +98,17 @@ def _run_rows(facts):
     shape = f"{widths} channels, {network['blocks']} blocks"
     if facts["points"]:
         initial, left = facts["points"]["initial"], facts["points"]["left"]
+        pruned = facts["points"]["pruned"]
+        after = f", after prunings {', '.join(map(str, pruned))}" if pruned else ""
         rows += [
             ("network", f"{shape}, {network['parameters']} parameters"),
             ("views", f"{_sizes(facts['views']['images'])}, kept with their cameras"),
             *(("", note) for note in facts["notes"]),
-            ("points", f"{left} ({initial} at the start)"),
+            ("points", f"{left} ({initial} at the start{after})"),
             ("grid", _grid_text(facts["grid"])),
+            ("cells", _cells_text(facts["cells"])),
         ]
+        rows += _work_rows(facts["work"]) if facts["work"] else []
     else:
         rows += [("network", shape), ("checkpoint", "none yet")]
     values = ", ".join(f"{name} {value:.4f}" for name, value in (facts["metrics"] or {}).items())
@@ -108,6 +119,29 @@ def _run_rows(facts):
         *rows,
         ("test views", f"{values or 'not evaluated yet'}{early}"),
         ("files", f"{files}; {_bytes(sum(facts['files'].values()))} in all"),
+    ]
+
+
+def _cells_text(cells):
+    box, hull, left = (cells[name] for name in ("box", "hull", "left"))
+    return (
+        f"{box} in the box, {hull / box:.1%} of them in the hull, {left / box:.1%} with a point;"
+        f" all of them would make the checkpoint {_bytes(cells['box_bytes'])},"
+        f" not {_bytes(cells['checkpoint_bytes'])}"
+    )
+
+
+def _work_rows(work):
+    fragments, step, network = work["fragments"], work["step"], work["network"]
+    found, done, whole = fragments["found"], network["multiplications"], network["whole"]
+    crop = f"crop of {step['side']} pixels" if step["side"] else "step"
+    share, billions = f"{done / whole:.1%}", f"{whole / 1e9:.2f} billion multiplications"
+    return [
+        ("a view", f"{work['drawn']:.0f} points drawn (means of {work['views']} views)"),
+        ("", f"{found:.0f} fragments, {fragments['blended'] / found:.1%} of them blended"),
+        ("", f"fragments in {network['tiles']:.1%} of the network's tiles, {share} of {billions}"),
+        ("a step", f"{step['touched']:.0f} points with gradients in a {crop}"),
+        ("", f"{step['with_gradients']:.0f} fragments with gradients"),
     ]
 
 

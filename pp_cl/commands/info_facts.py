@@ -1,5 +1,6 @@
 """The facts about a run or a scene that `pp-cl info` prints, as numbers for JSON."""
 
+import itertools
 import math
 import warnings
 from collections import Counter
@@ -13,6 +14,10 @@ from pp_cl.checkpoint import opened_run
 from pp_cl.config import scene_config
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
+from pp_cl.engine.layers.tiles import tiles_with
+from pp_cl.engine.network.layers import multiplications, unet_layers
+from pp_cl.engine.raster.weights import listed_fragments
+from pp_cl.engine.training.schedule import refine_steps
 from pp_cl.engine.views import MASK_THRESHOLD, View, evenly
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
@@ -26,6 +31,8 @@ from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_fr
 from pp_cl.scene.outline import SHOWN_VIEWS, outline_sheet
 from pp_cl.scene.verdict import WrongCameras, judged
 from pp_cl.session.start import first_hull
+
+WORK_VIEWS = 8  # in which run_work() counts
 
 Facts = dict[str, Any]
 Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
@@ -51,6 +58,8 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "notes": [],
         "points": None,
         "grid": None,
+        "cells": None,
+        "work": None,
         "device": last.get("device"),
         "seconds": last.get("seconds"),
         "psnr": next((row["psnr"] for row in reversed(rows) if "psnr" in row), None),
@@ -65,15 +74,82 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
     facts["network"]["parameters"] = sum(sizes)
     image_files, grid = unpacked_views(header["views"]), header["grid"]
+    initial, left = header["initial_points"], forms["points.ids"].shape[0]
+    points = [form for name, form in forms.items() if name.startswith("points.")]
+    of_point = sum(math.prod(form.shape[1:]) * form.dtype.itemsize for form in points)
+    whole, size = math.prod(grid["dims"]), folder.checkpoint.stat().st_size
+    refined = sum(at <= header["step"] for at in refine_steps(config.train))
     cameras = [one.camera.downscaled(config.scene.downscale) for one in image_files]
     return facts | {
         "step": header["step"],
         "finished": header["finished"],
         "notes": header.get("notes", []),
         "views": {"count": len(image_files), "images": _image_sizes(image_files)},
-        "points": {"initial": header["initial_points"], "left": forms["points.ids"].shape[0]},
+        "points": {"initial": initial, "left": left, "pruned": _prunings(rows)},
         "grid": grid | {"voxel_size_pixels": spacing_pixels(Grid.of_header(grid), cameras)},
+        # all of the size that cells have now
+        "cells": {
+            "box": whole,
+            "hull": initial * 8**refined,
+            "left": left,
+            "checkpoint_bytes": size,
+            "box_bytes": size + (whole - left) * of_point,
+        },
     }
+
+
+def _prunings(rows):
+    """How many points each pruning has left, by the rows of a log; refinements are none."""
+    counts = [row["points"] for row in rows if "points" in row]
+    return [after for before, after in itertools.pairwise(counts) if after < before]
+
+
+def run_work(dev: Device, folder: RunFolder) -> Facts:
+    """What is computed for a view of a run and for a step, means over some training views:
+    {"views", "fragments": {"found", "blended"}, "drawn": points; "step": {"side", "touched": points
+    that get gradients, "with_gradients": fragments}, of the crop in the middle of the view, the
+    whole where it is smaller; "network": {"tiles": share with fragments, "multiplications",
+    "whole": those of the whole image}}. Raises UserError as load() does.
+    """
+    run = load(folder.path, dev)
+    renderer, network = run.renderer, run.config.network
+    layers = unet_layers(network.widths, blocks=network.blocks)
+    side, rows = run.config.train.crop, []
+    for camera in evenly(run.cameras("train"), WORK_VIEWS):
+        image = renderer.forward(camera, run.gamma)
+        size, computed = image.size, image.computed_fraction
+        del image  # else its arrays would stay beside those of the next forward()
+        found, blended, drawn, tiles = _counted(
+            renderer.forward(camera, run.gamma, until="weights")
+        )
+        width, height = (min(side or n, n) for n in (camera.width, camera.height))
+        left, top = (camera.width - width) // 2, (camera.height - height) // 2
+        crop = camera.crop(left, top, width, height)
+        step = _counted(renderer.forward(crop, run.gamma, until="weights"))
+        whole = multiplications(layers, *size)
+        rows.append([found, blended, drawn, tiles, *step[1:3], whole * computed, whole])
+    means = np.mean(rows, axis=0).tolist()
+    found, blended, drawn, tiles, with_gradients, touched, done, whole = means
+    return {
+        "views": len(rows),
+        "fragments": {"found": found, "blended": blended},
+        "drawn": drawn,
+        "step": {"side": side, "touched": touched, "with_gradients": with_gradients},
+        "network": {"tiles": tiles, "multiplications": done, "whole": whole},
+    }
+
+
+def _counted(result):
+    """[fragments found, blended before the early stop or tracked, points of these, share of the
+    tiles of pixels with fragments] of a view up to its weights.
+    """
+    pairs, weights = result.pairs, result.weights
+    offset = pairs.pixel_offset.get().astype(np.int64)
+    is_listed, _, _ = listed_fragments(pairs, weights)
+    rank = np.arange(pairs.total) - np.repeat(offset[:-1], np.diff(offset))
+    blended = is_listed & (rank < weights.tracked)
+    covered = tiles_with((np.diff(offset) > 0).reshape(result.size))
+    return [pairs.total, blended.sum(), weights.total.get(), covered.mean()]
 
 
 def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:

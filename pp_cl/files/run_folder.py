@@ -27,7 +27,9 @@ MOST_LEVELS = 4  # of lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews: paths in it, which need not exist."""
+    """path: the folder; config, checkpoint, log, previews, frontier (of `pp-cl bench RUN`): paths
+    in it, which need not exist.
+    """
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
@@ -35,6 +37,7 @@ class RunFolder:
         self.checkpoint = self.path / "checkpoint.npz"
         self.log = self.path / "log.jsonl"
         self.previews = self.path / "previews"
+        self.frontier = self.path / "frontier.json"
 
     def __str__(self) -> str:
         return str(self.path)

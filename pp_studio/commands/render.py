@@ -92,6 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="samples per pixel: 1, 4, 9 or 16",
     )
+    shared.add_fast(parser)
     add("--features", action="store_true", help="exr: also the 16 features of each pixel")
     shared.add_run_scene(parser)
     shared.add_device(parser)
@@ -99,7 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a video of them where one is asked for."""
-    from pp_cl import load
+    from pp_cl import fastest, load
     from pp_cl.files import own
     from pp_studio.export.render_video import render_frames, render_video
     from pp_studio.video import check_video
@@ -109,6 +110,9 @@ def run(options: argparse.Namespace) -> None:
     if kind in VIDEOS:
         check_video(kind)
     run = load(options.run_folder, options.device, scene=options.scene)
+    if options.fast:
+        run, line = fastest(run)
+        print(line)
     cameras = _cameras(run, options.path, count, size=options.size, fov=options.fov)
     sizes = {(camera.width, camera.height) for camera in cameras}
     if kind in VIDEOS and len(sizes) > 1:

@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"address to listen on (default {LOOPBACK}: this machine only)",
     )
     add("--open", action="store_true", help="open the page in the default browser")
+    shared.add_fast(parser)
     shared.add_run_scene(parser)
     shared.add_device(parser)
 
@@ -48,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
     from pp_cl import find_run, open_device, stored_config
-    from pp_cl.errors import UserError, name_of, require
+    from pp_cl.errors import name_of, require
     from pp_cl.scene import scene_splits
     from pp_studio.view.run_view import RunView
     from pp_studio.view.scene_page import ScenePage
@@ -58,9 +59,8 @@ def run(options: argparse.Namespace) -> None:
     run, scene = find_run(options.run_folder), options.scene
     folder = run.path
     is_scene = folder.is_dir() and not run.config.exists()
-    if is_scene and scene is not None:
-        raise UserError("--scene: only of a run; leave it out")
     if is_scene:
+        shared.refuse(options, ("scene", "fast"), "only of a run")
         scene_splits(folder)
     else:
         stored_config(run, scene)
@@ -75,7 +75,8 @@ def run(options: argparse.Namespace) -> None:
         if is_scene:
             view = ScenePage(server, folder, options.device)
         else:
-            view = RunView(server, open_device(options.device), run, scene)
+            dev = open_device(options.device)
+            view = RunView(server, dev, run, scene, is_fast=options.fast)
         print(f"{options.run_folder}: {address}  (Ctrl-C ends)", flush=True)
         if options.open:
             open_browser(address)

@@ -132,8 +132,10 @@ def _begin(folder, paths, identity, replace):
 
 def _identity(run, cameras, style):
     """Of everything that the frames depend on."""
-    checkpoint = run.folder.checkpoint.stat()
-    digest = hashlib.sha256(repr((style, run.header["step"])).encode())
+    checkpoint, model = run.folder.checkpoint.stat(), run.model
+    varied = run.renderer.supersampling, model.cloud.count, bool(model.specular), len(run.others)
+    about = style, run.header["step"], run.config.raster, varied
+    digest = hashlib.sha256(repr(about).encode())
     digest.update(f"{checkpoint.st_size} {checkpoint.st_mtime_ns}".encode())
     for camera in cameras:
         digest.update(run.model.packed(camera).tobytes())

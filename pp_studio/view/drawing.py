@@ -1,13 +1,12 @@
 """What a run shows to a camera, as 8-bit images: colours, depth, normals, or a photograph."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pp_cl import Camera, Run
-from pp_cl.engine import Model, Renderer, Target, View
+from pp_cl.engine import Target, View
 from pp_cl.errors import UserError
 from pp_cl.files import linear_to_srgb, srgb_to_linear, to_8bit
 from pp_studio.large import render_large
@@ -95,19 +94,12 @@ def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> i
 
 def most_opaque(run: Run, share: float) -> Run:
     """The run with that share of its points, in (0, 1], those of the highest opacity, and at least
-    one; it has the same network.
+    one, and so each of its members.
     """
-    model = run.model
-    opacity = model.cloud.opacity.get()[:, 0]
+    opacity = run.model.cloud.opacity.get()[:, 0]
     count = max(1, round(share * len(opacity)))
     keep = np.sort(np.argsort(-opacity, kind="stable")[:count]).astype(np.uint32)
-    cloud = model.cloud.rows(run.dev, run.dev.upload(keep))
-    thinned = Model(run.dev, model.grid, model.depth_range, cloud, net=model.net)
-    found = replace(run, model=thinned)
-    # the network is frozen already
-    found.renderer = Renderer(run.dev, thinned, run.config.raster, run.renderer.supersampling)
-    found.ball = run.ball
-    return found
+    return run.varied(rows=keep, others=[most_opaque(other, share) for other in run.others])
 
 
 def colour_scale(values: Any, low: float, high: float, is_known: np.ndarray) -> np.ndarray:

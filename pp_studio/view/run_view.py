@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from pp_cl import OnStep, Run, RunFolder, Training, load
+from pp_cl import OnStep, Run, RunFolder, Training, fastest, load
 from pp_cl.engine import Device
 from pp_cl.errors import UserError, name_of
 from pp_studio.view.model_page import ModelPage, announce
@@ -20,15 +20,23 @@ RENEWED = 1.0  # seconds after which a tab that rests sees the training's model 
 
 class RunView:
     """Serves a run folder that another process may still train into. page: None while there is no
-    checkpoint; told: of what is wrong, a line on the page. scene: where the run's is now.
+    checkpoint; told: of what is wrong, a line on the page. scene: where the run's is now. is_fast:
+    it is shown as fastest() says.
     """
 
     def __init__(
-        self, server: Any, dev: Device, folder: RunFolder, scene: str | None = None
+        self,
+        server: Any,
+        dev: Device,
+        folder: RunFolder,
+        scene: str | None = None,
+        *,
+        is_fast: bool = False,
     ) -> None:
         self.page: ModelPage | None = None
         self.told = server.gui.add_markdown("")
         self._server, self._dev, self._folder, self._scene = server, dev, folder, scene
+        self._is_fast = is_fast
         self._seen: dict[Any, Any] = {}  # by file: what differs when it is replaced or grows
         announce(server, f"reading {folder}")
 
@@ -64,7 +72,12 @@ class RunView:
             return self._seen[path] != before
 
     def _take(self, run):
-        self.told.content = ""
+        line = ""
+        if self._is_fast:
+            if not self.page:
+                announce(self._server, "measuring once which setting is fastest")
+            run, line = fastest(run)
+        self.told.content = line
         if self.page:
             self.page.take(run)
             return

@@ -30,7 +30,13 @@ FOUND |= {"rasteriser": [RASTER], "memory": [MEMORY]}
 SPLAT = {"name": "demo", "steps": 1500, "seconds": 45.1, "gaussians": 41819}
 SPLAT |= {"psnr_same": 25.0, "psnr_larger": 35.2}
 HARD = {"case": "a: b", "what": "1 / 0", "naive": "nan", "error": "1e-07", "bound": "1e-06"}
-FOUND |= {"pytorch": [TORCH], "splats": [SPLAT], "stability": [HARD]}
+WIDE = TORCH | {"widths": "128,256,512", "size": 256, "variant": "direct", "forward_ratio": 0.6}
+FOUND |= {"pytorch": [TORCH, WIDE], "splats": [SPLAT], "stability": [HARD]}
+TRADED = {"knob": "default", "ms": 9.0, "psnr": 30.0, "mean_err": 1e-4, "setting": {}}
+TRADED |= {"is_default": True, "is_frontier": True}
+WORKED = {"name": "demo", "box": 9000, "hull": 0.3, "left": 0.1, "stored": 20.0, "whole": 90.0}
+WORKED |= {"fragments": 4e5, "blended": 0.6, "computed": 0.5, "drawn": 0.7, "touched": 0.2}
+FOUND |= {"work": [WORKED], "frontier": [TRADED]}
 FOUND |= {f"stages_{preset}": STEP for preset in TOOL.STEPS}
 
 
@@ -40,8 +46,36 @@ def test_tables_and_plots(tmp_path):
         written = docs_tables.table(about | contents)
         last = written.splitlines()[-1].split("|")[1:-1]
         assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
-    TOOL.draw(TOOL.trained(FOUND, TOOL.CURVES), TOOL.timed(FOUND), "2 cores", tmp_path)
-    assert len({*tmp_path.glob("*.png")}) == 4
+    TOOL.draw(FOUND, "2 cores", tmp_path)
+    assert len({*tmp_path.glob("*.png")}) == 6
+
+
+def test_work_is_told_in_shares(tmp_path, monkeypatch):
+    """Of 1000 cells 200 are of the hull, and 100 have points."""
+    cells = {"box": 1000, "hull": 200, "left": 100}
+    cells |= {"checkpoint_bytes": 2 * 2**20, "box_bytes": 20 * 2**20}
+    counted = {"drawn": 50.0, "fragments": {"found": 800.0, "blended": 600.0}}
+    counted |= {"step": {"touched": 30.0}, "network": {"multiplications": 4e9, "whole": 1.6e10}}
+    monkeypatch.setattr(TOOL, "read_found", lambda *words: {"cells": cells, "work": counted})
+    row = {"box": 1000, "hull": 0.2, "left": 0.1, "stored": 2, "whole": 20, "fragments": 800}
+    row |= {"blended": 0.75, "computed": 0.25, "drawn": 0.5, "touched": 0.3}
+    assert TOOL.work(tmp_path) == [{"name": name} | row for name in TOOL.WORKED.values()]
+
+
+def test_each_point_of_speed_has_its_name():
+    rows = TOOL.timed(FOUND)
+    assert [row["panel"] for row in rows] == [
+        "rasteriser",
+        "network of 32, 64, 128 channels, 200x200",
+        *["network of 128, 256, 512 channels, 256x256"] * 2,
+    ]
+    told = [row["label"].replace("\n", " ") for row in rows]
+    assert told[0] == "grid, 250 k points, 200x200 pixels"
+    assert told[1:] == [
+        "pp-cl, auto (1.40 times PyTorch's speed)",
+        "pp-cl, direct (0.60 times PyTorch's speed)",
+        "PyTorch",
+    ]
 
 
 def test_others_results_stand_beside_images_of_their_size():

@@ -53,9 +53,11 @@ from pp_cl.engine.network.tile_plan import (
 )
 from pp_cl.settings import NetworkConfig
 
-# Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
-# MOST_COMPUTED of the multiplications remain: finding them costs time too.
-LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
+# Background tiles are skipped only in images of at least LEAST_PIXELS pixels, of LEAST_FROZEN where
+# the network is not trained, and only if at most MOST_COMPUTED of the multiplications remain:
+# finding them costs time too. A frame of the demo takes a tenth less at 200x200, the same at
+# 128x128.
+LEAST_PIXELS, LEAST_FROZEN, MOST_COMPUTED = 1 << 16, 1 << 15, 0.8
 WHITE = 1.0  # of a target where its image is transparent
 SIMPLE = {"gate": gate_forward, "pool": avgpool2_forward, "upsample": upsample2_forward}
 
@@ -197,10 +199,9 @@ class Network:
         self._is_frozen = True
         self._workspaces.clear()
 
-    @staticmethod
-    def is_planned(size: tuple[int, int]) -> bool:
+    def is_planned(self, size: tuple[int, int]) -> bool:
         """Whether plan_tiles() is worth a try for an image of size (height, width)."""
-        return math.prod(size) >= LEAST_PIXELS
+        return math.prod(size) >= (LEAST_FROZEN if self._is_frozen else LEAST_PIXELS)
 
     def plan_tiles(
         self, size: tuple[int, int], active: np.ndarray, gradient_tiles: np.ndarray | None = None

@@ -111,6 +111,8 @@ def test_few_tiles_in_large_images_only(dev, rng):
         assert (plan is not None) == chosen
         if chosen:
             assert plan.computed_fraction <= pp_cl.engine.network.unet.MOST_COMPUTED
+    net.freeze()  # the last of them, which is smaller, and half of it
+    assert net.plan_tiles(x.shape[:2], active_mask(x)) and not net.is_planned((124, 256))
 
 
 @pytest.mark.parametrize("blocks", BLOCKS)

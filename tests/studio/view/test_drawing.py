@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.scenes import ring_cameras
 
+from pp_cl.engine.network.specular import Specular
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.run import load
@@ -11,6 +12,7 @@ from pp_studio.view.drawing import (
     SHOWN,
     colour_scale,
     draw,
+    most_opaque,
     nearest_view,
     normals_from_depth,
 )
@@ -48,6 +50,15 @@ def test_the_error_is_that_of_the_nearest_view_from_its_own_camera(run, views):
     assert photo.min() < 250 and error.max() > 5
     with pytest.raises(UserError, match="photographs"):
         draw(run, [], near, "error")
+
+
+def test_a_share_of_the_points_is_of_each_member_and_keeps_the_specular_layer(run):
+    run.model.specular = Specular(run.dev)
+    count = run.model.cloud.count
+    thinned = most_opaque(run.varied(others=[run.varied()]), 0.25)
+    for one in (thinned, *thinned.others):
+        assert one.model.cloud.count == round(count / 4)
+        assert one.model.specular is run.model.specular
 
 
 def test_fragments_are_those_of_the_pairs(run, monkeypatch):

@@ -1,0 +1,398 @@
+"""`pp-cl bench RUN`: a finished run rendered at the settings that trade time for error, and the
+fastest of them that is hardly worse than the default, which is kept in the run's folder.
+"""
+
+import hashlib
+import itertools
+import json
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pp_cl.engine.camera import Camera
+from pp_cl.engine.layers.choice import AUTO, OFFERED, device_class
+from pp_cl.engine.network.unet import UNet
+from pp_cl.engine.render import is_supersampled
+from pp_cl.engine.training.target import Target
+from pp_cl.engine.views import View, evenly
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import check_ours, write_json
+from pp_cl.files.untrusted import opened_zip, read_json_text, strict_json
+from pp_cl.metrics.psnr_ssim import Metrics, mean
+from pp_cl.progress import Progress, track
+from pp_cl.run import Run
+
+EARLY_STOPS = 0.0, 0.001, 0.003, 0.01, 0.03, 0.1
+SHARES = 1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1  # of the points
+# Test views at most; where frames are slow, as many as make a round of ROUND seconds, at least
+# LEAST_VIEWS, of which as many are timed again and again, for SECONDS in all.
+MOST_VIEWS, LEAST_VIEWS, ROUND, SECONDS = 16, 4, 40.0, 40.0
+MOST_LOSS = 0.1  # dB that the fastest setting may lose against the default
+LEAST_GAIN = 1.1  # times as fast as the default: less is within what times of two runs differ by
+# dB that single changes may lose in all to be tried together
+TOGETHER = 0.08, 0.3, 1.0
+MOST_KEPT = 2**20  # bytes of the file; a row takes some 600
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a run is rendered.
+
+    early_stop: of raster. samples: of a pixel, 1 or 4. points: share that is kept, those of the
+    highest visibility(). specular: whether that layer is applied. members: of how many
+    the mean is shown. convolutions: what computes them, of choice.VARIANTS or AUTO.
+    """
+
+    early_stop: float
+    samples: int
+    points: float
+    specular: bool
+    members: int
+    convolutions: str
+
+
+class Renderings:
+    """A finished run, and the same run by other settings. default: its own setting. choices: {field
+    of Setting: its values, the default's among them} that differ in time and error. Raises
+    UserError for an unfinished run.
+    """
+
+    def __init__(self, run: Run) -> None:
+        if not run.header["finished"]:
+            step, steps = run.header["step"], run.config.train.iterations
+            raise UserError(
+                f"{run.folder}: is at step {step} of {steps}; finish it first with `pp-cl train"
+                f" --out {run.folder}`"
+            )
+        self.run, self._members = run, [run, *run.others]
+        raster = run.config.raster
+        has_specular = any(one.model.specular for one in self._members)
+        samples = run.renderer.supersampling**2
+        count = len(self._members)
+        self.default = Setting(raster.early_stop, samples, 1.0, has_specular, count, AUTO)
+        self.choices: dict[str, tuple] = {
+            "early_stop": tuple(sorted({*EARLY_STOPS, raster.early_stop})),
+            "samples": (4, 1) if is_supersampled(raster) else (samples,),
+            "points": SHARES,
+            "specular": (True, False) if has_specular else (False,),
+            "members": tuple(range(count, 0, -1)),
+            "convolutions": (AUTO, *OFFERED[device_class(run.dev)]),
+        }
+
+    def settings(self) -> list[Setting]:
+        """The exact one, which is the default without an early stop; the default; those that differ
+        from it in one field.
+        """
+        default = self.default
+        found = [replace(default, early_stop=0.0), default]
+        for name, values in self.choices.items():
+            found += [replace(default, **{name: value}) for value in values]
+        return list(dict.fromkeys(found))
+
+    def varied(self, setting: Setting, index: int = 0) -> Run:
+        """The run, or a further member, by a setting; points and buffers are its own."""
+        run, rows, net, others = self._members[index], None, None, []
+        if index == 0:
+            others = [self.varied(setting, i) for i in range(1, setting.members)]
+        if setting.points < 1:
+            ranked = self._ranked[index]
+            rows = np.sort(ranked[: max(1, round(setting.points * len(ranked)))]).astype(np.uint32)
+        if setting.convolutions != AUTO:
+            net = UNet.of_settings(run.dev, run.config.network)
+            net.variant = setting.convolutions
+            for name, parameter in run.model.net.parameters.items():
+                run.dev.write(net.parameters[name], run.dev.download(parameter))
+        return run.varied(
+            rows=rows,
+            early_stop=setting.early_stop,
+            supersampling=math.isqrt(setting.samples),
+            has_specular=setting.specular,
+            net=net,
+            others=others,
+        )
+
+    @cached_property
+    def _ranked(self):
+        """Of each member, its points by visibility(), the highest first."""
+        return [np.argsort(-visibility(one), kind="stable") for one in self._members]
+
+    def words(self, setting: Setting) -> str:
+        """How a setting differs from the default."""
+        told = {
+            "early_stop": f"early stop {setting.early_stop:g}",
+            "samples": f"{setting.samples} sample{'s' * (setting.samples > 1)} a pixel",
+            "points": f"{setting.points:.0%} of the points",
+            "specular": "no specular layer",
+            "members": f"{setting.members} of {self.default.members} members",
+            "convolutions": f"convolutions: {setting.convolutions}",
+        }
+        return ", ".join(told[name] for name in self.changed(setting)) or "default"
+
+    def changed(self, setting: Setting) -> list[str]:
+        """The fields in which a setting differs from the default."""
+        default = asdict(self.default)
+        return [name for name, value in asdict(setting).items() if value != default[name]]
+
+
+def visibility(run: Run) -> np.ndarray:
+    """(N,) float64: the sum of each point's blend weights over the pixels of all training views.
+    Leaving out a fifth of the points by it costs the demo 1.1 dB, by the highest sum of one view
+    1.6 dB.
+    """
+    dev, renderer, n = run.dev, run.renderer, run.model.cloud.count
+    weight, seen, total = dev.zeros((n,)), dev.zeros((n,)), np.zeros(n)
+    for camera in run.cameras("train"):
+        drawn = renderer.forward(camera, run.gamma, until="weights")
+        dev.fill(weight, 0)
+        renderer.record_weights(drawn, weight, seen)
+        total += dev.download(weight)
+        del drawn  # else its arrays would stay beside the larger ones of the next view
+    renderer.release()
+    return total
+
+
+# ---- measuring
+
+
+def measured(run: Run, metrics: tuple[str, ...] = ("psnr",)) -> dict[str, Any]:
+    """What `pp-cl bench RUN` finds: {"run", "device", "platform", "views": how many, "rows"}, kept
+    in the run's folder for fastest(). A row: {"bench": "run", "knob": the field of Setting that
+    differs from the default, "together" for several, "default" for none; "setting": all fields;
+    "words"; "ms": a frame, median; "ms_range"; "max_err", "mean_err": of colours in [0, 1], against
+    the exact rendering; the metrics against the photographs, means over the views; "is_default";
+    "is_frontier": no other is faster with as high a PSNR, to 0.01 dB; "is_fast": what fastest()
+    takes}. metrics: psnr among them. Raises UserError as Renderings and Run.scene() do.
+    """
+    renderings, dev = Renderings(run), run.dev
+    check_ours([run.folder.frontier])
+    rows = Measurement(renderings, run.scene("test").splits["test"], metrics).rows()
+    about = {"run": str(run.folder), "device": dev.name, "platform": dev.info["platform"]}
+    result = about | rows
+    try:
+        write_json(run.folder.frontier, {"key": _key(renderings)} | result)
+    except UserError as error:
+        warnings.warn(f"{error}; --fast measures it again", stacklevel=2)
+    return result
+
+
+class Measurement:
+    """Measures settings of a run on test views, in turns. metrics: as of measured()."""
+
+    def __init__(
+        self, renderings: Renderings, views: Sequence[View], metrics: tuple[str, ...]
+    ) -> None:
+        self._renderings, self._measure = renderings, Metrics(renderings.run.dev, metrics)
+        self._views = evenly(views, MOST_VIEWS)
+        self._ms: dict[Setting, list[float]] = {}
+        self._found: dict[Setting, dict[str, float]] = {}
+        self._exact: list[np.ndarray] = []
+
+    def rows(self) -> dict[str, Any]:
+        """{"views", "rows"} of measured()."""
+        settings = self._renderings.settings()
+        self._choose_views(len(settings))
+        # the times of single changes say which are worth being tried together
+        for choose in (lambda: settings, self._together):
+            for setting in track(choose(), "measuring", "setting"):
+                self._judge(setting, self._render(setting, self._views))
+            self._time(SECONDS / 2)
+        return {"views": len(self._views), "rows": self._marked()}
+
+    def _time(self, seconds):
+        """Time all settings so far in turn, at least once."""
+        some, end = evenly(self._views, LEAST_VIEWS), time.perf_counter() + seconds
+        with Progress("timing"):
+            while True:
+                for setting in self._found:
+                    self._render(setting, some, self._ms.setdefault(setting, []))
+                if time.perf_counter() >= end:
+                    return
+
+    def _choose_views(self, count):
+        """Leave so many views that a round of `count` settings is not too long."""
+        run, camera = self._renderings.run, self._views[0].camera
+        with Progress("building kernels"):
+            frame(run, camera)
+        start = time.perf_counter()
+        frame(run, camera)
+        most = int(ROUND / (count * (time.perf_counter() - start)))
+        self._views = evenly(self._views, max(LEAST_VIEWS, most))
+        release(run)
+        target = Target(run.dev)
+        self._truths = [target.whole(view) for view in self._views]
+
+    def _render(self, setting, views, ms=None):
+        """The images of the views. ms: takes their milliseconds."""
+        run, images = self._renderings.varied(setting), []
+        frame(run, views[0].camera)  # makes the buffers
+        for view in views:
+            start = time.perf_counter()
+            images.append(frame(run, view.camera))
+            if ms is not None:
+                ms.append((time.perf_counter() - start) * 1e3)
+        release(run)
+        return images
+
+    def _judge(self, setting, images):
+        """Take down the errors of the images; the first ones are the exact ones."""
+        self._exact = self._exact or images
+        errors = [np.abs(a - b) for a, b in zip(images, self._exact, strict=True)]
+        found = {
+            "max_err": max(float(error.max()) for error in errors),
+            "mean_err": float(np.mean([error.mean(dtype=np.float64) for error in errors])),
+        }
+        rows = zip(images, self._views, self._truths, strict=True)
+        self._found[setting] = found | mean(
+            [self._measure(image, view.ignoring(truth, image)) for image, view, truth in rows]
+        )
+
+    def _median(self, setting):
+        return float(np.median(self._ms[setting]))
+
+    def _together(self):
+        """The settings that differ in several fields and are fastest, by the sums of what each
+        field gains and loses, for each of TOGETHER.
+        """
+        default = self._renderings.default
+        ms, psnr = self._median(default), self._found[default]["psnr"]
+        single: dict[str, list] = {}
+        for setting in self._found:
+            for name in self._renderings.changed(setting):
+                gains = ms - self._median(setting), psnr - self._found[setting]["psnr"]
+                single.setdefault(name, [(getattr(default, name), 0.0, 0.0)]).append(
+                    (getattr(setting, name), *gains)
+                )
+        tried = []
+        for chosen in itertools.product(*single.values()):
+            values, gained, lost = zip(*chosen, strict=True)
+            setting = replace(default, **dict(zip(single, values, strict=True)))
+            if len(self._renderings.changed(setting)) > 1:
+                tried.append((sum(gained), sum(lost), setting))
+        best = [
+            max((t for t in tried if t[1] <= most), key=lambda t: t[0], default=(0, 0, None))
+            for most in TOGETHER
+        ]
+        return list(dict.fromkeys(setting for gained, _, setting in best if gained > 0))
+
+    def _marked(self):
+        """The rows of measured()."""
+        rows, renderings = [], self._renderings
+        for setting, found in self._found.items():
+            changed, times = renderings.changed(setting), self._ms[setting]
+            rows.append(
+                {
+                    "bench": "run",
+                    "knob": (*changed, "default")[0] if len(changed) < 2 else "together",
+                    "setting": asdict(setting),
+                    "words": renderings.words(setting),
+                    "ms": self._median(setting),
+                    "ms_range": [min(times), max(times)],
+                    **found,
+                    "is_default": not changed,
+                }
+            )
+        fast = fastest_row(rows)
+        for row in rows:
+            as_good = [r for r in rows if round(r["psnr"], 2) >= round(row["psnr"], 2)]
+            row["is_frontier"] = row is min(as_good, key=lambda r: r["ms"])
+            row["is_fast"] = row is fast
+        return rows
+
+
+def frame(run: Run, camera: Camera) -> np.ndarray:
+    """(H, W, 3) float32 in [0, 1]: what the run shows to a camera."""
+    return run.checked(run.shown(run.renderer.forward(camera, run.gamma)))
+
+
+def release(run: Run) -> None:
+    """Free what a run's renderers keep from view to view."""
+    for one in (run, *run.others):
+        one.renderer.release()
+
+
+def fastest_row(rows: list[dict]) -> dict:
+    """The row that is fastest of those with at most MOST_LOSS dB less than the default; the
+    default's where that is not LEAST_GAIN times as fast.
+    """
+    default = next(row for row in rows if row["is_default"])
+    fast = min((r for r in rows if default["psnr"] - r["psnr"] <= MOST_LOSS), key=lambda r: r["ms"])
+    return fast if default["ms"] >= LEAST_GAIN * fast["ms"] else default
+
+
+# ---- what is kept
+
+
+def fastest(run: Run) -> tuple[Run, str]:
+    """(a finished run as it is rendered fastest with a PSNR at most 0.1 dB below the default's, a
+    line that says how). What is fastest is measured once for a checkpoint and a device, as `pp-cl
+    bench RUN` does, and kept in the run's folder. Raises UserError as measured() does.
+    """
+    renderings = Renderings(run)
+    setting, line = _kept(renderings) or _chosen(renderings, measured(run))
+    return (run if setting == renderings.default else renderings.varied(setting)), line
+
+
+def _kept(renderings):
+    """_chosen() of what is kept for the run's checkpoint and device; None where nothing is, or what
+    no measurement has written.
+    """
+    try:
+        found = strict_json(read_json_text(renderings.run.folder.frontier, MOST_KEPT))
+        return _chosen(renderings, found) if found["key"] == _key(renderings) else None
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return None
+
+
+def _chosen(renderings, result):
+    """(Setting, the line of fastest()) of what was measured. Raises ValueError for values that the
+    run does not have.
+    """
+    (fast,), (default,) = (
+        [row for row in result["rows"] if row[key] is True] for key in ("is_fast", "is_default")
+    )
+    setting = Setting(**fast["setting"])
+    for name, values in renderings.choices.items():
+        if getattr(setting, name) not in values:
+            raise ValueError(f"{name} {getattr(setting, name)!r}")
+    if setting == renderings.default:
+        line = f"no setting is {LEAST_GAIN:g} times as fast as the default within {MOST_LOSS:g} dB"
+    else:
+        line = (
+            f"{renderings.words(setting)}: {default['ms'] / fast['ms']:.2f} times as fast,"
+            f" {fast['psnr']:.2f} dB in place of {default['psnr']:.2f}"
+        )
+    return setting, f"--fast: {line} ({renderings.run.folder.frontier})"
+
+
+def _key(renderings):
+    """What a measurement depends on, as text: the arrays of the checkpoints by their checksums, the
+    settings that `pp-cl` renders them by, and the device.
+    """
+    sums = []
+    for member in [renderings.run, *renderings.run.others]:
+        with opened_zip(member.folder.checkpoint) as archive:
+            sums.append([[one.filename, one.CRC] for one in archive.infolist()])
+    dev = renderings.run.dev
+    about = [sums, asdict(renderings.default), dev.name, dev.info["platform"]]
+    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
+
+
+# ---- the printed table
+
+COLUMNS = "{:46} {:>8} {:>8} {:>8} {:>7}  {}".format
+HEAD = COLUMNS("setting", "ms", "largest", "mean", "PSNR", "")
+
+
+def line(row: dict) -> str:
+    """A line of the printed table, of a row of measured()."""
+    marks = {"is_default": "the default", "is_frontier": "frontier", "is_fast": "--fast"}
+    more = [f"LPIPS {row['lpips']:.4f}"] if "lpips" in row else []
+    more += [words for name, words in marks.items() if row[name]]
+    found = f"{row['ms']:.1f}", f"{row['max_err']:.1e}", f"{row['mean_err']:.1e}"
+    return COLUMNS(row["words"], *found, f"{row['psnr']:.2f}", ", ".join(more)).rstrip()

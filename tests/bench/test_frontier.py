@@ -1,0 +1,195 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+from support.refused import failure
+from support.runs import train_and_interrupt
+
+from pp_cl import fastest
+from pp_cl.bench import frontier
+from pp_cl.bench.frontier import Renderings, fastest_row, frame, measured, visibility
+from pp_cl.bench.plots import plot_frontier
+from pp_cl.cli import main
+from pp_cl.engine.raster.weights import listed_fragments
+from pp_cl.errors import UserError
+from pp_cl.evaluate import evaluate_run
+from pp_cl.run import load
+
+
+@pytest.fixture(scope="module")
+def whole(finished):
+    """The run's folder, and what was measured of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frontier, "SECONDS", 0.0)
+        file = finished.parent / "b.json"
+        words = ["--metrics", "psnr,ssim", "--json", str(file)]
+        words += ["--plot", str(finished.parent / "b.png")]
+        assert main(["bench", str(finished), *words]) == 0
+    return finished, json.loads(file.read_text())
+
+
+@pytest.fixture
+def run(whole, dev, tmp_path):
+    return load(shutil.copytree(whole[0], tmp_path / "run"), dev)
+
+
+@pytest.fixture
+def unmeasured(monkeypatch):
+    """Fails the test that measures again."""
+
+    def fail(_run):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(frontier, "measured", fail)
+
+
+def of_knob(result, knob):
+    rows = [row for row in result["rows"] if row["knob"] in (knob, "default")]
+    return sorted(rows, key=lambda row: row["setting"][knob])
+
+
+def test_each_setting_has_a_row(whole, dev, tmp_path):
+    folder, result = whole
+    rows = result["rows"]
+    assert result["device"] == dev.name and result["views"] == 2
+    assert len({json.dumps(row["setting"]) for row in rows}) == len(rows)
+    for row in rows:
+        assert 0 < row["ms_range"][0] <= row["ms"] <= row["ms_range"][1]
+        assert 0 <= row["mean_err"] <= row["max_err"] <= 1 and row["psnr"] > 5
+    (default,) = (row for row in rows if row["is_default"])
+    found = evaluate_run(load(folder, dev), out=tmp_path / "eval")["mean"]
+    assert {name: default[name] for name in found} == pytest.approx(found)
+    assert sum(row["is_fast"] for row in rows) == 1
+    assert {row["knob"] for row in rows} >= {"early_stop", "samples", "points", "convolutions"}
+    for row in (row for row in rows if row["knob"] == "convolutions"):
+        assert row["max_err"] == pytest.approx(default["max_err"], abs=1e-5)
+    assert (folder.parent / "b.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_errors_fall_with_the_early_stop_and_with_more_points(whole):
+    errors = [row["mean_err"] for row in of_knob(whole[1], "early_stop")]
+    assert errors[0] == 0 and (np.diff(errors) > 0).all() and len(errors) == 6
+    errors = [row["mean_err"] for row in of_knob(whole[1], "points")]
+    assert (np.diff(errors) < 0).all() and len(errors) == 8
+
+
+def test_the_table_names_default_and_frontier(whole, capsys):
+    for row in whole[1]["rows"]:
+        text = frontier.line(row)
+        assert text.startswith(row["words"]) and f"{row['psnr']:.2f}" in text
+        assert ("the default" in text) == row["is_default"]
+        assert ("frontier" in text) == row["is_frontier"]
+        assert ("--fast" in text) == row["is_fast"]
+
+
+def row(ms, psnr, **more):
+    return {"ms": ms, "psnr": psnr, "is_default": False} | more
+
+
+def test_the_fastest_row_is_hardly_worse_than_the_default():
+    default = row(10.0, 30.0, is_default=True)
+    fast, worse, slower = row(6.0, 29.91), row(3.0, 29.89), row(8.0, 30.5)
+    assert fastest_row([slower, default, worse, fast]) is fast
+    assert fastest_row([row(9.2, 30.0), default, worse]) is default  # at its knee
+
+
+def curve(axes, label):
+    (found,) = (line.get_xydata().tolist() for line in axes.lines if line.get_label() == label)
+    return found
+
+
+def test_a_curve_for_each_knob_goes_through_the_default(whole, tmp_path):
+    rows = whole[1]["rows"]
+    left, right = plot_frontier(rows, str(tmp_path / "a.svg")).axes
+    (default,) = ([row["ms"], row["psnr"]] for row in rows if row["is_default"])
+    stops = [[row["ms"], row["psnr"]] for row in of_knob(whole[1], "early_stop")]
+    assert curve(right, "early stop") == stops and default in stops
+    assert curve(right, "default") == [default]
+    front = sorted([row["ms"], row["psnr"]] for row in rows if row["is_frontier"])
+    assert curve(right, "frontier") == front
+    assert curve(left, "early stop")[0] == [stops[0][0], pytest.approx(4e-6)]  # has no logarithm
+
+
+def test_what_is_fastest_is_kept_until_the_checkpoint_changes(run, dev, unmeasured):
+    file = run.folder.frontier
+    kept = json.loads(file.read_text())
+    # whichever it was, half of the points are now
+    chosen = next(one for one in kept["rows"] if one["setting"]["points"] == 0.5)
+    for one in kept["rows"]:
+        one["is_fast"] = one is chosen
+    file.write_text(json.dumps(kept))
+    fast, line = fastest(run)
+    assert "50% of the points" in line and f"{chosen['psnr']:.2f} dB" in line
+    assert fast.model.cloud.count == round(0.5 * run.model.cloud.count)
+    for damaged in ("", "{", json.dumps(kept | {"key": "a"}), json.dumps(kept | {"rows": []})):
+        file.write_text(damaged)
+        with pytest.raises(AssertionError, match="measured again"):
+            fastest(run)
+    chosen["setting"]["points"] = -3
+    file.write_text(json.dumps(kept))
+    with pytest.raises(AssertionError, match="measured again"):
+        fastest(run)
+    chosen["setting"]["points"] = 0.5
+    file.write_text(json.dumps(kept))
+    fastest(run)
+    words = ["--out", str(run.folder), "--set", "train.iterations=64"]
+    assert main(["train", run.config.scene.path, *words]) == 0
+    with pytest.raises(AssertionError, match="measured again"):
+        fastest(load(run.folder.path, dev))
+
+
+def test_a_run_that_is_fastest_as_it_is_says_so(run, unmeasured):
+    kept = json.loads(run.folder.frontier.read_text())
+    for one in kept["rows"]:
+        one["is_fast"] = one["is_default"]
+    run.folder.frontier.write_text(json.dumps(kept))
+    fast, line = fastest(run)
+    assert fast is run and "no setting is 1.1 times as fast as the default" in line
+
+
+def test_each_setting_changes_what_it_says(run, dev):
+    camera = run.cameras("test")[0]
+    renderings = Renderings(run)
+    assert np.array_equal(frame(renderings.varied(renderings.default), camera), frame(run, camera))
+    for setting in renderings.settings():
+        varied = renderings.varied(setting)
+        assert varied.config.raster.early_stop == setting.early_stop
+        assert varied.renderer.supersampling**2 == setting.samples
+        assert varied.model.net.variant == setting.convolutions
+        assert varied.model.cloud.count == round(setting.points * run.model.cloud.count)
+
+
+def test_visibility_is_the_sum_of_the_blend_weights(run):
+    expected = np.zeros(run.model.cloud.count)
+    for camera in run.cameras("train"):
+        drawn = run.renderer.forward(camera, run.gamma, until="weights")
+        _, point, weight = listed_fragments(drawn.pairs, drawn.weights)
+        np.add.at(expected, point, weight)
+    np.testing.assert_allclose(visibility(run), expected, rtol=1e-5)
+
+
+def test_members_are_dropped_one_after_the_other(run, dev):
+    other = run.varied(rows=np.arange(run.model.cloud.count // 2, dtype=np.uint32))
+    renderings = Renderings(run.varied(others=[other]))
+    assert renderings.choices["members"] == (2, 1)
+    camera = run.cameras("test")[0]
+    (alone,) = (s for s in renderings.settings() if s.members == 1)
+    assert renderings.words(alone) == "1 of 2 members"
+    assert np.array_equal(frame(renderings.varied(alone), camera), frame(run, camera))
+    both = frame(renderings.varied(renderings.default), camera)
+    np.testing.assert_array_equal(both, np.mean([frame(run, camera), frame(other, camera)], 0))
+
+
+def test_only_finished_runs_are_measured(scene, tmp_path, monkeypatch):
+    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
+    told = f"{tmp_path / 'run'}: is at step 20 of 60; finish it first with `pp-cl train --out"
+    assert told in failure("bench", tmp_path / "run")
+    assert told in failure("render", tmp_path / "run", "--fast")
+
+
+def test_a_file_of_the_users_is_not_replaced(run):
+    run.folder.frontier.write_text("mine")
+    with pytest.raises(UserError, match=r"frontier\.json: pp-cl did not write this"):
+        measured(run)
+    assert run.folder.frontier.read_text() == "mine"
