@@ -34,6 +34,9 @@ from pp_cl.settings import Config
 
 COMPARED_VIEWS = 2  # training images that tell whether a scene is the run's
 NEAREST = 0.05  # of a point to the eye, in radii of the object
+# Pixels rendered around an image. Without them the corner of a white background has 227 of 255;
+# four more change no pixel by 0.2 of 255, and images of 200 pixels take 8 % more.
+MARGIN = 4
 
 
 @dataclass
@@ -54,7 +57,7 @@ class Run:
         """Renders the model, whose parameters must not change any more."""
         self.model.net.freeze()
         supersampling = supersampling_at(self._last_step, self.config.train)
-        return Renderer(self.dev, self.model, self.config.raster, supersampling)
+        return Renderer(self.dev, self.model, self.config.raster, supersampling, MARGIN)
 
     def varied(
         self,

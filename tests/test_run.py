@@ -3,6 +3,7 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,16 @@ def test_a_run_renders_what_the_evaluation_saves(trained, capsys):
         saved = read_rgba(trained[1] / "eval" / "images" / f"r_{i}.png")[..., :3]
         np.testing.assert_array_equal(saved, to_8bit(image))
         np.testing.assert_array_equal(trained[0].render(trained[0].cameras()[i]).colour, image)
+
+
+def test_the_border_of_an_image_is_as_bright_as_the_background_within(trained):
+    run = pp_cl.load(trained[1])
+    camera = run.cameras("test")[0].resized(64, 64)
+    camera = replace(camera, fx=camera.fx / 3, fy=camera.fy / 3)  # the ball is in the middle
+    image = to_8bit(run.render(camera).colour).astype(int)
+    assert (np.abs(image[:8] - image[4, 4]) <= 1).all() and (image != image[4, 4]).any()
+    run.renderer.margin = 0
+    assert np.abs(to_8bit(run.render(camera).colour)[0, 0] - image[4, 4]).max() > 5
 
 
 def test_depths_of_drawn_pixels_stay_on_the_surface(trained, monkeypatch):

@@ -143,11 +143,14 @@ class Camera:
         scale = self.width / 2 / math.tan(radians / 2) / self.fx
         return replace(self, fx=scale * self.fx, fy=scale * self.fy)
 
-    def padded(self, multiple: int) -> tuple["Camera", int, int]:
-        """(camera, left, top): enlarged so that `multiple` divides both sides; this camera's image
-        starts at column `left` and row `top` of the larger one.
+    def padded(self, multiple: int, margin: int = 0) -> tuple["Camera", int, int]:
+        """(camera, left, top): enlarged by `margin` pixels on each side, and further so that
+        `multiple` divides both; this camera's image starts at column `left` and row `top` of the
+        larger one.
         """
-        extra_w, extra_h = -self.width % multiple, -self.height % multiple
+        extra_w, extra_h = (
+            2 * margin + -(side + 2 * margin) % multiple for side in (self.width, self.height)
+        )
         left, top = extra_w // 2, extra_h // 2
         return self.crop(-left, -top, self.width + extra_w, self.height + extra_h), left, top
 

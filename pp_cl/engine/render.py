@@ -139,10 +139,19 @@ class RenderResult:
 
 class Renderer:
     """Renders a model. Its buffers are reused from view to view. supersampling: of images, as
-    RenderResult has it, 1 or 2.
+    RenderResult has it, 1 or 2. margin: pixels around an image, except in a training, that are
+    rendered as well and cut off: the network takes what lies outside for zeros, and darkens
+    the pixels beside it.
     """
 
-    def __init__(self, dev: Device, model: Model, settings: RasterConfig, supersampling: int = 1):
+    def __init__(
+        self,
+        dev: Device,
+        model: Model,
+        settings: RasterConfig,
+        supersampling: int = 1,
+        margin: int = 0,
+    ):
         self.dev = dev
         self.model = model
         self.settings = settings
@@ -151,7 +160,7 @@ class Renderer:
         # the views.
         self._by_pair = False
         self._capacity, self._visible_capacity = [1, 1], [1, 1]
-        self.supersampling = supersampling
+        self.supersampling, self.margin = supersampling, margin
         self.release()
 
     @property
@@ -176,7 +185,7 @@ class Renderer:
         gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
         times_seen: Array | None = None,
     ) -> RenderResult:
-        """Render a camera, which is padded to multiples of net.multiple pixels.
+        """Render a camera, which is padded by the margin and to multiples of net.multiple pixels.
 
         until: the last stage wanted: blend weights, blended features or the network's image, which
         alone is supersampled, if it is composited by alpha.
@@ -187,7 +196,8 @@ class Renderer:
         Network.plan_tiles(); called after the wait for the device. times_seen: of find_pairs().
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
-        padded, left, top = camera.padded(net.multiple)
+        margin = self.margin if until == "image" and not training else 0
+        padded, left, top = camera.padded(net.multiple, margin)
         size, side = (padded.height, padded.width), 1
         if until == "image" and is_supersampled(self.settings):
             side = self.supersampling

@@ -66,12 +66,15 @@ def test_crop_shift_and_downscale_move_pixels_as_they_say(rng):
     assert (camera.downscaled(4).width, camera.downscaled(4).height) == (10, 7)
 
 
+@pytest.mark.parametrize("margin", [0, 3, 4])
 @pytest.mark.parametrize("width, height", [(40, 30), (1, 1), (33, 31), (4, 8)])
-def test_padding_keeps_every_pixel(rng, width, height):
+def test_padding_keeps_every_pixel(rng, width, height, margin):
     camera = make_camera(rng, width, height)
-    padded, left, top = camera.padded(4)
+    padded, left, top = camera.padded(4, margin)
     assert padded.width % 4 == padded.height % 4 == 0
-    assert 0 <= padded.width - width < 4 and 0 <= padded.height - height < 4
+    more = [padded.width - width - 2 * margin, padded.height - height - 2 * margin]
+    assert (left, top) == (margin + more[0] // 2, margin + more[1] // 2)
+    assert 0 <= min(more) and max(more) < 4
     points = points_in_front(camera, rng)
     np.testing.assert_allclose(project(padded, points), project(camera, points) + [left, top])
 

@@ -114,6 +114,19 @@ def test_padding_does_not_move_the_image(dev, rng):
     np.testing.assert_allclose(inner, whole[7:26, 5:26], atol=2e-5)
 
 
+def test_a_margin_is_the_image_around_it_and_no_training_has_one(dev, rng):
+    model, camera = make_model(dev, rng), ring_cameras(1, 32)[0].crop(5, 7, 20, 18)
+    settings = RasterConfig(blend="alpha", radius=0.85)
+    plain, framed = (Renderer(dev, model, settings, 2, margin) for margin in (0, 4))
+    larger = plain.render(camera.crop(-4, -5, 28, 28), GAMMA)
+    found = framed.forward(camera, GAMMA)
+    image, offset = found.clamped(), found.offset
+    np.testing.assert_array_equal(image, larger[5:23, 4:24])
+    assert (image != plain.render(camera, GAMMA)).any()
+    assert framed.forward(camera, GAMMA, training=True).size == (20, 20) != found.size
+    assert framed.forward(camera, GAMMA, until="features").size == (20, 20)
+
+
 def test_an_empty_view_is_the_background(dev, rng):
     model, camera = make_model(dev, rng), ring_cameras(1, 16)[0]
     away = replace(camera, pose=camera.pose * [-1, 1, -1, 1])  # turned round
