@@ -196,17 +196,20 @@ class Run:
         samples: int = 1,
         features: bool = False,
         early_stop: float | None = None,
+        supersampling: int | None = None,
     ) -> RenderedView:
         """The model as the camera sees it. samples: it is the mean of so many images, a square
         number, shifted by fractions of a pixel. features: with the network's input. early_stop: in
-        place of raster.early_stop. Raises ValueError for another number of samples, UserError where
-        the image holds NaN.
+        place of raster.early_stop. supersampling: places of a pixel, 1 or 2 each way, at which the
+        points are seen, in place of as many as in the training. Raises ValueError for another
+        number of samples, UserError where the image holds NaN.
         """
         side = math.isqrt(samples)
         if samples < 1 or side * side != samples:
             raise ValueError(f"{samples} samples are no square number")
         shifts = (np.arange(side) + 0.5) / side - 0.5
-        options = {"early_stop": early_stop, "depth_range": self.depth_range(camera)}
+        options: dict[str, Any] = {"early_stop": early_stop, "supersampling": supersampling}
+        options["depth_range"] = self.depth_range(camera)
 
         def sample(dx, dy):
             result = self.renderer.forward(camera.shifted(dx, dy), self.gamma, **options)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from pp_cl import Camera, RenderedView, Run
 from pp_cl.engine import MIN_SIDE
@@ -14,6 +15,12 @@ from pp_cl.engine import MIN_SIDE
 # Of a woven rendering, each way. A run of lego's images of 200 pixels, at 800: the network at 800
 # has 28.0 dB, its image of 200 enlarged 27.3, 2 x 2 of these woven 28.8 and 4 x 4 29.0.
 MOST_PARTS = 4
+# Pixels of the training: the deviations of the filter along outlines, and of those that find them.
+# A run of the demo's images of 200 pixels, at 720: 30.5 dB with teeth, 30.2 without.
+ALONG, BEFORE, AROUND = 0.4, 0.5, 1.0
+TAPS = np.linspace(-2, 2, 9)  # of that filter, in deviations
+EDGE = 0.25  # change of alpha in a pixel of the training from which an outline is one altogether
+LEAST_EDGE = 0.01
 
 
 def parts(run: Run, camera: Camera) -> int:
@@ -31,24 +38,68 @@ def parts(run: Run, camera: Camera) -> int:
 def render_large(
     run: Run, camera: Camera, *, on_part: Callable[[], object] = lambda: None, **options: Any
 ) -> RenderedView:
-    """run.render(camera, **options), in which the points are as dense as the network knows them:
-    an image that is much finer than those of the training is woven of several, each of them shifted
-    by a fraction of a pixel. on_part: called before each of these.
+    """run.render(camera, **options), in which the points are as dense as the network knows them: an
+    image that is much finer than those of the training is woven() with smooth_outlines(). on_part:
+    called before each of its parts.
     """
     n = parts(run, camera)
     if n == 1:
         on_part()
         return run.render(camera, **options)
+    return smooth_outlines(woven(run, camera, n, on_part, **options), n)
+
+
+def woven(
+    run: Run, camera: Camera, n: int, on_part: Callable[[], object], **options: Any
+) -> RenderedView:
+    """An image of n x n renderings at 1/n of its scale, each shifted by another fraction of a
+    pixel. They see the points at one place of a pixel: at four, which are as far apart as some
+    pixels of the image, it would be blurred.
+    """
     focal = {name: getattr(camera, name) / n for name in ("fx", "fy", "cx", "cy")}
     width, height = -(-camera.width // n), -(-camera.height // n)
     small = replace(camera, **focal, width=width, height=height)
-    woven: dict[str, np.ndarray] = {}
+    whole: dict[str, np.ndarray] = {}
     for row, column in itertools.product(range(n), repeat=2):
         on_part()
         shift = [(place + 0.5) / n - 0.5 for place in (column, row)]
-        part = run.render(small.shifted(*shift), **options)
+        part = run.render(small.shifted(*shift), supersampling=1, **options)
         for name, values in vars(part).items():
             if values is not None:
-                whole = np.empty((n * height, n * width, *values.shape[2:]), values.dtype)
-                woven.setdefault(name, whole)[row::n, column::n] = values
-    return RenderedView(**{k: v[: camera.height, : camera.width] for k, v in woven.items()})
+                empty = np.empty((n * height, n * width, *values.shape[2:]), values.dtype)
+                whole.setdefault(name, empty)[row::n, column::n] = values
+    return RenderedView(**{k: v[: camera.height, : camera.width] for k, v in whole.items()})
+
+
+def smooth_outlines(view: RenderedView, n: int) -> RenderedView:
+    """The view with alpha averaged along the outlines of the object, not across them, over about
+    the n pixels that one of the training is wide: at a finer scale an outline shows the points that
+    it is made of as the teeth of a comb.
+    """
+    alpha = view.alpha
+    down, across = np.gradient(gaussian_filter(alpha, BEFORE * n))
+    xx, xy, yy = (
+        gaussian_filter(product, AROUND * n)
+        for product in (across * across, across * down, down * down)
+    )
+    rows, columns = np.nonzero(np.sqrt(xx + yy) * n > LEAST_EDGE)
+    xx, xy, yy = (product[rows, columns] for product in (xx, xy, yy))
+    weight = np.minimum(np.sqrt(xx + yy) * n / EDGE, 1)
+    angle = (
+        np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
+    )  # of the line that alpha changes least along
+    along = np.stack([np.sin(angle), np.cos(angle)])
+    shares = np.exp(-(TAPS**2) / 2)
+    mean = sum(
+        share
+        * map_coordinates(alpha, [rows, columns] + ALONG * n * tap * along, order=1, mode="nearest")
+        for tap, share in zip(TAPS, shares / shares.sum(), strict=True)
+    )
+    smooth, colour = alpha.copy(), view.colour.copy()
+    smooth[rows, columns] += weight * (mean - alpha[rows, columns])
+    # what shows at alpha a over white is a colour + (1 - a), with the colours around
+    near = gaussian_filter(colour - (1 - alpha[..., None]), (1, 1, 0))[rows, columns]
+    near /= np.maximum(gaussian_filter(alpha, 1)[rows, columns, None], 1 / 255)
+    change = (smooth - alpha)[rows, columns, None]
+    colour[rows, columns] += change * (near.clip(0, 1) - 1)
+    return replace(view, colour=colour.clip(0, 1), alpha=smooth)

@@ -181,6 +181,7 @@ class Renderer:
         until: Literal["weights", "features", "image"] = "image",
         early_stop: float | None = None,
         depth_range: tuple[float, float] | None = None,
+        supersampling: int | None = None,
         training: bool = False,
         gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
         times_seen: Array | None = None,
@@ -191,7 +192,7 @@ class Renderer:
         alone is supersampled, if it is composited by alpha.
         gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
         the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
-        softmax needs the model's.
+        softmax needs the model's. supersampling: instead of the renderer's.
         training: keep what backward() needs. gradient_tiles: returns that argument of
         Network.plan_tiles(); called after the wait for the device. times_seen: of find_pairs().
         """
@@ -200,7 +201,7 @@ class Renderer:
         padded, left, top = camera.padded(net.multiple, margin)
         size, side = (padded.height, padded.width), 1
         if until == "image" and is_supersampled(self.settings):
-            side = self.supersampling
+            side = supersampling or self.supersampling
         if max(size) > MOST_SIDE:
             raise UserError(
                 f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
