@@ -92,7 +92,7 @@ class Run:
         # what a member shows of a view does not depend on which points are left out
         found.ball = self.ball
         samples = supersampling or self.renderer.supersampling
-        found.renderer = Renderer(dev, shown, raster, samples)
+        found.renderer = Renderer(dev, shown, raster, samples, self.renderer.margin)
         if net:
             net.freeze()
         return found

@@ -14,6 +14,7 @@ from pp_cl.scene import looked_at, up_of
 MARGIN = 0.95  # of the image that the object may fill
 HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles an image would spin
 TURNS = 2  # of a spiral
+RING = math.radians(15)  # of elevations; a spiral of less makes one turn, else it is an orbit twice
 NEIGHBOURS = 4  # of a camera, in whose directions another lies between()
 SAMPLED_POINTS = 20_000
 
@@ -26,7 +27,8 @@ def around(
 
     path: orbit, a circle at the images' median elevation that begins where the first was taken, the
     last frame one step before the first; spiral, two turns from the lowest tenth of the elevations
-    to the highest. cameras: those of the images. points: (N, 3), the object's, in the world.
+    to the highest, one where these are within RING. cameras: those of the images. points: (N, 3),
+    the object's, in the world.
     """
     up, centre = up_of(cameras), (points.min(axis=0) + points.max(axis=0)) / 2
     points = points[:: max(1, len(points) // SAMPLED_POINTS)] - centre
@@ -38,7 +40,8 @@ def around(
     angles, low = 2 * math.pi * np.arange(frames) / frames, np.median(elevations)
     high = low
     if path == "spiral":
-        angles, (low, high) = TURNS * angles, np.quantile(elevations, [0.1, 0.9])
+        low, high = np.quantile(elevations, [0.1, 0.9])
+        angles *= TURNS if high - low >= RING else 1
     towards = [
         math.cos(e) * (math.cos(a) * ahead + math.sin(a) * aside) + math.sin(e) * up
         for a, e in zip(angles, np.linspace(low, high, frames), strict=True)

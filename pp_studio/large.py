@@ -23,26 +23,39 @@ EDGE = 0.25  # change of alpha in a pixel of the training from which an outline 
 LEAST_EDGE = 0.01
 
 
-def parts(run: Run, camera: Camera) -> int:
-    """How many renderings at the training's scale a camera's image is woven of, each way."""
+def fineness(run: Run, camera: Camera) -> float:
+    """How many pixels of a camera the middle of the object has for one of the run's images, each
+    way.
+    """
     centre = run.ball[0]
 
-    def fineness(one):
+    def scale(one):
         return min(one.fx, one.fy) / max(float(np.linalg.norm(one.eye - centre)), 1e-30)
 
-    times = fineness(camera) / np.median([fineness(one) for one in run.cameras("train")])
-    most = min(MOST_PARTS, min(camera.width, camera.height) // MIN_SIDE)
-    return max(1, min(math.ceil(times - 0.25), most))
+    return float(scale(camera) / np.median([scale(one) for one in run.cameras("train")]))
+
+
+def parts(run: Run, camera: Camera, most: int = MOST_PARTS) -> int:
+    """How many renderings, up to `most`, at the training's scale a camera's image is woven of, each
+    way.
+    """
+    most = min(most, min(camera.width, camera.height) // MIN_SIDE)
+    return max(1, min(math.ceil(fineness(run, camera) - 0.25), most))
 
 
 def render_large(
-    run: Run, camera: Camera, *, on_part: Callable[[], object] = lambda: None, **options: Any
+    run: Run,
+    camera: Camera,
+    *,
+    most: int = MOST_PARTS,
+    on_part: Callable[[], object] = lambda: None,
+    **options: Any,
 ) -> RenderedView:
     """run.render(camera, **options), in which the points are as dense as the network knows them: an
-    image that is much finer than those of the training is woven() with smooth_outlines(). on_part:
-    called before each of its parts.
+    image that is much finer than those of the training is woven() with smooth_outlines(). most: of
+    parts(). on_part: called before each part is rendered.
     """
-    n = parts(run, camera)
+    n = parts(run, camera, most)
     if n == 1:
         on_part()
         return run.render(camera, **options)

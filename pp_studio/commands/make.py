@@ -13,7 +13,6 @@ from pp_cl.commands import options as shared
 from pp_cl.config import field_of
 from pp_cl.errors import UserError
 from pp_studio.capture import STAGES
-from pp_studio.commands import render
 from pp_studio.commands.capture import add_hints
 from pp_studio.export import QUICK
 
@@ -36,7 +35,6 @@ LEAST_TRAINING = 0.6  # of what the capture leaves
 LEAST_LEFT = 0.25  # of the minutes that a capture leaves, however long it took
 PER_PHOTOGRAPH = 0.03  # minutes that a capture takes, about: on two cores with AVX-512
 OF_SPLAT = 0.6  # of what is left after the evaluation
-LEAST_FPS = 8  # of the video
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -119,7 +117,7 @@ def run(options: argparse.Namespace) -> None:
             _step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
             show(split)
         if not is_newer(out / video, folder.checkpoint):
-            words = ["--fps", f"{_fps(load(folder.path, options.device), split, clock.left):d}"]
+            words = ["--minutes", f"{clock.left:.3g}"]
             _step("render", str(folder), "--out", str(out / video), *words, *device)
             show(split)
     print(
@@ -219,18 +217,6 @@ def _hints(options):
         box = options.box if isinstance(options.box, str) else ",".join(map(repr, options.box))
         words.append(f"--box={box}")
     return words
-
-
-def _fps(run, split, minutes):
-    """Frames a second of a video that takes so many minutes, by what the evaluation took."""
-    from pp_cl.scene import read_json
-    from pp_studio.large import parts
-
-    camera = run.cameras("train")[0]
-    times = max(1, render.LEAST_HEIGHT / camera.height)
-    larger = camera.resized(round(times * camera.width), round(times * camera.height))
-    seconds = read_json(run.folder.metrics(split))["seconds_per_frame"] * parts(run, larger) ** 2
-    return round(min(max(LEAST_FPS, 60 * minutes / (render.SECONDS * seconds)), render.FPS))
 
 
 def _step(name, *words):

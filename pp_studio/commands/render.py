@@ -12,7 +12,7 @@ from pp_cl.errors import UserError
 HELP = "render a run along a path of cameras: a video, or frames with alpha and depth"
 EPILOG = """paths:
   orbit       a circle around the object, at the height of the photographs
-  spiral      two turns, from the lowest photographs to the highest
+  spiral      two turns, from the lowest photographs to the highest; one where these form a ring
   SPLIT       the cameras of a split of the scene: train, val, test
   FILE        nerfstudio's camera_path.json, a transforms.json, or cameras.json of 3D Gaussian
               Splatting and brush, in the world of the scene"""
@@ -93,6 +93,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="samples per pixel: 1, 4, 9 or 16",
     )
     shared.add_fast(parser)
+    add(
+        "--minutes",
+        type=shared.number(0.01, 1e5),
+        default=math.inf,
+        metavar="N",
+        help="draw less finely, or the 3D Gaussians that an export has fitted, where all frames"
+        " would take longer",
+    )
     add("--features", action="store_true", help="exr: also the 16 features of each pixel")
     shared.add_run_scene(parser)
     shared.add_device(parser)
@@ -124,12 +132,14 @@ def run(options: argparse.Namespace) -> None:
     if kind in VIDEOS and not options.out:
         own(out.parent, [out], "move it away, or choose another --out")
     if kind in VIDEOS:
-        seconds = render_video(run, cameras, out, options.fps, style)
+        rendered = render_video(run, cameras, out, options.fps, style, minutes=options.minutes)
     else:
-        seconds, _ = render_frames(run, cameras, out, style)
-    made = f"{len(seconds)} of {len(cameras)} frames"
-    if seconds:
-        made += f", {statistics.median(seconds) * 1e3:.0f} ms each on {run.dev.name}"
+        rendered = render_frames(run, cameras, out, style, minutes=options.minutes)
+    made = f"{len(rendered.seconds)} of {len(cameras)} frames"
+    if rendered.seconds:
+        made += f", {statistics.median(rendered.seconds) * 1e3:.0f} ms each on {run.dev.name}"
+    if rendered.why:
+        print(f"frames are {rendered.why}")
     print(f"rendered {made}\nwrote {out}")
 
 
@@ -211,7 +221,12 @@ def _cameras(run, path, count, *, size, fov):
     if Path(path).suffix:
         return [shaped(camera) for camera in read_cameras(Path(path), size)]
     if path not in MADE:
-        return [shaped(camera) for camera in run.cameras(path)]
+        try:
+            return [shaped(camera) for camera in run.cameras(path)]
+        except UserError as error:
+            raise UserError(
+                f"--path {path}: {error}; the paths that every run has are orbit and spiral"
+            ) from None
     training = run.cameras("train")
     first = shaped(training[0])
     if not size and first.height < LEAST_HEIGHT:

@@ -18,8 +18,18 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl import Config, Progress, Run
-from pp_cl.engine import MIN_SIDE, Crop, Crops, FirstFeatures, Model, PointCloud, Trainer, View
+from pp_cl import Camera, Config, Progress, Run
+from pp_cl.engine import (
+    MIN_SIDE,
+    Crop,
+    Crops,
+    FirstFeatures,
+    Model,
+    PointCloud,
+    Renderer,
+    Trainer,
+    View,
+)
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
 from pp_studio.camera_path import between
@@ -223,6 +233,41 @@ def _table(run, cloud):
     axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
     table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
     return table
+
+
+def drawn_by(run: Run, gaussians: Gaussians) -> Run:
+    """The run with its Gaussians in place of its points and network: its render() draws them as
+    viewers do, for cameras of window_camera().
+    """
+    dev, grid, table = run.dev, run.model.grid, gaussians.table
+    place = table["position"] / grid.voxel_size + (np.asarray(grid.dims) - 1) / 2
+    vertices = np.rint(place).clip(0, np.asarray(grid.dims) - 1)
+    ids = grid.ids(vertices.astype(np.int64))
+    settings = config_of(run, FEWEST).raster
+    axes = Rotation.from_quat(np.roll(table["turn"], -1, axis=1)).as_matrix()
+    axes *= table["deviations"][:, None] / (settings.radius * grid.voxel_size)
+    lower = np.linalg.cholesky(axes @ axes.transpose(0, 2, 1))
+    offset = np.zeros((len(table), 9))
+    offset[:, :3] = place - vertices
+    offset[:, 3:6] = np.log(lower[:, range(3), range(3)])
+    offset[:, 6:9] = lower[:, [1, 2, 2], [0, 0, 1]]
+    sh = np.zeros((len(table), COUNT, 16))
+    sh[..., :3] = table["harmonics"]
+    sh[:, 0, :3] += 0.5 / CONSTANT
+    rows = np.argsort(ids, kind="stable")
+    cloud = PointCloud.of_gaussians(dev, ids[rows], offset[rows], table["opacity"][rows], sh[rows])
+    model = Model(dev, grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
+    drawn = replace(run, model=model, config=replace(run.config, raster=settings), others=[])
+    drawn.renderer, drawn.ball = Renderer(dev, model, settings), run.ball
+    return drawn
+
+
+def window_camera(camera: Camera, finer: float, gaussians: Gaussians) -> Camera:
+    """A camera for a run of drawn_by() that shows Gaussians as the nearest window does for which
+    they are made. finer: how many of its pixels there are for one of the run's images, each way.
+    """
+    least, _ = gaussians.windows
+    return replace(camera, samples=max(1.0, least / finer))
 
 
 def check_drawable(run: Run) -> None:

@@ -2,15 +2,17 @@
 
 import hashlib
 import json
+import math
 import shutil
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
-from pp_cl import Camera, Run, track
+from pp_cl import Camera, RenderedView, Run, track
 from pp_cl.errors import UserError
 from pp_cl.files import (
     MANIFEST,
@@ -25,7 +27,8 @@ from pp_cl.files import (
     write_json,
     write_png,
 )
-from pp_studio.large import render_large
+from pp_studio.export.gaussians import drawn_by, kept_gaussians, window_camera
+from pp_studio.large import MOST_PARTS, fineness, parts, render_large
 from pp_studio.video import write_video
 
 MOST_IDENTITY = 1000  # bytes of it
@@ -33,6 +36,9 @@ MOST_IDENTITY = 1000  # bytes of it
 PIXEL_BYTES, MOST_HELD = {".webp": 4, ".gif": 1}, 2**31
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
 LOCK = ".pp-cl.lock"
+GAUSSIANS = 0  # in place of a number of parts
+WRITING = 0.05  # seconds, about, that a frame takes to be written, and its share of a video
+FEWER_PARTS = 2  # where as many as there may be would take too long: lego has 0.2 dB less
 
 
 @dataclass(frozen=True)
@@ -40,23 +46,44 @@ class Style:
     """How frames are rendered and written.
 
     suffix: png or exr. background: sRGB in [0, 1], None: transparent; OpenEXR always is. samples:
-    per pixel, a square number. features: in OpenEXR, the network's input too.
+    per pixel, a square number. features: in OpenEXR, the network's input too. parts: at most so
+    many renderings, each way, that a frame is woven of; GAUSSIANS: those of kept_gaussians() are
+    drawn.
     """
 
     suffix: str = "png"
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     samples: int = 1
     features: bool = False
+    parts: int = MOST_PARTS
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What render_frames() has done. seconds: of each frame that was not there. paths: of all. why:
+    a line on how frames are drawn that would have taken too long, "" of others.
+    """
+
+    seconds: list[float]
+    paths: list[Path]
+    why: str = ""
 
 
 def render_frames(
-    run: Run, cameras: Sequence[Camera], folder: Path, style: Style, *, replace: bool = False
-) -> tuple[list[float], list[Path]]:
-    """Render the frames of the cameras that are not there yet into a folder; returns the seconds of
-    each that was not, and all files.
+    run: Run,
+    cameras: Sequence[Camera],
+    folder: Path,
+    style: Style,
+    *,
+    minutes: float = math.inf,
+    anew: bool = False,
+) -> Rendered:
+    """Render the frames of the cameras that are not there yet into a folder.
 
-    replace: frames of something else make room. Raises UserError for a folder that cannot be made,
-    holds other files or frames, or that another process renders into.
+    minutes: for all frames; where the style takes longer, they are drawn less finely, or by the
+    Gaussians that the run's folder keeps. anew: frames of something else make room. Raises
+    UserError for a folder that cannot be made, holds other files or frames, or that another process
+    renders into.
     """
     # Python stands for bytes that are no UTF-8 by these
     if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
@@ -70,16 +97,19 @@ def render_frames(
         _identity_of(folder)  # no lock is made in a folder of others
     check_target(folder / IDENTITY)
     folder.mkdir(parents=True, exist_ok=True)
-    seconds = []
+    seconds, why = [], ""
     try:
         with FileLock(folder / LOCK, timeout=0):
-            _begin(folder, paths, _identity(run, cameras, style), replace)
+            if minutes < math.inf:
+                style, why = _affordable(run, cameras, style, minutes, _identity_of(folder))
+            _begin(folder, paths, _identity(run, cameras, style), anew)
+            draw = _drawer(run, style)
             frames = zip(cameras, paths, strict=True)
             for camera, path in track(frames, "rendering", "frame", len(paths)):
                 if path.exists():
                     continue
                 start = time.perf_counter()
-                rendered = render_large(run, camera, samples=style.samples, features=style.features)
+                rendered = draw(camera)
                 if style.suffix == "exr":
                     write_exr(path, rendered.channels())
                 else:
@@ -89,15 +119,21 @@ def render_frames(
         raise UserError(
             f"{folder}: another process renders there; wait for its end, or choose another --out"
         ) from None
-    return seconds, paths
+    return Rendered(seconds, paths, why)
 
 
 def render_video(
-    run: Run, cameras: Sequence[Camera], video: Path, fps: float, style: Style
-) -> list[float]:
+    run: Run,
+    cameras: Sequence[Camera],
+    video: Path,
+    fps: float,
+    style: Style,
+    *,
+    minutes: float = math.inf,
+) -> Rendered:
     """Render a video, whose frames are in a hidden folder beside it until it is written, for a
-    later call to go on with; returns the seconds of each frame that was not there. Raises UserError
-    as render_frames and write_video do, and for a video whose frames would fill the memory.
+    later call to go on with. minutes: of render_frames. Raises UserError as render_frames and
+    write_video do, and for a video whose frames would fill the memory.
     """
     check_file(video)
     held = PIXEL_BYTES.get(video.suffix.lower(), 0) * sum(c.width * c.height for c in cameras)
@@ -107,19 +143,60 @@ def render_video(
             " make it shorter or smaller, or write --format mp4"
         )
     folder = video.with_name(f".{video.name}.frames")
-    seconds, paths = render_frames(run, cameras, folder, style, replace=True)
+    rendered = render_frames(run, cameras, folder, style, minutes=minutes, anew=True)
     channels = 4 if style.background is None else 3
-    write_video(video, (read_rgba(path)[..., :channels] for path in paths), fps)
+    write_video(video, (read_rgba(path)[..., :channels] for path in rendered.paths), fps)
     remove_ours(folder.iterdir())
     if {path.name for path in folder.iterdir()} <= {LOCK, MANIFEST}:
         shutil.rmtree(folder)
-    return seconds
+    return rendered
 
 
-def _begin(folder, paths, identity, replace):
+def _drawer(run: Run, style: Style) -> Callable[[Camera], RenderedView]:
+    """What draws a frame."""
+    if style.parts:
+        options = {"samples": style.samples, "features": style.features}
+        return lambda camera: render_large(run, camera, most=style.parts, **options)
+    gaussians: Any = kept_gaussians(run)
+    drawn = drawn_by(run, gaussians)
+
+    def draw(camera):
+        window = window_camera(camera, fineness(run, camera), gaussians)
+        return drawn.render(window, samples=style.samples)
+
+    return draw
+
+
+def _affordable(run, cameras, style, minutes, there):
+    """(the first of some styles with which all frames take these minutes, else the last, Rendered.
+    why). there: identity of frames that are there, with whose style the others are drawn.
+    """
+    ways = {style: ""}
+    if parts(run, cameras[0], style.parts) > FEWER_PARTS:
+        ways[replace(style, parts=FEWER_PARTS)] = "less finely"
+    if not style.features and kept_gaussians(run):
+        ways[replace(style, parts=GAUSSIANS)] = "as the run's 3D Gaussians, without its network"
+    for way, how in ways.items():
+        if there == _identity(run, cameras, way):
+            return way, f"drawn {how}, as they were begun" if how else ""
+    first = 0.0
+    for way in ways:
+        draw = _drawer(run, way)
+        draw(cameras[0])  # builds kernels
+        start = time.perf_counter()
+        draw(cameras[0])
+        needed = (time.perf_counter() - start + WRITING) * len(cameras) / 60
+        first = first or needed
+        if needed <= minutes:
+            break
+    why = f"drawn {ways[way]}: otherwise they would take {first:.1f} minutes"
+    return way, why if ways[way] else ""
+
+
+def _begin(folder, paths, identity, anew):
     """Have a folder hold frames of this identity alone."""
     if _identity_of(folder) not in (None, identity):
-        if not replace:
+        if not anew:
             raise UserError(
                 f"{folder}: holds frames of another model, path or style; choose another --out,"
                 " or delete it"

@@ -74,7 +74,7 @@ def test_padding_keeps_every_pixel(rng, width, height, margin):
     assert padded.width % 4 == padded.height % 4 == 0
     more = [padded.width - width - 2 * margin, padded.height - height - 2 * margin]
     assert (left, top) == (margin + more[0] // 2, margin + more[1] // 2)
-    assert 0 <= min(more) and max(more) < 4
+    assert min(more) >= 0 and max(more) < 4
     points = points_in_front(camera, rng)
     np.testing.assert_allclose(project(padded, points), project(camera, points) + [left, top])
 

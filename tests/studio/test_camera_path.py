@@ -60,6 +60,24 @@ def test_the_object_is_whole_and_nothing_jumps(tilted, path):
         assert np.linalg.norm(eyes[0] - eyes[-1]) == pytest.approx(steps[0], rel=1e-6)
 
 
+def test_a_spiral_of_one_ring_makes_one_turn(rng):
+    points = rng.uniform(-1, 1, (50, 3))
+    ring = [
+        Camera.look_at((4 * np.cos(a), 4 * np.sin(a), rise), (0, 0, 0), fx=60, width=64, height=64)
+        for a, rise in zip(np.arange(24) / 24 * 2 * np.pi, rng.uniform(0.9, 1.1, 24), strict=True)
+    ]
+    high = [
+        Camera.look_at((3 * np.cos(a), 3 * np.sin(a), 3), (0, 0, 0), fx=60, width=64, height=64)
+        for a in np.arange(24) / 24 * 2 * np.pi
+    ]
+    for cameras, turns in ((ring, 1), ([*ring, *high], 2)):
+        frames = around("spiral", cameras, points, cameras[0], 40)
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        x, y, _ = np.transpose([camera.eye - middle for camera in frames])
+        angles = np.unwrap(np.arctan2(y, x))
+        assert angles[-1] - angles[0] == pytest.approx(turns * 2 * np.pi * 39 / 40, rel=1e-3)
+
+
 def test_a_camera_above_the_object_is_no_division_by_zero():
     camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), fx=50, width=64, height=64)
     points = np.array([[-1.0, -1, -1], [1, 1, 1]])

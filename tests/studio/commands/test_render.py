@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import imageio.v2 as imageio
 import numpy as np
@@ -12,7 +13,9 @@ from support.refused import failure
 from pp_cl.cli import main
 from pp_cl.files.atomic import MANIFEST
 from pp_cl.files.image import read_rgba
+from pp_cl.metrics.psnr_ssim import psnr
 from pp_studio.export import render_video
+from pp_studio.export.gaussians import first_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +87,7 @@ def test_sizes_have_folders_of_their_own_and_need_no_scene(trained):
     large = {"orbit_720x720.mp4", "orbit_720x720", "spiral_720x720.mp4"}
     assert names == large | {"orbit_32x32.mp4"}
     assert "/nowhere" in failure(*words[:2], "--path", "test")
+    assert "every run has are orbit and spiral" in failure(*words[:2], "--path", "circle")
     assert "choose another" in failure(*words[:2], "--format", "exr")
 
 
@@ -104,6 +108,43 @@ def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys)
     told = failure(*words, "--background", "black")
     assert "holds frames of another model, path or style" in told
     assert files() == whole
+
+
+def test_what_frames_cost_decides_how_they_are_drawn(trained, tmp_path, monkeypatch, capsys):
+    """By a clock that only renderings of a finer image advance."""
+    clock, real, asked = [0.0], render_video.render_large, []
+
+    def slow(run, camera, *, most, **options):
+        clock[0] += {4: 10, 2: 5}[most]
+        asked.append(most)
+        return real(run, camera, most=most, **options)
+
+    monkeypatch.setattr(render_video, "render_large", slow)
+    monkeypatch.setattr(render_video, "time", Mock(perf_counter=lambda: clock[0]))
+    words = ["render", trained, "--format", "png", "--seconds", "1", "--fps", "4"]
+    words += ["--size", "96x96"]
+
+    def frames(name, minutes):
+        asked.clear()
+        assert main([*words, "--out", str(tmp_path / name), "--minutes", minutes]) == 0
+        return [read_rgba(path) for path in sorted((tmp_path / name).glob("*.png"))]
+
+    whole = frames("whole", "1")
+    assert set(asked) == {4} and "frames are" not in capsys.readouterr().out
+    coarser = frames("coarser", "0.5")
+    assert asked[-4:] == [2] * 4 and "otherwise they would take 0.7 min" in capsys.readouterr().out
+    frames("none", "0.01")  # no Gaussians are there
+    assert asked[-4:] == [2] * 4
+    monkeypatch.setattr(render_video, "kept_gaussians", first_gaussians)
+    gaussians = frames("gaussians", "0.01")
+    assert asked == [4, 4, 2, 2] and "3D Gaussians" in capsys.readouterr().out
+    assert len(whole) == len(coarser) == len(gaussians) == 4
+    for one, other in zip(whole, gaussians, strict=True):
+        assert 20 < psnr(one[..., :3], other[..., :3]) < 60
+    (tmp_path / "gaussians/00002.png").unlink()
+    again = frames("gaussians", "1")  # goes on as it was begun
+    assert asked == [] and "as they were begun" in capsys.readouterr().out
+    np.testing.assert_array_equal(again, gaussians)
 
 
 def test_transparent_frames_and_colours(trained, tmp_path):

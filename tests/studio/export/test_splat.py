@@ -20,8 +20,10 @@ from pp_studio.export.gaussians import (
     DEVIATION,
     WindowCrops,
     begun,
+    drawn_by,
     fit_gaussians,
     fitted_gaussians,
+    window_camera,
 )
 from pp_studio.export.harmonics import fit_harmonics
 from pp_studio.export.splat import (
@@ -103,6 +105,24 @@ def likeness(run, path, scale):
         blocks = draw_splats(found, large).reshape(camera.height, scale, camera.width, scale, 3)
         measured.append(psnr(to_8bit(blocks.mean((1, 3))), to_8bit(run.render(camera).colour)))
     return np.mean(measured)
+
+
+def test_the_engine_draws_them_as_viewers_do(run, ply):
+    found, kept = read_splats(ply), fitted_gaussians(run)
+    least, most = kept.windows
+    drawn = drawn_by(run, kept)
+    for scale in (least, 3, most):
+        camera = run.cameras("test")[0]
+        camera = camera.resized(round(scale * camera.width), round(scale * camera.height))
+        view = drawn.render(window_camera(camera, scale, kept))
+        viewers = draw_splats(found, turned(run, camera))
+        assert psnr(to_8bit(view.colour), to_8bit(viewers)) > 50
+        np.testing.assert_array_equal(view.alpha == 0, np.isinf(view.depth))
+    small = run.cameras("test")[0]  # in which viewers would draw them too wide
+    as_is = drawn.render(small).colour
+    mended = drawn.render(window_camera(small, 1.0, kept)).colour
+    wanted = to_8bit(run.render(small).colour)
+    assert psnr(to_8bit(mended), wanted) > psnr(to_8bit(as_is), wanted) + 1
 
 
 def test_gaussians_look_like_the_run_in_windows_of_any_size(run, ply):
