@@ -38,7 +38,7 @@ IDENTITY = "frames.json"  # in the folder of the frames: what they show
 LOCK = ".pp-cl.lock"
 GAUSSIANS = 0  # in place of a number of parts
 WRITING = 0.05  # seconds, about, that a frame takes to be written, and its share of a video
-FEWER_PARTS = 2  # where as many as there may be would take too long: lego has 0.2 dB less
+FEWER_PARTS = 2  # where as many as there may be would take too long (large.py says what it costs)
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def render_video(
 def _drawer(run: Run, style: Style) -> Callable[[Camera], RenderedView]:
     """What draws a frame."""
     if style.parts:
-        options = {"samples": style.samples, "features": style.features}
+        options: Any = {"samples": style.samples, "features": style.features}
         return lambda camera: render_large(run, camera, most=style.parts, **options)
     gaussians: Any = kept_gaussians(run)
     drawn = drawn_by(run, gaussians)

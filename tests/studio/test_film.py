@@ -29,9 +29,10 @@ def flicker(cameras, views):
     places = depth * first.rays()[rows, columns] + first.eye
     x, y, z = ((places - second.eye) @ second.pose[:, :3]).T
     at = np.stack([second.fy * y / z + second.cy, second.fx * x / z + second.cx]) - 0.5
-    nearest = np.rint(at).astype(int).clip(0, np.array([second.height, second.width])[:, None] - 1)
-    seen = np.abs(after.median_depth[*nearest] / z - 1) < NEAR
-    seen &= after.alpha[*nearest] >= OPAQUE
+    most = [[second.height - 1], [second.width - 1]]
+    nearest = tuple(np.rint(at).astype(int).clip(0, most))
+    seen = np.abs(after.median_depth[nearest] / z - 1) < NEAR
+    seen &= after.alpha[nearest] >= OPAQUE
     shown = [map_coordinates(after.colour[..., c], at[:, seen], order=1) for c in range(3)]
     return 255 * np.abs(before.colour[rows, columns][seen] - np.transpose(shown)).mean()
 
