@@ -73,7 +73,7 @@ def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
 
     for axes, value in (left, error), (right, lambda row: row["psnr"]):
         axes.set(xlabel="milliseconds a frame", xlim=(0, 1.1 * max(row["ms"] for row in rows)))
-        axes.grid(True, which="both", alpha=0.3)
+        axes.grid(True, alpha=0.3)
 
         def draw(some, *style, axes=axes, value=value, **options):
             axes.plot([row["ms"] for row in some], [*map(value, some)], *style, **options)

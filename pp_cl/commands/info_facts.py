@@ -149,7 +149,7 @@ def _counted(result):
     rank = np.arange(pairs.total) - np.repeat(offset[:-1], np.diff(offset))
     blended = is_listed & (rank < weights.tracked)
     covered = tiles_with((np.diff(offset) > 0).reshape(result.size))
-    return [pairs.total, blended.sum(), weights.total.get(), covered.mean()]
+    return [pairs.total, blended.sum(), weights.total, covered.mean()]
 
 
 def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:

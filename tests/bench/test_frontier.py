@@ -83,8 +83,9 @@ def test_the_table_names_default_and_frontier(whole, capsys):
         assert ("--fast" in text) == row["is_fast"]
 
 
-def row(ms, psnr, **more):
-    return {"ms": ms, "psnr": psnr, "is_default": False} | more
+def row(ms, psnr, early_stop=0.01, least=None, **more):
+    found = {"ms": ms, "ms_range": [least or ms - 1, ms + 1], "psnr": psnr, "is_default": False}
+    return found | {"setting": {"early_stop": early_stop, "samples": 4}} | more
 
 
 def test_the_fastest_row_is_hardly_worse_than_the_default():
@@ -92,6 +93,8 @@ def test_the_fastest_row_is_hardly_worse_than_the_default():
     fast, worse, slower = row(6.0, 29.91), row(3.0, 29.89), row(8.0, 30.5)
     assert fastest_row([slower, default, worse, fast]) is fast
     assert fastest_row([row(9.2, 30.0), default, worse]) is default  # at its knee
+    by_chance = row(5.0, 30.0, early_stop=0.0), row(6.0, 30.0, least=9.0)
+    assert fastest_row([*by_chance, default]) is default
 
 
 def curve(axes, label):
