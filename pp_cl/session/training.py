@@ -62,9 +62,10 @@ class HullFacts(NamedTuple):
 @dataclass
 class Training:
     """A training that is ready to begin or to go on. config: its settings, which another plan
-    replaces. info: what a checkpoint's header holds beside
-    the model's. hull: None if it resumes. measured: the views on which train.eval_every measures
-    PSNR. began: time.monotonic() when it was opened, from which train.minutes count.
+    replaces. info: what a checkpoint's header holds beside the model's. hull: None if it resumes.
+    measured: the views on which train.eval_every measures PSNR. began: time.monotonic() when it was
+    opened, from which train.minutes count. on_preview: is called after each preview, between two
+    steps.
     """
 
     folder: RunFolder
@@ -75,9 +76,16 @@ class Training:
     hull: HullFacts | None
     measured: list[View]
     began: float
+    on_preview: Callable[[], None] = lambda: None
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
     _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
+    _earlier: float = field(default=0.0, init=False)  # seconds before it was interrupted
+
+    @property
+    def passed(self) -> float:
+        """Seconds of train.minutes that have passed, those before an interruption included."""
+        return self._earlier + time.monotonic() - self.began
 
     def run(
         self,
@@ -124,7 +132,7 @@ class Training:
             pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
             may_stay_coarse = "train.refine_at" in self.config.automatic
             budget = Budget(self.config, pixels, may_stay_coarse)
-            seconds = earlier = log.seconds
+            seconds = self._earlier = log.seconds
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < self.config.train.iterations:
@@ -135,8 +143,7 @@ class Training:
                 took = time.perf_counter() - start
                 seconds += took
                 if self.config.train.minutes and not trainer.begun:
-                    passed = earlier + time.monotonic() - self.began
-                    if plan := budget.plan(self.config, trainer.step, passed):
+                    if plan := budget.plan(self.config, trainer.step, self.passed):
                         place = trainer.model.grid, trainer.views, trainer.step
                         self._follow(plan.for_grid(self.config.train, *place))
                 if trainer.step == first and not any(self.folder.previews.glob("*.png")):
@@ -242,6 +249,16 @@ class Training:
         self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
         write_comparison(path, [self._rendered(view)], [trainer.target(view)])
+        self.on_preview()
+
+    def present_run(self) -> Run:
+        """What is trained by now as a run, to be drawn between two steps. Its renderer is the
+        trainer's, as one of its own would freeze the network.
+        """
+        header = self.info | {"step": self.trainer.step, "finished": False}
+        run = Run(self.trainer.dev, self.folder, self.config, header, self.trainer.model)
+        run.renderer = self.trainer.renderer
+        return run
 
     def _rendered(self, view):
         """The present model's image of a view. Raises Diverged where there is none."""

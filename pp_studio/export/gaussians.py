@@ -188,12 +188,13 @@ def _fitted(run, table):
     return Gaussians(table, run.model.grid.centre, (least, most), LOW_PASS)
 
 
-def first_gaussians(run: Run) -> Gaussians:
+def first_gaussians(run: Run, views: int = FIRST_VIEWS) -> Gaussians:
     """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
-    the colours that the network gives them. Raises UserError as check_drawable does.
+    the colours that the network gives them in so many views. Raises UserError as check_drawable
+    does.
     """
     check_drawable(run)
-    cloud = begun(run, fit_harmonics(run, steps=0, most=FIRST_VIEWS), 0)
+    cloud = begun(run, fit_harmonics(run, steps=0, most=views), 0)
     return Gaussians(_table(run, cloud), run.model.grid.centre)
 
 
