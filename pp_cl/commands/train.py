@@ -174,7 +174,7 @@ def _images_line(training, chosen):
     if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
-    return f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
+    return f"images: scaled from {stored} to {used}{why}"
 
 
 def _sizes(cameras):

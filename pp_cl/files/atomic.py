@@ -232,7 +232,7 @@ def check_ours(paths: Iterable[Path], mend: str = "move it away") -> None:
     there = [path for path in paths if os.path.lexists(path)]
     if others := set(there) - set(ours(there)):
         first = min(others)
-        raise UserError(f"{first}: pp-cl did not write this, or not as it is now; {mend}")
+        raise UserError(f"{first}: was not written by pp-cl, or was changed since; {mend}")
 
 
 def remove_ours(paths: Iterable[Path]) -> None:

@@ -229,8 +229,7 @@ class _Clock:
 
     def tell_of_capture(self, source: str) -> None:
         """Say how the minutes are divided, before the photographs are looked at."""
-        count = sum(1 for _ in Path(source).glob("*")) if Path(source).is_dir() else 0
-        capture = min(PER_PHOTOGRAPH * count or 3.0, self.minutes)
+        capture = min(PER_PHOTOGRAPH * _photographs(source), self.minutes)
         print(
             f"{self.minutes:g} minutes: about {capture:.1f} for cameras and masks, a quarter of the"
             " rest for evaluation, splat and video, and what is left for the training",
@@ -330,8 +329,16 @@ def _is_scene(source):
     try:
         return bool(scene_format(source))
     except UserError:
-        print(f"{source}: no file of cameras that is known; capture finds them and the masks")
+        found = f"{_photographs(source)} photographs" if Path(source).is_dir() else "a video"
+        print(f"{source}: {found}; working out where each was taken, and cutting out the object")
         return False
+
+
+def _photographs(source):
+    """How many a capture takes."""
+    from pp_studio.capture.frames import FRAMES, listed
+
+    return len(listed(Path(source))) if Path(source).is_dir() else FRAMES
 
 
 def _hints(options):

@@ -11,7 +11,7 @@ import numpy as np
 
 from pp_cl import Run
 from pp_cl.engine import View
-from pp_cl.errors import UserError, name_of, require
+from pp_cl.errors import UserError, require
 from pp_cl.files import check_file, check_new_folder, check_ours, image_paths, own, write_text
 from pp_cl.scene import write_scene
 from pp_studio.export import (
@@ -95,7 +95,7 @@ def export_run(
         told = f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
     elif name == "html":
         fitted = gaussians.fitted_gaussians(run)
-        text = page.page_text(fitted, run.cameras("train"), name_of(run.folder.path))
+        text = page.page_text(fitted, run.cameras("train"), run.folder.name)
         write = partial(write_text, path, text)
         told = f"{len(fitted.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     elif name in SPLATS:

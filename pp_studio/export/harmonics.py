@@ -125,7 +125,7 @@ def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
     def product(flat):
         coefficients = flat.reshape(b.shape)
         result = ridge[..., None] * coefficients
-        for seen in observe(run, cameras, "harmonics", blending=True):
+        for seen in observe(run, cameras, "colours by direction", blending=True):
             at, rows = seen.functions(positions), seen.visible
             colours, _ = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[rows]))
             result[rows] += at[:, :, None] * seen.gathered(colours)[:, None]

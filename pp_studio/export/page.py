@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl import Camera, Run
-from pp_cl.errors import name_of
 from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
 from pp_cl.scene import up_of
 from pp_studio.camera_path import level
@@ -157,7 +156,7 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
     figures = []
     with atomic_folder(folder) as unfinished:
         for run in runs:
-            name = name_of(run.folder.path)
+            name = run.folder.name
             stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-") or "run"
             while stem.lower() in {"index", *map(str.lower, stems)}:  # as some disks take names
                 stem += "-2"

@@ -22,7 +22,7 @@ def trained_lines(capsys, *words):
 
 def test_a_preset_reduces_large_images_and_says_so(tmp_path, capsys):
     scene, out = write_ball_scene(tmp_path / "ball", views=4, size=400), tmp_path / "run"
-    line = "images: 400x400, reduced 2 times to 200x200"
+    line = "images: scaled from 400x400 to 200x200"
     chosen = f"{line} for the preset tiny (--downscale 1 keeps them)"
     assert chosen in trained_lines(capsys, scene, "--out", out)
     assert json.loads((out / "config.json").read_text())["scene"]["downscale"] == 2
