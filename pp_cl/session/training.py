@@ -64,8 +64,7 @@ class Training:
     """A training that is ready to begin or to go on. config: its settings, which another plan
     replaces. info: what a checkpoint's header holds beside the model's. hull: None if it resumes.
     measured: the views on which train.eval_every measures PSNR. began: time.monotonic() when it was
-    opened, from which train.minutes count. on_preview: is called after each preview, between two
-    steps.
+    opened, from which train.minutes count. on_preview: is called after each preview, if set.
     """
 
     folder: RunFolder
@@ -76,7 +75,7 @@ class Training:
     hull: HullFacts | None
     measured: list[View]
     began: float
-    on_preview: Callable[[], None] = lambda: None
+    on_preview: Callable[[], None] | None = field(default=None, init=False)
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
     _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
@@ -142,10 +141,10 @@ class Training:
                 terms = trainer.train_step()
                 took = time.perf_counter() - start
                 seconds += took
-                if self.config.train.minutes and not trainer.begun:
-                    if plan := budget.plan(self.config, trainer.step, self.passed):
-                        place = trainer.model.grid, trainer.views, trainer.step
-                        self._follow(plan.for_grid(self.config.train, *place))
+                is_planned = self.config.train.minutes and not trainer.begun
+                if is_planned and (plan := budget.plan(self.config, trainer.step, self.passed)):
+                    place = trainer.model.grid, trainer.views, trainer.step
+                    self._follow(plan.for_grid(self.config.train, *place))
                 if trainer.step == first and not any(self.folder.previews.glob("*.png")):
                     self._preview_by = time.monotonic() + FIRST_PREVIEW  # the kernels are built
                 row = self._after_step(log, terms, seconds)
@@ -249,7 +248,8 @@ class Training:
         self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
         write_comparison(path, [self._rendered(view)], [trainer.target(view)])
-        self.on_preview()
+        if self.on_preview:
+            self.on_preview()
 
     def present_run(self) -> Run:
         """What is trained by now as a run, to be drawn between two steps. Its renderer is the

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
 EPILOG = """FOLDER then holds
   index.html           the result: the model to turn, views beside their photographs, the figures;
-                       it is there from the cameras on, and grows
+                       it is there once masks are made, shows what there is, and reloads itself
   model.html           the model alone, on one page
   video.mp4, splat.ply once around the object; 3D Gaussians for other viewers
   thumbnail.png        an image of it
@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> None:
                     show(f"In training, at step {training.trainer.step}.")
                 except (UserError, MemoryError) as error:  # which is no reason to end a training
                     warnings.warn(f"{page} is not renewed in the training: {error}", stacklevel=2)
-                    training.on_preview = lambda: None
+                    training.on_preview = None
 
             training.on_preview = renew
 

@@ -1,12 +1,13 @@
 """The web server of the viewer: viser's, started quietly on one address."""
 
+import html
 import io
 import json
 import logging
 import socket
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
 from pp_cl.errors import UserError
@@ -22,7 +23,6 @@ def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterat
     first from PORT on. Raises UserError for a host or port that cannot be had.
     """
     import viser
-    from viser import _messages
 
     if port is not None:  # viser would try others, for ever where it is the host that is wrong
         try:
@@ -42,9 +42,9 @@ def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterat
     try:
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.main_panel.float(x=15, y=-15)
-        with suppress(AttributeError):  # there is no public way to a title in the browser's tab
-            title = _messages.RunJavascriptMessage(f"document.title = {json.dumps(label)};")
-            server.gui._websock_interface.queue_message(title)
+        # viser has no other way to the title in the browser's tab
+        script = html.escape(f"document.title = {json.dumps(label)}")
+        server.gui.add_html(f'<img hidden src="data:," onerror="{script}">')
         yield server, f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
     finally:
         with redirect_stdout(io.StringIO()):

@@ -152,7 +152,7 @@ def test_an_open_page_is_renewed_in_the_training_and_its_bits_are_the_same(
                 state = (folder / "index.html").read_text("utf-8")
                 renewed.append((training.trainer.step, len(state)))
             else:
-                training.on_preview = lambda: None
+                training.on_preview = None
 
         monkeypatch.setattr(result, "write_preview", preview)
         assert main(["make", scene, "--out", str(folder)]) == 0
