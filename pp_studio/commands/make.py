@@ -143,7 +143,7 @@ def run(options: argparse.Namespace) -> None:
             show("Cameras and masks are found.")
             print(f"wrote {page}: open it in a browser; it grows by itself", flush=True)
             if not (out / MODEL).exists() and _wrote_hull(out, scene, clock.title, options, masks):
-                show("The outlines of the photographs in their colours, which will be trained.")
+                show("So far this is the object's outline in the colours of the photographs.")
         if not folder.config.exists():
             minutes = clock.training()
             preset = ["--preset", options.preset or _preset(minutes, share)]

@@ -34,6 +34,7 @@ PACKED = np.dtype(
 OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
 PLACES, TURNED = np.iinfo(np.uint16).max, 240
 FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
+RISE = 20.0  # degrees
 FILLED = 0.8  # of the shorter side, by the object as it is turned round; lines of text are above
 SAMPLED_POINTS = 20_000
 NEAREST = 0.05  # of the object's radius: what is nearer to the eye is not drawn, as in a run
@@ -184,10 +185,12 @@ def first_look(
     points: np.ndarray, centre: np.ndarray, cameras: Sequence[Camera]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(eye, up), both (3,), with which a page begins: it looks at the centre of the points (N, 3)
-    from the side of the first camera, 20 degrees above the horizon, and shows the whole object,
-    also when it is turned round.
+    from the side of the first camera, RISE above the horizon, or as near to it as cameras were, and
+    shows the whole object, also when it is turned round.
     """
-    up, rise = up_of(cameras), np.radians(20)
+    up, offsets = up_of(cameras), np.stack([one.eye - centre for one in cameras])
+    elevations = np.arcsin(offsets @ up / np.linalg.norm(offsets, axis=1))
+    rise = np.clip(np.radians(RISE), elevations.min(), elevations.max())
     ahead = level(cameras[0].eye - centre, up)
     points = points[:: max(1, len(points) // SAMPLED_POINTS)] - centre
     half, distance = FILLED * np.tan(np.radians(FIELD_OF_VIEW) / 2), 0.0

@@ -112,8 +112,8 @@ def write_result(
     version = str(time.time_ns()) if state else ""
     parts = {
         "title": html.escape(title),
-        "model": "\n".join([model if MODEL in shown else _later("model"), *plan]),
-        "state": f'<p class="state">{html.escape(state)}</p>' if state else "",
+        "model": model if MODEL in shown else _later("model"),
+        "state": "\n".join([f'<p class="state">{html.escape(state)}</p>'] * bool(state) + plan),
         "video": moving if video in shown else _later("video"),
         "views": views,
         "figures": "\n".join(

@@ -140,6 +140,14 @@ def test_before_the_fit_it_shows_the_points(run, tmp_path):
     assert psnr(image, to_8bit(run.render(camera).colour)) > 22
 
 
+def test_the_first_look_is_from_where_photographs_were_taken():
+    points, centre = np.random.default_rng(0).normal(size=(99, 3)), np.zeros(3)
+    for heights, expected in (((3, 3), 3), ((1, 50), 20), ((40, 50), 40)):
+        cameras = [seen_from(a, heights[a // 90 % 2]) for a in range(0, 720, 90)]
+        eye, up = first_look(points, centre, cameras)
+        assert np.degrees(np.arcsin(eye @ up / np.linalg.norm(eye))) == pytest.approx(expected)
+
+
 def test_the_first_look_shows_the_whole_object(run):
     centre, points = run.ball[0], run.model.positions()
     eye, up = first_look(points, centre, run.cameras("train"))
