@@ -23,7 +23,7 @@ from pp_cl.engine.training.between import keep_most_visible
 from pp_cl.engine.training.schedule import supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
-from pp_cl.files.atomic import check_target
+from pp_cl.files.atomic import check_room, check_target
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
 from pp_cl.files.sheets import write_comparison
@@ -104,6 +104,8 @@ class Training:
             if self.hull and self.hull.sheet is not None:
                 write_png(self.folder.path / MASKS_SHEET, self.hull.sheet)
             self._saved = self.trainer.step
+            size = sum(array.nbytes for array in self.trainer.arrays().values())
+            check_room(self.folder.checkpoint, size)
             try:
                 return self._run(on_step, is_stopped)
             except Diverged as error:
