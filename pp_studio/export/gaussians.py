@@ -37,7 +37,7 @@ GAUSSIAN = np.dtype(
     ]
 )
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
-FIRST_VIEWS = 40  # of which the points have their colours before the fit
+FIRST_VIEWS = 16  # of which the points have their colours before the fit
 LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
 
 # Pixels on the longer side of the smallest window for which splats are made; in smaller ones
@@ -188,13 +188,12 @@ def _fitted(run, table):
     return Gaussians(table, run.model.grid.centre, (least, most), LOW_PASS)
 
 
-def first_gaussians(run: Run, views: int = FIRST_VIEWS) -> Gaussians:
-    """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
-    the colours that the network gives them in so many views. Raises UserError as check_drawable
-    does.
+def first_gaussians(run: Run) -> Gaussians:
+    """As fitted_gaussians(), but before the fit, in seconds: round, as wide as the points, with the
+    means of the colours that the network gives them. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    cloud = begun(run, fit_harmonics(run, steps=0, most=views), 0)
+    cloud = begun(run, fit_harmonics(run, steps=-1, most=FIRST_VIEWS), 0)
     return Gaussians(_table(run, cloud), run.model.grid.centre)
 
 

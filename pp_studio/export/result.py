@@ -32,7 +32,6 @@ WHAT = {
     SPLAT: "3D Gaussians, for SuperSplat, Blender and other viewers",
     STILL: "an image of it",
 } | dict.fromkeys(VIDEOS, "once around the object")
-PREVIEWED_VIEWS = 16  # of which the model of a training in progress has its colours
 PLAN_WIDTH = 1000  # pixels of the drawing of the cameras
 
 
@@ -138,7 +137,7 @@ def write_preview(training: Training, folder: Path, title: str) -> None:
     # its own, as the training's would keep room for the fragments of whole images
     run.renderer = Renderer(run.dev, run.model, run.config.raster)
     try:
-        gaussians = first_gaussians(run, PREVIEWED_VIEWS)
+        gaussians = first_gaussians(run)
     finally:
         run.renderer.release()
     write_model(folder, gaussians, run.cameras("train"), title)
