@@ -23,6 +23,7 @@ def soon(monkeypatch):
     monkeypatch.setattr(progress, "REDRAWN", 0.02)
     monkeypatch.setattr(progress, "LINES_APART", 0.02)
     monkeypatch.setattr(progress, "_told", 0.0)
+    monkeypatch.setattr(progress, "_shown", None)
     monkeypatch.setenv("COLUMNS", "120")
 
 
