@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
-from pp_cl import Camera, open_device, track
+from pp_cl import Camera, Progress, open_device, track
 from pp_cl.config import scene_config
 from pp_cl.engine import View, evenly
 from pp_cl.scene import agreeing, build_grid, open_scene, scene_box, shrink
@@ -40,8 +40,9 @@ def hull_gaussians(
     views, box = open_scene(dev, config, ("train",)).splits["train"], scene_box(config)
     if not any(view.has_mask for view in views):
         return None  # there is nothing but a box
-    views, _, forgiven = agreeing(dev, views, box)
-    hull = build_grid(dev, views, POINTS, box, forgiven)
+    with Progress("carving the visual hull"):
+        views, _, forgiven = agreeing(dev, views, box)
+        hull = build_grid(dev, views, POINTS, box, forgiven)
     inside = np.zeros(hull.grid.dims, np.float32)
     inside[tuple(hull.grid.coordinates(hull.ids).T)] = 1
     # room around it, so that the surface is closed
