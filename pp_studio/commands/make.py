@@ -225,7 +225,7 @@ class _Clock:
     @property
     def told(self) -> str:
         """The same in words."""
-        return f"{self.left:.1f} of {self._until:.3g} minutes left"
+        return f"{self.left:.1f} of {round(self._until, 1):g} minutes left"
 
     def tell_of_capture(self, source: str) -> None:
         """Say how the minutes are divided, before the photographs are looked at."""
@@ -262,11 +262,11 @@ class _Clock:
         """Whether a finished training goes on, as more minutes are asked for than it was planned
         for, and are left; iterations() then has as many as they allow.
         """
-        left = self.minutes - self.passed
-        if self._planned >= self.minutes or left < LEAST_MORE:
+        left, rows = self.minutes - self.passed, folder.rows()
+        if self._planned >= self.minutes or left < LEAST_MORE or len(rows) < 2:
             return False
         self._planned, self._until = self.minutes, self.minutes
-        *rows, end = folder.rows()
+        end = rows.pop()  # its training's last step is in the one before
         late = next(row for row in rows if row["step"] >= LATE * end["step"])
         took, last = rows[-1]["seconds"] - late["seconds"], rows[-1]
         seconds = took / max(last["step"] - late["step"], 1) or last["seconds"] / last["step"]
