@@ -92,7 +92,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     with signals.interrupting() as caught:
         try:
             words = sys.argv[1:] if argv is None else list(argv)
-            options = _parser(words[:1]).parse_args(words)
+            parser = _parser(words[:1])
+            if not words:
+                parser.print_help()
+                return 0
+            options = parser.parse_args(words)
             json_alone = getattr(options, "json", None) is sys.stdout
             with redirect_stdout(sys.stderr) if json_alone else nullcontext():
                 options.run(options)

@@ -20,17 +20,20 @@ FORMAT = (
     "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"
 )
 ENDLESS = "{desc}: {elapsed}{postfix}"  # where nobody knows how much there is to do
+TIMED = "{desc}: {percentage:3.0f}%|{bar}| $left{postfix}"  # where time is given, and no units
 # of a terminal that does not tell its size, where tqdm would show nothing
 SIZE = 100, 20
 
 Item = TypeVar("Item")
 _told = time.monotonic()  # when the last line was due
+_shown: "Progress | None" = None  # the stage that is shown: those within it are not
 
 
 class Progress:
     """A stage, to be entered while it runs. what: it does, such as `matching`; total: its units,
-    None where nobody knows; done: those done before; stream: sys.stderr if not given. The text of
-    `note` follows what is done.
+    None where nobody knows; done: those done before; stream: sys.stderr if not given. given: the
+    stage has so many minutes, and its units are the seconds of these, which pass by themselves. The
+    text of `note` follows what is done. Nothing is shown within another stage.
     """
 
     def __init__(
@@ -40,16 +43,22 @@ class Progress:
         unit: str = "",
         *,
         done: int = 0,
+        given: float = 0.0,
         stream: TextIO | None = None,
     ) -> None:
-        self.total, self.note = total, ""
+        self.total, self.note = round(60 * given) or total, ""
+        self._given = given
         self._what, self._unit, self._stream = what, unit, stream or sys.stderr
         self._first = self._done = done
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._follow, daemon=True)
 
     def __enter__(self) -> "Progress":
+        global _shown
         self._start, self._bar = time.monotonic(), None
+        if _shown is not None:
+            return self
+        _shown = self
         if self._stream.isatty():
             columns, rows = shutil.get_terminal_size(SIZE)
             self._bar = tqdm(
@@ -67,6 +76,10 @@ class Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
+        global _shown
+        if _shown is not self:
+            return
+        _shown = None
         self._ended.set()
         self._thread.join()
         if self._bar is not None:
@@ -84,7 +97,11 @@ class Progress:
     def _show(self):
         global _told
         now = time.monotonic()
+        if self._given:
+            self._done = min(self._first + int(now - self._start), round(60 * self._given))
         if self._bar is not None:
+            if self._given:
+                self._bar.bar_format = TIMED.replace("$left", self._left())
             self._bar.n, self._bar.total = self._done, self.total
             self._bar.set_postfix_str(self.note)
         elif now - _told >= LINES_APART:
@@ -93,6 +110,8 @@ class Progress:
 
     def _line(self, seconds):
         """What a file shows after so many seconds of the stage."""
+        if self._given:
+            return f"{self._what}: {', '.join([self._left()] + [self.note] * bool(self.note))}"
         done = self._done - self._first
         parts = [f"{self._done} of {self.total} {self._unit}s"] if self.total else []
         if self.total and done:
@@ -101,6 +120,10 @@ class Progress:
         else:
             parts.append(f"{tqdm.format_interval(seconds)} so far")
         return f"{self._what}: {', '.join(parts + [self.note] * bool(self.note))}"
+
+    def _left(self):
+        left = self._given - self._done / 60
+        return f"{left:.1f} of {self._given:.1f} minutes left"
 
 
 def track(

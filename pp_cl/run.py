@@ -24,7 +24,7 @@ from pp_cl.engine.views import View
 from pp_cl.errors import UserError, few_names
 from pp_cl.files.image import to_8bit
 from pp_cl.files.rendered_view import RenderedView, mean_rendered_view
-from pp_cl.files.run_folder import RunFolder
+from pp_cl.files.run_folder import MADE, RunFolder
 from pp_cl.progress import track
 from pp_cl.scene.hull import misplaced
 from pp_cl.scene.identity import difference, unpacked_views
@@ -278,7 +278,7 @@ def stored_config(folder: RunFolder, scene: str | None = None) -> Config:
 
 def find_run(path: Path | str) -> RunFolder:
     """The run in a folder: itself, or the one that `pp-cl make` has put into it, unless a scene."""
-    folder, made = RunFolder(path), RunFolder(Path(path) / "run")
+    folder, made = RunFolder(path), RunFolder(Path(path) / MADE)
     if folder.config.exists() or not made.config.exists():
         return folder
     try:

@@ -25,6 +25,12 @@ def test_devices_are_listed_and_without_one_it_is_said_what_to_install(
         assert "install" in failure(*words)
 
 
+def test_without_a_command_the_help_is_printed(capsys):
+    assert main([]) == 0
+    printed = capsys.readouterr()
+    assert "train" in printed.out and "usage: pp-cl" in printed.out and not printed.err
+
+
 def test_a_run_that_lies_in_runs_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs" / "mine"

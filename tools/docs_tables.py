@@ -201,8 +201,8 @@ def _signature(thing: Any) -> str:
     if isinstance(node, ast.ClassDef):
         inits = [one for one in node.body if getattr(one, "name", "") == "__init__"]
         if not inits:  # a dataclass, a NamedTuple
-            fields = [one for one in node.body if isinstance(one, ast.AnnAssign)]
-            shown = [ast.unparse(one) for one in fields if ast.unparse(one.target)[0] != "_"]
+            fields = [ast.unparse(one) for one in node.body if isinstance(one, ast.AnnAssign)]
+            shown = [one for one in fields if one[0] != "_" and "init=False" not in one]
             return f"({', '.join(one.split(' = field(')[0] for one in shown)})" if shown else ""
         (node,) = inits
     node.args.args = [one for one in node.args.args if one.arg not in ("self", "cls")]

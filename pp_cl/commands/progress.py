@@ -16,7 +16,8 @@ GIB = 2**30
 
 class TrainingProgress:
     """Rate, time left, PSNR, points and device memory of a training: to be entered while it runs,
-    and called after each step with its row of the log. The rate begins once kernels are built.
+    and called after each step with its row of the log. The rate begins once kernels are built. Of
+    train.minutes those that are left are shown, as their steps are planned ever anew.
     """
 
     def __init__(self, training: Training, stream: TextIO | None = None) -> None:
@@ -39,10 +40,14 @@ class TrainingProgress:
         """Move on to a step."""
         if self._training.config.train.iterations != self._steps:
             self._replan()
+        train = self._training.config.train
         if step == self._built:
             self._stages.close()
+            done: dict[str, Any] = {"total": self._steps, "unit": "step", "done": step}
+            if given := train.minutes / train.members:
+                done = {"given": given, "done": round(self._training.passed)}
             self._shown = self._stages.enter_context(
-                Progress("training", self._steps, "step", done=step, stream=self._stream)
+                Progress("training", **done, stream=self._stream)
             )
         elif step > self._built:
             self._shown.update()
@@ -50,8 +55,9 @@ class TrainingProgress:
             if "test_psnr" in row:
                 self._test = f" (test {row['test_psnr']:.2f})"
             memory = self._dev.bytes / GIB
+            at = f"step {step}, " if train.minutes else ""
             self._shown.note = (
-                f"PSNR {row['psnr']:.2f}{self._test}, {row['points']} points, {memory:.2f} GiB"
+                f"{at}PSNR {row['psnr']:.2f}{self._test}, {row['points']} points, {memory:.2f} GiB"
             )
 
     def _replan(self):
@@ -63,9 +69,8 @@ class TrainingProgress:
             if steps < few:
                 more = train.minutes * few / max(steps, 1)
                 text += (
-                    f"; below {few} it stays blurred: give --minutes {more:.0f}, a smaller"
-                    " --preset, or fewer --points"
+                    f"; with fewer than {few} it stays blurred: it needs some {more:.0f} minutes"
                 )
+                text += ", or a smaller --preset" if name != next(iter(FEW)) else ""
             tqdm.write(text, self._stream)
         self._steps, self._is_told = train.iterations, True
-        self._shown.total = self._steps

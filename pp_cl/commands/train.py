@@ -4,13 +4,18 @@ import argparse
 import importlib
 import math
 import signal
+from collections.abc import Callable
 from contextlib import ExitStack
+from typing import TYPE_CHECKING
 
 from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
 from pp_cl.config import begin_with, help_lines, load_config
 from pp_cl.errors import UserError, require
 from pp_cl.presets import PRESETS, SHORT
+
+if TYPE_CHECKING:
+    from pp_cl.session.training import Training
 
 HELP = "learn a scene; the same command resumes an unfinished run"
 EPILOG = "\n".join(("settings (--set), with tiny's values and those that differ:", *help_lines()))
@@ -45,8 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shared.add_device(parser)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Train, or say that there is nothing left to train."""
+def run(options: argparse.Namespace, follow: Callable[["Training"], None] = lambda _: None) -> None:
+    """Train, or say that there is nothing left to train. follow: is called with each training
+    before its first step.
+    """
     from pp_cl.config import run_config
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.session.training import members
@@ -70,10 +77,10 @@ def run(options: argparse.Namespace) -> None:
     for one, of_one in members(folder, config):
         if one is not folder:
             print(f"a training with the next seed, in {one}")
-        _train(one, of_one, options, chosen)
+        _train(one, of_one, options, chosen, follow)
 
 
-def _train(folder, config, options, chosen):
+def _train(folder, config, options, chosen, follow):
     """Train one run. chosen: whether the preset chose the images' size."""
     from pp_cl.drivers import device_line, open_device
     from pp_cl.engine.training.schedule import refine_steps
@@ -90,6 +97,7 @@ def _train(folder, config, options, chosen):
     dev = open_device(options.device)
     print(device_line(dev, options.device))
     training = open_training(dev, folder, config, stored)
+    follow(training)
     train = training.config.train
     print(_images_line(training, chosen))
     print(_first_line(training))
@@ -166,7 +174,7 @@ def _images_line(training, chosen):
     if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
-    return f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
+    return f"images: scaled from {stored} to {used}{why}"
 
 
 def _sizes(cameras):

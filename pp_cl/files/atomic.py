@@ -190,6 +190,17 @@ def check_target(path: Path) -> None:
         _remove(_temporary(tried))
 
 
+def check_room(path: Path, needed: int) -> None:
+    """Raise UserError where the disk of a file, whose folder is there, has no room for so many
+    bytes beside what it holds.
+    """
+    if (free := shutil.disk_usage(path.parent).free) < needed:
+        raise UserError(
+            f"{path}: takes {needed / 1e6:.0f} MB, and {free / 1e6:.0f} are free on its disk; free"
+            " some space"
+        )
+
+
 # ---- the program's own files
 
 
@@ -232,7 +243,7 @@ def check_ours(paths: Iterable[Path], mend: str = "move it away") -> None:
     there = [path for path in paths if os.path.lexists(path)]
     if others := set(there) - set(ours(there)):
         first = min(others)
-        raise UserError(f"{first}: pp-cl did not write this, or not as it is now; {mend}")
+        raise UserError(f"{first}: was not written by pp-cl, or was changed since; {mend}")
 
 
 def remove_ours(paths: Iterable[Path]) -> None:

@@ -12,11 +12,12 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import check_ours, own, remove_ours, told, write_text
+from pp_cl.errors import UserError, name_of, shown
+from pp_cl.files.atomic import check_ours, is_owned, own, remove_ours, told, write_text
 from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_json
 
 MASKS_SHEET = "masks.png"
+MADE = "run"  # in the folder that `pp-cl make` fills
 MOST_OWNER = 1000  # bytes of the line that names the owner
 MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
 MOST_LOG = 2**25  # bytes of a log: 80,000 rows
@@ -41,6 +42,12 @@ class RunFolder:
 
     def __str__(self) -> str:
         return str(self.path)
+
+    @property
+    def name(self) -> str:
+        """Of the run: that of its folder, or of the one around it that `pp-cl make` fills."""
+        is_part = self.path.name == MADE and is_owned(self.path.parent)
+        return name_of(self.path.parent if is_part else self.path)
 
     def member(self, number: int) -> "RunFolder":
         """The folder of a further member, from 2 on."""

@@ -23,7 +23,7 @@ from pp_cl.engine.training.between import keep_most_visible
 from pp_cl.engine.training.schedule import supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import Diverged, UserError
-from pp_cl.files.atomic import check_target
+from pp_cl.files.atomic import check_room, check_target
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_SHEET, RunFolder
 from pp_cl.files.sheets import write_comparison
@@ -62,9 +62,9 @@ class HullFacts(NamedTuple):
 @dataclass
 class Training:
     """A training that is ready to begin or to go on. config: its settings, which another plan
-    replaces. info: what a checkpoint's header holds beside
-    the model's. hull: None if it resumes. measured: the views on which train.eval_every measures
-    PSNR. began: time.monotonic() when it was opened, from which train.minutes count.
+    replaces. info: what a checkpoint's header holds beside the model's. hull: None if it resumes.
+    measured: the views on which train.eval_every measures PSNR. began: time.monotonic() when it was
+    opened, from which train.minutes count. on_preview: is called after each preview, if set.
     """
 
     folder: RunFolder
@@ -75,9 +75,16 @@ class Training:
     hull: HullFacts | None
     measured: list[View]
     began: float
+    on_preview: Callable[[], None] | None = field(default=None, init=False)
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
     _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
+    _earlier: float = field(default=0.0, init=False)  # seconds before it was interrupted
+
+    @property
+    def passed(self) -> float:
+        """Seconds of train.minutes that have passed, those before an interruption included."""
+        return self._earlier + time.monotonic() - self.began
 
     def run(
         self,
@@ -97,6 +104,8 @@ class Training:
             if self.hull and self.hull.sheet is not None:
                 write_png(self.folder.path / MASKS_SHEET, self.hull.sheet)
             self._saved = self.trainer.step
+            size = sum(array.nbytes for array in self.trainer.arrays().values())
+            check_room(self.folder.checkpoint, size)
             try:
                 return self._run(on_step, is_stopped)
             except Diverged as error:
@@ -124,7 +133,7 @@ class Training:
             pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
             may_stay_coarse = "train.refine_at" in self.config.automatic
             budget = Budget(self.config, pixels, may_stay_coarse)
-            seconds = earlier = log.seconds
+            seconds = self._earlier = log.seconds
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < self.config.train.iterations:
@@ -134,11 +143,10 @@ class Training:
                 terms = trainer.train_step()
                 took = time.perf_counter() - start
                 seconds += took
-                if self.config.train.minutes and not trainer.begun:
-                    passed = earlier + time.monotonic() - self.began
-                    if plan := budget.plan(self.config, trainer.step, passed):
-                        place = trainer.model.grid, trainer.views, trainer.step
-                        self._follow(plan.for_grid(self.config.train, *place))
+                is_planned = self.config.train.minutes and not trainer.begun
+                if is_planned and (plan := budget.plan(self.config, trainer.step, self.passed)):
+                    place = trainer.model.grid, trainer.views, trainer.step
+                    self._follow(plan.for_grid(self.config.train, *place))
                 if trainer.step == first and not any(self.folder.previews.glob("*.png")):
                     self._preview_by = time.monotonic() + FIRST_PREVIEW  # the kernels are built
                 row = self._after_step(log, terms, seconds)
@@ -242,6 +250,17 @@ class Training:
         self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
         write_comparison(path, [self._rendered(view)], [trainer.target(view)])
+        if self.on_preview:
+            self.on_preview()
+
+    def present_run(self) -> Run:
+        """What is trained by now as a run, to be drawn between two steps. Its renderer is the
+        trainer's, as one of its own would freeze the network.
+        """
+        header = self.info | {"step": self.trainer.step, "finished": False}
+        run = Run(self.trainer.dev, self.folder, self.config, header, self.trainer.model)
+        run.renderer = self.trainer.renderer
+        return run
 
     def _rendered(self, view):
         """The present model's image of a view. Raises Diverged where there is none."""

@@ -16,7 +16,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from pp_cl import Camera, track
+from pp_cl import Camera, Progress, track
 from pp_cl.engine import Grid, evenly, smallest_voxel_size
 from pp_cl.errors import UserError
 from pp_cl.scene import ImageFile
@@ -167,7 +167,7 @@ def cut_out_all(
     left = [i for i, one in enumerate(windows) if one.mask is None]
     labels = [
         _seeds(one, box, points, inside, some) if one.mask is None else one.mask.astype(np.uint8)
-        for one, some in zip(windows, seen, strict=True)
+        for one, some in zip(track(windows, "finding the object", "image"), seen, strict=True)
     ]
     seeds = list(labels)
     if not any((label & 1).any() for label in labels):  # the lowest bit: it is the object's
@@ -176,7 +176,9 @@ def cut_out_all(
         )
 
     def cut(number):
-        colours, text = _colours(windows, labels), f"cutting out, {number} of {2 + ROUNDS}"
+        text = f"cutting out, {number} of {2 + ROUNDS}"
+        with Progress(text):
+            colours = _colours(windows, labels)
         for i in track(left, text, "image"):
             label, (background, front) = labels[i].copy(), (some.copy() for some in colours)
             how = cv2.GC_EVAL_FREEZE_MODEL  # the colours are not changed
@@ -194,10 +196,11 @@ def cut_out_all(
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
-            for i in left:
+            for i in track(left, f"voting, {number} of {ROUNDS}", "image"):
                 labels[i], agreed[i] = _relabelled(windows[i], seeds[i], *hull)
         surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
-        standing_out = evidence(found, beside(), surely)
+        with Progress("what stands out"):
+            standing_out = evidence(found, beside(), surely)
         for i in left:  # what stands out, or does not, is no longer open
             label, wall = labels[i].copy(), standing_out[i] < IS_WALL
             crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
@@ -299,7 +302,7 @@ def forgiving_hull(
     positions = grid.lattice()
     seen, rejected = np.zeros((2, len(positions)), np.int32)
     most, left = int(FORGIVEN * len(windows)), np.arange(len(positions))
-    for one in windows:
+    for one in track(windows, "what the masks agree on", "image"):
         found, rows, columns = one.inside(positions[left])
         seen[left[found]] += 1
         rejected[left[found]] += ~one.mask[rows, columns]

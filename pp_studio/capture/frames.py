@@ -94,10 +94,10 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
                 (unfinished / one["name"]).unlink()
         if len(usable) < LEAST:
             why = [f"{one['source']} {one['reason']}" for one in left_out[:3]]
+            others = f", {len(left_out)} cannot be used ({'; '.join(why)})" if why else ""
             raise UserError(
-                f"{source}: {len(usable)} of {len(found)} images can be used, at least {LEAST} are"
-                f" needed ({'; '.join(why) or 'nothing is wrong with them'}); take 30 or more all"
-                " around the object"
+                f"{source}: {len(usable)} images{others}; at least {LEAST} are needed: take 30 or"
+                " more all around the object"
             )
     for one in usable:
         del one["small"]

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_fill_holes
 from skimage.measure import label
 from skimage.segmentation import find_boundaries
 
-from pp_cl import track
+from pp_cl import Progress, track
 from pp_cl.engine import View, evenly, fitting_downscale
 from pp_cl.errors import UserError, few_names, shown
 from pp_cl.files import atomic_folder, contact_sheet, read_mask, read_rgba, write_png
@@ -105,14 +105,17 @@ def write_masks(
                 if larger is None:
                     break
                 box = larger
-                windows = [_window(scene, one, box) for one in in_view]
+                reading = track(in_view, "reading images", "image")
+                windows = [_window(scene, one, box) for one in reading]
             of_name = dict(zip([one.name for one in in_view], windows, strict=True))
             for one in track(left, "masks", "image"):
                 mask = cut.whole_mask(of_name[one.name], read_rgba(scene / one.name)[..., :3])
                 write_png(mask_file(scene, one.name), mask)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
-    views = [_reduced(scene, one, CHECKED_SIDE)[0] for one in image_files]
-    wrong = {one.view.name: one.share for one in disagreements(views, box)}
+    checking = track(image_files, "checking masks", "image")
+    views = [_reduced(scene, one, CHECKED_SIDE)[0] for one in checking]
+    with Progress("comparing masks"):
+        wrong = {one.view.name: one.share for one in disagreements(views, box)}
     if wrong:
         shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
         counts += f"; {len(wrong)} contradict the others: {few_names(shares)}"
@@ -194,7 +197,7 @@ def _uniform(scene, image_files, windows, box, points):
     held = {}  # of each mask, whether it holds the points of the object that its view shows
     with_holes = len(windows) * cut.FORGIVEN >= 1  # as one that is a spot has one view against it
     found = {}
-    for i in left:
+    for i in track(left, "looking for a uniform background", "image"):
         mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
         if mask is not None:
             mask, (_, rows, columns) = mask > 127, windows[i].inside(points[i])
@@ -251,8 +254,8 @@ def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: b
     one; all white where neither is there. Nothing where no photograph has either.
     """
     with atomic_folder(folder) as unfinished:
-        left = list(names)
-        for name in (one for one in names if not one.lower().endswith(OPAQUE)):
+        left, may_have = list(names), [n for n in names if not n.lower().endswith(OPAQUE)]
+        for name in track(may_have, "alpha", "image"):
             alpha = read_rgba(frames / name)[..., 3]
             if (alpha < 255).any():
                 write_png(unfinished / f"{name}.png", np.where(alpha > 127, np.uint8(255), 0))

@@ -173,7 +173,7 @@ class Capture:
             if Path(before["source"]).exists() or not is_same:
                 raise UserError(
                     f"{self.scene}: was made from {before['source']}; choose another --out, or"
-                    " begin again with --from frames"
+                    f" replace it by `pp-cl capture {self.source} --out {self.scene} --from frames`"
                 )
             write_json(self._file("options"), before | {"source": self.options["source"]})
             changed.remove("source")
@@ -261,7 +261,7 @@ class Capture:
         if _is_uniform(self._found("frames")["images"]):  # it has no features that stand still
             turns, line = True, f"{line}, all of the object: placed as on a turntable"
         elif turns := isolated(self.work, features.remove_still, self.database, begun, turntable):
-            line += "; the object turns before a background that stands still, which is left out"
+            line += "; a turntable: the background, which stands still, is ignored"
         return {"line": line, "turns": turns}
 
     def _poses(self):

@@ -5,21 +5,25 @@ import importlib
 import os
 import shlex
 import time
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
 from pp_cl.config import field_of
-from pp_cl.errors import UserError
+from pp_cl.errors import Stopped, UserError
 from pp_studio.capture import STAGES
 from pp_studio.commands.capture import add_hints
 from pp_studio.export import QUICK
 
+if TYPE_CHECKING:
+    from pp_cl import RunFolder
+
 HELP = "photos, a video or a scene to a page, a video and a splat, in one folder"
 EPILOG = """FOLDER then holds
   index.html           the result: the model to turn, views beside their photographs, the figures;
-                       it is there from the cameras on, and grows
+                       it is there once masks are made, shows what there is, and reloads itself
   model.html           the model alone, on one page
   video.mp4, splat.ply once around the object; 3D Gaussians for other viewers
   thumbnail.png        an image of it
@@ -32,8 +36,11 @@ PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
 # the capture leaves, within these.
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
 LEAST_TRAINING = 0.6  # of what the capture leaves
-LEAST_LEFT = 0.25  # of the minutes that a capture leaves, however long it took
-PER_PHOTOGRAPH = 0.03  # minutes that a capture takes, about: on two cores with AVX-512
+# Of the minutes, left after a capture, however long it took: the training has a third of them then.
+LEAST_LEFT = 5 / 9
+LEAST_MORE = 0.1  # minutes for which a finished training goes on
+LATE = 0.8  # of a training: by the steps after it those are counted for which it goes on
+PER_PHOTOGRAPH = 0.05  # minutes that a capture takes, about: on two cores without AVX-512
 OF_SPLAT = 0.6  # of what is left after the evaluation
 
 
@@ -46,14 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--minutes",
         type=shared.number(0.1, MOST_MINUTES),
         metavar="N",
-        help=f"minutes for all of it ({MINUTES:g}); where finding cameras and masks takes most of"
-        " them, a quarter comes on top",
+        help=f"minutes for all of it ({MINUTES:g}; a third of them is the training's, also where"
+        " cameras and masks take longer); with more of them a finished model is trained on",
     )
     add(
         "--preset",
         choices=list(PRESET_FROM)[::-1],
         help="of the training (by its minutes: tiny below 8, small below 30, then full)",
     )
+    add("--title", metavar="TEXT", help="of the page (the name of FOLDER)")
     add_hints(parser)
     shared.add_device(parser)
 
@@ -63,8 +71,17 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl import RunFolder, load
     from pp_cl.scene import read_json, scene_splits
     from pp_studio.export.gaussians import fitted_gaussians
-    from pp_studio.export.result import INDEX, SPLAT, VIDEOS, begin_result, is_newer, write_result
-    from pp_studio.export.result import MINUTES as PASSED
+    from pp_studio.export.result import (
+        INDEX,
+        MODEL,
+        SPLAT,
+        STATE,
+        VIDEOS,
+        begin_result,
+        is_newer,
+        write_preview,
+        write_result,
+    )
     from pp_studio.video import check_video
 
     share, out, is_scene = _share(), Path(options.out), _is_scene(options.source)
@@ -72,54 +89,82 @@ def run(options: argparse.Namespace) -> None:
         shared.refuse(options, ("turntable", "mask_command", "box"), "only of photographs")
     begin_result(out)
     device = ["--device", options.device] if options.device else []
-    folder, scene, masks = RunFolder(out / "run"), options.source, []
+    folder, scene = RunFolder(out / "run"), options.source
     page, video = out / INDEX, VIDEOS[0]
+    masks: list[str] = []
     told: list[str] = []
     try:
         check_video("mp4")
     except UserError:
         video = VIDEOS[1]
 
-    def show(split=""):
-        run = load(folder.path, options.device) if folder.checkpoint.exists() else None
-        write_result(run, split, out, video, told, scene)
+    with _Clock(out / STATE, options.minutes, options.title) as clock:
 
-    with _Clock(out / PASSED, options.minutes) as clock:
+        def show(state="", split=""):
+            run = load(folder.path, options.device) if split else None
+            state = state and f"{state} {clock.told}; this page renews itself."
+            facts = {"run": run, "split": split, "scene": scene, "told": told, "state": state}
+            write_result(out, clock.title, video, **facts)
+
+        def step(name, *words, **more):
+            _step(name, *words, note=clock.told, **more)
+            clock.keep()
+
+        def follow(training):
+            def renew():
+                try:
+                    write_preview(training, out, clock.title)
+                    show(f"In training, at step {training.trainer.step}.")
+                except (UserError, MemoryError) as error:  # which is no reason to end a training
+                    warnings.warn(f"{page} is not renewed in the training: {error}", stacklevel=2)
+                    training.on_preview = None
+
+            training.on_preview = renew
+
+        def train(*words):
+            step("train", scene, "--out", str(folder), *words, *masks, *device, follow=follow)
+
+        if clock.is_renamed:
+            (out / MODEL).unlink(missing_ok=True)
         if is_scene:
             masks = ["--masks", options.masks] if options.masks else []
         else:
             scene = str(out / "scene")
             if not Path(scene, "transforms.json").exists():
                 clock.tell_of_capture(options.source)
-            _step("capture", options.source, "--out", scene, *_hints(options))
+            step("capture", options.source, "--out", scene, *_hints(options))
             *stages, _ = STAGES  # the last one tells what it has written
             found = {name: read_json(out / f"scene/capture/{name}.json") for name in stages}
             told = [f"{name}: {one['line']}" for name, one in found.items()]
+        preset = ["--preset", options.preset] if options.preset else []
         if not folder.checkpoint.exists():
-            show()
-            print(f"wrote {page}: open it in a browser; it grows as parts are done")
+            show("Cameras and masks are found.")
+            print(f"wrote {page}: open it in a browser; it grows by itself", flush=True)
+            if not (out / MODEL).exists() and _wrote_hull(out, scene, clock.title, options, masks):
+                show("So far this is the object's outline in the colours of the photographs.")
         if not folder.config.exists():
-            training = clock.training()
-            chosen = next(n for n, least in PRESET_FROM.items() if share * training >= least)
-            preset = ["--preset", options.preset or chosen, "--minutes", f"{training:.3g}"]
+            minutes = clock.training()
+            preset = ["--preset", options.preset or _preset(minutes, share)]
+            train(*preset, "--minutes", f"{minutes:.3g}")
         else:  # as it began, unless told otherwise, which train refuses
-            preset = ["--preset", options.preset] if options.preset else []
-        _step("train", scene, "--out", str(folder), *preset, *masks, *device)
+            train(*preset, *clock.iterations())
+        if clock.goes_on(folder):
+            train(*clock.iterations())
         split = "test" if "test" in scene_splits(scene) else "train"
-        show(split)
-        print(f"wrote {page}: with the model; figures, splat and video follow")
-        _step("eval", str(folder), "--split", split, *device)
-        show(split)
+        show("Trained; the figures follow.", split)
+        print(f"wrote {page}: with the model; figures, splat and video follow", flush=True)
+        step("eval", str(folder), "--split", split, *device)
         if not is_newer(out / SPLAT, folder.checkpoint):
+            show("Trained and measured; splat and video follow.", split)
             # of which export makes the file
             fitted_gaussians(load(folder.path, options.device), QUICK, OF_SPLAT * clock.left)
             words = ["--format", "splat"]
-            _step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
-            show(split)
+            step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
         if not is_newer(out / video, folder.checkpoint):
+            show("Trained and measured; the video follows.", split)
             words = ["--minutes", f"{clock.left:.3g}"]
-            _step("render", str(folder), "--out", str(out / video), *words, *device)
-            show(split)
+            step("render", str(folder), "--out", str(out / video), *words, *device)
+        show("", split)
     print(
         f"wrote {page} in {clock.passed:.1f} minutes; `pp-cl view {folder}` shows the exact model"
     )
@@ -127,60 +172,142 @@ def run(options: argparse.Namespace) -> None:
 
 class _Clock:
     """The minutes of all of it: those asked for, and those that have passed, which a file keeps for
-    the same command to go on. Raises UserError where others were asked for before.
+    the same command to go on, with the page's title. What a step took that failed does not count.
+
+    asked, title: None, as before.
     """
 
-    def __init__(self, file: Path, asked: float | None) -> None:
+    def __init__(self, file: Path, asked: float | None, title: str | None) -> None:
+        from pp_cl.errors import name_of
         from pp_cl.scene import read_json
 
         known: dict[str, Any] = read_json(file) if file.exists() else {}
-        self.minutes = known.get("asked", asked or MINUTES)
-        if asked not in (None, self.minutes):
-            raise UserError(
-                f"{file.parent}: was begun with --minutes {self.minutes:g}; leave it out, or choose"
-                " another --out"
-            )
-        self._file, self._before = file, known.get("passed", 0.0)
+        self.minutes = asked or known.get("minutes", MINUTES)
+        before = known.get("title")
+        self.title = before or name_of(file.parent) if title is None else title
+        self.is_renamed = before not in (None, self.title)
+        self._file, self._passed = file, known.get("passed", 0.0)
+        # minutes for which the training is planned, and its iterations if it goes on after these
+        self._planned = known.get("planned", self.minutes)
+        self._iterations: int | None = known.get("iterations")
+        self._until = max(self.minutes, known.get("until", 0.0))
         self._began = time.monotonic()
 
     def __enter__(self) -> "_Clock":
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and not issubclass(kind, (Stopped, KeyboardInterrupt)):
+            self._began = time.monotonic()
+        self.keep()
+
+    def keep(self) -> None:
+        """Write down what has passed by now."""
         from pp_cl.files import write_json
 
-        write_json(self._file, {"asked": self.minutes, "passed": round(self.passed, 2)})
+        self._passed, self._began = self.passed, time.monotonic()
+        kept = {"title": self.title, "minutes": self.minutes, "passed": round(self._passed, 2)}
+        kept |= {"planned": self._planned, "until": round(self._until, 2)}
+        write_json(self._file, kept | {"iterations": self._iterations})
 
     @property
     def passed(self) -> float:
         """Minutes since the beginning, without those between two commands."""
-        return self._before + (time.monotonic() - self._began) / 60
+        return self._passed + (time.monotonic() - self._began) / 60
 
     @property
     def left(self) -> float:
         """Minutes that are left, a tenth of one at least."""
-        return max(self.minutes - self.passed, 0.1)
+        return max(self._until - self.passed, 0.1)
+
+    @property
+    def told(self) -> str:
+        """The same in words."""
+        return f"{self.left:.1f} of {round(self._until, 1):g} minutes left"
 
     def tell_of_capture(self, source: str) -> None:
         """Say how the minutes are divided, before the photographs are looked at."""
-        count = sum(1 for _ in Path(source).glob("*")) if Path(source).is_dir() else 0
-        capture = min(PER_PHOTOGRAPH * count or 3.0, self.minutes)
+        capture = min(PER_PHOTOGRAPH * _photographs(source), self.minutes)
         print(
-            f"{self.minutes:g} min: about {capture:.1f} for cameras and masks, a quarter of the"
+            f"{self.minutes:g} minutes: about {capture:.1f} for cameras and masks, a quarter of the"
             " rest for evaluation, splat and video, and what is left for the training",
             flush=True,
         )
 
     def training(self) -> float:
-        """Minutes of the training; says how the rest is divided."""
-        left = max(self.minutes - self.passed, LEAST_LEFT * self.minutes)
+        """Minutes of the training, which it is planned for from now on; says how the rest is
+        divided.
+        """
+        passed = self.passed
+        left = max(self.minutes - passed, LEAST_LEFT * self.minutes)
+        self._planned, self._until = self.minutes, passed + left
+        return self._divided(left)
+
+    def _divided(self, left):
+        """Minutes of a training out of those that are left, of which it tells."""
         after = min(max(AFTER * left, LEAST_AFTER), MOST_AFTER, (1 - LEAST_TRAINING) * left)
+        told = f"{self.minutes:g} minutes: {self.passed:.1f} have passed"
+        if self._until > self.minutes + 0.05:
+            told += f", which is too long; {self._until:.1f} are taken in all"
         print(
-            f"{self.minutes:g} min: {self.passed:.1f} have passed, {left - after:.1f} for the"
-            f" training, {after:.1f} for evaluation, splat and video",
+            f"{told}; {left - after:.1f} for the training, {after:.1f} for evaluation, splat and"
+            " video",
             flush=True,
         )
         return left - after
+
+    def goes_on(self, folder: "RunFolder") -> bool:
+        """Whether a finished training goes on, as more minutes are asked for than it was planned
+        for, and are left; iterations() then has as many as they allow.
+        """
+        left, rows = self.minutes - self.passed, folder.rows()
+        if self._planned >= self.minutes or left < LEAST_MORE or len(rows) < 2:
+            return False
+        self._planned, self._until = self.minutes, self.minutes
+        end = rows.pop()  # its training's last step is in the one before
+        late = next(row for row in rows if row["step"] >= LATE * end["step"])
+        took, last = rows[-1]["seconds"] - late["seconds"], rows[-1]
+        seconds = took / max(last["step"] - late["step"], 1) or last["seconds"] / last["step"]
+        ending = end["seconds"] - last["seconds"]
+        more = (60 * self._divided(left) - ending) / seconds
+        self._iterations = end["step"] + max(1, round(more))
+        self.keep()
+        return True
+
+    def iterations(self) -> list[str]:
+        """The words of a training that goes on after it was finished."""
+        return ["--iterations", str(self._iterations)] if self._iterations else []
+
+
+def _wrote_hull(out, scene, title, options, masks):
+    """Whether the page of what the masks tell could be written."""
+    from pp_studio.export.hull import hull_gaussians
+    from pp_studio.export.result import write_model
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the training tells the same
+        try:
+            found = hull_gaussians(scene, options.masks if masks else None, options.device)
+        except UserError:
+            return False
+    if found:
+        write_model(out, *found, title)
+    return found is not None
+
+
+def _preset(minutes, share):
+    """That of so many minutes of a share of the processor; says so where others take the rest."""
+    quiet, chosen = (
+        next(name for name, least in PRESET_FROM.items() if one >= least)
+        for one in (minutes, share * minutes)
+    )
+    if chosen != quiet:
+        print(
+            f"other programs take {1 - share:.0%} of the processor: the preset is {chosen}, not"
+            f" {quiet}, as on a quiet machine; --preset {quiet} keeps it",
+            flush=True,
+        )
+    return chosen
 
 
 def _share():
@@ -200,8 +327,16 @@ def _is_scene(source):
     try:
         return bool(scene_format(source))
     except UserError:
-        print(f"{source}: no file of cameras that is known; capture finds them and the masks")
+        found = f"{_photographs(source)} photographs" if Path(source).is_dir() else "a video"
+        print(f"{source}: {found}; working out where each was taken, and cutting out the object")
         return False
+
+
+def _photographs(source):
+    """How many a capture takes."""
+    from pp_studio.capture.frames import FRAMES, listed
+
+    return len(listed(Path(source))) if Path(source).is_dir() else FRAMES
 
 
 def _hints(options):
@@ -219,10 +354,10 @@ def _hints(options):
     return words
 
 
-def _step(name, *words):
-    """Run another command, as it would be typed."""
-    print(f"== pp-cl {name} {shlex.join(words)}", flush=True)
+def _step(name, *words, note, **more):
+    """Run another command, as it would be typed. note: is told with it. more: of its run()."""
+    print(f"== pp-cl {name} {shlex.join(words)}  # {note}", flush=True)
     module = importlib.import_module(COMMANDS[name])
     parser = argparse.ArgumentParser(prog=f"pp-cl {name}")
     module.add_arguments(parser)
-    module.run(parser.parse_args(list(words)))
+    module.run(parser.parse_args(list(words)), **more)

@@ -70,7 +70,10 @@ def run(options: argparse.Namespace) -> None:
             " steers it; nothing is encrypted",
             file=sys.stderr,
         )
-    with started(name_of(folder), options.host, options.port) as (server, address):
+    with started(name_of(folder) if is_scene else run.name, options.host, options.port) as (
+        server,
+        address,
+    ):
         view: ScenePage | RunView
         if is_scene:
             view = ScenePage(server, folder, options.device)

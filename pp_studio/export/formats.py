@@ -95,7 +95,7 @@ def export_run(
         told = f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
     elif name == "html":
         fitted = gaussians.fitted_gaussians(run)
-        text = page.page_text(run, fitted)
+        text = page.page_text(fitted, run.cameras("train"), run.folder.name)
         write = partial(write_text, path, text)
         told = f"{len(fitted.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     elif name in SPLATS:

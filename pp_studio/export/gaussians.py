@@ -47,7 +47,7 @@ GAUSSIAN = np.dtype(
     ]
 )
 LEAST_OPAQUE = 1 / 255  # what viewers leave out
-FIRST_VIEWS = 40  # of which the points have their colours before the fit
+FIRST_VIEWS = 16  # of which the points have their colours before the fit
 LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
 
 # Pixels on the longer side of the smallest window for which splats are made; in smaller ones
@@ -199,11 +199,11 @@ def _fitted(run, table):
 
 
 def first_gaussians(run: Run) -> Gaussians:
-    """As fitted_gaussians(), but as the fit begins, in seconds: round, as wide as the points, with
-    the colours that the network gives them. Raises UserError as check_drawable does.
+    """As fitted_gaussians(), but before the fit, in seconds: round, as wide as the points, with the
+    means of the colours that the network gives them. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    cloud = begun(run, fit_harmonics(run, steps=0, most=FIRST_VIEWS), 0)
+    cloud = begun(run, fit_harmonics(run, steps=-1, most=FIRST_VIEWS), 0)
     return Gaussians(_table(run, cloud), run.model.grid.centre)
 
 

@@ -103,7 +103,8 @@ def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
     Colours are blended as the features are, over white, and clamped at last: one point's may lie
     outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
     gradients, preconditioned by A's blocks of a point. Views are weighed anew in each, since the
-    weights of all would fill the memory.
+    weights of all would fill the memory. steps: -1 takes what the preconditioner makes of b alone:
+    means of the colours of a point's pixels, by its weights.
     """
     cameras, n = evenly(run.cameras("train"), most), run.model.cloud.count
     positions = run.model.positions()
@@ -122,10 +123,13 @@ def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
     blocks[:, diagonal, diagonal] += ridge
     inverse = np.linalg.inv(blocks)
 
+    if steps < 0:
+        return (inverse @ b).astype(np.float32)
+
     def product(flat):
         coefficients = flat.reshape(b.shape)
         result = ridge[..., None] * coefficients
-        for seen in observe(run, cameras, "harmonics", blending=True):
+        for seen in observe(run, cameras, "colours by direction", blending=True):
             at, rows = seen.functions(positions), seen.visible
             colours, _ = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[rows]))
             result[rows] += at[:, :, None] * seen.gathered(colours)[:, None]

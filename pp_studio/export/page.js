@@ -5,7 +5,9 @@
 
 const header = JSON.parse(document.getElementById("header").textContent);
 const canvas = document.querySelector("canvas");
-const hint = document.querySelector("p");
+const hint = document.querySelector("p"), unseen = document.querySelector("aside");
+const isWithin = parent !== window;  // it is shown by another page
+document.body.classList.toggle("within", isWithin);
 
 // ---- vectors ----
 const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
@@ -299,6 +301,28 @@ function hashOf(look) {
   return `#eye=${list(look.eye)}&target=${list(look.target)}&up=${list(look.up)}&fov=${look.fov}`;
 }
 
+// By how many degrees a look is beyond those that were photographed.
+function beyond(look) {
+  const up = header.up, ahead = header.ahead, degrees = 180 / Math.PI;
+  const towards = unit(add(look.eye, header.centre, -1));
+  const rise = degrees * Math.asin(Math.max(-1, Math.min(1, dot(towards, up))));
+  const azimuth = Math.atan2(dot(towards, cross(up, ahead)), dot(towards, ahead));
+  const sectors = header.photographed, count = sectors.length;
+  const at = (azimuth / (2 * Math.PI) + 1) * count, first = Math.floor(at), part = at - first;
+  const [low, high, aside] = sectors[first % count].map(
+    (value, i) => (1 - part) * value + part * sectors[(first + 1) % count][i]);
+  return Math.max(low - rise, rise - high, aside * Math.cos(rise / degrees), 0);
+}
+
+// Shows the less of the model the further the window's look is beyond the photographs.
+const FREE = 10, FADED = 30, FAINT = 0.1;  // degrees, degrees, opacity
+function fade() {
+  const isFixed = look.w && look.h;  // for a script or a test, which want what there is
+  const part = isFixed ? 0 : Math.min(1, Math.max(0, (beyond(look) - FREE) / (FADED - FREE)));
+  canvas.style.opacity = 1 - (1 - FAINT) * part;
+  unseen.style.opacity = Math.max(0, 2 * part - 1);
+}
+
 const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
 if (!gl) hint.textContent = "This page needs WebGL2, which this browser or device does not have.";
 const draw = gl && makeDrawer(gl);
@@ -339,6 +363,13 @@ function show() {
   const [camera, width, height] = windowCamera(1);
   setCamera(camera);
   resizeCanvas(camera, `${width}px`, `${height}px`);
+  fade();
+}
+
+// Keeps the look in the address, and tells a page around this one, which may load it again.
+function remember() {
+  history.replaceState(null, "", hashOf(look));
+  if (isWithin) parent.postMessage(location.hash, "*");
 }
 
 // Draws a movement, in the order that the worker found last, and as coarsely as the machine needs.
@@ -347,6 +378,7 @@ function frame(now) {
   if (!gl) return;
   const [camera, width, height] = windowCamera(fineness);
   resizeCanvas(camera, `${width}px`, `${height}px`);
+  fade();
   sortSoon(axisOf(camera));
   draw(camera, order);
   requestAnimationFrame((then) => {  // when the machine is ready for another one
@@ -354,7 +386,10 @@ function frame(now) {
     else if (then - now < FAST) fineness = Math.min(1, 1.05 * fineness);
   });
   clearTimeout(rests);
-  rests = setTimeout(show, REST);
+  rests = setTimeout(() => {
+    show();
+    if (!fingers.size) remember();
+  }, REST);
 }
 
 // Has a worker sort, the newest axis after the one it is at; where there is none, this thread does.
@@ -412,16 +447,26 @@ function approach(factor) {
   look.eye = add(look.target, add(look.eye, look.target, -1), factor);
 }
 
+// A finger within another page may be about to scroll that, which a browser tells after some pixels.
+const SLOP = 16;
+let isTurning = false;
 const fingers = new Map();
 canvas.addEventListener("pointerdown", (event) => {
   fingers.set(event.pointerId, [event.clientX, event.clientY]);
   canvas.setPointerCapture(event.pointerId);
+  isTurning = !isWithin || event.pointerType !== "touch" || fingers.size > 1;
+  if (isWithin) parent.postMessage("held", "*");
 });
 canvas.addEventListener("pointermove", (event) => {
   const before = fingers.get(event.pointerId);
   if (!before) return;
   const now = [event.clientX, event.clientY], [dx, dy] = add(now, before, -1);
+  if (!isTurning && Math.hypot(dx, dy) < SLOP) return;
   fingers.set(event.pointerId, now);
+  if (!isTurning) {
+    isTurning = true;
+    return;
+  }
   if (fingers.size === 2) {
     const [other] = [...fingers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
     move(dx / 2, dy / 2);
@@ -432,8 +477,12 @@ canvas.addEventListener("pointermove", (event) => {
 });
 const released = (event) => {
   fingers.delete(event.pointerId);
-  history.replaceState(null, "", hashOf(look));
+  remember();
 };
+// two fingers are the model's, also where one scrolls the page around it
+canvas.addEventListener("touchmove", (event) => {
+  if (event.touches.length > 1) event.preventDefault();
+}, { passive: false });
 canvas.addEventListener("pointerup", released);
 canvas.addEventListener("pointercancel", released);
 canvas.addEventListener("contextmenu", (event) => event.preventDefault());

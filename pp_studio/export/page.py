@@ -4,7 +4,7 @@ import base64
 import html
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl import Camera, Run
-from pp_cl.errors import name_of
 from pp_cl.files import atomic_folder, to_8bit, write_png, write_text
 from pp_cl.scene import up_of
 from pp_studio.camera_path import level
@@ -35,8 +34,11 @@ PACKED = np.dtype(
 OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
 PLACES, TURNED = np.iinfo(np.uint16).max, 240
 FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
+RISE = 20.0  # degrees
 FILLED = 0.8  # of the shorter side, by the object as it is turned round; lines of text are above
 SAMPLED_POINTS = 20_000
+NEAREST = 0.05  # of the object's radius: what is nearer to the eye is not drawn, as in a run
+SECTORS, BESIDE = 36, 45.0  # azimuths, and degrees to either side that a photograph speaks for
 STILL = 600, 315  # pixels; the least that is shown large beside a link
 HERE = Path(__file__).parent
 
@@ -78,19 +80,23 @@ def _nearest_axes(deviations, turn):
     return kept, np.rint(found[:, :3] * TURNED + 128).astype(np.uint8)
 
 
-def page_text(run: Run, gaussians: Gaussians, still: str = "", title: str = "") -> str:
-    """The page. gaussians: of the run. still: the file of an image that stands for it where it is
-    linked to, if any. title: instead of the name of the run's folder.
+def page_text(gaussians: Gaussians, cameras: Sequence[Camera], title: str, still: str = "") -> str:
+    """The page. cameras: of the training. still: the file of an image that stands for it where it
+    is linked to, if any.
     """
     rows, about = pack(gaussians.table)
     data, corner = base64.b64encode(rows.tobytes()).decode(), about.pop("corner")
-    (centre, _), cameras, (eye, up) = run.ball, run.cameras("train"), first_look(run)
+    places = gaussians.table["position"].astype(np.float64)
+    # a few may have gone astray
+    low, high = np.quantile(places, [OUTLIERS, 1 - OUTLIERS], axis=0) + gaussians.origin
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    eye, up = first_look(places + gaussians.origin, centre, cameras)
     # what a pixel of the training shows in the middle of the object
     pixels = [np.linalg.norm(one.eye - centre) / min(one.fx, one.fy) for one in cameras]
     header = about | {
         "count": len(rows),
         "origin": (gaussians.origin + corner).tolist(),
-        "nearest": run.nearest,
+        "nearest": NEAREST * radius,
         "centre": centre.tolist(),
         "pixel": float(np.median(pixels)),
         "windows": gaussians.windows,
@@ -98,15 +104,37 @@ def page_text(run: Run, gaussians: Gaussians, still: str = "", title: str = "") 
         "eye": eye.tolist(),
         "up": up.tolist(),
         "fov": FIELD_OF_VIEW,
+        "ahead": level(eye - centre, up).tolist(),
+        "photographed": photographed(cameras, centre, up, level(eye - centre, up)),
     }
     parts = {
-        "title": html.escape(title or name_of(run.folder.path)),
-        "about": f"{len(rows):,} Gaussians, {len(data) / 1e6:.1f} MB",
+        "title": html.escape(title),
         "header": json.dumps(header).replace("<", "\\u003c"),
         "gaussians": data,
         "script": (HERE / "page.js").read_text("utf-8"),
     }
     return filled("page.html", parts, still)
+
+
+def photographed(
+    cameras: Sequence[Camera], centre: np.ndarray, up: np.ndarray, ahead: np.ndarray
+) -> list[list[int]]:
+    """From where an object was photographed: for each of SECTORS azimuths around `up`, counted from
+    `ahead` on by the right hand, [lowest elevation, highest elevation, how far the nearest camera
+    is aside beyond BESIDE], in whole degrees.
+    """
+    offsets = np.stack([one.eye - centre for one in cameras])
+    height, across = offsets @ up, offsets @ np.stack([ahead, np.cross(up, ahead)], axis=1)
+    elevations = np.degrees(np.arctan2(height, np.linalg.norm(across, axis=1)))
+    azimuths = np.degrees(np.arctan2(across[:, 1], across[:, 0]))
+    found = []
+    for sector in range(SECTORS):
+        apart = np.abs((azimuths - sector * 360 / SECTORS + 180) % 360 - 180)
+        near = apart <= max(apart.min(), BESIDE)
+        aside = max(0.0, apart.min() - BESIDE)
+        row = (elevations[near].min(), elevations[near].max(), aside)
+        found.append([round(float(one)) for one in row])
+    return found
 
 
 def filled(template: str, parts: dict[str, str], still: str) -> str:
@@ -129,12 +157,12 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
     figures = []
     with atomic_folder(folder) as unfinished:
         for run in runs:
-            name = name_of(run.folder.path)
+            name = run.folder.name
             stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-") or "run"
             while stem.lower() in {"index", *map(str.lower, stems)}:  # as some disks take names
                 stem += "-2"
             stems.append(stem)
-            page = page_text(run, fitted_gaussians(run), f"{stem}.png")
+            page = page_text(fitted_gaussians(run), run.cameras("train"), name, f"{stem}.png")
             write_text(unfinished / f"{stem}.html", page)
             write_png(unfinished / f"{stem}.png", still(run))
             image = f'<img src="{stem}.png" alt="">'
@@ -146,22 +174,25 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
 
 def still(run: Run) -> np.ndarray:
     """(H, W, 3) uint8: the run as a page of it begins, as large as STILL."""
-    (eye, up), (width, height) = first_look(run), STILL
+    look = run.model.positions(), run.ball[0], run.cameras("train")
+    (eye, up), (width, height) = first_look(*look), STILL
     focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     camera = Camera.look_at(eye, run.ball[0], up, fx=focal, width=width, height=height)
     return to_8bit(render_large(run, camera).colour)
 
 
-def first_look(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """(eye, up), both (3,), with which a page begins: it looks at the middle of run.ball from the
-    side of the first training view, 20 degrees above the horizon, and shows the whole object, also
-    when it is turned round.
+def first_look(
+    points: np.ndarray, centre: np.ndarray, cameras: Sequence[Camera]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(eye, up), both (3,), with which a page begins: it looks at the centre of the points (N, 3)
+    from the side of the first camera, RISE above the horizon, or as near to it as cameras were, and
+    shows the whole object, also when it is turned round.
     """
-    centre, cameras = run.ball[0], run.cameras("train")
-    up, rise = up_of(cameras), np.radians(20)
+    up, offsets = up_of(cameras), np.stack([one.eye - centre for one in cameras])
+    elevations = np.arcsin(offsets @ up / np.linalg.norm(offsets, axis=1))
+    rise = np.clip(np.radians(RISE), elevations.min(), elevations.max())
     ahead = level(cameras[0].eye - centre, up)
-    points = run.model.positions() - centre
-    points = points[:: max(1, len(points) // SAMPLED_POINTS)]
+    points = points[:: max(1, len(points) // SAMPLED_POINTS)] - centre
     half, distance = FILLED * np.tan(np.radians(FIELD_OF_VIEW) / 2), 0.0
     for angle in np.radians(range(0, 360, 15)):
         side = np.cos(angle) * ahead + np.sin(angle) * np.cross(up, ahead)

@@ -1,10 +1,11 @@
 """The folder that `pp-cl make` fills: a page about a run, beside the files that it shows. It can be
-written at any time, and shows what is there by then.
+written at any time, shows what is there by then, and is loaded again by itself until all is.
 """
 
 import html
 import json
 import shutil
+import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,18 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl import Run
-from pp_cl.errors import name_of
+from pp_cl import Camera, Run, Training
+from pp_cl.engine import Renderer
 from pp_cl.files import atomic_path, own, write_png, write_text
 from pp_cl.scene import scene_frames
 from pp_studio.capture.overview import overview
-from pp_studio.export.gaussians import first_gaussians, fitted_gaussians
-from pp_studio.export.page import filled, page_text, still
+from pp_studio.export.gaussians import Gaussians, first_gaussians, fitted_gaussians
+from pp_studio.export.page import HERE, filled, page_text, still
 
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS, CAMERAS, MASKS = "thumbnail.png", "views.png", "cameras.png", "masks.png"
 VIDEOS = ("video.mp4", "video.webp")
-MINUTES = "minutes.json"  # those asked for, and those that have passed
+VERSION = "version.js"  # calls what an open page listens to with the version of the newest
+STATE = "make.json"  # what the same command goes on with
 LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
 WHAT = {
     MODEL: "the model alone, one page that needs no network",
@@ -37,27 +39,36 @@ def begin_result(folder: Path) -> None:
     """Make the folder. Raises UserError where it holds other files, or one in the place of a file
     of the result that is not the program's.
     """
-    names = (INDEX, MODEL, SPLAT, STILL, VIEWS, CAMERAS, MASKS, MINUTES, *VIDEOS)
+    names = (INDEX, MODEL, SPLAT, STILL, VIEWS, CAMERAS, MASKS, VERSION, STATE, *VIDEOS)
     mend = "move it away, or choose another --out"
     own(folder, [folder / name for name in names], mend, alone=True)
 
 
-def write_result(
-    run: Run | None,
-    split: str,
-    folder: Path,
-    video: str,
-    told: Sequence[str] = (),
-    scene: str = "",
-) -> None:
-    """Write index.html, the model's page and the images that it shows, beside the video and the
-    splats, if those are newer than the run's checkpoint. What is not there yet is said to come.
+def write_model(folder: Path, gaussians: Gaussians, cameras: Sequence[Camera], title: str) -> None:
+    """Write the model's page. cameras: of the photographs."""
+    write_text(folder / MODEL, page_text(gaussians, cameras, title))
 
-    run: None before there is a checkpoint; then the cameras and masks of the scene are shown.
-    split: whose evaluation is shown. video: the file's name. told: what is to be known of the
-    photographs, a line each. scene: its path, or demo; the run's, unless given.
+
+def write_result(
+    folder: Path,
+    title: str,
+    video: str,
+    *,
+    run: Run | None = None,
+    split: str = "",
+    scene: str = "",
+    told: Sequence[str] = (),
+    state: str = "",
+) -> None:
+    """Write index.html and the images that it shows, beside the video and the splats, if those are
+    newer than the run's checkpoint, and the run's model. What is not there yet is said to come.
+
+    run: None before there is a checkpoint; then the cameras and masks of the scene are shown, and
+    the page of the model that is there. split: whose evaluation is shown. video: the file's name.
+    scene: its path, or demo. told: what is to be known of the photographs, a line each. state: what
+    is still to be done, in words; "": nothing, and the page is not loaded again.
     """
-    title, views, shown = name_of(folder), _later("evaluation"), set()
+    views, shown = _later("evaluation"), set()
     if run:
         done = run.folder.checkpoint
         found: dict[str, Any] = {}
@@ -71,10 +82,9 @@ def write_result(
         if not is_newer(folder / MODEL, folder / SPLAT if SPLAT in shown else done):
             write_png(folder / STILL, still(run))
             gaussians = (fitted_gaussians if SPLAT in shown else first_gaussians)(run)
-            write_text(folder / MODEL, page_text(run, gaussians, title=title))
+            write_model(folder, gaussians, run.cameras("train"), title)
         shown |= {MODEL, STILL}
-        model = '<iframe src="model.html" title="The model; drag to turn it"></iframe>'
-        rows = _figures(run, found)
+        plan, rows = [], _figures(run, found)
         told = [*told, *run.header.get("notes", [])]
         if names := run.header.get("left_out"):
             told.append(f"left out, as their masks contradict the others': {', '.join(names)}")
@@ -82,11 +92,13 @@ def write_result(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the training tells the same
             cameras = [one.camera for one in scene_frames(scene, "train")]
-        model = "\n".join([_later("model"), *_plan(folder, Path(scene), cameras)])
+        shown = {MODEL} if (folder / MODEL).exists() else set()
+        plan = _plan(folder, Path(scene), cameras)
         rows = [
             ("photographs for the training", str(len(cameras))),
             ("size of the photographs", f"{cameras[0].width}x{cameras[0].height}"),
         ]
+    model = '<iframe title="The model; drag to turn it"></iframe>'
     moving = _image(video, "the object from all sides")
     if video.endswith(".mp4"):
         moving = f'<video src="{video}" autoplay loop muted playsinline controls></video>'
@@ -96,19 +108,39 @@ def write_result(
             size = (folder / name).stat().st_size / 1e6
             links.append(f'<li><a href="{name}">{name}</a>, {size:.1f} MB: {WHAT[name]}</li>')
     items = "\n".join(f"<li>{html.escape(line)}</li>" for line in told)
+    version = str(time.time_ns()) if state else ""
     parts = {
         "title": html.escape(title),
-        "model": model,
+        "model": model if MODEL in shown else _later("model"),
+        "state": "\n".join([f'<p class="state">{html.escape(state)}</p>'] * bool(state) + plan),
         "video": moving if video in shown else _later("video"),
         "views": views,
         "figures": "\n".join(
             f"<tr><td>{html.escape(name)}</td><td>{html.escape(value)}</td></tr>"
             for name, value in rows
         ),
-        "notes": f"<h2>About the photographs</h2>\n<ul>\n{items}\n</ul>" if told else "",
+        "notes": f"<p>About the photographs:</p>\n<ul>\n{items}\n</ul>" if told else "",
         "files": "\n".join(links) or "<li>none yet</li>",
+        "script": (HERE / "result.js").read_text("utf-8"),
+        "version": version,
     }
     write_text(folder / INDEX, filled("result.html", parts, STILL if run else CAMERAS))
+    write_text(folder / VERSION, f'ppclVersion("{version}");\n')  # last: it has the page loaded
+
+
+def write_preview(training: Training, folder: Path, title: str) -> None:
+    """Write the model's page of a training by now, between two of its steps. Raises UserError as
+    first_gaussians does.
+    """
+    run, renderer = training.present_run(), training.trainer.renderer
+    renderer.release()
+    # its own, as the training's would keep room for the fragments of whole images
+    run.renderer = Renderer(run.dev, run.model, run.config.raster)
+    try:
+        gaussians = first_gaussians(run)
+    finally:
+        run.renderer.release()
+    write_model(folder, gaussians, run.cameras("train"), title)
 
 
 def is_newer(file: Path, other: Path) -> bool:
@@ -141,7 +173,7 @@ def _image(name, what):
 
 
 def _later(what):
-    return f'<p class="later">The {what} is still to come; reload this page then.</p>'
+    return f'<p class="later">The {what} is still to come.</p>'
 
 
 def _figures(run, found):

@@ -93,7 +93,8 @@ def cut_in_spz(table: np.ndarray) -> str:
     over = np.abs(table["harmonics"][:, 1:]) - 1  # of colours by direction
     if not (over > 0).any():
         return ""
-    return f", {(over > 0).mean():.2%} of its harmonics cut to 1, by {over.max():.2f} at most"
+    share, most = (over > 0).mean(), over.max()
+    return f", {share:.2%} of its colours by direction clipped, by {most:.2f} at most"
 
 
 def write_splat_spz(path: Path, table: np.ndarray) -> None:

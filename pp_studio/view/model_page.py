@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from pp_cl import Camera, Run
 from pp_cl.engine import MIN_SIDE, View
-from pp_cl.errors import UserError, name_of
+from pp_cl.errors import UserError
 from pp_cl.scene import frame_keys, up_of
 from pp_studio.camera_path import through
 from pp_studio.export.gaussians import CONSTANT, kept_gaussians
@@ -111,15 +111,9 @@ class ModelPage:
                 name, min=least, max=most, step=step, initial_value=value, **options
             )
 
-        self._stop = slider("Early stop", 0.0, 0.5, 0.001, early_stop)
-        self._share = slider("Points kept, %", 1, 100, 1, 100, visible=not is_training)
-        self._exposure = slider("Exposure, stops", -3.0, 3.0, 0.1, 0.0)
-        self._shown = gui.add_checkbox("Training views", True, hint="click one to go there")
-        trained = [(one, one.value) for one in (self._stop, self._share, self._exposure)]
-        for handle in (self._show, self._shown, *(one for one, _ in trained)):
-            handle.on_update(self._switched)
-        gui.add_button("As trained").on_click(
-            lambda _: [setattr(handle, "value", value) for handle, value in trained]
+        self._exposure = slider("Brightness", -3.0, 3.0, 0.1, 0.0, hint="in stops")
+        self._shown = gui.add_checkbox(
+            "Photographs", True, hint="where they were taken; click one to go there"
         )
         gui.add_button("Save image").on_click(self._with_tab(self._want_file))
         with gui.add_folder("Camera path", expand_by_default=False):
@@ -127,6 +121,17 @@ class ModelPage:
             gui.add_button("Remove the last").on_click(self._remove_key)
             self._seconds = slider("Seconds", 1, 60, 1, 4)
             gui.add_button("Save path.json").on_click(self._with_tab(self._send_path))
+        with gui.add_folder("For experts", expand_by_default=False):
+            self._stop = slider("Early stop", 0.0, 0.5, 0.001, early_stop, hint="raster.early_stop")
+            self._share = slider(
+                "Points shown, %", 1, 100, 1, 100, hint="the most opaque", visible=not is_training
+            )
+            first = [(one, one.value) for one in (self._stop, self._share, self._exposure)]
+            gui.add_button("Reset").on_click(
+                lambda _: [setattr(handle, "value", value) for handle, value in first]
+            )
+        for handle in (self._show, self._shown, *(one for one, _ in first)):
+            handle.on_update(self._switched)
         series = [{"label": "step"}, {"label": "PSNR", "scale": "dB", "stroke": BLUE}]
         series.append({"label": "loss", "scale": "loss", "stroke": ORANGE})
         axes = [{"stroke": GREY}, {"scale": "dB", "stroke": BLUE}]
@@ -315,7 +320,7 @@ class ModelPage:
         if found := self._image(self._camera(tab)):
             file = io.BytesIO()
             Image.fromarray(found[0]).save(file, "PNG")
-            run = name_of(self.run.folder.path)
+            run = self.run.folder.name
             name = f"{run}_step_{self.run.header['step']}_{self._show.value}.png"
             tab.client.send_file_download(name, file.getvalue(), save_immediately=True)
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from pp_cl import OnStep, Run, RunFolder, Training, fastest, load
+from pp_cl import OnStep, RunFolder, Training, fastest, load
 from pp_cl.engine import Device
-from pp_cl.errors import UserError, name_of
+from pp_cl.errors import UserError
 from pp_studio.view.model_page import ModelPage, announce
 from pp_studio.view.server import started
 
@@ -103,13 +103,10 @@ def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
     drawn there, between two steps, and leave the bits of the training as they are: they use the
     buffers that its previews use.
     """
-    trainer, model = training.trainer, training.trainer.model
-    header = training.info | {"step": trainer.step, "finished": False}
-    run = Run(trainer.dev, training.folder, training.config, header, model)
-    run.renderer = trainer.renderer  # not one of its own, which would freeze the network
+    trainer, run = training.trainer, training.present_run()
     cameras = [view.camera for view in trainer.views]
     most = max(camera.width * camera.height for camera in cameras)  # what memory is planned for
-    with started(name_of(training.folder.path)) as (server, address):
+    with started(training.folder.name) as (server, address):
         page = ModelPage(server, run, trainer.views, most_pixels=most, is_training=True)
         page.tell("the first step builds kernels")
         announce(server, "the first step builds kernels")

@@ -1,6 +1,8 @@
 """The web server of the viewer: viser's, started quietly on one address."""
 
+import html
 import io
+import json
 import logging
 import socket
 import warnings
@@ -17,8 +19,8 @@ ANY = ("0.0.0.0", "::")  # noqa: S104 compared with, not bound to
 @contextmanager
 def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterator[tuple[Any, str]]:
     """(viser's server with an empty page, what to open in a browser) until the block ends. label:
-    heads the page's panel. port: 0 takes any that is free; None the first from PORT on. Raises
-    UserError for a host or port that cannot be had.
+    heads the page's panel and its tab in the browser. port: 0 takes any that is free; None the
+    first from PORT on. Raises UserError for a host or port that cannot be had.
     """
     import viser
 
@@ -40,6 +42,9 @@ def started(label: str, host: str = LOOPBACK, port: int | None = None) -> Iterat
     try:
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.main_panel.float(x=15, y=-15)
+        # viser has no other way to the title in the browser's tab
+        script = html.escape(f"document.title = {json.dumps(label)}")
+        server.gui.add_html(f'<img hidden src="data:," onerror="{script}">')
         yield server, f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
     finally:
         with redirect_stdout(io.StringIO()):
@@ -52,4 +57,4 @@ def switches(server: Any) -> Any:
     """
     panel = server.gui.add_panel()
     panel.dock_right()
-    return panel.add_tab("Switches")
+    return panel.add_tab("Display")

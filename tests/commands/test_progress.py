@@ -23,6 +23,7 @@ def soon(monkeypatch):
     monkeypatch.setattr(progress, "REDRAWN", 0.02)
     monkeypatch.setattr(progress, "LINES_APART", 0.02)
     monkeypatch.setattr(progress, "_told", 0.0)
+    monkeypatch.setattr(progress, "_shown", None)
     monkeypatch.setenv("COLUMNS", "120")
 
 
@@ -77,10 +78,33 @@ def test_on_a_terminal_a_bar_moves_by_itself():
     assert "\n" not in stream.getvalue()
 
 
+def test_nothing_is_shown_within_another_stage():
+    stream, within = io.StringIO(), io.StringIO()
+    with progress.Progress("training", stream=stream):
+        for _ in progress.track([1, 2], "colours", "view", stream=within):
+            until(stream, "training: ")
+    with progress.Progress("colours", stream=within):
+        until(within, "colours: ")
+    assert within.getvalue().count("view") == 0
+
+
+@pytest.mark.parametrize("kind", [io.StringIO, Terminal])
+def test_of_given_minutes_those_left_are_told(kind):
+    stream = kind()
+    with progress.Progress("training", given=2.0, done=30, stream=stream) as bar:
+        until(stream, "1.5 of 2.0 minutes left")
+        bar.note = "step 7"
+        until(stream, "minutes left, step 7")
+    assert kind is io.StringIO or "training:  25%" in stream.getvalue()
+    with progress.Progress("training", given=2.0, done=200, stream=stream):
+        until(stream, "0.0 of 2.0 minutes left")
+
+
 @pytest.mark.parametrize("kind", [io.StringIO, Terminal])
 def test_a_training_tells_its_rate_points_and_memory(kind):
     trainer = SimpleNamespace(step=100, dev=SimpleNamespace(bytes=3 * 2**29))
-    config = SimpleNamespace(train=SimpleNamespace(iterations=400))
+    train = SimpleNamespace(iterations=400, minutes=0, members=1)
+    config = SimpleNamespace(train=train)
     stream = kind()
     with TrainingProgress(SimpleNamespace(trainer=trainer, config=config), stream) as follower:
         until(stream, "building kernels (once): 00:0")

@@ -1,4 +1,6 @@
 import json
+import re
+from types import SimpleNamespace
 
 import numpy as np
 from support.refused import failure
@@ -22,12 +24,22 @@ def trained_lines(capsys, *words):
 
 def test_a_preset_reduces_large_images_and_says_so(tmp_path, capsys):
     scene, out = write_ball_scene(tmp_path / "ball", views=4, size=400), tmp_path / "run"
-    line = "images: 400x400, reduced 2 times to 200x200"
+    line = "images: scaled from 400x400 to 200x200"
     chosen = f"{line} for the preset tiny (--downscale 1 keeps them)"
     assert chosen in trained_lines(capsys, scene, "--out", out)
     assert json.loads((out / "config.json").read_text())["scene"]["downscale"] == 2
     given = ("--set", "scene.downscale=1")
     assert "images: 400x400" in trained_lines(capsys, scene, "--out", tmp_path / "b", *given)
+
+
+def test_a_full_disk_is_told_before_the_first_step(scene, tmp_path, monkeypatch):
+    free = SimpleNamespace(free=10_000)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: free)
+    line = failure(*arguments(scene, tmp_path / "run"))
+    assert re.search(r"run/checkpoint.npz: takes \d+ MB, and 0 are free on its disk; free", line)
+    assert not (tmp_path / "run/log.jsonl").exists()
+    free.free = 10**9
+    assert main([str(word) for word in arguments(scene, tmp_path / "run")]) == 0
 
 
 def test_memory_and_what_is_left_out_are_a_line_each(tmp_path, capsys):

@@ -29,8 +29,12 @@ def ball_image(camera, radius=0.8):
     b = rays @ camera.eye
     disc = b**2 - (camera.eye @ camera.eye - radius**2)
     surface = camera.eye + rays * (-b - np.sqrt(np.maximum(disc, 0)))[..., None]
-    colour = 0.5 + 0.4 * np.sin(4 * surface + [0, 1, 2])
-    return np.rint(255 * np.dstack([colour, disc > 0])).astype(np.uint8)
+    return np.rint(255 * np.dstack([ball_colour(surface), disc > 0])).astype(np.uint8)
+
+
+def ball_colour(surface):
+    """(..., 3) in [0, 1]: the ball's colour at positions on its surface."""
+    return 0.5 + 0.4 * np.sin(4 * surface + [0, 1, 2])
 
 
 def write_ball_scene(folder, views=8, size=48, splits=("train", "test")):

@@ -56,7 +56,7 @@ def hold_out(items: Sequence[Item], split: str, files: Sequence[Path] = ()) -> l
 
 def progress(items: Sequence[Item]) -> Iterable[Item]:
     """The items, under a bar: there may be thousands."""
-    return track(items, "listing", "image")
+    return track(items, "checking images", "image")
 
 
 # Images -------------------------------------------------------------------------------------------

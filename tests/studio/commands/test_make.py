@@ -1,17 +1,25 @@
 import importlib
+import json
 import re
 import shutil
 import signal
+from contextlib import suppress
 
+import numpy as np
 import pytest
-from support.runs import spoken
+from support.runs import SETTINGS, spoken
 
 from pp_cl.cli import main
 from pp_cl.commands import COMMANDS
+from pp_cl.config import run_config
+from pp_cl.errors import UserError
 from pp_cl.files.atomic import own, write_json
 from pp_cl.files.image import read_rgba
+from pp_cl.files.run_folder import RunFolder
 from pp_studio.capture import STAGES
 from pp_studio.commands import make, render
+from pp_studio.export import result
+from pp_studio.export.result import begin_result
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +43,7 @@ def test_the_page_links_what_is_there(made):
     named = set(re.findall(r'(?:src|href|content)="([\w.]+\.\w+)"', page))
     assert named == {"model.html", "video.mp4", "splat.ply", "views.png", "thumbnail.png"}
     assert all((folder / name).stat().st_size > 0 for name in named)
-    assert "<title>out</title>" in page and "<!--" not in page
+    assert "<title>out</title>" in page and "<!--" not in page and "renews itself" not in page
     assert "PSNR, dB" in page and "the training has not seen" in page
     assert read_rgba(folder / "thumbnail.png").shape == (315, 600, 4)
 
@@ -50,8 +58,109 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
     assert made == [(folder / name).stat().st_mtime_ns for name in ("video.mp4", "splat.ply")]
     assert (folder / "index.html").exists()
     assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
-    status, lines = spoken(["make", scene, "--out", folder, "--minutes", "7"])
-    assert status == 2 and f"{folder}: was begun with --minutes 0.1; leave it out" in lines[-1]
+
+
+def test_with_more_minutes_a_finished_model_is_trained_on(made, capsys, monkeypatch):
+    scene, folder = made
+    monkeypatch.setattr(render, "LEAST_HEIGHT", 32)
+    monkeypatch.setattr(make, "LEAST_MORE", -100)  # however busy the machine is
+    before, folder = folder, shutil.copytree(folder, folder.with_name("more"))
+    passed = json.loads((folder / "make.json").read_text())["passed"]
+    words = ["make", scene, "--out", str(folder), "--minutes", f"{passed + 0.25:.3f}"]
+    assert main([*words, "--title", "A <ball>"]) == 0
+    steps = [load_header(one / "run")["step"] for one in (before, folder)]
+    assert steps[1] > steps[0] and "extends a finished training" in capsys.readouterr().out
+    assert "<title>A &lt;ball&gt;</title>" in (folder / "index.html").read_text("utf-8")
+    assert "A &lt;ball&gt;" in (folder / "model.html").read_text("utf-8")
+    checkpoint = (folder / "run/checkpoint.npz").read_bytes()
+    for more in ([], ["--minutes", "0.1"]):  # what is there is of more
+        assert main([*words[:4], *more]) == 0
+        assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
+    assert "A &lt;ball&gt;" in (folder / "index.html").read_text("utf-8")
+
+
+def load_header(run):
+    with np.load(run / "checkpoint.npz") as stored:
+        return json.loads(stored["header"].tobytes())
+
+
+@pytest.fixture
+def minutes(monkeypatch):
+    """A function that lets so many minutes pass."""
+    now = [0.0]
+    monkeypatch.setattr(make.time, "monotonic", lambda: now[0])
+
+    def passing(count):
+        now[0] += 60 * count
+
+    return passing
+
+
+def test_attempts_that_fail_do_not_count(tmp_path, minutes):
+    def attempt(count, error=None):
+        with suppress(Exception, KeyboardInterrupt), make._Clock(file, 10, None) as clock:
+            minutes(1)
+            clock.keep()
+            minutes(count)
+            if error:
+                raise error
+        return make._Clock(file, None, None).passed
+
+    file = tmp_path / "make.json"
+    assert attempt(5, UserError("no photographs")) == 1
+    assert attempt(6, ValueError()) == 2
+    assert attempt(1, KeyboardInterrupt()) == 4
+    assert attempt(2) == 7
+
+
+def test_a_third_of_the_minutes_is_the_trainings(tmp_path, minutes, capsys):
+    with make._Clock(tmp_path / "make.json", 9, None) as clock:
+        minutes(3)
+        assert clock.training() == pytest.approx(4.5) and clock.left == pytest.approx(6)
+        assert "too long" not in capsys.readouterr().out
+        minutes(10)
+        assert clock.training() == pytest.approx(3.75)
+        assert "9 minutes: 13.0 have passed, which is too long; 18.0 are taken" in (
+            capsys.readouterr().out
+        )
+        assert clock.left == pytest.approx(5) and clock.told == "5.0 of 18 minutes left"
+    assert make._Clock(tmp_path / "make.json", None, None).left == pytest.approx(5)
+
+
+def test_a_preset_that_others_make_smaller_is_told(capsys):
+    assert make._preset(15, 1.0) == "small" and not capsys.readouterr().out
+    assert make._preset(15, 0.2) == "tiny"
+    told = "other programs take 80% of the processor: the preset is tiny, not small"
+    assert told in capsys.readouterr().out
+
+
+def test_an_open_page_is_renewed_in_the_training_and_its_bits_are_the_same(
+    runs, tmp_path, monkeypatch
+):
+    scene, renewed, real = runs.ball(views=12, size=32), [], result.write_preview
+    monkeypatch.setattr(render, "LEAST_HEIGHT", 32)
+    for name in ("out", "alone"):
+        folder = tmp_path / name
+        begin_result(folder)
+        given = [(*one, "test") for one in (SETTINGS | {"scene.downscale": 1}).items()]
+        run = RunFolder(folder / "run")
+        run.create(run_config(run, scene, "tiny", given).to_json())
+
+        def preview(training, folder, title, name=name):
+            if name == "out":
+                real(training, folder, title)
+                state = (folder / "index.html").read_text("utf-8")
+                renewed.append((training.trainer.step, len(state)))
+            else:
+                training.on_preview = None
+
+        monkeypatch.setattr(result, "write_preview", preview)
+        assert main(["make", scene, "--out", str(folder)]) == 0
+    assert [step for step, _ in renewed] == [15, 30, 45, 60]
+    stored = [np.load(tmp_path / name / "run/checkpoint.npz") for name in ("out", "alone")]
+    assert stored[0].files == stored[1].files
+    for name in stored[0].files:
+        assert stored[0][name].tobytes() == stored[1][name].tobytes(), name
 
 
 def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, monkeypatch):
@@ -96,7 +205,7 @@ def test_what_is_not_its_own_stays(made, tmp_path):
     page = folder / "index.html"
     page.write_text(page.read_text("utf-8") + "mine", "utf-8")
     status, lines = spoken(["make", scene, "--out", folder])
-    assert status == 2 and "index.html: pp-cl did not write this" in lines[-1]
+    assert status == 2 and "index.html: was not written by pp-cl" in lines[-1]
     assert page.read_text("utf-8").endswith("mine")
 
 
@@ -116,7 +225,7 @@ class Enough(Exception):
 def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
     steps = []
 
-    def step(name, *given):
+    def step(name, *given, **_):
         steps.append((name, given))
         for stage in STAGES if name == "capture" else ():
             write_json(found / f"{stage}.json", {"line": f"{stage} done"})
@@ -125,7 +234,7 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
 
     monkeypatch.setattr(make, "_step", step)
     monkeypatch.setattr(make, "_share", lambda: 1.0)
-    monkeypatch.setattr("pp_studio.export.result.write_result", lambda *given: None)
+    monkeypatch.setattr("pp_studio.export.result.write_result", lambda *_, **__: None)
     photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
     found.mkdir(parents=True)

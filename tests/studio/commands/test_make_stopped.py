@@ -41,9 +41,7 @@ def begins(process, stage):
 
 def result(out):
     files = content(out)
-    return {
-        name: data for name, data in files.items() if not name.endswith((".html", "minutes.json"))
-    }
+    return {name: data for name, data in files.items() if not name.endswith((".html", "make.json"))}
 
 
 def test_any_moment_will_do(runs, tmp_path):

@@ -1,7 +1,6 @@
 import base64
 import json
 import re
-import shutil
 import time
 from dataclasses import replace
 
@@ -9,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.browser import ask, image_of, new_page
+from support.scenes import ring_cameras
 from support.splats import draw_splats, splats_of
 
 from pp_cl.engine.camera import Camera
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
-from pp_cl.run import load
 from pp_studio.export import QUALITIES, QUICK
 from pp_studio.export.gaussians import (
     GAUSSIAN,
@@ -29,6 +28,7 @@ from pp_studio.export.page import (
     first_look,
     pack,
     page_text,
+    photographed,
     write_gallery,
 )
 
@@ -38,7 +38,7 @@ def page(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "view.html"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(QUALITIES, QUICK, (300, 0.0))  # as many steps as make it look like the run
-        path.write_text(page_text(run, fitted_gaussians(run)))
+        path.write_text(page_text(fitted_gaussians(run), run.cameras("train"), "ball"))
     return path
 
 
@@ -134,18 +134,27 @@ def test_a_browser_draws_gaussians_by_their_rules_in_all_sizes(run, page):
 
 def test_before_the_fit_it_shows_the_points(run, tmp_path):
     path = tmp_path / "first.html"
-    path.write_text(page_text(run, first_gaussians(run)))
+    path.write_text(page_text(first_gaussians(run), run.cameras("train"), "ball"))
     camera = run.cameras("test")[0]
     [image] = drawn(path, [camera])
     assert psnr(image, to_8bit(run.render(camera).colour)) > 22
 
 
+def test_the_first_look_is_from_where_photographs_were_taken():
+    points, centre = np.random.default_rng(0).normal(size=(99, 3)), np.zeros(3)
+    for heights, expected in (((3, 3), 3), ((1, 50), 20), ((40, 50), 40)):
+        cameras = [seen_from(a, heights[a // 90 % 2]) for a in range(0, 720, 90)]
+        eye, up = first_look(points, centre, cameras)
+        assert np.degrees(np.arcsin(eye @ up / np.linalg.norm(eye))) == pytest.approx(expected)
+
+
 def test_the_first_look_shows_the_whole_object(run):
-    (centre, _), (eye, up) = run.ball, first_look(run)
+    centre, points = run.ball[0], run.model.positions()
+    eye, up = first_look(points, centre, run.cameras("train"))
     camera = looking(eye, centre, up, 40)
     for angle in range(0, 360, 45):
         turn = Rotation.from_rotvec(np.radians(angle) * up).as_matrix()
-        x, y, _ = camera.project((run.model.positions() - centre) @ turn.T + centre)
+        x, y, _ = camera.project((points - centre) @ turn.T + centre)
         assert x.min() > 9 and x.max() < 39 and y.min() > 2 and y.max() < 28
     assert max(np.ptp(x) / 30, np.ptp(y) / 30) > 0.6
 
@@ -258,6 +267,47 @@ def test_what_rests_after_a_movement_is_drawn_in_full(page):
     assert np.array_equal(rested, full) and np.abs(first - rested.astype(int)).max() > 60
 
 
+def seen_from(azimuth, elevation):
+    """A camera that looks at the origin from there, in degrees, x ahead and z up."""
+    a, e = np.radians([azimuth, elevation])
+    eye = 4 * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+    return Camera.look_at(eye, (0, 0, 0), fx=50, width=32, height=32)
+
+
+def test_a_page_knows_from_where_its_object_was_photographed():
+    cameras = [seen_from(*at) for at in ((0, 10), (40, 50), (100, -20))]
+    sectors = photographed(cameras, np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]))
+    assert len(sectors) == 36
+    assert sectors[0] == [10, 50, 0] and sectors[7] == [-20, 50, 0] and sectors[12] == [-20, -20, 0]
+    assert sectors[18] == [-20, -20, 35] and sectors[30] == [10, 10, 15]
+
+
+def test_beyond_the_photographs_it_fades(run, page):
+    header = header_of(page)
+    centre, up, ahead = (np.array(header[name]) for name in ("centre", "up", "ahead"))
+    script = """for (let i = 0; i < 40; i++) {
+            dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowDown" }));
+            ppcl.show();
+        }
+        return ["canvas", "aside"].map(
+            (name) => Number(document.querySelector(name).style.opacity));"""
+    low, high, aside = header["photographed"][0]
+    assert aside == 0 and -80 < low < high < 80
+    shown = []
+    for elevation in (high, high + 9, high + 20, high + 35):
+        e = np.radians(elevation)
+        eye = centre + 4 * (np.cos(e) * ahead + np.sin(e) * up)
+        fragment = f"#eye={','.join(map(str, eye))}&target={','.join(map(str, centre))}"
+        shown.append(
+            ask(page, script.partition("return")[1] + script.partition("return")[2], fragment)
+        )
+    opacities, words = zip(*shown, strict=True)
+    assert opacities[:2] == (1, 1) and opacities[3] == 0.1
+    assert opacities[2] == pytest.approx(0.55, abs=0.05)
+    assert words == (0, 0, pytest.approx(0, abs=0.1), 1)
+    assert ask(page, script) == [0.1, 1]  # turned there by keys
+
+
 def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):
     assert write_gallery(tmp_path / "all", [run, run]) == 2
     names = {path.name for path in (tmp_path / "all").iterdir()}
@@ -273,11 +323,11 @@ def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):
         assert still[:, [0, -1], :3].min() > 200
 
 
-def test_the_runs_name_is_text(run_folder, session_device, tmp_path):
-    folder = tmp_path / "<b> & </script>".replace("/", "")
-    shutil.copytree(run_folder, folder)
-    one = np.ones(1, GAUSSIAN)
-    text = page_text(load(folder, session_device), Gaussians(one, np.zeros(3), (1, 1), 0))
+def test_its_title_is_text():
+    two = np.ones(2, GAUSSIAN)
+    two["position"][0] = 0
+    cameras = ring_cameras(3, 32)
+    text = page_text(Gaussians(two, np.zeros(3), (1, 1), 0), cameras, "<b> & <script>")
     assert "<title>&lt;b&gt; &amp; &lt;script&gt;</title>" in text
 
 

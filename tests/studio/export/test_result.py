@@ -1,15 +1,22 @@
 import os
 import re
 import shutil
+import time
 
+import numpy as np
 import pytest
-from support.scenes import write_ball_scene
+from scipy.spatial.transform import Rotation
+from support.browser import new_page
+from support.scenes import ball_colour, write_ball_scene
+from support.viewing import wait
 
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load
-from pp_studio.export import result
-from pp_studio.export.result import begin_result, write_result
+from pp_studio.export import hull, result
+from pp_studio.export.gaussians import CONSTANT
+from pp_studio.export.hull import hull_gaussians
+from pp_studio.export.result import begin_result, write_model, write_result
 
 
 def shown(folder):
@@ -25,16 +32,97 @@ def test_before_the_training_it_shows_cameras_and_masks(tmp_path):
     (scene / "capture").mkdir()
     folder = tmp_path / "made"
     begin_result(folder)
-    write_result(None, "test", folder, "video.mp4", ["poses: 7 of 9 images"], str(scene))
+    told = {"scene": str(scene), "told": ["poses: 7 of 9 images"], "state": "3 minutes left"}
+    write_result(folder, "Ball", "video.mp4", **told)
     text, named = shown(folder)
-    assert named == {"cameras.png"} and "poses: 7 of 9 images" in text
+    assert named == {"cameras.png"} and "poses: 7 of 9 images" in text and "3 minutes" in text
     drawn = read_rgba(folder / "cameras.png")
     assert drawn.shape == (500, 1000, 4) and drawn[..., :3].min() < 100
     assert text.count("still to come") == 3  # the model, the video, the evaluation
     for name in ("box.png", "masks.png"):
         shutil.copy(folder / "cameras.png", scene / "capture" / name)
-    write_result(None, "test", folder, "video.mp4", (), str(scene))
+    write_result(folder, "Ball", "video.mp4", scene=str(scene))
     assert shown(folder)[1] == {"cameras.png", "masks.png"}
+
+
+@pytest.fixture(scope="module")
+def begun(runs, tmp_path_factory):
+    """(folder of a result before its training, with the hull's model, {facts of write_result})."""
+    scene, folder = runs.ball(views=12, size=60), tmp_path_factory.mktemp("result") / "made"
+    begin_result(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hull, "POINTS", 10_000)  # as few as a processor draws at once
+        write_model(folder, *hull_gaussians(scene), "Ball")
+    return folder, {"scene": scene, "state": "3 minutes left"}
+
+
+def open_page(folder, facts):
+    """A new_page() of the result, renewed so that it has a title that nobody has seen yet."""
+    write_result(folder, "Ball", "video.mp4", **facts)
+    return new_page((folder / "index.html").as_uri())
+
+
+def test_an_open_page_renews_itself_and_keeps_the_look(begun):
+    folder, facts = begun
+    text = "document.documentElement?.textContent ?? ''"  # also while it is loaded again
+    with open_page(folder, facts) as page:
+        model = "document.querySelector('iframe').src"
+        assert page.evaluate(model).endswith("/model.html")
+        time.sleep(1)
+        page.drag((300, 300), [(12, 3)] * 10)
+        wait(lambda: page.evaluate("location.hash").startswith("#eye="))
+        look = page.evaluate("location.hash")
+        facts = facts | {"told": ["a new line"]}
+        write_result(folder, "Ball", "video.mp4", **facts)
+        wait(lambda: "a new line" in page.evaluate(text))
+        assert page.evaluate("location.hash") == look and page.evaluate(model).endswith(look)
+        write_result(folder, "Ball", "video.mp4", **facts | {"state": "", "told": ["the last"]})
+        wait(lambda: "the last" in page.evaluate(text))
+        assert "version" not in "".join(page.asked[-1:]) and not page.wrong
+
+
+TOUCH = {"enabled": True, "maxTouchPoints": 2}
+PHONE = {"width": 390, "height": 740, "deviceScaleFactor": 1, "mobile": True}
+
+
+def test_on_a_phone_one_finger_scrolls_past_the_model_and_turns_it(begun):
+    folder, facts = begun
+    with open_page(folder, facts) as page:
+        page.call("Emulation.setDeviceMetricsOverride", **PHONE)
+        page.call("Emulation.setTouchEmulationEnabled", **TOUCH)
+        page.call("Page.reload")
+        wait(lambda: page.evaluate("document.readyState") == "complete")
+        time.sleep(1)
+
+        def swipe(across, down):
+            steps = np.linspace(0, 1, 9)[:, None]
+            for x, y in (190, 300) + steps * (across, down):
+                kind = "touchMove" if (x, y) != (190, 300) else "touchStart"
+                touches = [{"x": x, "y": y}]
+                page.call("Input.dispatchTouchEvent", type=kind, touchPoints=touches)
+            page.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+        swipe(-120, 0)
+        wait(lambda: page.evaluate("location.hash").startswith("#eye="))
+        assert page.evaluate("scrollY") == 0
+        look = page.evaluate("location.hash")
+        swipe(0, -200)
+        wait(lambda: page.evaluate("scrollY") > 100)
+        assert page.evaluate("location.hash") == look and not page.wrong
+
+
+def test_a_hull_has_the_colours_of_its_photographs(runs):
+    gaussians, cameras = hull_gaussians(runs.ball(views=12, size=60))
+    assert [(one.width, one.height) for one in cameras] == [(60, 60)] * 12
+    positions = gaussians.table["position"] + gaussians.origin
+    radii = np.linalg.norm(positions, axis=1)
+    assert 0.75 < np.median(radii) < 0.95  # of the ball it is 0.8
+    surface = 0.8 * positions / radii[:, None]
+    is_seen = np.abs(surface[:, 2]) < 0.5  # the cameras are above, all around
+    wrong = 0.5 + CONSTANT * gaussians.table["harmonics"][:, 0] - ball_colour(surface)
+    assert np.abs(wrong[is_seen]).mean() < 0.06
+    normals = Rotation.from_quat(np.roll(gaussians.table["turn"], -1, axis=1)).apply([0, 0, 1])
+    assert np.quantile((normals * surface).sum(1) / 0.8, 0.05) > 0.8
 
 
 @pytest.fixture
@@ -49,14 +137,15 @@ def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
     folder, pages = tmp_path / "made", []
     for name in ("fitted", "first"):
         monkeypatch.setattr(result, f"{name}_gaussians", lambda _, name=name: name)
-    monkeypatch.setattr(result, "page_text", lambda run, of, title: pages.append(of) or "the model")
+    monkeypatch.setattr(result, "page_text", lambda of, *_: pages.append(of) or "the model")
     begin_result(folder)
-    write_result(trained, "test", folder, "video.mp4")
+    write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     text, named = shown(folder)
-    assert named == {"model.html", "thumbnail.png"} and text.count("still to come") == 2
+    assert named == {"model.html", "thumbnail.png"} and "<title>Ball</title>" in text
+    assert text.count("still to come") == 2
     (folder / "video.mp4").write_bytes(b"film")
     os.utime(folder / "video.mp4", ns=(10**18 - 1,) * 2)  # of the checkpoint before
-    write_result(trained, "test", folder, "video.mp4")
+    write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     assert shown(folder)[1] == {"model.html", "thumbnail.png"} and pages == ["first"]
     for name in ("video.mp4", "splat.ply"):
         (folder / name).write_bytes(b"made")
@@ -66,10 +155,10 @@ def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
         '{"mean": {"psnr": 30.5, "ssim": 0.9, "lpips": 0.1}, "per_image": [1, 2]}'
     )
     shutil.copy(folder / "thumbnail.png", measured / "comparison.png")
-    write_result(trained, "test", folder, "video.mp4")
+    write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     text, named = shown(folder)
     assert named == {"model.html", "video.mp4", "splat.ply", "views.png", "thumbnail.png"}
     assert "30.5 (mean of 2 views)" in text and "LPIPS" in text and "still to come" not in text
     assert pages == ["first", "fitted"]  # the model's page is that of the splat now
-    write_result(trained, "test", folder, "video.mp4")
+    write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     assert len(pages) == 2

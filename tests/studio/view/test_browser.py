@@ -32,6 +32,7 @@ def test_a_browser_shows_the_model_and_asks_nobody_else(served, dev, trained):
 
     with drawing(view.page), new_page(address) as page:
         shown(page, is_colour)
+        assert page.evaluate("document.title") == "test"
         page.key("2")
         shown(page, is_alpha)
         page.key("1")

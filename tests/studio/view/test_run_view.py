@@ -68,11 +68,11 @@ def test_a_moving_camera_gets_drafts_and_one_at_rest_the_full_image(view, served
 def test_switches_change_what_is_drawn(view, served):
     changes = (
         ("Show depth", True, {"show": "depth"}),
-        ("Exposure, stops", -2.0, {"show": "depth", "exposure": -2.0}),
-        ("As trained", True, {"show": "depth"}),
+        ("Brightness", -2.0, {"show": "depth", "exposure": -2.0}),
+        ("Reset", True, {"show": "depth"}),
         ("Show", "colour", {}),
-        ("Points kept, %", 20, {"share": 0.2}),
-        ("Points kept, %", -7, {"share": 0.01}),  # what no slider says
+        ("Points shown, %", 20, {"share": 0.2}),
+        ("Points shown, %", -7, {"share": 0.01}),  # what no slider says
     )
     checks = [like(view, CAMERA, **look) for _, _, look in changes]
     with looking(view, served[1]) as opened, drawing(view.page):

@@ -1,0 +1,23 @@
+"use strict";
+// Keeps the look at the model, which its own page tells, in the address of this one, and loads this
+// one again once version.js, which pp-cl make writes after each part, names a newer version. Pages
+// that lie in a folder may read no files, but load scripts.
+
+const version = "<!-- version -->", AGAIN = 3000;  // milliseconds
+const model = document.querySelector("iframe");
+let isHeld = false;
+if (model) model.src = "model.html" + location.hash;
+addEventListener("message", ({ source, data }) => {
+  if (!model || source !== model.contentWindow) return;
+  isHeld = data === "held";
+  if (String(data).startsWith("#")) history.replaceState(null, "", data);
+});
+window.ppclVersion = (newest) => {
+  if (newest !== version && !isHeld) location.reload();
+};
+if (version) setInterval(() => {
+  const script = document.createElement("script");
+  script.src = `version.js?${Date.now()}`;
+  script.onload = script.onerror = () => script.remove();
+  document.head.append(script);
+}, AGAIN);
