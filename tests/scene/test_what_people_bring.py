@@ -246,7 +246,7 @@ TRAINS = {
     "a workspace of COLMAP": (
         "colmap",
         workspace,
-        "of 2 models the largest beside images is read",
+        "of 2 models, the largest with images next to it is read",
     ),
     "undistorted images beside photographs": ("colmap", undistorted, ""),
     "cut-outs, masks for some": ("colmap", cut_out, ""),
