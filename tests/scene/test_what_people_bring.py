@@ -309,7 +309,7 @@ def test_a_test_view_of_another_place_is_not_measured(tmp_path):
     (tmp_path / "ball/transforms_test.json").write_text(json.dumps(data))
     assert train(folder, tmp_path / "run")[0] == 0
     status, lines = spoken(["eval", tmp_path / "run"])
-    told = "test: 1 of 4 views left out: their masks are beside the model (train/r_6.png)"
+    told = "test: 1 of 4 views left out: their masks miss the model (train/r_6.png)"
     assert status == 0 and any(told in line for line in lines), lines
     measured = json.loads((tmp_path / "run/eval/metrics.json").read_text())["per_image"]
     assert [one["name"] for one in measured] == ["train/r_0.png", "train/r_3.png", "train/r_9.png"]
