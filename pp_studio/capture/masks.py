@@ -1,5 +1,5 @@
-"""Masks of photographs with known cameras: given, of their alpha, of a uniform background, of a
-program of the user's; else cut out by colour around the sparse points and voted on by all views.
+"""Makes masks of photographs with known cameras: from given masks, alpha, a uniform background or a
+program of the user; otherwise by colour around the sparse points, with a vote of all views.
 """
 
 import os
@@ -39,11 +39,11 @@ ON_MASK = 0.9  # of the object's points, that a mask of a uniform background hol
 CHECKED_SIDE = 200  # pixels of the masks that are compared
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of an image, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
-SECONDS = 600  # that a program may take for a mask
+SECONDS = 600  # a program may take so long for a mask
 
 
 def mask_file(scene: Path, name: str) -> Path:
-    """Where write_masks() writes the mask of a photograph."""
+    """The file to which write_masks() writes the mask of a photograph."""
     return scene / "masks" / f"{Path(name).stem}.png"
 
 
@@ -61,11 +61,11 @@ def write_masks(
     turns: bool = False,
     grows: bool = False,
 ) -> tuple[str, list[str], np.ndarray]:
-    """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
-    lies there is kept, and helps to make the others. Returns one line on what was done, the names
-    of photographs whose masks contradict the others, the worst first, and the box.
+    """Write the mask of each photograph to mask_file(), 8-bit gray, white on the object. Existing
+    masks are kept and help to make the others. Returns one line on what was done, the names of
+    photographs whose masks contradict the others, the worst first, and the box.
 
-    scene: the folder that the photographs' names are relative to; their images have no distortion.
+    scene: the folder to which the photographs' names are relative; their images have no distortion.
     box: (2, 3) around the object. points: (N, 3) in the scene's world. seen: for each photograph
     the indices (M,) of the points that it shows. given: a folder of masks of the photographs as
     they were taken, which may be named like the photographs' sources, as {name: source} has them;
@@ -80,11 +80,11 @@ def write_masks(
     left = _without_mask(scene, image_files)
     how = {"kept": len(image_files) - len(left)}
     shown = [i for i, one in enumerate(image_files) if cut.place_of(one, box)]
-    shown = shown or list(range(len(image_files)))  # which window() refuses
+    shown = shown or list(range(len(image_files)))  # window() then raises the error
     beside = {one.name for one in image_files} - {image_files[i].name for i in shown}
     for one in track(left, "masks", "image"):
         source, mask = _found(scene, one, given, sources or {}, fitted, words)
-        if mask is None and one.name in beside:  # as videos have, where they begin or end
+        if mask is None and one.name in beside:  # such as at the beginning or end of a video
             source = "empty, as the object is outside"
             mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
         if mask is not None:
@@ -124,7 +124,7 @@ def _without_mask(scene, image_files):
 
 
 def _found(scene, image_file, given, sources, fitted, words):
-    """(where from, (H, W) uint8 mask, or None) of a photograph, without the others."""
+    """(its source, (H, W) uint8 mask or None) of a photograph, without looking at the others."""
     file, size = scene / image_file.name, (image_file.camera.width, image_file.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)
@@ -163,7 +163,7 @@ def program_words(command: str) -> list[str]:
     """The words of --mask-command. Raises UserError unless they name a program, {image}, {mask}."""
     lexer = shlex.shlex(command, posix=True)
     lexer.whitespace_split, lexer.commenters = True, ""
-    if os.name == "nt":  # where backslashes part folders, and names hold apostrophes
+    if os.name == "nt":  # on Windows, backslashes separate folders, and names hold apostrophes
         lexer.escape, lexer.quotes = "", '"'
     try:
         words = list(lexer)
@@ -175,13 +175,13 @@ def program_words(command: str) -> list[str]:
 
 
 def _written_mask(scene, image_file):
-    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written."""
+    """(H, W) uint8 mask of a photograph, from the scene, where a user may have written it."""
     file = mask_file(scene, image_file.name)
     return read_mask_of_size(file, (image_file.camera.width, image_file.camera.height))
 
 
 def _window(scene, image_file, box):
-    """The Window of a photograph, with its mask if that is written."""
+    """The Window of a photograph, with its mask if that exists."""
     found = cut.window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
     if mask_file(scene, image_file.name).is_file():
         found.mask = found.reduced(_written_mask(scene, image_file)) > 127
@@ -189,7 +189,7 @@ def _window(scene, image_file, box):
 
 
 def _uniform(scene, image_files, windows, box, points):
-    """Write the masks of photographs where nearly all have a uniform background; their number."""
+    """If nearly all photographs have a uniform background, write their masks; returns how many."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
     held = {}  # of each mask, whether it holds the points of the object that its view shows
     with_holes = len(windows) * cut.FORGIVEN >= 1  # as one that is a spot has one view against it
@@ -270,8 +270,8 @@ def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: b
 def outline_sheet(
     scene: Path, image_files: Sequence[ImageFile], first: Sequence[str] = ()
 ) -> np.ndarray:
-    """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks drawn
-    over them. first: names of those that come first; the others are spread evenly.
+    """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks.
+    first: names of the photographs that come first; the others are spread evenly.
     """
     wrong = [one for one in image_files if one.name in first][:SHOWN_VIEWS]
     others = [one for one in image_files if one.name not in first]
@@ -287,7 +287,7 @@ def outline_sheet(
 
 
 def _reduced(scene, one, side):
-    """(a View of a photograph's mask, whose longer side is about this; by which factor)."""
+    """(a View of a photograph's mask, reduced to a longer side of about `side`, the factor)."""
     mask = _written_mask(scene, one)
     factor = fitting_downscale(mask.shape, side)
     image = shrink(np.dstack([mask] * 4), factor)
