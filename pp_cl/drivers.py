@@ -131,8 +131,9 @@ def list_left_out() -> list[tuple[str, str]]:
 
 def separate_devices() -> list[str]:
     """Indices "platform:device" of the devices that can work side by side: PP_DEVICE alone if it is
-    set; otherwise the device that open_device() takes and, if that is a GPU, the other working
-    GPUs, those of the same name from one platform only. Raises UserError if no device works.
+    set; otherwise the device that open_device() takes and, if that is a GPU, the other GPUs that
+    work. Of GPUs with the same name, those of one platform are taken. Raises UserError if no device
+    works.
     """
     if os.environ.get("PP_DEVICE"):
         return [os.environ["PP_DEVICE"]]

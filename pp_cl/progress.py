@@ -28,9 +28,9 @@ _told = time.monotonic()  # when the last line was due
 
 
 class Progress:
-    """A context manager around a stage. what: the stage's name, such as `matching`; total: its
-    number of units, or None if unknown; done: units done before; stream: None for sys.stderr. The
-    text of `note` is shown after the numbers.
+    """Shows the progress of a stage while its block runs. what: the stage's name, such as
+    `matching`; total: its number of units, or None if unknown; done: units done before; stream:
+    None for sys.stderr. The text of `note` is shown after the numbers.
     """
 
     def __init__(

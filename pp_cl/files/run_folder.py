@@ -27,8 +27,8 @@ MOST_LEVELS = 4  # of nested lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews, frontier (of `pp-cl bench RUN`): paths
-    in it, which need not exist.
+    """The paths in a run's folder `path`: config, checkpoint, log, previews and frontier (of `pp-cl
+    bench RUN`). None need exist.
     """
 
     def __init__(self, path: Path | str) -> None:

@@ -39,9 +39,7 @@ ISLAND = 0.02  # of the largest region of a mask; smaller regions are dropped
 ROUNDS = 2  # of votes
 STANDS_OUT, IS_WALL = 3.0, -4.0  # log-odds above and below which colours are overruled
 LIKE_WALL = -2.0  # log-odds below which not even nearly all other views are believed
-CROWDED = (
-    0.3  # share of 3x3 pixels that look like the background; on the object only single ones do
-)
+CROWDED = 0.3  # share of 3x3 pixels like the background; on the object only single pixels are
 CELLS = 112**3  # vertices on which views vote
 FORGIVEN = 0.15  # share of the views that see a vertex whose masks may reject it
 SLIPS = 0.08  # the same: if no more masks reject it, these are cut wrongly; but see LIKE_WALL
