@@ -90,7 +90,7 @@ def test_a_full_disk_is_one_line_that_names_the_log(folder):
                 log.write(ROWS[2])
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    with pytest.warns(UserWarning, match="line 3 is no row"), folder.open_log(15):
+    with pytest.warns(UserWarning, match="line 3 is not a row"), folder.open_log(15):
         assert rows(folder) == ROWS[:2]
 
 
