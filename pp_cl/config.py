@@ -143,7 +143,7 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
         if key == "scene.path":
             raise UserError(f"{origin}: SCENE or --scene gives scene.path; leave it out")
         if key in origins:
-            raise UserError(f"{origin}: {origins[key]} sets {key}, too; leave one out")
+            raise UserError(f"{origin}: {key} is set by {origins[key]}, too; leave one out")
         origins[key] = origin
     if origins.keys() >= {*LENGTH}:
         raise UserError(

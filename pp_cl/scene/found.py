@@ -273,7 +273,7 @@ def find_masks(
         first = PurePosixPath(place) / f"{_in_tree(images[0])}.png"
         usual = first.with_suffix("").with_suffix(".png")
         raise UserError(
-            f"{folder / place}: no image has a mask in it, such as {first} or {usual}; add masks,"
+            f"{folder / place}: no mask of any image in it, such as {first} or {usual}; add masks,"
             " or remove the folder"
         )
     return mask_of

@@ -264,7 +264,11 @@ TRAINS = {
         ],
         "masks are taken from",
     ),
-    "one opaque image among cut-outs": ("colmap", one_opaque, "but for a rim (images/000003.png)"),
+    "one opaque image among cut-outs": (
+        "colmap",
+        one_opaque,
+        "except for a rim (images/000003.png)",
+    ),
     "an empty mask": ("colmap", empty_mask, "1 of 12 views left out: an empty mask"),
     "a pose that is far off": (
         "nerfstudio",

@@ -164,7 +164,7 @@ def rigid(value: Any, fail: Fail) -> np.ndarray:
     if matrix is None:
         raise Unusable(fail("must be 4x4 or 3x4 finite numbers, camera-to-world"), "no pose")
     if len(matrix) == 4 and matrix[:, 3].tolist() == [0, 0, 0, 1] != matrix[3].tolist():
-        what = "matrices are read by columns, as their last column is 0 0 0 1"
+        what = "matrices are read column by column, as their last column is 0 0 0 1"
         warnings.warn(what, stacklevel=1)
         matrix = matrix.T
     if np.abs(matrix[3:] - [0, 0, 0, 1]).max(initial=0) > 1e-6:
