@@ -195,7 +195,7 @@ class PairedPoints:
         return gradients
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
-        """gradients() and {"positions": (N, 3), "radius": (N,)} of sum(features * grad_features)."""
+        """gradients(), and {"positions": (N, 3), "radius": (N,)} of sum(features * grad)."""
         gradients, view = self.gradients(grad_features), (self.projected, self.pairs, self.weights)
         pair_gradient = self.backward.pair_gradient
         positions, radius = spheres_backward(
