@@ -164,7 +164,7 @@ def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
             ids, grid = stored.array("points.ids"), stored.header["grid"]
             is_ascending = bool((ids[1:] > ids[:-1]).all())
             if not is_ascending or (Grid.of_header(grid).coordinates(ids) >= grid["dims"]).any():
-                problem, mend = "points.ids must be ascending vertices of its grid", MEND
+                problem, mend = "points.ids must be vertices of its grid in ascending order", MEND
         if problem:
             raise UserError(f"{path}: {problem}; {mend}")
         yield stored

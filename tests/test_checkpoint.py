@@ -310,7 +310,7 @@ def test_a_training_does_not_go_on_from_it(scene, tmp_path, monkeypatch):
     header.pop("format")
     save_checkpoint(file, header, arrays | {"points.ids": arrays["points.ids"][::-1].copy()})
     told = failure(*arguments(scene, tmp_path / "run"))
-    assert told.startswith(f"pp-cl: {file}: points.ids must be ascending vertices of its grid")
+    assert told.startswith(f"pp-cl: {file}: points.ids must be vertices of its grid in ascending")
 
 
 def overflow(path):
