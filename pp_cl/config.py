@@ -296,8 +296,8 @@ def run_config(
     if stored and folder.checkpoint.exists():
         if other_preset:
             raise UserError(
-                f"{folder.config}: the run has preset {stored.preset}, but {preset_name} is asked"
-                " for; use another --out"
+                f"{folder.config}: preset is {stored.preset} in this run, but {preset_name} is"
+                " asked for; use another --out"
             )
         return _resumed(folder, stored, scene, given)
     if not stored or other_preset:
@@ -356,6 +356,6 @@ def _resumed(folder, stored, scene, given):
 def refuse_setting(folder: RunFolder, key: str, there: Any, asked: Any) -> NoReturn:
     """Raise UserError: the training in the folder has another value of a setting."""
     raise UserError(
-        f"{folder.config}: the run has {key} {there}, but {asked} is asked for; use another --out,"
-        " or the settings of the run"
+        f"{folder.config}: {key} is {there} in this run, but {asked} is asked for; use another"
+        " --out, or the settings of the run"
     )
