@@ -80,8 +80,8 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
 
     Returns {"images": [{name, source, lens, focal, size, sharpness, uniform}], "left_out":
     [{source, reason}]}; lens is equal for photographs of one camera at one focal length; focal, in
-    pixels, is None where COLMAP may guess it by EXIF; uniform: whether the background is. Raises
-    UserError where too few are usable.
+    pixels, is None if COLMAP guesses it from EXIF; uniform: whether the background is. Raises
+    UserError if too few images are usable.
     """
     with atomic_folder(images) as unfinished:
         take = _photographs if source.is_dir() else _frames
@@ -294,7 +294,7 @@ def _look(image):
 
 
 def _is_uniform(image):
-    """Whether the border of an image shows one colour, that of what is behind the object."""
+    """Whether the border of an image shows one colour, which is the background's."""
     small = image.convert("RGB")
     small.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
     return is_uniform(np.array(small))

@@ -31,12 +31,12 @@ from pp_studio.capture.uniform import uniform_mask
 
 cv2 = needed("cv2")
 
-OPAQUE = (".jpg", ".jpeg")  # files that have no alpha need not be read for it
-GLANCED_SIDE = 640  # pixels of a uniform background that only features are looked for within
-UNIFORM = 0.9  # of the photographs that have a uniform background
-SPOT = 0.9  # of a region that a mask encloses, behind which others see the object
-ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
-CHECKED_SIDE = 200  # pixels of the masks that are compared
+OPAQUE = (".jpg", ".jpeg")  # files without alpha, which need not be read to find that out
+GLANCED_SIDE = 640  # longer side, pixels, at which masks for finding features are made
+UNIFORM = 0.9  # share of the photographs that must have a uniform background
+SPOT = 0.9  # a hole of a mask is a spot on the object if other views see the object in this share
+ON_MASK = 0.9  # share of the object's points that the mask of a uniform background must cover
+CHECKED_SIDE = 200  # longer side, pixels, at which masks are compared
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of an image, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
 SECONDS = 600  # a program may take so long for a mask
@@ -67,13 +67,13 @@ def write_masks(
 
     scene: the folder to which the photographs' names are relative; their images have no distortion.
     box: (2, 3) around the object. points: (N, 3) in the scene's world. seen: for each photograph
-    the indices (M,) of the points that it shows. given: a folder of masks of the photographs as
-    they were taken, which may be named like the photographs' sources, as {name: source} has them;
-    fitted(name, mask) is such a mask, (H, W) uint8, for the image. command: of a program that makes
-    masks, which {image} and {mask} stand for. turns: the object turns before a background that
-    stands still. grows: whether the box is enlarged where it cuts off what is cut out. Raises
-    UserError for masks that are given and missing or broken, a program that fails, a box in which
-    nothing is seen, an object of the colour of its uniform background.
+    the indices (M,) of the points that it shows. given: a folder of masks of the distorted
+    photographs, whose names may be those of the photographs' sources; sources: {name: source};
+    fitted(name, mask): turns such a mask, (H, W) uint8, into the image's. command: runs a program
+    that makes masks; {image} and {mask} stand for the files. turns: the object turns before a
+    still background. grows: enlarge the box if it cuts off a part of the object. Raises UserError
+    for missing or broken given masks, a program that fails, a box in which nothing is seen, and an
+    object that has the colour of its uniform background.
     """
     words = None if command is None else program_words(command)
     (scene / "masks").mkdir(exist_ok=True)
@@ -191,14 +191,14 @@ def _window(scene, image_file, box):
 def _uniform(scene, image_files, windows, box, points):
     """If nearly all photographs have a uniform background, write their masks; returns how many."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    held = {}  # of each mask, whether it holds the points of the object that its view shows
-    with_holes = len(windows) * cut.FORGIVEN >= 1  # as one that is a spot has one view against it
+    held = {}  # for each mask, whether it covers the object's points that its view shows
+    with_holes = len(windows) * cut.FORGIVEN >= 1  # since one view votes against a hole in a spot
     found = {}
     for i in left:
         mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
         if mask is not None:
             mask, (_, rows, columns) = mask > 127, windows[i].inside(points[i])
-            # features of thin parts lie in gaps between them, too
+            # features of thin parts also lie in the gaps between these
             held[i] = (
                 binary_fill_holes(mask)[rows, columns] if len(rows) else np.array([mask.any()])
             )
@@ -228,14 +228,14 @@ def _uniform(scene, image_files, windows, box, points):
 
 
 def _spots(windows, numbers, box):
-    """{number of a window: (H, W) bool, holes of its mask where other views see the object}."""
+    """{index of a window: (H, W) bool, holes of its mask in which other views see the object}."""
     masked = [one for one in windows if one.mask is not None]
     hull, rejections, _, voxel_size = cut.forgiving_hull(masked, box)
     found = {}
     for i in numbers:
         one = windows[i]
         regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
-        # behind a gap all is rejected by views beside this, too
+        # neighbouring views, too, reject all places behind a gap
         shown, rows, columns = one.inside(hull)
         others = rejections[shown] - ~one.mask[rows, columns]
         held = cut.silhouette(one, hull[shown[others == 0]], cut.gap_of(one, hull, voxel_size))
@@ -246,9 +246,9 @@ def _spots(windows, numbers, box):
 
 
 def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: bool) -> None:
-    """Write to the new folder NAME.png, 8-bit gray, of each photograph, white where it shows the
-    object: by its alpha, which may hide a wall, or by its uniform background, if nearly all have
-    one; all white where neither is there. Nothing where no photograph has either.
+    """Write NAME.png, 8-bit gray, for each photograph into the new folder, white on the object: by
+    alpha, which may hide a wall, or by the uniform background, if nearly all photographs have one;
+    otherwise all white. If no photograph has either, write nothing.
     """
     with atomic_folder(folder) as unfinished:
         left = list(names)

@@ -259,7 +259,7 @@ class Capture:
             begun.unlink()
         pairs = isolated(self.work, features.match, self.database)
         line = f"{pairs} pairs of images"
-        if _is_uniform(self._found("frames")["images"]):  # it has no features that stand still
+        if _is_uniform(self._found("frames")["images"]):  # such a background has no features
             turns, line = True, f"{line}, all of the object: placed as on a turntable"
         elif turns := isolated(self.work, features.remove_still, self.database, begun, turntable):
             line += "; the object turns before a background that stands still, which is left out"
@@ -378,7 +378,7 @@ class Capture:
 
 
 def _is_uniform(taken):
-    """Whether nearly all images have a uniform background, by take_images()."""
+    """Whether nearly all images have a uniform background, according to take_images()."""
     return float(np.mean([one.get("uniform", False) for one in taken])) >= masks.UNIFORM
 
 
