@@ -1,5 +1,5 @@
-"""The checkpoint of a run: a .npz of uncompressed arrays and a JSON header. Before memory is taken
-for what is read, it is compared with its part of the file and with the run's settings.
+"""The checkpoint of a run: a .npz of uncompressed arrays and a JSON header. Before memory is
+allocated for an array, its size is compared with its part of the file and with the run's settings.
 """
 
 import json
@@ -27,10 +27,10 @@ from pp_cl.files.untrusted import opened_zip, refusal, strict_json
 from pp_cl.scene.identity import unpacked_views
 from pp_cl.settings import Config
 
-FORMAT = 4  # raised when the arrays change meaning
+FORMAT = 4  # raised when the arrays change their meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
-MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
-# {key of the header: its types as JSON has them}, and those that it may lack
+MOST_LENGTH = 1e30  # world units; float32 cannot hold products of larger lengths
+# {key of the header: its types in JSON}, and the keys that it may lack
 KEYS: dict[str, tuple] = dict.fromkeys(
     ("step", "initial_points", "format", "extended_from"), (int,)
 )
@@ -45,14 +45,14 @@ Arrays = Mapping[str, np.ndarray | DeviceRows]
 
 
 def save_checkpoint(path: Path, header: dict[str, Any], arrays: Arrays) -> None:
-    """Write {name: array} and a JSON header as np.savez does, without a copy of a whole array and
+    """Write {name: array} and a JSON header as np.savez does, but without copying a whole array and
     without times. The SH coefficients of a finished run become float16 (docs/training.md). Raises
     Diverged for NaN and Inf, UserError for a header that is too large to be read.
     """
     text = json.dumps({"format": FORMAT, **header}, sort_keys=True).encode()
     if len(text) > MOST_HEADER:
         raise UserError(
-            f"{path}: its header would have {len(text)} bytes, more than the {MOST_HEADER} that are"
+            f"{path}: its header would have {len(text)} bytes, but at most {MOST_HEADER} can be"
             " read; train on fewer images"
         )
     is_finished = header.get("finished", False)
@@ -76,9 +76,9 @@ def check_finite(arrays: Arrays) -> None:
 
 
 def _finite_pieces(name, array, dtype):
-    """The rows of an array, some at a time. Raises Diverged."""
+    """Yield the rows of an array, some at a time. Raises Diverged for NaN and Inf."""
     for rows in [array] if isinstance(array, np.ndarray) else array.pieces():
-        with np.errstate(over="ignore"):  # infinite, which is told
+        with np.errstate(over="ignore"):  # an overflow gives Inf, which is reported
             piece = np.ascontiguousarray(rows, dtype)
         if not _is_finite(piece):
             raise Diverged(f"{name} holds NaN or Inf")
@@ -90,7 +90,7 @@ def _is_finite(array):
 
 
 class Form(NamedTuple):
-    """What an array is before it is read."""
+    """The shape and dtype of an array that is not read yet."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -101,14 +101,14 @@ class Form(NamedTuple):
 
 class Checkpoint:
     """An opened checkpoint. header: its JSON object; forms: {name: Form} of its arrays. Raises
-    ValueError, and what zipfile raises, for anything else than save_checkpoint() writes.
+    ValueError, and zipfile's exceptions, for a file that save_checkpoint() has not written.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
         self.path, self._archive = path, archive
         members = archive.infolist()
         if sum(info.file_size for info in members) > path.stat().st_size:
-            raise ValueError("it unfolds to more than the file holds")
+            raise ValueError("its arrays claim more bytes than the file holds")
         self.forms = {info.filename.removesuffix(".npy"): self._form(info) for info in members}
         text = self.forms.pop("header", None)
         if text is None or text.dtype != np.uint8 or math.prod(text.shape) > MOST_HEADER:
@@ -117,11 +117,13 @@ class Checkpoint:
         if not isinstance(self.header, dict):
             raise ValueError("its header is no JSON object")
         if self.header.get("format") != FORMAT:
-            found = quoted(self.header.get("format"), 40)
-            raise UserError(f"{path}: format {found}, this version reads {FORMAT}; train again")
+            number = quoted(self.header.get("format"), 40)
+            raise UserError(
+                f"{path}: format {number}, but this version reads {FORMAT}; train again"
+            )
 
     def _form(self, info):
-        """The Form of an array, which is as large as its part of the file."""
+        """The Form of an array, which must be as large as its part of the file."""
         with self._archive.open(info) as member:
             if np.lib.format.read_magic(member) != (1, 0):  # others have headers of up to 4 GiB
                 raise ValueError("holds an array of another version than 1.0")
@@ -135,7 +137,7 @@ class Checkpoint:
             return np.lib.format.read_array(member, allow_pickle=False)
 
     def array(self, name: str) -> np.ndarray:
-        """One of its arrays, float32 where float16 is stored. Raises UserError."""
+        """One of its arrays; float16 becomes float32. Raises UserError for NaN and Inf."""
         with _refused(self.path):
             array = self._read(name)
         if not _is_finite(array):
@@ -145,8 +147,9 @@ class Checkpoint:
 
 @contextmanager
 def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
-    """The checkpoint in the folder of a run with these settings, until the block ends. Raises
-    UserError naming the file when it is missing, broken, of another format, or not of this run.
+    """The checkpoint in the folder of a run with these settings, opened until the block ends.
+    Raises UserError naming the file if it is missing, broken, of another format, or not of this
+    run.
     """
     path = folder.checkpoint
     if not path.is_file():
@@ -161,7 +164,7 @@ def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
             ids, grid = stored.array("points.ids"), stored.header["grid"]
             is_ascending = bool((ids[1:] > ids[:-1]).all())
             if not is_ascending or (Grid.of_header(grid).coordinates(ids) >= grid["dims"]).any():
-                problem, mend = "points.ids are no vertices of its grid in ascending order", MEND
+                problem, mend = "points.ids must be vertices of its grid in ascending order", MEND
         if problem:
             raise UserError(f"{path}: {problem}; {mend}")
         yield stored
@@ -170,14 +173,14 @@ def opened_run(folder: RunFolder, config: Config) -> Iterator[Checkpoint]:
 def load_run_state(
     folder: RunFolder, config: Config
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(header, arrays) of opened_run()."""
+    """(header, {name: array}) of opened_run()'s checkpoint."""
     with opened_run(folder, config) as stored:
         return stored.header, {name: stored.array(name) for name in stored.forms}
 
 
 @contextmanager
 def _refused(path):
-    """What is wrong becomes a UserError: zipfile meets broken bytes with whatever comes up."""
+    """Turn exceptions into UserErrors; zipfile raises all kinds of them on broken bytes."""
     try:
         yield
     except UserError:
@@ -187,15 +190,15 @@ def _refused(path):
 
 
 def _problem_of_header(header, steps):
-    """What in a header is not as a training of so many steps writes it; "" where all is."""
+    """How a header differs from one that a training of `steps` steps writes; "" if it does not."""
     if lacking := sorted(KEYS.keys() - OPTIONAL - header.keys()):
         return f"its header lacks {lacking[0]}"
     if unknown := sorted(header.keys() - KEYS.keys()):
         return f"its header holds {shown(unknown[0], 40)}, which this version does not know"
     if wrong := [key for key, value in header.items() if type(value) not in KEYS[key]]:
-        return f"{wrong[0]} in its header is of another kind"
+        return f"{wrong[0]} in its header has the wrong type"
     if not 1 <= header["step"] <= steps:
-        return f"it is of step {shown(str(header['step']))}, of {steps} in its config.json"
+        return f"it is of step {shown(str(header['step']))}, but its config.json has {steps} steps"
     try:
         views, grid = unpacked_views(header["views"]), Grid.of_header(header["grid"])
         near, far = header["depth_range"]
@@ -215,7 +218,7 @@ def _problem_of_header(header, steps):
 
 
 def _problem_of_forms(stored, config):
-    """How a checkpoint's arrays differ from what the settings call for; "" where they do not."""
+    """How a checkpoint's arrays differ from those that the settings require; "" if they do not."""
     header, forms = stored.header, stored.forms
     ids = forms.get("points.ids")
     n = ids.shape[0] if ids and len(ids.shape) == 1 else 0
@@ -226,16 +229,16 @@ def _problem_of_forms(stored, config):
     step, gains = None if header["finished"] else header["step"], 0
     if step is not None and config.train.exposure != "off":
         views = len(header["views"]) - len(header.get("left_out", []))
-        # gains are kept until it is decided that the training needs none
+        # gains are stored until the training decides that it needs none
         if "exposed" in header or step < decided_at(header.get("extended_from", 0), views):
             gains = views
     expected = stored_forms(config, n, step, gains, has_specular="specular" in header)
     for name in sorted(expected.keys() | forms.keys()):
-        found, wanted = forms.get(name), expected.get(name)
+        form, wanted = forms.get(name), expected.get(name)
         if wanted is None:
             return f"holds {shown(name, 40)}, which does not belong there"
-        if found != wanted:
-            return f"{name} is {found or 'missing'}, expected {wanted}"
+        if form != wanted:
+            return f"{name} is {form or 'missing'}, expected {wanted}"
     return ""
 
 
@@ -247,8 +250,8 @@ def stored_forms(
     *,
     has_specular: bool = False,
 ) -> dict[str, Form]:
-    """{name: Form} of the arrays of a checkpoint with n points after `step` steps, None: finished.
-    gains: the views that have them. has_specular: whether the model has that layer.
+    """{name: Form} of the arrays in a checkpoint with n points after `step` steps; None: finished.
+    gains: number of views with gains. has_specular: whether the model has the specular layer.
     """
     degrees = SH_DEGREES[: config.points.sh_degree + 1]
     sh_dtype = np.float16 if step is None else np.float32

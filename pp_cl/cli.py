@@ -1,4 +1,4 @@
-"""The command line: builds the parser from the commands, turns exceptions into exit statuses."""
+"""The command line: builds the parser from the commands and turns exceptions into exit statuses."""
 
 import argparse
 import importlib
@@ -23,11 +23,11 @@ class _UsageError(UserError):
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse with one-line errors that name the nearest word, and without empty values."""
+    """argparse with one-line errors that suggest the nearest word, and without empty values."""
 
     def error(self, message):
         taker = next((word for word in ("--json", "--metrics") if word in self._words), "")
-        if "required" in message and taker:  # which may have taken what is missing as its value
+        if "required" in message and taker:  # it may have taken the missing word as its value
             message += f" (write it before {taker})"
         end = " " if message.endswith("?") else "; "
         raise _UsageError(f"{self.prog}: {message}{end}see {self.prog} --help")
@@ -46,7 +46,7 @@ class _Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, "is empty; write it, or leave it out")
         try:
             return super()._get_value(action, text)
-        except UserError as error:  # of a type
+        except UserError as error:  # raised by the action's type
             raise argparse.ArgumentError(action, str(error)) from None
 
     def _check_value(self, action, value):
@@ -63,8 +63,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def program(argv: Sequence[str] | None = None) -> int:
-    """main() of a process of its own: it ends soon after Ctrl-C or SIGTERM whatever it is doing,
-    and streams may be as shells give them: closed, full, without a reader.
+    """main() for a process: it ends soon after Ctrl-C or SIGTERM, whatever it is doing, and accepts
+    streams as shells give them: closed, full, or without a reader.
     """
     signals.watch()
     for name in ("stdout", "stderr"):
@@ -72,14 +72,14 @@ def program(argv: Sequence[str] | None = None) -> int:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     try:
         return main(argv)
-    except KeyboardInterrupt as second:  # where main() told of the first
+    except KeyboardInterrupt as second:  # main() has reported the first
         return 128 + (second.args or [signal.SIGINT])[0]
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         for stream in (sys.stdout, sys.stderr):
             try:
                 stream.flush()
-            except OSError:  # what is left goes nowhere, or Python would try again and report that
+            except OSError:  # discard the rest, which Python would try to write again and report
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     warnings.showwarning = _show_warning
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # letters that its encoding lacks
+        if isinstance(stream, io.TextIOWrapper):  # for characters that its encoding lacks
             stream.reconfigure(errors="backslashreplace")
     with signals.interrupting() as caught:
         try:
@@ -105,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except Stopped as stopped:
             return _fail(str(stopped), stopped.status)
         except BaseException as error:
-            if caught:  # whatever came of it: an import, say, or the end of another process
+            if caught:  # the signal may have caused any error, such as in an import
                 return _fail(signals.INTERRUPTED, 128 + caught[0])
             match error:
                 case _UsageError():
@@ -126,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     )
                 case MemoryError():
                     return _fail("the host has no memory left; lower --points or raise --downscale")
-                case ImportError() if "failed to map segment" in str(error):  # as the loader says
+                case ImportError() if "failed to map segment" in str(error):  # the loader's words
                     return _fail(f"no memory to load a library ({error}); raise `ulimit -v`")
                 case KeyboardInterrupt():
                     return _fail(signals.INTERRUPTED, 128 + signal.SIGINT)
@@ -134,12 +134,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _show_warning(message, *_args, **_kwargs):
-    """One line on stderr, without the place in our source."""
+    """Show a warning as one line on stderr, without its place in our source."""
     _show(f"pp-cl: {one_line(message)}")
 
 
 def _show(line):
-    with suppress(OSError):  # of a full disk, which is no reason to stop
+    with suppress(OSError):  # a full disk is no reason to stop
         print(line, file=sys.stderr, flush=True)
 
 
@@ -150,7 +150,9 @@ def _fail(message, status=2):
 
 
 def _parser(first):
-    """The parser of the command that the first word names, else of all. first: [] or [word]."""
+    """The parser of the command that the first word names, or else of all commands. first: [] or
+    [word].
+    """
     parser = _Parser(
         prog="pp-cl",
         description="Reconstruct an object from photographs with OpenCL.",

@@ -14,23 +14,23 @@ from pp_cl.files.untrusted import read_regular
 from pp_cl.presets import IMAGE_SIZES, PRESETS
 from pp_cl.settings import FORMAT, Config, every_setting
 
-# what other packages may use; docs/api.md lists it
+# names that other packages may use; docs/api.md lists them
 __all__ = ["PRESETS", "configure", "field_of", "load_config", "preset"]
 __all__ += ["refuse_setting", "run_config", "scene_config"]
 
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
-RANDOM = "random"  # of network.start, beside demo and a folder
+RANDOM = "random"  # a value of network.start; others are demo and folders
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
-LENGTH = ("train.minutes", "train.iterations")  # of which a run has one
-# settings that runs of 0.3.0 lack, as they were trained
+LENGTH = ("train.minutes", "train.iterations")  # a run has one of them
+# settings that runs of 0.3.0 lack, with the values with which they were trained
 ADDED: dict[str, Any] = {"train.specular": "off", "train.members": 1}
-AUTOMATIC = ("train.refine_at", "raster.radius", "train.view_opacity")  # by the hull
+AUTOMATIC = ("train.refine_at", "raster.radius", "train.view_opacity")  # chosen by the hull
 MEND_SETTINGS = "restore it or start a new run"
 
 
 def preset(name: str) -> Config:
-    """Config of a preset. Raises UserError for an unknown name."""
+    """The Config of a preset. Raises UserError for an unknown name."""
     if name not in PRESETS:
         raise UserError(f"--preset {name}: unknown; choose from {', '.join(PRESETS)}")
     config = Config(preset=name)
@@ -52,7 +52,7 @@ def assign(config: Config, key: str, value: Any, origin: str) -> None:
 
 
 def _convert(value, example, where):
-    """The value, or its text, as the type of the example. Raises UserError."""
+    """The value, or its text, converted to the type of the example. Raises UserError."""
     if isinstance(example, tuple):
         items = value.split(",") if isinstance(value, str) else value
         if not isinstance(items, (list, tuple)) or len(items) != len(example):
@@ -69,7 +69,7 @@ def _convert(value, example, where):
 
 
 def whole(value: Any) -> int:
-    """A whole number, or its text, as 1e6. Raises ValueError or TypeError for anything else."""
+    """A whole number, or its text, such as 1e6. Raises ValueError or TypeError for other values."""
     number = finite(value)
     if number != int(number):
         raise ValueError
@@ -77,7 +77,7 @@ def whole(value: Any) -> int:
 
 
 def finite(value: Any) -> float:
-    """A finite number, or its text. Raises ValueError or TypeError for anything else."""
+    """A finite number, or its text. Raises ValueError or TypeError for other values."""
     number = float(value)
     if isinstance(value, bool) or not math.isfinite(number):
         raise ValueError
@@ -85,7 +85,7 @@ def finite(value: Any) -> float:
 
 
 def _word(value):
-    """A text that a system can take as the name of a file."""
+    """A text that the system accepts as a file name. Raises ValueError or TypeError."""
     word = os.fspath(value)
     if not isinstance(word, str) or len(word) > MOST_TEXT or b"\0" in os.fsencode(word):
         raise ValueError
@@ -103,7 +103,9 @@ KINDS = {
 
 
 def validate(config: Config, origin: str, origins: Mapping[str, str] | None = None) -> None:
-    """Raise UserError naming the origin, that of `origins` first, of a key that is not allowed."""
+    """Raise UserError for a value that is not allowed, naming its key and the key's origin in
+    `origins`, or else `origin`.
+    """
 
     def where(key):
         return f"{(origins or {}).get(key, origin)}: {key}"
@@ -132,14 +134,14 @@ def _check(value, where, *, least, most, choices, **_):
 
 
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
-    """The config with another scene, to which masks in its folder move along, and the given
-    settings: (key, value or its text, origin). Raises UserError naming the first that makes no
-    sense, and for scene.path among them.
+    """The config with another scene and the given settings: (key, value or its text, origin). Paths
+    of masks inside the old scene's folder move with it. Raises UserError naming the first setting
+    that makes no sense, and for scene.path among them.
     """
     given, origins = list(given), dict[str, str]()
     for key, _, origin in given:
         if key == "scene.path":
-            raise UserError(f"{origin}: scene.path is what SCENE or --scene says; leave it out")
+            raise UserError(f"{origin}: SCENE or --scene gives scene.path; leave it out")
         if key in origins:
             raise UserError(f"{origin}: {key} is set by {origins[key]}, too; leave one out")
         origins[key] = origin
@@ -156,7 +158,7 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
         if path == "demo" and key in OF_MASKS:
-            raise UserError(f"{origin}: the demo has masks of its own; leave it out")
+            raise UserError(f"{origin}: the demo has its own masks; leave this out")
         assign(config, key, value, origin)
     folders = (config.scene, "masks"), (config.scene, "ignore"), (config.network, "start")
     for owner, name in folders:
@@ -169,8 +171,8 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
 def begin_with(
     path: Path | str, given: list[tuple[str, Any, str]]
 ) -> tuple[str, list[tuple[str, Any, str]]]:
-    """(preset, settings) of another run's config.json, all but those of its scene, with the given
-    ones on top. Raises UserError as load_config.
+    """(preset, settings) of another run's config.json without its scene's settings, overridden by
+    the given ones. Raises UserError as load_config() does.
     """
     config = load_config(path)
     length = "train.minutes" if config.train.minutes else "train.iterations"
@@ -186,7 +188,7 @@ def begin_with(
 
 
 def load_config(path: Path | str) -> Config:
-    """Config of a config.json. Raises UserError naming the file and the key."""
+    """The Config in a config.json. Raises UserError naming the file and the key."""
     path = Path(path)
     try:
         stored = json.loads(read_regular(path, MOST_BYTES))
@@ -205,27 +207,28 @@ def load_config(path: Path | str) -> Config:
     automatic = stored.pop("automatic", [])
     if type(number) is not int or number != FORMAT:
         raise UserError(
-            f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
+            f"{path}: format is {quoted(number, 40)}, but this version reads {FORMAT}; start a new"
+            " run"
         )
     if type(name) is not str or name not in PRESETS:
-        raise broken(f"key preset is missing or none of {', '.join(PRESETS)}")
+        raise broken(f"key preset is missing or not one of {', '.join(PRESETS)}")
     if not isinstance(automatic, list) or not all(key in AUTOMATIC for key in automatic):
-        raise broken(f"automatic is {quoted(automatic, 40)}, no list of {', '.join(AUTOMATIC)}")
-    found: dict[str, Any] = {}
+        raise broken(f"automatic is {quoted(automatic, 40)}, not a list of {', '.join(AUTOMATIC)}")
+    by_key: dict[str, Any] = {}
     for section, values in stored.items():
         if not isinstance(values, dict):
-            raise broken(f"{shown(section, 40)} is no section of settings")
-        found |= {f"{section}.{key}": value for key, value in values.items()}
-    config, found = Config(name, automatic), ADDED | found
+            raise broken(f"{shown(section, 40)} is not a section of settings")
+        by_key |= {f"{section}.{key}": value for key, value in values.items()}
+    config, by_key = Config(name, automatic), ADDED | by_key
     for key, section, item in every_setting(config):
-        if key not in found:
+        if key not in by_key:
             raise broken(f"{key} is missing")
-        value = found.pop(key)
+        value = by_key.pop(key)
         if not _is_alike(value, item.default):
             raise broken(f"{key} is {quoted(value, 40)}, not like {text_of(item.default)}")
         setattr(section, item.name, _convert(value, item.default, f"{path}: {key}"))
-    if found:
-        raise broken(f"unknown key {shown(min(found), 100)}")
+    if by_key:
+        raise broken(f"unknown key {shown(min(by_key), 100)}")
     validate(config, str(path))
     if not config.scene.path:
         raise broken("scene.path is empty")
@@ -233,20 +236,20 @@ def load_config(path: Path | str) -> Config:
 
 
 def _is_alike(value, example):
-    """Whether a value of JSON is of a setting's type: texts and truth values are no numbers."""
+    """Whether a JSON value has a setting's type; texts and truth values do not count as numbers."""
     if isinstance(example, tuple):
-        return isinstance(value, list) and all(_is_alike(one, example[0]) for one in value)
+        return isinstance(value, list) and all(_is_alike(part, example[0]) for part in value)
     return type(value) in ((int, float) if type(example) in (int, float) else (type(example),))
 
 
 def nearby_run(folder: Path) -> str:
-    """What to say of a folder that is no run's where the one of its name in runs/ is, else ""."""
+    """A question that suggests the run of a folder's name in runs/; "" if there is none."""
     near = folder.parent / "runs" / folder.name
     return f"did you mean {near}?" if (near / "config.json").is_file() else ""
 
 
 def text_of(value: Any) -> str:
-    """The value of a setting as --set takes it."""
+    """The text of a setting's value that --set accepts."""
     if isinstance(value, tuple):
         return ",".join(map(text_of, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
@@ -258,7 +261,7 @@ def field_of(key: str) -> dataclasses.Field:
 
 
 def help_lines() -> list[str]:
-    """Lines `section.key = default  (help)` of all settings, with presets' values that differ."""
+    """Lines `section.key = default  (help)` for all settings, with the presets' other values."""
     lines = []
     for key, _, item in every_setting(Config()):
         changed = [(name, own[key]) for name, own in PRESETS.items() if key in own]
@@ -267,10 +270,10 @@ def help_lines() -> list[str]:
     return lines
 
 
-# ---- the settings of a training in a folder: of a new one, or of one that goes on
+# ---- the settings of a training in a folder: of a new training, or of one that continues
 
-# settings that a checkpoint may go on with others of: places, which it knows by more than that, and
-# what the model does not depend on
+# settings that may change between checkpoints: paths, since the checkpoint knows its scene by more
+# than its path, and settings that do not affect the model
 FREE = (
     *("scene.path", "scene.masks", "scene.ignore", "train.memory_gib", "train.eval_every"),
     *("train.log_every", "train.checkpoint_every", "train.checkpoint_minutes"),
@@ -283,24 +286,23 @@ def run_config(
     preset_name: str | None = None,
     given: Iterable[tuple[str, Any, str]] = (),
 ) -> Config:
-    """Config of a training in `folder`: that of the run there, else the preset's, with the given
-    settings: (key, value or its text, origin). A run that has a checkpoint must have the same
-    values, but a finished one may have another length. Raises UserError naming the first setting
-    that differs or makes no sense, or what is wrong with the scene's files.
+    """The Config of a training in `folder`: the run's there, or else the preset's, with the given
+    settings: (key, value or its text, origin). They must not change a run that has a checkpoint,
+    except for FREE settings and the length of a finished run. Raises UserError naming the first
+    setting that differs or makes no sense, or the fault in the scene's files.
     """
     given, stored = list(given), load_config(folder.config) if folder.config.exists() else None
     other_preset = stored is not None and preset_name not in (None, stored.preset)
     if stored and folder.checkpoint.exists():
         if other_preset:
             raise UserError(
-                f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
-                " another --out"
+                f"{folder.config}: preset is {stored.preset} in this run, but {preset_name} is"
+                " asked for; use another --out"
             )
         return _resumed(folder, stored, scene, given)
     if not stored or other_preset:
         return scene_config(scene, preset_name or "tiny", given)
-    # a training that was stopped before its first checkpoint: what was automatic is open
-    # again
+    # the training was stopped before its first checkpoint: automatic settings are chosen again
     for key in stored.automatic:
         assign(stored, key, field_of(key).default, "preset")
     if "train.iterations" in [key for key, _, _ in given]:
@@ -311,9 +313,9 @@ def run_config(
 def scene_config(
     scene: str, preset_name: str, given: Iterable[tuple[str, Any, str]] = ()
 ) -> Config:
-    """Config of a preset for a scene, with the given settings: unless scene.downscale is among
-    them, images are reduced to about the preset's size. Raises UserError as configure() and
-    scene_frames() do.
+    """The Config of a preset for a scene, with the given settings. Unless these set
+    scene.downscale, images are reduced to about the preset's size. Raises UserError as configure()
+    and scene_frames() do.
     """
     # here, so that --help needs neither numpy nor OpenCL
     from pp_cl.engine.views import MIN_SIDE, fitting_downscale
@@ -322,7 +324,7 @@ def scene_config(
     given = list(given)
     config = configure(preset(preset_name), scene, given)
     if "scene.downscale" not in [key for key, _, _ in given]:
-        cameras = [one.camera for one in scene_frames(config.scene.path)]
+        cameras = [image_file.camera for image_file in scene_frames(config.scene.path)]
         sizes = [(camera.width, camera.height) for camera in cameras]
         fitting = fitting_downscale(max(sizes, key=max), IMAGE_SIZES[preset_name])
         most = max(1, min(map(min, sizes)) // MIN_SIDE)
@@ -331,11 +333,11 @@ def scene_config(
 
 
 def _resumed(folder, stored, scene, given):
-    """The settings of a run with a checkpoint: FREE may change, of a finished one LENGTH, too."""
+    """The settings of a run with a checkpoint: FREE may change, and LENGTH if it is finished."""
     from pp_cl.checkpoint import opened_run
 
     config, free = configure(load_config(folder.config), scene, given), {*FREE}
-    if stored.train.minutes:  # planned meanwhile, as train.iterations are
+    if stored.train.minutes:  # the run has planned these, as it did train.iterations
         config.train.refine_at = stored.train.refine_at
         config.train.supersampled = stored.train.supersampled
     if config.train.iterations != stored.train.iterations:
@@ -352,8 +354,8 @@ def _resumed(folder, stored, scene, given):
 
 
 def refuse_setting(folder: RunFolder, key: str, there: Any, asked: Any) -> NoReturn:
-    """Raise UserError: a training in the folder has another value of a setting."""
+    """Raise UserError: the training in the folder has another value of a setting."""
     raise UserError(
-        f"{folder.config}: {key} is {there} there, {asked} asked for; use another --out, or the"
-        " settings of the run"
+        f"{folder.config}: {key} is {there} in this run, but {asked} is asked for; use another"
+        " --out, or the settings of the run"
     )

@@ -1,7 +1,7 @@
-"""OpenCL drivers and devices of this machine: which of them work, and which device is taken.
+"""Finds the OpenCL drivers and devices of this machine that work, and chooses a device.
 
-A process of its own tries all drivers: one that crashes or hangs ends that process alone, and is
-named and left out.
+A separate process tries all drivers: a driver that crashes or hangs ends only that process, and is
+reported and left out.
 """
 
 import atexit
@@ -34,69 +34,71 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import cache_folder, make_cache_folder, write_json
 from pp_cl.speeds import Listed, by_speed, identity, is_gpu
 
-RUNTIME = "intel-opencl-rt"  # Intel's CPU runtime, which the extra `cpu` brings
+RUNTIME = "intel-opencl-rt"  # Intel's CPU runtime, which the extra `cpu` installs
 RUNTIME_LIBRARIES = ("libintelocl.so", "intelocl64.dll")
-CHOSEN = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH")  # where users name drivers
-REST = "the system's OpenCL drivers"  # where nobody tells them apart before they are loaded
-SECONDS = 20  # of a driver: a first build takes 1 to 2, several times as long on a busy machine
+CHOSEN = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH")  # variables with which users name drivers
+REST = "the system's OpenCL drivers"  # if they cannot be told apart before they are loaded
+SECONDS = 20  # for a driver: a first build takes 1 to 2, several times as long on a busy machine
 STALE = 20  # seconds; pyopencl keeps its cache locked for milliseconds
-BEGINS = "pp-cl begins with "  # the line of report() before it tries a driver
+BEGINS = "pp-cl begins with "  # the line that report() prints before it tries a driver
 TEMPORARY_CACHE = "pp-cl-cache-"
 UNSEEN = "was not seen when its driver was tried"
-NONE = 4  # of what does not match a choice
+NONE = 4  # _match() of a device that does not match
 
-LEAST_CONSTANT = 64  # bytes of constant memory, which the kernels' tables take
+LEAST_CONSTANT = 64  # bytes of constant memory for the kernels' tables
 
-# A device is accepted only after this ran on it: PyPI's PoCL 3.0 is listed on current CPUs and
+# A device is accepted only if it runs this kernel: PyPI's PoCL 3.0 is listed on current CPUs but
 # fails every build.
 PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
 
 # {"devices": [[platform, name, version, problem or None]], "left_out": {driver: why}}
 Found = dict[str, Any]
-_tried: dict[str, Found] = {}  # {_kept_in() of the drivers: what this process knows of them}
+_tried: dict[str, Found] = {}  # {_kept_in() of the drivers: this process's result of trying them}
 
 
 # ---- devices
 
 
 def open_device(choice: str | None = None) -> Device:
-    """Device chosen by `choice`, else PP_DEVICE, else the fastest of those that work.
+    """The device chosen by `choice`, or else by PP_DEVICE, or else the fastest one that works.
 
-    choice: "platform:device" as printed by `pp-cl devices`, or a part of the platform's name, the
-    whole or a part of the device's, in this order, as PoCL's devices carry the name of the
-    processor; of several the fastest. Raises UserError when nothing matches or works.
+    choice: "platform:device" as printed by `pp-cl devices`, a part of the platform's name, or the
+    whole or a part of the device's name, in this order, since PoCL's devices have the processor's
+    name; the fastest match is taken. Raises UserError if no device matches or works.
     """
     choice = choice or os.environ.get("PP_DEVICE")
-    found = list_devices()
-    matches = [_match(one, choice) for one in found]
-    working = [m for m, one in zip(matches, found, strict=True) if one[2] is None and m < NONE]
+    devices = list_devices()
+    matches = [_match(row, choice) for row in devices]
+    working = [m for m, row in zip(matches, devices, strict=True) if row[2] is None and m < NONE]
     if working:
         best = min(working)
-        alike = [one for m, one in zip(matches, found, strict=True) if m == best]
+        alike = [row for m, row in zip(matches, devices, strict=True) if m == best]
         return Device(by_speed(alike)[0][1])
-    told = [
+    lines = [
         f"{i} {device.name.strip()} ({device.platform.name.strip()}) {problem or 'works'}"
-        for i, device, problem in found
+        for i, device, problem in devices
     ]
-    told += [f"{driver} {problem}" for driver, problem in list_left_out()]
-    listed = "; ".join(told)
-    if choice and found and min(matches) == NONE:
+    lines += [f"{driver} {problem}" for driver, problem in list_left_out()]
+    listed = "; ".join(lines)
+    if choice and devices and min(matches) == NONE:
         raise UserError(f"device {choice!r}: no such OpenCL device; found {listed}")
     asked = f"device {choice!r}: " if choice else ""
     raise UserError(f"{asked}no working OpenCL device (found {listed or 'none'}): {mend()}")
 
 
 def device_line(device: Device, choice: str | None) -> str:
-    """What a command says of a device, and why it is this one. choice: of open_device()."""
+    """The line in which a command names its device and the reason for it. choice: as in
+    open_device().
+    """
     chosen = choice or os.environ.get("PP_DEVICE")
     others = 0 if chosen else len(by_speed(list_devices())) - 1
     why = f", the fastest of {others + 1}" if others > 0 else ""
     return f"device: {device.name} [{device.info['platform']}]{why}"
 
 
-def _match(found, choice):
-    """How one of list_devices() matches `choice`, 0 the best, NONE not at all."""
-    index, device, _ = found
+def _match(row, choice):
+    """How well an entry of list_devices() matches `choice`: 0 is best, NONE is no match."""
+    index, device, _ = row
     word, name = (choice or index).lower(), device.name.strip().lower()
     ways = word == index, word in device.platform.name.lower(), word == name, word in name
     return next((n for n, matches in enumerate(ways) if matches), NONE)
@@ -104,33 +106,34 @@ def _match(found, choice):
 
 def list_devices(*, again: bool = False) -> list[Listed]:
     """[(index "platform:device", cl.Device, problem or None)] of the devices whose drivers neither
-    crash nor hang. again: drivers are tried anew, also those that are known.
+    crash nor hang. again: try all drivers anew.
     """
     _give_cache()
     tried = try_drivers(again=again)
-    known: dict[tuple[str, ...], list[str | None]] = {}  # of devices that are alike in their order
+    known: dict[tuple[str, ...], list[str | None]] = {}  # of equal devices, in their order
     for *name, problem in tried["devices"]:
         known.setdefault(tuple(name), []).append(problem)
     usable = {n: lib for n, lib in find_drivers().items() if n not in tried["left_out"]}
-    found: list[Listed] = []
+    rows: list[Listed] = []
     for p, owner in enumerate(load_drivers(usable)):
         for d, device in enumerate(devices_of(owner)):
             problems = known.get(identity(device))
-            if not problems and not again:  # another version, or a device more
+            if not problems and not again:  # another version, or an additional device
                 return list_devices(again=True)
-            found.append((f"{p}:{d}", device, problems.pop(0) if problems else UNSEEN))
-    return found
+            rows.append((f"{p}:{d}", device, problems.pop(0) if problems else UNSEEN))
+    return rows
 
 
 def list_left_out() -> list[tuple[str, str]]:
-    """[(driver, problem)] of the drivers that crash or hang."""
+    """[(driver, problem)] for the drivers that crash or hang."""
     return [*try_drivers()["left_out"].items()]
 
 
 def separate_devices() -> list[str]:
-    """Indices "platform:device" of the devices that can work side by side: PP_DEVICE alone if set,
-    else the one that open_device() takes, and where it is a GPU the others that work, each name of
-    one platform. Raises UserError where nothing works.
+    """Indices "platform:device" of the devices that can work side by side: PP_DEVICE alone if it is
+    set; otherwise the device that open_device() takes and, if that is a GPU, the other GPUs that
+    work. Of GPUs with the same name, those of one platform are taken. Raises UserError if no device
+    works.
     """
     if os.environ.get("PP_DEVICE"):
         return [os.environ["PP_DEVICE"]]
@@ -139,7 +142,7 @@ def separate_devices() -> list[str]:
         open_device()  # says what is wrong
     if not is_gpu(working[0][1]):
         return [working[0][0]]
-    owners: dict[str, str] = {}  # {name of a GPU: the platform that it is taken of}
+    owners: dict[str, str] = {}  # {name of a GPU: the platform from which it is taken}
     return [
         index
         for index, device, _ in working
@@ -149,18 +152,18 @@ def separate_devices() -> list[str]:
 
 
 def mend() -> str:
-    """What to do where nothing works: the one command that brings this system a device."""
+    """Advice if no device works: the one command that installs a driver on this system."""
     managers = {
         "apt-get": "sudo apt install pocl-opencl-icd",
         "dnf": "sudo dnf install pocl",
         "pacman": "sudo pacman -S pocl",
     }
-    found = [command for name, command in managers.items() if shutil.which(name)]
+    commands = [command for name, command in managers.items() if shutil.which(name)]
     intel = platform.machine() in ("x86_64", "AMD64") and sys.platform != "darwin"
     if intel and not in_conda() and not runtime_library():
         command = f"pip install {RUNTIME} intel-cmplr-lib-rt"
-    elif found and sys.platform == "linux" and not in_conda():
-        command = found[0]
+    elif commands and sys.platform == "linux" and not in_conda():
+        command = commands[0]
     else:
         command = "conda install -c conda-forge pyopencl pocl"
     return f"install a driver with `{command}`; docs/install.md names those of GPUs"
@@ -171,14 +174,15 @@ def devices_of(platform: cl.Platform) -> list[cl.Device]:
     try:
         return platform.get_devices()
     except cl.Error:
-        return []  # a platform without devices says so with an error
+        return []  # a platform without devices raises an error
 
 
 def find_problem(device: cl.Device) -> str | None:
-    """What keeps a device from working, None if it runs a test kernel."""
+    """What keeps a device from working; None if it runs a test kernel."""
     if device.max_constant_buffer_size < LEAST_CONSTANT:
         return (
-            f"holds {device.max_constant_buffer_size} bytes of constants, {LEAST_CONSTANT} needed"
+            f"holds {device.max_constant_buffer_size} bytes of constants, but needs"
+            f" {LEAST_CONSTANT}"
         )
     try:
         context = cl.Context([device])
@@ -193,50 +197,51 @@ def find_problem(device: cl.Device) -> str | None:
 
 
 def _give_cache():
-    """A temporary cache where the user's cannot be written, in which drivers and pyopencl fail;
-    and none with locks of killed processes, for which pyopencl waits a minute at each build.
+    """Set up a temporary cache if the user's cannot be written, which makes drivers and pyopencl
+    fail; remove the locks of killed processes, for which pyopencl waits a minute at each build.
     """
-    # pyopencl 2026.1 reads this variable, unset or not, where its cache cannot be written: KeyError
+    # if its cache cannot be written, pyopencl 2026.1 raises KeyError while this variable is unset
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
     for lock in Path(user_cache_dir("pyopencl", "pyopencl")).glob("*/lock"):
-        with suppress(OSError):  # of another process that was faster
+        with suppress(OSError):  # another process may have removed it
             if time.time() - lock.stat().st_mtime > STALE:
                 lock.unlink()
     if sys.platform == "win32":
-        return  # which has caches elsewhere
+        return  # Windows has its caches elsewhere
     home = os.path.expanduser("~/.cache")
     for name, usual in (("XDG_CACHE_HOME", home), ("POCL_CACHE_DIR", "")):
         folder = os.environ.get(name) or usual
         if not folder or not (fault := _fault_of(folder)):
             continue
-        # another file system may be of the same kind
+        # other file systems may have the same fault
         places = (tempfile.gettempdir(), "/var/tmp", os.getcwd())  # noqa: S108 - of a new folder
         place = next((place for place in places if not _fault_of(place)), None)
         temporary = os.environ[name] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE, dir=place)
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        what = f"{folder}: {fault}; kernels are built again, in {temporary}"
+        what = f"{folder}: {fault}; kernels are built again in {temporary}"
         warnings.warn(f"{what}: set {name} to keep them", stacklevel=3)
 
 
 def _fault_of(folder):
-    """What keeps drivers from a cache in a folder, which is made; "" if nothing does."""
+    """What keeps drivers from using a folder as cache, which is created; "" if nothing does."""
     try:
         os.makedirs(folder, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(bytes(2**20))  # a full disk is noticed as well
     except OSError as error:
         return error.strerror
-    # PoCL keeps kernels as libraries, and ends the process where it may not load them
+    # PoCL stores kernels as libraries, and ends the process if it may not load them
     is_noexec = os.statvfs(folder).f_flag & getattr(os, "ST_NOEXEC", 0)
-    return "is mounted noexec, so that no kernel in it runs" if is_noexec else ""
+    return "is mounted noexec, so that no kernel in it can run" if is_noexec else ""
 
 
 # ---- drivers: found, tried, loaded
 
 
 def find_drivers() -> dict[str, str]:
-    """{name: library}: of each .icd file on Linux, else "" for all that the system's loader finds;
-    and of Intel's runtime beside pp-cl, whose name is its library.
+    """{name: library}: each .icd file and its library on Linux, or one name with "" for all drivers
+    that the system's loader finds; and Intel's runtime from this environment, with its library as
+    name.
     """
     chosen = next((os.environ[name] for name in CHOSEN if os.environ.get(name)), "")
     drivers: dict[str, str] = {}
@@ -256,7 +261,9 @@ def find_drivers() -> dict[str, str]:
 
 
 def runtime_library() -> Path | None:
-    """The library of Intel's CPU runtime beside pp-cl: its own .icd file names another place."""
+    """The library of Intel's CPU runtime in this Python environment, or None; the .icd file of the
+    runtime names another place.
+    """
     with suppress(PackageNotFoundError):
         for file in files(RUNTIME) or []:
             if file.name in RUNTIME_LIBRARIES and (path := Path(str(file.locate()))).is_file():
@@ -265,27 +272,27 @@ def runtime_library() -> Path | None:
 
 
 def in_conda() -> bool:
-    """Whether this Python belongs to a conda environment, whose loader has drivers of its own."""
+    """Whether this Python belongs to a conda environment, whose loader has its own drivers."""
     return Path(sys.prefix, "conda-meta").is_dir()
 
 
 def try_drivers(*, again: bool = False) -> Found:
-    """What is found of these drivers, as kept in the user's cache; found anew where they are not
-    known yet, where none works, or `again`.
+    """The result of trying the drivers, from the user's cache; they are tried anew if the cache
+    lacks it, if no device worked, or if `again`.
     """
     drivers = find_drivers()
     file = _kept_in(drivers)
-    found = {} if again else _tried.get(file) or _read(cache_folder() / file)
-    if not found:
-        found = _probe(drivers)
-        with suppress(UserError):  # without a cache they are tried at each start
-            write_json(make_cache_folder() / file, found)
-    _tried[file] = found
-    return found
+    result = {} if again else _tried.get(file) or _read(cache_folder() / file)
+    if not result:
+        result = _probe(drivers)
+        with suppress(UserError):  # without a cache, drivers are tried at each start
+            write_json(make_cache_folder() / file, result)
+    _tried[file] = result
+    return result
 
 
 def _kept_in(drivers):
-    """The file's name of what is found of these drivers, another for other versions of them."""
+    """The name of the cache's file for these drivers; other versions have another name."""
     about = [cl.VERSION_TEXT]
     for names in drivers.items():
         file = next(filter(os.path.isfile, reversed(names)), None)
@@ -294,17 +301,21 @@ def _kept_in(drivers):
 
 
 def _read(path):
-    """What was found before; {} if nothing worked, without the file, or if it is damaged."""
+    """The stored result of trying drivers; {} if no device worked, or the file is missing or
+    damaged.
+    """
     try:
-        found = json.loads(path.read_text("utf-8"))
-        works = any(problem is None for _, _, _, problem in found["devices"])
-        return found if works and isinstance(found["left_out"], dict) else {}
+        result = json.loads(path.read_text("utf-8"))
+        works = any(problem is None for _, _, _, problem in result["devices"])
+        return result if works and isinstance(result["left_out"], dict) else {}
     except (OSError, ValueError, TypeError, LookupError):
         return {}
 
 
 def _probe(drivers):
-    """What report() finds of drivers; it is started anew without each that crashes or hangs."""
+    """The result of report() in a separate process, restarted without each driver that crashes or
+    hangs.
+    """
     code = f"import sys; sys.path[:] = {sys.path!r}; from pp_cl import drivers; drivers.report()"
     left_out: dict[str, str] = {}
     while True:
@@ -314,7 +325,7 @@ def _probe(drivers):
             command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace"
         )
         lines = done.stdout.splitlines()
-        if done.returncode == 0:  # after whatever the drivers have printed
+        if done.returncode == 0:  # drivers may have printed other lines before
             return {"devices": json.loads(lines[-1]), "left_out": left_out}
         begun = [line.removeprefix(BEGINS) for line in lines if line.startswith(BEGINS)]
         status = done.returncode
@@ -325,8 +336,9 @@ def _probe(drivers):
 
 
 def report() -> None:
-    """Try the drivers in sys.argv[1], JSON of {name: library}, and print as JSON the rows of their
-    devices, the name of each driver before it is tried. One that takes SECONDS ends the process.
+    """Try the drivers in sys.argv[1], JSON of {name: library}; print each driver's name before it
+    is tried, and at last the rows of all devices as JSON. A driver that takes SECONDS ends the
+    process.
     """
 
     def begin(name: str) -> None:
@@ -348,33 +360,33 @@ def report() -> None:
 
 
 def load_drivers(drivers: dict[str, str]) -> list[cl.Platform]:
-    """The platforms of some drivers; the system's loader is shown no others at its first use."""
+    """The platforms of these drivers; the system's loader sees no others when it is first used."""
     libraries = [library for name, library in drivers.items() if library != name]
     # Intel's runtime works without a loader: it dispatches calls, too
     runtime = [address for name in drivers if drivers[name] == name for address in _addresses(name)]
-    found = _listed_by_loader(libraries) if libraries else []
-    return found + [cl.Platform.from_int_ptr(address) for address in runtime]
+    platforms = _listed_by_loader(libraries) if libraries else []
+    return platforms + [cl.Platform.from_int_ptr(address) for address in runtime]
 
 
 def _listed_by_loader(libraries):
-    before, found = dict(os.environ), []
+    before, platforms = dict(os.environ), []
     with tempfile.TemporaryDirectory(prefix="pp-cl-drivers-") as folder:
         for i, library in enumerate(libraries):
             Path(folder, f"{i}.icd").write_text(f"{library}\n", "utf-8")
         if any(libraries):
             os.environ |= {"OCL_ICD_VENDORS": folder, "PYOPENCL_HOME": folder}
-        with suppress(cl.Error):  # of a loader that finds none
-            found = cl.get_platforms()
+        with suppress(cl.Error):  # raised by a loader that finds no platform
+            platforms = cl.get_platforms()
     for name in ("OCL_ICD_VENDORS", "PYOPENCL_HOME"):
         os.environ.pop(name, None)
     os.environ |= before
-    return found
+    return platforms
 
 
 def _addresses(library):
-    """Where the platforms of a driver's library lie; [] where it cannot be loaded."""
+    """The addresses of the platforms in a driver's library; [] if it cannot be loaded."""
     try:
-        # WinDLL finds what the library needs beside it
+        # WinDLL searches the library's folder for the libraries that it needs
         driver = ctypes.WinDLL(library) if sys.platform == "win32" else ctypes.CDLL(library)
         address = driver.clGetExtensionFunctionAddress
     except (OSError, AttributeError):

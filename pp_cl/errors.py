@@ -1,4 +1,4 @@
-"""The exceptions that a user sees as one line, and the quoting of text from files in that line."""
+"""The exceptions that a user sees as one line, and functions that quote foreign text in it."""
 
 import difflib
 import os
@@ -7,12 +7,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 MOST_LINE = 1000  # characters of a message: two long paths and a reason
-NAMES_SHOWN = 3  # of many, in a message
+NAMES_SHOWN = 3  # in a message; others are counted
 
 
 def one_line(text: object, most: int = MOST_LINE) -> str:
-    """A message as a terminal can show it: on one line, without control characters, and without
-    its middle where it is longer than that.
+    """A message that a terminal can show: on one line, without control characters, and without its
+    middle if it is longer than `most` characters.
     """
     text = str(text)
     if len(text) > most:
@@ -21,15 +21,15 @@ def one_line(text: object, most: int = MOST_LINE) -> str:
 
 
 class UserError(Exception):
-    """Bad input or environment. The message, one line, names the file (and key) and the mend."""
+    """Bad input or environment. The message, one line, names the file (and key) and the remedy."""
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(message))
 
 
 class Unusable(UserError):
-    """What makes one view of a scene unusable, while the others may do without it. why: in a few
-    words, the same for all views of a kind.
+    """One view of a scene cannot be used, but the others may do without it. why: the reason in a
+    few words, the same for all views with this fault.
     """
 
     def __init__(self, message: object, why: str) -> None:
@@ -45,7 +45,7 @@ class Diverged(UserError):
 
 
 class BuildError(RuntimeError):
-    """A driver does not build a kernel file. The message is one line; log: the compiler's words."""
+    """A driver cannot build a kernel file. The message is one line; log: the compiler's output."""
 
     def __init__(self, message: str, log: str) -> None:
         super().__init__(one_line(message))
@@ -53,8 +53,8 @@ class BuildError(RuntimeError):
 
 
 class Stopped(Exception):
-    """A command ended in good order before all was done. The message says how to go on; status: the
-    exit status, 128 and the number of the signal that ended it, else 1.
+    """A command ended in good order before it was done. The message says how to continue; status:
+    the exit status, 128 plus the number of the signal that ended it, or 1.
     """
 
     def __init__(self, message: str, status: int) -> None:
@@ -63,25 +63,25 @@ class Stopped(Exception):
 
 
 def require(what: str, *packages: str) -> None:
-    """Raise UserError where one of the packages that something needs is not installed."""
+    """Raise UserError if one of the packages that `what` needs is not installed."""
     if any(find_spec(package.replace("-", "_")) is None for package in packages):
         install = f"`pip install {' '.join(packages)}`"
         raise UserError(f"{what} needs {' and '.join(packages)}; install with {install}")
 
 
 def name_of(folder: Path) -> str:
-    """The name of a folder, which may be no UTF-8, as others can take it."""
+    """The name of a folder as valid Unicode; the name on disk may not be UTF-8."""
     return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def shown(text: str, most: int = 100) -> str:
-    """one_line() of what others wrote, for a message, of at most `most` characters."""
+    """one_line() of foreign text, for a message, cut to at most `most` characters."""
     text = one_line(" ".join(text[: 4 * most].split()))
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def quoted(value: object, most: int = 100) -> str:
-    """shown() of a value as Python writes it: texts in quotation marks."""
+    """shown() of a value's repr(): strings get quotation marks."""
     try:
         return shown(repr(value), most)
     except (RecursionError, ValueError):  # nested deeply, or a number of thousands of digits
@@ -89,16 +89,18 @@ def quoted(value: object, most: int = 100) -> str:
 
 
 def few_names(names: Sequence[str]) -> str:
-    """A few of the names, and how many more there are."""
+    """The first names, and the number of the others."""
     more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     return ", ".join(names[:NAMES_SHOWN]) + more
 
 
 def suggestion(word: str, words: Iterable[str]) -> str:
-    """`did you mean X? ` for the one of the nearest words with the longest run of the same letters,
-    else "".
-    """
+    """`did you mean X? `, with the near word that shares the longest run of letters, or ""."""
     word = word[:100]
     near = difflib.get_close_matches(word, list(words))
-    near.sort(key=lambda one: -difflib.SequenceMatcher(None, word, one).find_longest_match().size)
+    near.sort(
+        key=lambda near_word: (
+            -difflib.SequenceMatcher(None, word, near_word).find_longest_match().size
+        )
+    )
     return f"did you mean {near[0]}? " if near else ""

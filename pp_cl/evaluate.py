@@ -28,14 +28,14 @@ def evaluate_run(
     scene: str | None = None,
     out: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Measure a run, or the one in a folder, as `pp-cl eval` does; writes metrics.json, whose
-    content it returns, and comparison.png into the folder `out`, else RUN/eval, or RUN/eval/SPLIT
-    for other splits than test. Where the run's images differed in colour, views are also
-    measured with theirs, coloured_alike().
+    """Measure a run, or the run in a folder, as `pp-cl eval` does. Writes metrics.json, whose
+    content it returns, and comparison.png into the folder `out`; None: RUN/eval for the split test,
+    RUN/eval/SPLIT for others. If the run's images differed in colour, renderings are also measured
+    with the images' colours, by coloured_alike().
 
-    metrics: out of psnr, ssim, lpips. save_images: write every view to images/ there, too. device,
-    scene: of a folder, as load() takes them. Raises UserError for a missing or broken split, and
-    for files that would be lost.
+    metrics: from psnr, ssim and lpips. save_images: also write every view to images/. device,
+    scene: as in load(), for a folder. Raises UserError for a missing or broken split, and for files
+    that would be lost.
     """
     run = run if isinstance(run, Run) else load(run, device, scene=scene)
     target = run.folder.evaluation(split) if out is None else Path(out)
@@ -58,7 +58,7 @@ def evaluate_run(
         rendered = run.renderer.forward(view.camera, run.gamma)
         image, computed = run.checked(run.shown(rendered)), rendered.computed_fraction
         costs.append((time.perf_counter() - start, computed))
-        del rendered  # else its arrays would stay beside the larger ones of the next view
+        del rendered  # free its arrays before the next view, which may need larger ones
         whole = targets.crop(view, (0, 0, view.camera.width, view.camera.height))
         truth, alpha = (array.get() for array in whole)
         truth = view.ignoring(truth, image)

@@ -1,6 +1,6 @@
-"""How a long stage shows that it goes on: by a bar on a terminal, elsewhere by a line now and then.
+"""Shows the progress of a long stage: with a bar on a terminal, elsewhere with a line now and then.
 
-It moves by itself, too, where the stage is in one long call of a library or a driver.
+A thread updates it, also while the stage is in one long call of a library or a driver.
 """
 
 import shutil
@@ -13,15 +13,15 @@ from typing import Any, TextIO, TypeVar
 
 from tqdm import tqdm
 
-REDRAWN = 1.0  # seconds between two states of the bar
+REDRAWN = 1.0  # seconds between two updates of the bar
 LINES_APART = 25.0  # seconds between two lines of all stages, and some more between stages
-# tqdm's, with little beside what follows; it is cut off at the right border
+# tqdm's format, but shorter, so that the note has room; a terminal cuts it off at the right border
 FORMAT = (
     "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"
 )
-ENDLESS = "{desc}: {elapsed}{postfix}"  # where nobody knows how much there is to do
-TIMED = "{desc}: {percentage:3.0f}%|{bar}| $left{postfix}"  # where time is given, and no units
-# of a terminal that does not tell its size, where tqdm would show nothing
+ENDLESS = "{desc}: {elapsed}{postfix}"  # if the total is unknown
+TIMED = "{desc}: {percentage:3.0f}%|{bar}| $left{postfix}"  # if the stage has a time, and no units
+# of a terminal that does not tell its size, on which tqdm would show nothing
 SIZE = 100, 20
 
 Item = TypeVar("Item")
@@ -30,10 +30,11 @@ _shown: "Progress | None" = None  # the stage that is shown: those within it are
 
 
 class Progress:
-    """A stage, to be entered while it runs. what: it does, such as `matching`; total: its units,
-    None where nobody knows; done: those done before; stream: sys.stderr if not given. given: the
-    stage has so many minutes, and its units are the seconds of these, which pass by themselves. The
-    text of `note` follows what is done. Nothing is shown within another stage.
+    """Shows the progress of a stage while its block runs. what: the stage's name, such as
+    `matching`; total: its number of units, or None if unknown; done: units done before; stream:
+    None for sys.stderr. given: minutes that the stage has; its units are then seconds, which pass
+    by themselves. The text of `note` is shown after the numbers. Nothing is shown within another
+    stage.
     """
 
     def __init__(
@@ -86,12 +87,12 @@ class Progress:
             self._bar.close()
 
     def update(self, done: int = 1) -> None:
-        """Units that have been done since the last call."""
+        """Add the units that were done since the last call."""
         self._done += done
 
     def _follow(self):
         while not self._ended.wait(min(REDRAWN, LINES_APART)):
-            with suppress(OSError, ValueError):  # of a full disk, or a stream that was closed
+            with suppress(OSError, ValueError):  # the disk may be full, or the stream closed
                 self._show()
 
     def _show(self):
@@ -109,14 +110,14 @@ class Progress:
             print(self._line(now - self._start), file=self._stream, flush=True)
 
     def _line(self, seconds):
-        """What a file shows after so many seconds of the stage."""
+        """The line for a stream that is no terminal, after `seconds` of the stage."""
         if self._given:
             return f"{self._what}: {', '.join([self._left()] + [self.note] * bool(self.note))}"
         done = self._done - self._first
         parts = [f"{self._done} of {self.total} {self._unit}s"] if self.total else []
         if self.total and done:
-            left = tqdm.format_interval((self.total - self._done) * seconds / done)
-            parts += [f"{done / seconds:.3g} a second", f"{left} left"]
+            remaining = tqdm.format_interval((self.total - self._done) * seconds / done)
+            parts += [f"{done / seconds:.3g} a second", f"{remaining} left"]
         else:
             parts.append(f"{tqdm.format_interval(seconds)} so far")
         return f"{self._what}: {', '.join(parts + [self.note] * bool(self.note))}"
@@ -129,7 +130,7 @@ class Progress:
 def track(
     items: Iterable[Item], what: str, unit: str, total: int | None = None, **options: Any
 ) -> Iterator[Item]:
-    """The items in turn, under a Progress. total: their number, where they do not tell it."""
+    """Yield the items with a Progress. total: their number, if they are not a sequence."""
     if total is None and isinstance(items, Sequence):
         total = len(items)
     with Progress(what, total, unit, **options) as progress:

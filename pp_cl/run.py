@@ -1,4 +1,4 @@
-"""A trained model in the folder of a run: load it, render any camera, evaluate it on views."""
+"""A trained model in the folder of a run: loads it and renders any camera."""
 
 import math
 import warnings
@@ -41,8 +41,8 @@ MARGIN = 4
 
 @dataclass
 class Run:
-    """The model of a run's last checkpoint, and the header of that. others: further members, of
-    whose images and its own the mean is shown.
+    """The model of a run's last checkpoint, and that checkpoint's header. others: further members;
+    the run shows the mean of all members' images.
     """
 
     dev: Device
@@ -99,17 +99,17 @@ class Run:
 
     @property
     def _last_step(self):
-        # the settings of a finished run that is extended say where it goes, not where it is
+        # while a finished run is extended, its settings have the future length, its header the step
         return self.config.train.iterations if self.header["finished"] else self.header["step"]
 
     @property
     def gamma(self) -> float:
-        """Depth sharpness of the blend at the run's last step."""
+        """The depth sharpness of the blend at the run's last step."""
         return gamma_at(self._last_step, self.config.train.iterations)
 
     def scene(self, split: str) -> Scene:
         """The run's scene with one split, without views that training has left out or that show
-        another place. Raises UserError where it is missing, broken or another than the run's.
+        another place. Raises UserError if it is missing, broken or not the run's scene.
         """
         check_scene(self.config.scene.path)
         scene = open_scene(self.dev, self.config, (split,))
@@ -122,37 +122,39 @@ class Run:
         self._compare(trained)
         views, gone = scene.splits[split], set(self.header.get("left_out", []))
         gone |= {v.name for v in misplaced(self.model.grid, self.model.cloud.ids.get(), views)}
-        left = [view for view in views if view.name not in gone]
-        if len(left) == len(views):
+        kept = [view for view in views if view.name not in gone]
+        if len(kept) == len(views):
             return scene
         names = few_names([view.name for view in views if view.name in gone])
-        told = f"{split}: {len(views) - len(left)} of {len(views)} views left out: their masks"
-        told += f" are beside the model ({names})"
-        warnings.warn(f"{self.config.scene.path}: {told}", stacklevel=2)
-        return replace(scene, splits={split: left}, notes=[*scene.notes, told])
+        text = f"{split}: {len(views) - len(kept)} of {len(views)} views left out: their masks"
+        text += f" miss the model ({names})"
+        warnings.warn(f"{self.config.scene.path}: {text}", stacklevel=2)
+        return replace(scene, splits={split: kept}, notes=[*scene.notes, text])
 
     def _compare(self, read):
-        """Raise UserError unless the training views, of read() also the pixels, are the run's."""
+        """Raise UserError unless the training views are the run's. read() gives the views whose
+        pixels are compared, too.
+        """
         path, header = self.config.scene.path, self.header
         try:
             views = read()
-            # views that were dropped or taken back since change no result
-            told = difference(header, list_split(path, edited=False).image_files, views)
+            # views dropped or restored since training do not change the result
+            differs = difference(header, list_split(path, edited=False).image_files, views)
         except UserError as error:
             warnings.warn(
                 f"{path}: cannot be compared with the scene of {self.folder} ({error})",
                 stacklevel=3,
             )
             return
-        if told:
+        if differs:
             raise UserError(
-                f"{self.folder.checkpoint}: belongs to another scene than {path} ({told}); say"
-                " where its own is with --scene"
+                f"{self.folder.checkpoint}: belongs to another scene than {path} ({differs}); say"
+                " where its own scene is with --scene"
             )
 
     def image_files(self, split: str) -> list[ImageFile]:
-        """A split's views without their pixels. The run keeps those of train; for others raises
-        UserError where the scene is missing, broken, or another one by names and cameras.
+        """A split's views without their pixels. The run stores those of train; for other splits,
+        raises UserError if the scene is missing or broken, or has other names or cameras.
         """
         if split == "train":
             return unpacked_views(self.header["views"])
@@ -164,25 +166,25 @@ class Run:
     def cameras(self, split: str = "test") -> list[Camera]:
         """The cameras of image_files(), at the run's resolution. Raises UserError."""
         downscale = self.config.scene.downscale
-        return [one.camera.downscaled(downscale) for one in self.image_files(split)]
+        return [image_file.camera.downscaled(downscale) for image_file in self.image_files(split)]
 
     def rendered(self, image_files: Sequence[ImageFile], *, opaque: bool) -> list[View]:
         """Views at the run's resolution whose images are its own renderings. opaque: over white, as
-        it was trained; else straight RGBA.
+        in training; otherwise straight RGBA.
         """
         views = []
-        for one in track(image_files, "rendering", "view"):
-            camera = one.camera.downscaled(self.config.scene.downscale)
+        for image_file in track(image_files, "rendering", "view"):
+            camera = image_file.camera.downscaled(self.config.scene.downscale)
             rendered = self.render(camera)
             white = np.dstack([rendered.colour, np.ones_like(rendered.alpha)])
             image = white if opaque else rendered.rgba()
-            views.append(View(one.name, camera, to_8bit(image), one.depth_range))
+            views.append(View(image_file.name, camera, to_8bit(image), image_file.depth_range))
         return views
 
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:
         """(centre (3,), radius) of the smallest ball around the middle of the points' box that
-        holds them all.
+        holds all points.
         """
         points = self.model.positions()
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -198,15 +200,15 @@ class Run:
         early_stop: float | None = None,
         supersampling: int | None = None,
     ) -> RenderedView:
-        """The model as the camera sees it. samples: it is the mean of so many images, a square
-        number, shifted by fractions of a pixel. features: with the network's input. early_stop: in
-        place of raster.early_stop. supersampling: places of a pixel, 1 or 2 each way, at which the
-        points are seen, in place of as many as in the training. Raises ValueError for another
-        number of samples, UserError where the image holds NaN.
+        """The model as the camera sees it. samples: a square number of images, shifted by fractions
+        of a pixel, whose mean is taken. features: add the network's input. early_stop: replaces
+        raster.early_stop. supersampling: 1 or 2, samples along each side of a pixel; None: as in
+        the training. Raises ValueError if samples is not a square number, UserError if the image
+        holds NaN.
         """
         side = math.isqrt(samples)
         if samples < 1 or side * side != samples:
-            raise ValueError(f"{samples} samples are no square number")
+            raise ValueError(f"{samples} samples: must be a square number")
         shifts = (np.arange(side) + 0.5) / side - 0.5
         options: dict[str, Any] = {"early_stop": early_stop, "supersampling": supersampling}
         options["depth_range"] = self.depth_range(camera)
@@ -215,8 +217,8 @@ class Run:
             result = self.renderer.forward(camera.shifted(dx, dy), self.gamma, **options)
             with self.dev.stage("depth"):
                 view = result.points, result.pairs, result.weights, result.size
-                found = depth_forward(self.dev, *view, self.model.grid.voxel_size)
-            layers = [result.cropped(self.dev.download(array)) for array in found]
+                depths = depth_forward(self.dev, *view, self.model.grid.voxel_size)
+            layers = [result.cropped(self.dev.download(array)) for array in depths]
             if features:
                 layers.append(result.cropped(self.dev.download(result.features)))
             return RenderedView(self.shown(result, **options), *layers)
@@ -226,8 +228,8 @@ class Run:
         return rendered
 
     def shown(self, result: RenderResult, **options: Any) -> np.ndarray:
-        """(height, width, 3) float32 in [0, 1]: what the run shows of a view, by what its renderer
-        has made of it, and its other members by the options of Renderer.forward().
+        """(height, width, 3) float32 in [0, 1]: the run's image of a view, given its renderer's
+        result: the mean with the other members' images. options: of Renderer.forward(), for these.
         """
         images = [result.clamped()]
         for other in self.others:
@@ -236,20 +238,20 @@ class Run:
 
     @property
     def nearest(self) -> float:
-        """World units: points that are nearer to the eye are not drawn."""
+        """Points nearer to the eye than this are not drawn; world units."""
         return NEAREST * self.ball[1]
 
     def checked(self, image: np.ndarray) -> np.ndarray:
-        """An image of the run. Raises UserError naming the checkpoint where it holds NaN."""
+        """The given image of the run. Raises UserError naming the checkpoint if it holds NaN."""
         if np.isnan(image).any():
             raise UserError(
-                f"{self.folder.checkpoint}: its parameters are too large, the image holds NaN;"
+                f"{self.folder.checkpoint}: its parameters are so large that the image holds NaN;"
                 " restore a copy, or train again with a lower network.rate or train.sh_rate"
             )
         return image
 
     def depth_range(self, camera: Camera) -> tuple[float, float] | None:
-        """(near, far) of a camera anywhere; None, the model's, where the blend depends on it."""
+        """(near, far) for any camera; None, which means the model's, if the blend depends on it."""
         if self.config.raster.blend == "softmax":
             return None
         centre, radius = self.ball
@@ -258,14 +260,14 @@ class Run:
 
 
 def scene_is_there(path: str) -> bool:
-    """Whether a run's scene can be read, or made by the program."""
+    """Whether a run's scene exists in a folder, or is the one that pp-cl makes."""
     return path == DEMO or Path(path).is_dir()
 
 
 def check_scene(path: str) -> None:
-    """Raise UserError where the folder of a run's scene is not there."""
+    """Raise UserError if the folder of a run's scene is missing."""
     if not scene_is_there(path):
-        raise UserError(f"{path}: the run's scene is not there; say where with --scene")
+        raise UserError(f"{path}: the run's scene is missing; say where it is with --scene")
 
 
 def stored_config(folder: RunFolder, scene: str | None = None) -> Config:
@@ -277,7 +279,9 @@ def stored_config(folder: RunFolder, scene: str | None = None) -> Config:
 
 
 def find_run(path: Path | str) -> RunFolder:
-    """The run in a folder: itself, or the one that `pp-cl make` has put into it, unless a scene."""
+    """The run in a folder: the folder itself, or the run that `pp-cl make` has put into it, unless
+    the folder is a scene.
+    """
     folder, made = RunFolder(path), RunFolder(Path(path) / MADE)
     if folder.config.exists() or not made.config.exists():
         return folder
@@ -291,9 +295,9 @@ def find_run(path: Path | str) -> RunFolder:
 def load(
     folder: Path | str, device: str | Device | None = None, *, scene: str | None = None
 ) -> Run:
-    """The run in a folder, finished or not. device: an opened one, or as `pp-cl devices` lists
-    them, else the default. scene: the folder of its scene, if that has moved. Raises UserError
-    naming the file that is missing or broken.
+    """The run in a folder, finished or not. device: an opened device, a choice as in open_device(),
+    or None for the default. scene: the folder of its scene, if that has moved. Raises UserError
+    naming a missing or broken file.
     """
     dev = device if isinstance(device, Device) else open_device(device)
     place = find_run(folder)

@@ -1,4 +1,4 @@
-"""How fast OpenCL devices are, measured once, and which one is taken."""
+"""Measures once how fast OpenCL devices are, and sorts them for the choice of a device."""
 
 import json
 import math
@@ -24,34 +24,35 @@ from pp_cl.files.atomic import make_cache_folder, write_json
 Listed = tuple[str, cl.Device, str | None]
 
 SPEEDS = "speeds.json"
-# Another driver of CPUs is taken before Intel's only where it is so many times as fast: README says
-# that the whole demo takes PoCL 5 % longer, though some convolutions are faster with it.
+# Another CPU driver is preferred to Intel's only if it is this many times as fast: README says that
+# the whole demo takes PoCL 5 % longer, although some convolutions are faster with it.
 CLEARLY = 2.0
-SIDE, CHANNELS = 96, 64  # of the convolution, 3x3: the middle of the U-Net of `small`
-SECONDS = 1.0  # of a device
+SIDE, CHANNELS = 96, 64  # of the 3x3 convolution: the middle of the U-Net of `small`
+SECONDS = 1.0  # per device
 LONGEST = 120  # seconds until the measurement is given up; a busy machine builds kernels for 10
 
 
 def identity(device: cl.Device) -> tuple[str, str, str]:
-    """Platform, name and version, by which a device is known again."""
+    """Platform, name and version, by which a device is recognised."""
     return device.platform.name.strip(), device.name.strip(), device.driver_version.strip()
 
 
 def is_gpu(device: cl.Device) -> bool:
-    """Whether the driver says so."""
+    """Whether the driver says that the device is a GPU."""
     return bool(device.type & cl.device_type.GPU)
 
 
-def by_speed(found: Sequence[Listed]) -> list[Listed]:
-    """Those that work, the one that is taken first: the fastest, but Intel's driver of CPUs before
-    another that is not CLEARLY faster. Where no speed could be kept, GPUs first, then Intel's.
+def by_speed(listed: Sequence[Listed]) -> list[Listed]:
+    """The devices that work, the preferred one first: the fastest, but Intel's CPU driver before
+    another CPU driver that is not CLEARLY faster. If no speeds could be stored, GPUs come first,
+    then Intel's.
     """
-    working = [one for one in found if one[2] is None]
+    working = [row for row in listed if row[2] is None]
     speeds = kept_speeds([device for _, device, _ in working]) if len(working) > 1 else {}
     has_intels = any(_is_intels(device) for _, device, _ in working)
 
-    def rank(one):
-        _, device, _ = one
+    def rank(row):
+        _, device, _ = row
         speed, is_intels = speeds.get(_key(device), 0.0), _is_intels(device)
         if has_intels and not is_intels and not is_gpu(device):
             speed /= CLEARLY
@@ -65,8 +66,8 @@ def _is_intels(device):
 
 
 def kept_speeds(devices: Sequence[cl.Device]) -> dict[str, float]:
-    """{"platform, name, version": GFLOP/s} as kept in the user's cache, {} without one. Where a
-    device is not known there, all are measured, once for all processes that ask meanwhile.
+    """{"platform, name, version": GFLOP/s} from the user's cache, {} without one. If it lacks a
+    device, all devices are measured, once for all processes that ask in the meantime.
     """
     try:
         folder = make_cache_folder()
@@ -86,7 +87,7 @@ def _key(device):
 
 
 def _read(file):
-    """What is kept in a file; {} without it, or if it is damaged."""
+    """The speeds in a file; {} if it is missing or damaged."""
     try:
         speeds = json.loads(file.read_text("utf-8"))
         return {key: float(speed) for key, speed in speeds.items()}
@@ -95,7 +96,7 @@ def _read(file):
 
 
 def _measured():
-    """What measure() finds in a process of its own; {} if that crashes or hangs."""
+    """The result of measure() in a separate process; {} if that crashes or hangs."""
     code = (
         f"import sys; sys.path[:] = {sys.path!r}; from pp_cl import drivers, speeds;"
         " speeds.measure(drivers.list_devices())"
@@ -108,11 +109,13 @@ def _measured():
         return {}
 
 
-def measure(found: Sequence[Listed]) -> None:
-    """Print as JSON kept_speeds() of the devices that work, which take turns; the best counts."""
+def measure(listed: Sequence[Listed]) -> None:
+    """Print the speeds of the working devices as JSON, as in kept_speeds(). Devices take turns; the
+    best time of each counts.
+    """
     runs: dict[str, Callable[[], None]] = {}
-    for _, device, problem in found:
-        with suppress(Exception):  # of a driver: a device that cannot do it comes last
+    for _, device, problem in listed:
+        with suppress(Exception):  # drivers may raise anything; such a device comes last
             if problem is None:
                 runs[_key(device)] = _convolution(Device(device))
     seconds = dict.fromkeys(runs, math.inf)
@@ -129,7 +132,7 @@ def measure(found: Sequence[Listed]) -> None:
 
 
 def _convolution(dev):
-    """A function that computes one, which is done once."""
+    """A function that computes a convolution, after it has run once."""
     shape = ConvShape("forward", 3, (CHANNELS,), CHANNELS, (SIDE, SIDE))
     weight, bias = dev.zeros(packed_shape(3, CHANNELS, CHANNELS)), dev.zeros(CHANNELS)
     source, out = (dev.zeros((SIDE, SIDE, CHANNELS)) for _ in range(2))

@@ -310,7 +310,7 @@ def test_a_training_does_not_go_on_from_it(scene, tmp_path, monkeypatch):
     header.pop("format")
     save_checkpoint(file, header, arrays | {"points.ids": arrays["points.ids"][::-1].copy()})
     told = failure(*arguments(scene, tmp_path / "run"))
-    assert told.startswith(f"pp-cl: {file}: points.ids are no vertices of its grid in ascending")
+    assert told.startswith(f"pp-cl: {file}: points.ids must be vertices of its grid in ascending")
 
 
 def overflow(path):
@@ -336,4 +336,4 @@ def test_finite_weights_that_overflow_are_one_line(finished, tmp_path, monkeypat
     shutil.copytree(finished, "run")
     overflow(tmp_path / "run" / "checkpoint.npz")
     told = failure(words[0], "run", *words[1:])
-    assert "run/checkpoint.npz: its parameters are too large, the image holds NaN" in told
+    assert "run/checkpoint.npz: its parameters are so large that the image holds NaN" in told

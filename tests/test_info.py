@@ -116,7 +116,9 @@ def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts):
     metrics = json.loads((run / "eval" / "metrics.json").read_text())
     old.rename(new)
     assert facts(run)["grid"] == before["grid"]
-    assert f"{old}: the run's scene is not there; say where with --scene" in failure("eval", run)
+    assert f"{old}: the run's scene is missing; say where it is with --scene" in failure(
+        "eval", run
+    )
     sheet = ("--picture", tmp_path / "points.png")
     assert facts(run, "--scene", new)["grid"] == before["grid"]
     assert facts(run, "--scene", new, *sheet)["picture"] == str(tmp_path / "points.png")

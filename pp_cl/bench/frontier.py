@@ -323,7 +323,8 @@ def release(run: Run) -> None:
 def fastest_row(rows: list[dict]) -> dict:
     """The row that gains most of those with at most MOST_LOSS dB less than the default; the
     default's where none is LEAST_GAIN times as fast, by medians and by shortest times, which other
-    work on the machine hardly changes. More samples and a smaller early_stop take more work: what they gain is chance.
+    work on the machine hardly changes. More samples and a smaller early_stop take more work: what
+    they gain is chance.
     """
     default = next(row for row in rows if row["is_default"])
     own = default["setting"]

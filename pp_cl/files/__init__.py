@@ -1,4 +1,4 @@
-"""Reads and writes files: checkpoints, images, the folder of a run."""
+"""Reads and writes files: images, JSON, the folder of a run."""
 
 import lazy_loader
 

@@ -1,5 +1,5 @@
-"""Files are written under a temporary name, synced and renamed; folders that the program fills know
-which files in them are its own, and it replaces and removes no others.
+"""Writes files under a temporary name, syncs and renames them. Folders that pp-cl fills list the
+files that it wrote there, and it replaces and removes no others.
 """
 
 import errno
@@ -20,20 +20,21 @@ from platformdirs import user_cache_dir
 
 from pp_cl.errors import UserError, shown
 
-READER_SECONDS = 5  # which a viewer takes to read a large checkpoint
-DISK = (errno.EIO, errno.ENOSPC, errno.EDQUOT)  # errors of a disk, not of what a system cannot do
-# of what is being written, with the number of its process
+READER_SECONDS = 5  # a viewer may take so long to read a large checkpoint
+DISK = (errno.EIO, errno.ENOSPC, errno.EDQUOT)  # errors of a disk, not of missing features
+# the name of an unfinished file or folder, with the number of the process that writes it
 TEMPORARY = re.compile(r"\..+\.(\d+)\.pp-cl\.tmp(\..*)?", re.DOTALL)
-# In a folder that the program fills, its manifest: a line of JSON [path in the folder, SHA-256] for
-# each file that it has written there or below, also for former ones. A line is added before the
-# file gets its name; after a kill in between it says nothing of a file of others.
+# The manifest of a folder that pp-cl fills: a line of JSON [path in the folder, SHA-256] for each
+# file that it has written there or below, also for former files. The line is written before the
+# rename. If the process dies in between, it matches no file, so no other file is taken for ours.
 MANIFEST = ".pp-cl-files.jsonl"
 
 
 @contextmanager
 def atomic_file(path: Path | str, *, noted: bool = True) -> Iterator[BinaryIO]:
-    """A binary file object whose content appears under `path` only when the block ends well; noted:
-    in the manifest of the folder. Raises UserError naming a file that cannot be written.
+    """A binary file object whose content appears under `path` only when the block ends without an
+    error; noted: add it to the folder's manifest. Raises UserError naming a file that cannot be
+    written.
     """
     with _renamed(Path(path), noted=noted) as temporary, open(temporary, "wb") as file:
         yield file
@@ -43,16 +44,16 @@ def atomic_file(path: Path | str, *, noted: bool = True) -> Iterator[BinaryIO]:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """The same as a temporary path of the same suffix, for a library to write to."""
-    kinds = OSError, RuntimeError  # the latter of libraries in C++
+    """As atomic_file(), but a temporary path with the same suffix, to which a library writes."""
+    kinds = OSError, RuntimeError  # C++ libraries raise the latter
     with _renamed(path, path.suffix) as temporary, told(path, kinds):
         yield temporary
 
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that appears as `folder` only when the block ends well. Raises UserError
-    if that holds something or cannot be written, with the final place of a file in it.
+    """A temporary folder that appears as `folder` only when the block ends without an error. Raises
+    UserError if `folder` is not empty or cannot be written; errors in the block name final paths.
     """
     folder = folder.resolve()
     check_new_folder(folder)
@@ -61,14 +62,14 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
             temporary.mkdir(parents=True)
             yield temporary
             if folder.is_dir():
-                folder.rmdir()  # it is empty; Windows replaces no folder
+                folder.rmdir()  # it is empty; Windows cannot replace a folder
         except UserError as error:
             raise UserError(str(error).replace(str(temporary), str(folder))) from error
 
 
 @contextmanager
 def _renamed(path, suffix="", *, noted=True):
-    """A temporary path, of which what is there gets the name `path` when the block ends well."""
+    """A temporary path; what the block writes there is renamed to `path` unless it raises."""
     temporary = _temporary(path, suffix)
     try:
         with told(path):
@@ -82,12 +83,12 @@ def _renamed(path, suffix="", *, noted=True):
 
 
 def _temporary(path, suffix=""):
-    """The name under which a file is written."""
+    """The name of a file while it is written."""
     return path.parent / f".{path.name}.{os.getpid()}.pp-cl.tmp{suffix}"  # `.` and `/` have no name
 
 
 def _replace(temporary, path):
-    """os.replace(), which Windows refuses as long as another process reads what is there."""
+    """os.replace(), which Windows refuses as long as another process reads the old file."""
     end = time.monotonic() + (READER_SECONDS if sys.platform == "win32" else 0)
     while True:
         try:
@@ -99,7 +100,7 @@ def _replace(temporary, path):
 
 
 def _sync_folder(folder):
-    """Make a rename in the folder survive a power cut, where system and file system know how."""
+    """Make a rename in the folder survive a power cut, if system and file system can."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     try:
@@ -114,7 +115,7 @@ def _sync_folder(folder):
 
 
 def _remove(temporary):
-    """Remove what did not get its final name; what stays is removed by the next start."""
+    """Remove a file or folder that was not renamed; the next start removes any that remains."""
     with suppress(OSError):
         if temporary.is_dir():
             shutil.rmtree(temporary, ignore_errors=True)
@@ -123,7 +124,7 @@ def _remove(temporary):
 
 
 def mend(error: Exception) -> str:
-    """What to do about a file that cannot be opened or written."""
+    """Advice on a file that cannot be opened or written."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free some space"
@@ -138,7 +139,7 @@ def mend(error: Exception) -> str:
 def told(
     path: Path | str, kinds: tuple[type[Exception], ...] = (OSError,), then: str = ""
 ) -> Iterator[None]:
-    """An exception of these kinds becomes a UserError with the file and the mend, and `then`."""
+    """Turn an exception of these kinds into a UserError with the file, advice, and `then`."""
     try:
         yield
     except kinds as error:
@@ -147,13 +148,13 @@ def told(
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a text file atomically; names that are no UTF-8 are escaped."""
+    """Write a text file atomically; names that are not UTF-8 are escaped."""
     with atomic_file(path) as file:
         file.write(text.encode(errors="backslashreplace"))
 
 
 def write_json(path: Path | str, value: Any) -> None:
-    """Write JSON atomically; NaN and Inf are refused with ValueError."""
+    """Write JSON atomically. Raises ValueError for NaN and Inf."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
@@ -161,7 +162,7 @@ def write_json(path: Path | str, value: Any) -> None:
 
 
 def check_new_folder(folder: Path) -> None:
-    """Raise UserError where atomic_folder would write over something, or could not."""
+    """Raise UserError if atomic_folder() would overwrite something or could not write."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise UserError(f"{folder}: exists already; choose a new or empty folder")
     if folder.is_dir() and (os.path.ismount(folder) or folder.samefile(".")):
@@ -170,15 +171,15 @@ def check_new_folder(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Raise UserError where atomic_file or atomic_path could not write a file."""
+    """Raise UserError if atomic_file() or atomic_path() could not write a file."""
     if path.is_dir():
         raise UserError(f"{path}: is a folder; name a file")
     check_target(path)
 
 
 def check_target(path: Path) -> None:
-    """Raise UserError where nothing can be made under a path: tried with a temporary file in the
-    first folder above that there is.
+    """Raise UserError if nothing can be created at a path, which is tried with a temporary file in
+    the nearest existing folder above it.
     """
     tried = Path(os.path.abspath(path))
     try:
@@ -207,9 +208,9 @@ def check_room(path: Path, needed: int) -> None:
 def own(
     folder: Path, files: Iterable[Path] = (), mend: str = "move it away", *, alone: bool = False
 ) -> None:
-    """Make a folder one that the program fills, and remove what killed processes left unfinished
-    in it. files: will be written there. alone: nothing of others may be there before. Raises
-    UserError, with nothing changed, as that says, and as check_ours does for `files`.
+    """Make a folder one that pp-cl fills, and remove the unfinished files of killed processes.
+    files: files to be written there. alone: the folder must not hold files of others. Raises
+    UserError, with nothing changed, if it does, and as check_ours() does for `files`.
     """
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is not a folder; choose another --out")
@@ -223,12 +224,12 @@ def own(
 
 
 def is_owned(folder: Path) -> bool:
-    """Whether the program fills a folder."""
+    """Whether pp-cl fills a folder, so that it has a manifest."""
     return (folder / MANIFEST).is_file()
 
 
 def ours(paths: Iterable[Path]) -> list[Path]:
-    """Those of the files that are as the program has written them."""
+    """The files among the paths that are still as pp-cl wrote them."""
     lines = functools.cache(lambda home: {*(home / MANIFEST).read_bytes().splitlines()})
     return [
         path
@@ -239,25 +240,25 @@ def ours(paths: Iterable[Path]) -> list[Path]:
 
 
 def check_ours(paths: Iterable[Path], mend: str = "move it away") -> None:
-    """Raise UserError naming the first file that is there and not ours(): it would be lost."""
+    """Raise UserError naming the first existing file that is not ours() and would be lost."""
     there = [path for path in paths if os.path.lexists(path)]
     if others := set(there) - set(ours(there)):
         first = min(others)
-        raise UserError(f"{first}: was not written by pp-cl, or was changed since; {mend}")
+        raise UserError(f"{first}: pp-cl did not write this, or it was changed since; {mend}")
 
 
 def remove_ours(paths: Iterable[Path]) -> None:
-    """Remove those of the files that are ours(), and the folders that are empty without them."""
+    """Remove the files that are ours(), and then their empty folders."""
     for path in ours(paths):
         path.unlink()
         for folder in path.parents:
-            if any(folder.iterdir()):  # at the latest the one with the manifest
+            if any(folder.iterdir()):  # at the latest the folder with the manifest
                 break
             folder.rmdir()
 
 
 def _home(path):
-    """The folder nearest above that the program fills; None without one, and in unfinished ones."""
+    """The nearest folder above that pp-cl fills; None without one, and in unfinished folders."""
     for folder in Path(os.path.abspath(path)).parents:
         if is_owned(folder):
             return folder
@@ -267,26 +268,27 @@ def _home(path):
 
 
 def _note(file, path):
-    """Add a file, or all in a folder, that is about to become `path`, to the nearest manifest."""
+    """Add a file, or all files in a folder, soon renamed to `path`, to the nearest manifest."""
     if home := _home(path):
         inside = sorted(file.rglob("*")) if file.is_dir() else [file]
-        lines = [_line(home, path / one.relative_to(file), one) for one in inside if one.is_file()]
+        lines = [
+            _line(home, path / part.relative_to(file), part) for part in inside if part.is_file()
+        ]
         with open(home / MANIFEST, "ab") as manifest:
-            # the end of a line stands before it: the last one may be cut, of a process that was
-            # killed
+            # each line begins with a newline, since a killed process may have cut the last line
             manifest.write(b"".join(b"\n" + line for line in lines))
             manifest.flush()
             os.fsync(manifest.fileno())
 
 
 def _line(home, path, file):
-    """The line of a manifest for what stands in `file` and is, or will be, called `path`."""
+    """The manifest's line for the content of `file`, which is, or will be, called `path`."""
     relative = Path(os.path.abspath(path)).relative_to(home)
     return json.dumps([relative.as_posix(), sha256_of(file).hexdigest()]).encode()
 
 
 def sha256_of(file: Path) -> Any:
-    """The digest object of a file, which is read in pieces."""
+    """The hashlib digest of a file, which is read in pieces."""
     digest = hashlib.sha256()
     with open(file, "rb") as opened:
         while part := opened.read(2**20):
@@ -300,7 +302,7 @@ def remove_leftovers(folder: Path | str) -> None:
         named = TEMPORARY.fullmatch(leftover.name)
         if not named or _lives(int(named[1])):
             continue
-        # Windows cannot tell who lives, but refuses what a process has open
+        # Windows cannot tell which process is alive, but refuses to delete a file that one has open
         with suppress(PermissionError) if sys.platform == "win32" else nullcontext():
             if leftover.is_dir() and not leftover.is_symlink():
                 shutil.rmtree(leftover)
@@ -309,11 +311,11 @@ def remove_leftovers(folder: Path | str) -> None:
 
 
 def _lives(process):
-    """Whether another process has this number; where the system has no way to ask, none has."""
+    """Whether another process has this number; False if the system cannot tell."""
     if os.name != "posix" or process == os.getpid():
         return False
     try:
-        os.kill(process, 0)  # sends nothing
+        os.kill(process, 0)  # sends no signal
     except PermissionError:
         return True
     except (ProcessLookupError, OverflowError):
@@ -325,18 +327,17 @@ def _lives(process):
 
 
 def cache_folder() -> Path:
-    """PP_CACHE, else the user's cache folder of the system."""
+    """PP_CACHE, or else the user's cache folder on this system."""
     return Path(os.environ.get("PP_CACHE") or user_cache_dir("pp-cl"))
 
 
 def make_cache_folder() -> Path:
-    """The same, made where it is missing. Raises UserError if that fails."""
+    """cache_folder(), created if it is missing. Raises UserError if that fails."""
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
-            f"{folder}: cannot be made ({error.strerror}); "
-            "set PP_CACHE to a folder that can be written"
+            f"{folder}: cannot be created ({error.strerror}); set PP_CACHE to a writable folder"
         ) from None
     return folder

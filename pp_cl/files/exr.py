@@ -1,4 +1,4 @@
-"""OpenEXR images (linear light, premultiplied by alpha, with depth), by the package OpenEXR."""
+"""Reads and writes OpenEXR images (linear light, premultiplied by alpha, with depth)."""
 
 from contextlib import closing
 from pathlib import Path
@@ -12,15 +12,15 @@ from pp_cl.files.atomic import atomic_path
 from pp_cl.files.srgb import linear_to_srgb
 from pp_cl.files.untrusted import MOST_PIXELS, refusal
 
-COLOURS = (("R", "G", "B"), ("Y",))  # what makes an image
-# bytes of a tile, or of the most rows that a compression packs together, with all channels
+COLOURS = (("R", "G", "B"), ("Y",))  # channels that make an image
+# bytes of a tile, or of all rows that are compressed together, with all channels; most such rows
 MOST_CHUNK, CHUNK_ROWS = 2**29, 256
 FLOAT = Imath.PixelType(Imath.PixelType.FLOAT)
 
 
 def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
-    """Write channels, (H, W) float32 each, without loss, atomically. Raises UserError naming the
-    file when it cannot be written.
+    """Write channels, (H, W) float32 each, losslessly and atomically. Raises UserError naming a
+    file that cannot be written.
     """
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary:
@@ -28,16 +28,16 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
 
 
 def exr_size(path: Path | str) -> tuple[int, int]:
-    """(width, height) of the display window of an image, from its header. Raises UserError as
-    read_exr_rgba does.
+    """(width, height) of an image's display window, from its header. Raises UserError as
+    read_exr_rgba() does.
     """
     return _window(path, _header(path), "displayWindow")[1]
 
 
 def read_exr_rgba(path: Path | str) -> np.ndarray:
-    """(H, W, 4) uint8 straight sRGB of an image's display window: linear light above 1 is cut off,
-    no alpha means 255, and outside of the data window alpha is 0. Raises UserError naming a file
-    that is missing or broken, has several parts, no colours, too many pixels, NaN or infinite ones.
+    """(H, W, 4) uint8 straight sRGB of an image's display window: linear light above 1 is clipped,
+    a missing alpha means 255, and outside the data window alpha is 0. Raises UserError naming a
+    file that is missing or broken, or has several parts, no colours, too many pixels, NaN or Inf.
     """
     header = _header(path)
     first_shown, (width, height) = _window(path, header, "displayWindow")
@@ -45,8 +45,10 @@ def read_exr_rgba(path: Path | str) -> np.ndarray:
     names = _wanted(path, header, columns * min(rows, CHUNK_ROWS))
     try:
         with closing(OpenEXR.InputFile(str(path))) as file:
-            found = file.channels(names, FLOAT)
-            planes = [np.frombuffer(one, np.float32).reshape(rows, columns) for one in found]
+            channels = file.channels(names, FLOAT)
+            planes = [
+                np.frombuffer(channel, np.float32).reshape(rows, columns) for channel in channels
+            ]
     except Exception as error:  # the library's exceptions have no common class
         raise refusal(path, error, "OpenEXR") from error
     broken = ~np.logical_and.reduce([np.isfinite(plane) for plane in planes])
@@ -66,7 +68,7 @@ def read_exr_rgba(path: Path | str) -> np.ndarray:
 
 
 def _straight(light):
-    """(N, 4) uint8 straight sRGB of linear, premultiplied gray or RGB, maybe alpha behind it."""
+    """(N, 4) uint8 straight sRGB from linear, premultiplied gray or RGB, maybe with alpha."""
     count = light.shape[1]
     colours, alpha = (light, 1) if count % 2 else (light[:, :-1], np.clip(light[:, -1:], 0, 1))
     rgba = np.empty((len(light), 4), np.float32)
@@ -76,7 +78,7 @@ def _straight(light):
 
 
 def _header(path):
-    """The header of a file of one part with pixels. Raises UserError."""
+    """The header of a file that must have one part with pixels. Raises UserError."""
     if not Path(path).is_file():
         raise UserError(f"{path}: no such file; copy it there")
     try:
@@ -96,27 +98,27 @@ def _window(path, header, name):
     width, height = map(int, last - first + 1)
     if width < 1 or height < 1 or width * height > MOST_PIXELS:
         raise UserError(
-            f"{path}: {width}x{height} pixels, which must be 1 to {MOST_PIXELS}; copy the file"
+            f"{path}: {width}x{height} pixels, but must have 1 to {MOST_PIXELS}; copy the file"
             " again, or reduce it"
         )
     return first, (width, height)
 
 
 def _wanted(path, header, chunk):
-    """The names of R, G and B, or of Y, and of A. chunk: pixels that are packed together."""
+    """The names of the channels R, G and B, or Y, and A. chunk: pixels compressed together."""
     channels = {channel.name: channel for channel in header["channels"]}
-    layers = {name[: name.rfind(".") + 1] for name in channels}  # with the point behind their name
-    found = [
+    layers = {name[: name.rfind(".") + 1] for name in channels}  # including the point at the end
+    images = [
         (layer, [layer + name for name in colours])
         for layer in sorted(layers)
         for colours in COLOURS
         if all(layer + name in channels for name in colours)
     ]
-    whole = [one for one in found if one[0] == ""] or found
+    whole = [image for image in images if image[0] == ""] or images
     if len(whole) != 1:
         raise UserError(
             f"{path}: has {'no' if not whole else 'several'} images among its channels"
-            f" ({', '.join(sorted(channels))[:80]}); keep one of R, G, B and A, or of Y"
+            f" ({', '.join(sorted(channels))[:80]}); keep one image with R, G, B and A, or with Y"
         )
     layer, names = whole[0]
     names += [f"{layer}A"] * (f"{layer}A" in channels)
@@ -126,7 +128,7 @@ def _wanted(path, header, chunk):
     packed = 4 * len(channels) * (tiles.xSize * tiles.ySize if tiles else chunk)
     if packed > MOST_CHUNK:
         raise UserError(
-            f"{path}: {len(channels)} channels are packed together, {packed} bytes and more than"
+            f"{path}: {len(channels)} channels are packed together in {packed} bytes, more than"
             f" {MOST_CHUNK}; save R, G, B and A alone"
         )
     return names

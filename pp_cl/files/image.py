@@ -14,37 +14,38 @@ from pp_cl.files.atomic import atomic_file
 from pp_cl.files.exr import exr_size, read_exr_rgba
 from pp_cl.files.untrusted import MOST_PIXELS, opened_regular, refusal
 
-# Pillow warns of pixels by the hundred million, and of broken animations, in words of its own
+# silences Pillow's own warnings about hundreds of millions of pixels and broken animations
 warnings.filterwarnings("ignore", module=r"PIL\.")
-FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "AVIF")  # JPEG opens MPO, which phones write, too
-# of the files that read_rgba reads, those that may have alpha first
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "AVIF")  # JPEG also opens the MPO of phones
+# endings of the files that read_rgba() reads; formats that may have alpha come first
 ENDINGS = (".png", ".webp", ".tif", ".tiff", ".avif", ".jpg", ".jpeg", ".jfif", ".bmp", ".exr")
-# Pillow's names of what converts to RGBA without loss
+# Pillow's names of the modes that convert to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
-# Pillow's names of what becomes one of these first: inks, video, alpha that colours contain
+# Pillow's names of the modes that are converted to these first: inks, video, premultiplied alpha
 CONVERTED = {"CMYK": "RGB", "YCbCr": "RGB", "RGBa": "RGBA", "La": "LA"}
 LOSSY = (".jpg", ".jpeg", ".jfif")
-ORIENTATION = 0x0112  # the tag of EXIF
-QUARTERS = {6: 1, 3: 2, 8: 3}  # its values that turn and mirror nothing: quarter turns clockwise
-ON_THEIR_SIDE = (5, 6, 7, 8)  # its values with which width and height change places
+ORIENTATION = 0x0112  # EXIF's tag
+QUARTERS = {6: 1, 3: 2, 8: 3}  # quarter turns clockwise, for orientations that do not mirror
+ON_THEIR_SIDE = (5, 6, 7, 8)  # orientations that swap width and height
 UNREADABLE = "an image that cannot be read"
-# A mask may have been a JPEG with subsampled colours, or have a coloured rim. It has colours where
-# this share of the cells that are not dark differ by more than so many levels between the channels;
-# a cell is the mean of 4 x 4 pixels of the image at this size.
+# A mask may have been a JPEG with subsampled colours, or have a coloured rim. It counts as coloured
+# if COLOURED of the cells that are lighter than DARK differ by more than COLOURLESS levels between
+# the channels; a cell is the mean of 4 x 4 pixels of the mask resized to COLOUR_SIDE.
 COLOUR_SIDE, COLOURLESS, DARK, COLOURED = 512, 16, 64, 0.3
-# of a mask that holds the numbers of classes, not alpha; its pixels that are as those beside them
+# A mask holds class labels instead of alpha if its values are at most MOST_LABEL and the share FLAT
+# of its pixels equals the pixel to the left.
 MOST_LABEL, FLAT = 40, 0.8
-# bits per channel stand in the header chunk, the first of all
+# the byte of a PNG's first chunk, its header, that holds the bits per channel
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
 def read_rgba(
     path: Path | str, size: tuple[int, int] | None = None, *, turned: bool = False
 ) -> np.ndarray:
-    """(H, W, 4) uint8 straight sRGB and alpha of an image file, whatever its kind; no alpha means
-    255. size: (width, height) that it is to have: where it lies on its side, and where it is to be
-    turned, it is turned as its EXIF says. Raises Unusable naming a file that is missing, truncated,
-    no image, larger than MOST_PIXELS, or of another kind of numbers.
+    """(H, W, 4) uint8 straight sRGB and alpha of an image file of any kind; a missing alpha means
+    255. The EXIF orientation is applied if `turned`, or if the image has the expected (width,
+    height) `size` only when it lies on its side. Raises Unusable naming a file that is missing,
+    truncated, not an image, larger than MOST_PIXELS, or holds numbers of another kind.
     """
     with _opened(path) as image:
         if turned or (size is not None and size == image.size[::-1] != image.size):
@@ -54,7 +55,7 @@ def read_rgba(
 
 
 def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
-    """The image, opened from a file, in one of EIGHT_BIT_MODES, in sRGB. Raises Unusable."""
+    """An opened image file, converted to sRGB and one of EIGHT_BIT_MODES. Raises Unusable."""
     is_deep_gray = image.mode.startswith("I")
     if is_deep_gray or is_deep_png(path):
         _tell(path, "images of 16 bits a channel are read as 8")
@@ -70,7 +71,7 @@ def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
             "numbers of another kind",
         )
     if (profile := image.info.get("icc_profile")) and image.mode in ("RGB", "RGBA", "CMYK"):
-        with suppress(ImageCms.PyCMSError, OSError):  # a broken profile is none
+        with suppress(ImageCms.PyCMSError, OSError):  # ignores a broken profile
             known = ImageCms.ImageCmsProfile(io.BytesIO(profile))
             if "srgb" not in ImageCms.getProfileDescription(known).lower():
                 mode = "RGBA" if image.mode == "RGBA" else "RGB"
@@ -81,20 +82,20 @@ def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
 
 
 def _tell(path, what):
-    """Warn of what is done to images, once for a folder."""
+    """Warn how images are changed, once per folder."""
     warnings.warn(f"{Path(path).parent}: {what}", stacklevel=1)
 
 
 def is_transparent(path: Path | str) -> bool:
-    """Whether an image file has pixels that are not opaque. Raises Unusable as read_rgba does."""
+    """Whether an image file has pixels that are not opaque. Raises Unusable as read_rgba() does."""
     with _opened(path, checked=False) as image:
         has_alpha = image.has_transparency_data
         return has_alpha and image.convert("RGBA").getchannel("A").getextrema()[0] < 255
 
 
 def read_mask(path: Path | str) -> np.ndarray:
-    """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels,
-    else its gray. Raises UserError as read_rgba does, and for one with areas of colour.
+    """(H, W) uint8, 255 on the object: the alpha of an image that has transparent pixels, or else
+    its gray. Raises UserError as read_rgba() does, and for a mask with coloured areas.
     """
     with _opened(path) as opened:
         image = in_srgb(path, opened).copy()
@@ -123,14 +124,14 @@ def read_mask(path: Path | str) -> np.ndarray:
 
 
 def _is_flat(gray):
-    """Whether what is not 0 in (H, W) values is of areas, not of noise."""
+    """Whether the nonzero values of (H, W) are areas and not noise."""
     shown = gray[:, 1:] > 0
     return bool((gray[:, 1:] == gray[:, :-1])[shown].mean() > FLAT) if shown.any() else False
 
 
 def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> tuple[int, int]:
-    """(width, height) from the header of an image file; as its EXIF turns it where only so it has
-    the shape of the stated size. Raises UserError as read_rgba does.
+    """(width, height) from the header of an image file, turned as its EXIF says if only then it has
+    the aspect ratio of the stated size. Raises UserError as read_rgba() does.
     """
     if size := _exr(exr_size, path):
         return size
@@ -143,24 +144,24 @@ def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> t
 
 
 def exif_turns(path: Path | str) -> int:
-    """By how many quarter turns clockwise a picture is shown, as its EXIF has it; 0 without. Raises
-    Unusable as read_rgba does.
+    """The quarter turns clockwise by which a picture's EXIF says to show it; 0 without EXIF. Raises
+    Unusable as read_rgba() does.
     """
     if Path(path).suffix.lower() == ".exr":
         return 0
     with _opened(path, checked=False) as image:
-        # a PNG without it would be decoded for it
+        # getexif() would decode a PNG without EXIF
         has_exif = image.format != "PNG" or "exif" in image.info
         return QUARTERS.get(image.getexif().get(ORIENTATION), 0) if has_exif else 0
 
 
-def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether two sizes are of one shape, but for rounding."""
-    return abs(one[0] * other[1] - one[1] * other[0]) <= max(other)
+def same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two sizes have the same aspect ratio, up to rounding."""
+    return abs(size[0] * other[1] - size[1] * other[0]) <= max(other)
 
 
 def _exr(read, path):
-    """What read() gives of an OpenEXR file, None of another. Raises Unusable."""
+    """read(path) of an OpenEXR file; None for other files. Raises Unusable."""
     if Path(path).suffix.lower() != ".exr":
         return None
     try:
@@ -171,8 +172,8 @@ def _exr(read, path):
 
 @contextmanager
 def _opened(path, checked=True):
-    """The image file, opened; what goes wrong with it in the block becomes Unusable. checked: by
-    the checksums of a PNG, at which its decoder does not look.
+    """The opened image file; errors in the block become Unusable. checked: verify the checksums of
+    a PNG, which its decoder ignores.
     """
     if (light := _exr(read_exr_rgba, path)) is not None:
         yield Image.fromarray(light)
@@ -188,24 +189,24 @@ def _opened(path, checked=True):
     except Image.DecompressionBombError:
         text = f"{path}: more than {MOST_PIXELS} pixels; reduce the image"
         raise Unusable(text, UNREADABLE) from None
-    except UnidentifiedImageError:  # by its first bytes, whatever it is called
+    except UnidentifiedImageError:  # its first bytes count, not its name
         text = f"{path}: is no {', '.join(FORMATS)}; convert it, or copy it again"
         raise Unusable(text, UNREADABLE) from None
-    # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
+    # decoders raise all kinds of exceptions on broken bytes: OSError, SyntaxError, struct.error
     except Exception as error:
         raise Unusable(str(refusal(path, error, ", ".join(FORMATS))), UNREADABLE) from error
 
 
 def is_deep_png(path: Path | str) -> bool:
-    """Whether it is a PNG of 16 bits a channel, of which Pillow silently drops the low byte."""
+    """Whether a file is a PNG with 16 bits per channel, whose low byte Pillow silently drops."""
     with open(path, "rb") as file:
         head = file.read(PNG_DEPTH_BYTE + 1)
     return head.startswith(PNG_SIGNATURE) and head[PNG_DEPTH_BYTE] == 16
 
 
 def to_8bit(image: np.ndarray) -> np.ndarray:
-    """uint8 image of a float image: clamped to [0, 1], rounded to the nearest of 256 levels. Raises
-    ValueError for NaN.
+    """uint8 image from a float image, clamped to [0, 1] and rounded to the nearest of 256 levels.
+    Raises ValueError for NaN.
     """
     image = np.asarray(image)
     if np.isnan(image).any():
@@ -225,11 +226,11 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def image_paths(names: list[str]) -> list[PurePosixPath]:
-    """Relative paths of PNG files for views of these names, without the folders that all share."""
+    """Relative paths of PNG files for views with these names, without the folders all share."""
     paths = [PurePosixPath(name) for name in names]
     shared = os.path.commonpath([path.parent for path in paths])
     paths = [path.relative_to(shared) for path in paths]
     files = [path.with_suffix(".png") for path in paths]
-    if len(set(files)) < len(files):  # a.jpg beside a.png
+    if len(set(files)) < len(files):  # such as a.jpg and a.png
         files = [path.with_name(f"{path.name}.png") for path in paths]
     return files

@@ -1,4 +1,4 @@
-"""A rendered view on the host: colour, alpha and depth, and how they become an image file."""
+"""A rendered view on the host: its colour, alpha and depth, and its conversion to image files."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ WHITE = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A view as a model shows it: float32 arrays. colour: (H, W, 3), sRGB in [0, 1], over white.
-    alpha: (H, W) in [0, 1]. depth, median_depth: (H, W), along the camera's axis in world units, of
-    the mean blend weight and where half of it is reached; infinite where alpha is 0. features: (H,
-    W, 16), what the network made the colours of, or None.
+    """A view of a model, as float32 arrays. colour: (H, W, 3), sRGB in [0, 1], over white. alpha:
+    (H, W) in [0, 1]. depth, median_depth: (H, W), along the camera's axis in world units: the mean
+    by blend weight, and the depth at which half the weight is reached; infinite where alpha is 0.
+    features: (H, W, 16), the network's input, or None.
     """
 
     colour: np.ndarray
@@ -31,7 +31,7 @@ class RenderedView:
     features: np.ndarray | None = None
 
     def over(self, background: tuple[float, float, float] | None) -> np.ndarray:
-        """(H, W, 3) float32 in [0, 1]: the object over an sRGB colour, over None rgba()."""
+        """(H, W, 3) float32 in [0, 1]: the object over an sRGB colour; None: (H, W, 4) rgba()."""
         if background is None:
             return self.rgba()
         if tuple(background) == WHITE:
@@ -43,13 +43,13 @@ class RenderedView:
     def rgba(self) -> np.ndarray:
         """(H, W, 4) float32 in [0, 1]: straight (not premultiplied) colour, and alpha."""
         alpha = self.alpha[..., None]
-        # what shows at alpha a over white is a colour + (1 - a)
+        # a colour c of alpha a shows over white as a c + (1 - a)
         straight = (self.colour - (1 - alpha)) / np.maximum(alpha, 1 / 255)
         return np.concatenate([np.clip(straight, 0, 1), alpha], axis=2)
 
     def channels(self) -> dict[str, np.ndarray]:
-        """{channel: (H, W) float32} for OpenEXR: R, G, B, in linear light and multiplied by alpha,
-        A; Z, the median depth; mean.Z; feature.00 to feature.15 where the rendering has them.
+        """{channel: (H, W) float32} for OpenEXR: R, G, B, in linear light and multiplied by alpha;
+        A; Z, the median depth; mean.Z; feature.00 to feature.15 if the rendering has features.
         """
         rgba = self.rgba()
         light = srgb_to_linear(rgba[..., :3]) * rgba[..., 3:]
@@ -61,18 +61,18 @@ class RenderedView:
         return {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
 
     def save(self, path: Path | str, background: tuple[float, float, float] | None = WHITE) -> None:
-        """Write an 8-bit PNG; background None: transparent. Raises UserError as write_png does."""
+        """Write an 8-bit PNG; background None: transparent. Raises UserError like write_png()."""
         write_png(path, self.over(background))
 
     def _repr_png_(self) -> bytes:
-        """The rendering over white, by which a notebook shows it."""
+        """A PNG of the rendering over white, which notebooks show."""
         encoded = io.BytesIO()
         Image.fromarray(to_8bit(self.colour)).save(encoded, "PNG")
         return encoded.getvalue()
 
 
 def mean_rendered_view(views: Iterable[RenderedView]) -> RenderedView:
-    """The mean of several samples of one view; depths and features are those of the first."""
+    """The mean of several samples of one view, with the depths and features of the first."""
     taken = iter(views)
     first, n = next(taken), 1
     colour, alpha = first.colour, first.alpha

@@ -19,17 +19,17 @@ from pp_cl.files.untrusted import read_json_text, read_regular, refusal, strict_
 MASKS_SHEET = "masks.png"
 MADE = "run"  # in the folder that `pp-cl make` fills
 MOST_OWNER = 1000  # bytes of the line that names the owner
-MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
+MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes a few hundred
 MOST_LOG = 2**25  # bytes of a log: 80,000 rows
-MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
+MOST_LINE = 2**16  # bytes of a row; pp-cl writes no longer ones
 MOST_NUMBER = 1e300  # in a row
 GOES_ON = "; the same command goes on"
-MOST_LEVELS = 4  # of lists and dictionaries in a row
+MOST_LEVELS = 4  # of nested lists and dictionaries in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews, frontier (of `pp-cl bench RUN`): paths
-    in it, which need not exist.
+    """The paths in a run's folder `path`: config, checkpoint, log, previews and frontier (of `pp-cl
+    bench RUN`). None need exist.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -50,7 +50,7 @@ class RunFolder:
         return name_of(self.path.parent if is_part else self.path)
 
     def member(self, number: int) -> "RunFolder":
-        """The folder of a further member, from 2 on."""
+        """The folder of another member; numbers start at 2."""
         return RunFolder(self.path / f"member-{number}")
 
     def evaluation(self, split: str) -> Path:
@@ -58,27 +58,27 @@ class RunFolder:
         return self.path / "eval" if split == "test" else self.path / "eval" / split
 
     def metrics(self, split: str) -> Path:
-        """What the evaluation of a split has measured."""
+        """The file with the results of a split's evaluation."""
         return self.evaluation(split) / "metrics.json"
 
     def measured(self) -> dict[str, Any] | None:
-        """{"mean": {metric: value}, "step", "finished", "points", "device"} of the evaluation of
-        the test split, None where there is none. Raises UserError for a broken one.
+        """{"mean": {metric: value}, "step", "finished", "points", "device"} from the evaluation of
+        the test split, or None without one. Raises UserError if its file is broken.
         """
         file = self.metrics("test")
         if not file.exists():
             return None
         try:
             result = strict_json(read_json_text(file, MOST_METRICS))
-            found = {name: result[name] for name in ("mean", "step", "finished", "device")}
-            found["points"] = result["points"]["final"]
+            results = {name: result[name] for name in ("mean", "step", "finished", "device")}
+            results["points"] = result["points"]["final"]
             kinds = {"step": int, "finished": bool, "points": int, "device": str}
-            if any(type(found[name]) is not kind for name, kind in kinds.items()):
+            if any(type(results[name]) is not kind for name, kind in kinds.items()):
                 raise ValueError("values of another kind")
-            if not all(math.isfinite(value) for value in found["mean"].values()):
+            if not all(math.isfinite(value) for value in results["mean"].values()):
                 raise ValueError("infinite values")
-            return found
-        except Exception as error:  # whatever stands there
+            return results
+        except Exception as error:  # the file may hold anything
             raise refusal(file, error, "metrics", f"run `pp-cl eval {self}` again") from None
 
     def check_usable(self) -> None:
@@ -95,7 +95,7 @@ class RunFolder:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """While the block runs, no other process trains into the folder, which is made where it is
+        """While the block runs, no other process trains into the folder, which is created if it is
         missing. Raises UserError naming the process that owns the folder.
         """
         self.path.mkdir(parents=True, exist_ok=True)
@@ -108,7 +108,7 @@ class RunFolder:
             except (OSError, ValueError):
                 who = "another process"
             raise UserError(
-                f"{self}: {who} trains into it; wait for its end, or choose another --out"
+                f"{self}: {who} trains into it; wait until it ends, or choose another --out"
             ) from None
         except OSError as error:
             raise UserError(
@@ -125,15 +125,15 @@ class RunFolder:
                 lock.release()
 
     def check_sheets(self, step: int) -> None:
-        """Raise UserError for an image that training from this step on would lose, and that no
+        """Raise UserError naming an image that training from this step would overwrite and that no
         training has written as it is now.
         """
         begun = "" if step == 0 else f"step_{step:06d}.png"
-        previews = [one for one in self.previews.glob("step_*.png") if one.name > begun]
+        previews = [file for file in self.previews.glob("step_*.png") if file.name > begun]
         check_ours([self.path / MASKS_SHEET] * (step == 0) + previews)
 
     def create(self, config_json: str) -> None:
-        """Make the folders, remove images that belong to no checkpoint, write config.json."""
+        """Create the folders, remove images that belong to no checkpoint, write config.json."""
         own(self.path)
         if not self.checkpoint.exists():
             remove_ours([self.path / MASKS_SHEET, *self.previews.glob("step_*.png")])
@@ -145,22 +145,22 @@ class RunFolder:
         write_text(self.config, config_json + "\n")
 
     def rows(self) -> list[dict[str, Any]]:
-        """The rows of the log, up to the first that is broken. Raises UserError for a long one."""
+        """The rows of the log, up to the first broken one. Raises UserError if it is too long."""
         return _rows(self.log)
 
     def open_log(self, step: int) -> "Log":
-        """The log, cut off after `step`: later rows will be made again."""
+        """The log, cut off after `step`: training writes later rows again."""
         return Log(self.log, step)
 
 
 class Log:
-    """A file of one JSON object per logged step. seconds: of training, up to its last row."""
+    """A file with one JSON object per logged step. seconds: training time up to its last row."""
 
     def __init__(self, path: Path, step: int) -> None:
         rows = _rows(path, step)
         write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
         self.seconds = rows[-1]["seconds"] if rows else 0.0
-        # unbuffered: a failed write leaves nothing that closing would try to write again
+        # unbuffered, so that closing does not repeat a failed write
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115
 
     def __enter__(self) -> "Log":
@@ -171,7 +171,7 @@ class Log:
             self._file.close()
 
     def write(self, row: dict[str, Any]) -> None:
-        """Append a row. Raises UserError naming the file when it cannot be written, ValueError for
+        """Append a row. Raises UserError naming a file that cannot be written, and ValueError for
         NaN.
         """
         data = (json.dumps(row, allow_nan=False) + "\n").encode()
@@ -181,8 +181,8 @@ class Log:
 
 
 def read_row(line: bytes | str) -> dict[str, Any] | None:
-    """The row of a log in a line of it, with "step" and "seconds", from 0 on, and numbers that are
-    finite; None where a kill or a fault left something else.
+    """The row in a line of a log, with finite numbers, and "step" and "seconds" of at least 0; None
+    if a kill or a fault left anything else.
     """
     try:
         row = strict_json(line) if len(line) <= MOST_LINE else {}
@@ -195,7 +195,9 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
 
 
 def _is_loggable(value, levels=MOST_LEVELS):
-    """Whether a value of JSON may be written again: no number is huge, and few lists are nested."""
+    """Whether a JSON value can be written again: no number is huge and lists nest at most `levels`
+    deep.
+    """
     if isinstance(value, (list, dict)):
         inside = value.values() if isinstance(value, dict) else value
         return levels > 0 and all(_is_loggable(part, levels - 1) for part in inside)
@@ -203,8 +205,9 @@ def _is_loggable(value, levels=MOST_LEVELS):
 
 
 def _rows(path, step=math.inf):
-    """The rows of a log up to `step`, or to one that says finished where a step is given, or to one
-    that is broken, with a warning, unless the log may be growing. Raises UserError for a long log.
+    """The rows of a log before the first that is later than `step`, or finished (if a step is
+    given), or broken. A broken row gets a warning, unless the log may be growing. Raises UserError
+    if the log is too long.
     """
     size = path.stat().st_size if path.is_file() else 0
     if size > MOST_LOG:
@@ -217,7 +220,8 @@ def _rows(path, step=math.inf):
         if row is None or any(row[name] < last[name] for name in last):
             if line.endswith(b"\n") or step < math.inf:
                 warnings.warn(
-                    f"{path}: line {number} is no row of a log; it is left out, as is all after it",
+                    f"{path}: line {number} is not a row of a log; it and all later lines are left"
+                    " out",
                     stacklevel=2,
                 )
             break

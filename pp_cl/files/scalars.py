@@ -5,13 +5,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-BESIDES = ("step", "seconds")  # numbers of a row of the log that are no curves
+BESIDES = ("step", "seconds")  # numbers in a row of the log that are not curves
 
 
 @contextmanager
 def curves(folder: Path, step: int) -> Iterator[Callable[[int, dict[str, Any] | None], None]]:
-    """What writes the row of a step, if there is one, into a folder that TensorBoard reads. step:
-    from which on rows are written, anew where an interrupted training wrote them before.
+    """A function that writes a step's row of the log, if there is one, into a folder for
+    TensorBoard. step: the first step to write; rows of an interrupted training from there on are
+    replaced.
     """
     from tensorboardX import SummaryWriter
 
@@ -25,7 +26,9 @@ def curves(folder: Path, step: int) -> Iterator[Callable[[int, dict[str, Any] | 
 
 
 def scalars(row: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """(name, number) of each curve in a row of the log, such as rates/sh/0 of {"rates": {...}}."""
+    """Yield (name, number) for each curve in a row of the log, such as rates/sh/0 for the first
+    number of {"rates": {"sh": [...]}}.
+    """
     for name, value in row.items():
         if isinstance(value, (tuple, list)):
             value = dict(enumerate(value))

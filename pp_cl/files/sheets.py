@@ -1,4 +1,4 @@
-"""Contact sheets: many images in one image, predictions beside the truth or images of a scene."""
+"""Contact sheets: one image with many images, such as predictions next to the truth."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +18,8 @@ LINE, INK = (200, 200, 200), (60, 60, 60)
 def contact_sheet(
     images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
 ) -> np.ndarray:
-    """(H, W, 3) uint8 image of uint8 images, (H, W, 3) or (H, W, 4), row by row under their
-    captions, each over white in a cell as large as the largest.
+    """(H, W, 3) uint8 image that shows uint8 images, (H, W, 3) or (H, W, 4), row by row below their
+    captions, over white, in cells of the largest image's size.
     """
     columns = min(columns, len(images))
     rows = -(-len(images) // columns)
@@ -41,8 +41,8 @@ def contact_sheet(
 def write_comparison(
     path: Path, predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]
 ) -> None:
-    """Write a PNG file of float (H, W, 3) images in [0, 1]: a row of prediction, truth and error
-    for each view, the absolute difference, ERROR_SCALE times, dark on white.
+    """Write a PNG file that shows float (H, W, 3) images in [0, 1]: for each view, a row of
+    prediction, truth and error (the absolute difference times ERROR_SCALE, dark on white).
     """
     images: list[np.ndarray] = []
     for prediction, truth in zip(predictions, truths, strict=True):

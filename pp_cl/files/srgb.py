@@ -11,6 +11,6 @@ def srgb_to_linear(values: np.ndarray) -> np.ndarray:
 
 
 def linear_to_srgb(values: np.ndarray) -> np.ndarray:
-    """The inverse of srgb_to_linear: linear light in [0, 1] to sRGB."""
+    """The inverse of srgb_to_linear(): linear light in [0, 1] to sRGB."""
     low = values <= 0.0031308
     return np.where(low, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055).astype(np.float32)

@@ -15,17 +15,16 @@ from pp_cl.errors import UserError, shown
 
 MOST_REASON = 120  # characters
 UTF_16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
-MOST_VALUES = 2**22  # of a JSON file: 100,000 cameras of 40; with its text they take 1 GiB at most
-# bytes of a zip's directory: each file in it takes about ten times its part of it as zipfile keeps
-# it
+MOST_VALUES = 2**22  # in a JSON file: 100,000 cameras of 40; with the text, 1 GiB at most
+# bytes of a zip file's directory; in zipfile's memory it takes about ten times as much
 MOST_DIRECTORY = 2**24
-MOST_PIXELS = 2 * 89_478_485  # of an image; Pillow refuses more. The largest sensors have 151 M
+MOST_PIXELS = 2 * 89_478_485  # Pillow refuses larger images; the largest sensors have 151 M
 
 
 @contextmanager
 def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
-    """The opened file. Raises OSError for none, a folder, and pipes and devices, without an end."""
-    # Windows has no pipes with names in folders, but translates line ends unless told not to
+    """The opened file. Raises OSError if it is missing, a folder, or an endless pipe or device."""
+    # Windows keeps no named pipes in folders, but without O_BINARY it translates line ends
     flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     descriptor = os.open(path, os.O_RDONLY | flags)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -37,11 +36,11 @@ def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The zip file, until the block ends. Raises OSError as opened_regular, ValueError for a large
-    directory, and what zipfile raises.
+    """The zip file, opened until the block ends. Raises OSError as opened_regular() does,
+    ValueError for a large directory, and zipfile's exceptions.
     """
     with opened_regular(path) as file:
-        # what zipfile itself finds at the file's end says how much it will read at once
+        # zipfile reads as much at once as the record at the file's end says
         end = zipfile._EndRecData(file)  # type: ignore[attr-defined]
         if end is not None and end[zipfile._ECD_SIZE] > MOST_DIRECTORY:  # type: ignore[attr-defined]
             raise ValueError(f"its directory is larger than {MOST_DIRECTORY} bytes")
@@ -52,8 +51,9 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
 def read_regular(
     path: Path | str, most: int, encoding: str = "utf-8", errors: str = "strict"
 ) -> str:
-    """The text of a file of at most so many bytes; UTF-16 is known by its byte order mark. errors:
-    what other bytes become. Raises OSError as opened_regular, ValueError for a larger file.
+    """The text of a file of at most `most` bytes; UTF-16 is recognised by its byte order mark.
+    encoding, errors: as in bytes.decode(). Raises OSError as opened_regular() does, and ValueError
+    for a larger file.
     """
     with opened_regular(path) as file:
         content = file.read(most + 1)
@@ -65,8 +65,8 @@ def read_regular(
 def read_json_text(
     path: Path | str, most: int, encoding: str = "utf-8", errors: str = "strict"
 ) -> str:
-    """read_regular() of JSON of at most MOST_VALUES values, of which each may take a hundred times
-    the memory of its text, such as {}. Raises ValueError for more.
+    """read_regular() for JSON with at most MOST_VALUES values, since a value such as {} may take a
+    hundred times the memory of its text. Raises ValueError for more.
     """
     text = read_regular(path, most, encoding, errors)
     if sum(map(text.count, ",[{")) > MOST_VALUES:
@@ -75,27 +75,27 @@ def read_json_text(
 
 
 def strict_json(text: bytes | str) -> Any:
-    """The value of JSON. Raises ValueError for what is none, NaN and Infinity among it."""
+    """The value of a JSON text. Raises ValueError for invalid JSON, such as NaN and Infinity."""
     return json.loads(text, parse_constant=_refuse_constant)
 
 
 def _refuse_constant(name):
-    raise ValueError(f"holds {name}, which is no number")
+    raise ValueError(f"holds {name}, which is not a JSON number")
 
 
 def refusal(
     path: Path | str, error: Exception, kind: str, mend: str = "copy it again"
 ) -> UserError:
-    """The UserError about a file that could not be read as `kind`, or for the system not at all."""
+    """A UserError about a file that could not be read as `kind`, or not at all."""
     if isinstance(error, FileNotFoundError):
         return UserError(f"{path}: no such file; copy it there")
-    # the content names a place that no file has
+    # these errors come from the content, which names a place beyond the file's end
     is_content = (None, errno.EINVAL, errno.EOVERFLOW)
     if isinstance(error, OSError) and error.errno not in is_content:
         return UserError(
             f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
         )
     if isinstance(error, UnicodeDecodeError) and error.encoding == "utf-8":
-        return UserError(f"{path}: is no text in UTF-8; save it as UTF-8, or {mend}")
+        return UserError(f"{path}: is not UTF-8 text; save it as UTF-8, or {mend}")
     reason = shown(str(error), MOST_REASON) or type(error).__name__
     return UserError(f"{path}: cannot be read as {kind} ({reason}); {mend}")

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and LPIPS of an image, or of a folder of images, against the ground truth."""
+"""Measures PSNR, SSIM and LPIPS of an image, or a folder of images, against the ground truth."""
 
 import mimetypes
 from pathlib import Path
@@ -18,23 +18,23 @@ def compare(
     metrics: tuple[str, ...] = ("psnr", "ssim"),
     dev: Device | None = None,
 ) -> dict[str, Any]:
-    """Metrics of two images over white, or of two folders that hold images of the same names:
-    {"mean": {metric: number}, "per_image": [{"name", metric: number, ...}]}. metrics: out of psnr,
-    ssim, lpips, which needs dev. Raises UserError naming a file that is missing, unreadable,
-    without partner or of another size than its partner.
+    """Metrics of two images over white, or of two folders whose images have the same names:
+    {"mean": {metric: number}, "per_image": [{"name", metric: number, ...}]}. metrics: from psnr,
+    ssim and lpips, which needs dev. Raises UserError naming a file that is missing or unreadable,
+    or has no partner or another size than its partner.
     """
     rows, measure = [], Metrics(dev, metrics)
-    for one, other in _pairs(Path(prediction), Path(truth)):
-        a, b = read_over_white(one), read_over_white(other)
+    for file, other in _pairs(Path(prediction), Path(truth)):
+        a, b = read_over_white(file), read_over_white(other)
         if a.shape != b.shape:
             raise UserError(
-                f"{one}: {a.shape[1]}x{a.shape[0]} pixels, {other} has"
+                f"{file}: {a.shape[1]}x{a.shape[0]} pixels, but {other} has"
                 f" {b.shape[1]}x{b.shape[0]}; sizes must agree"
             )
         try:
-            rows.append({"name": one.name, **measure(a, b)})
+            rows.append({"name": file.name, **measure(a, b)})
         except UserError as error:
-            raise UserError(f"{one}: {error}") from None
+            raise UserError(f"{file}: {error}") from None
     return {"mean": mean(rows), "per_image": rows}
 
 
@@ -57,19 +57,19 @@ def _pairs(prediction, truth):
 
 
 def _image_names(folder):
-    """Names of the images in a folder, hidden files left out, as macOS puts them beside."""
+    """Names of the images in a folder, without hidden files such as macOS adds."""
     paths = [path for path in folder.iterdir() if not path.name.startswith(".")]
     for path in paths:
         kind = mimetypes.guess_type(path.name, strict=False)[0] or ""
         if kind.startswith("image/") and path.suffix.lower() not in ENDINGS:
             raise UserError(
-                f"{path}: not a format that is read; convert it to PNG, or move it away"
+                f"{path}: pp-cl cannot read this format; convert it to PNG, or move it away"
             )
     return {path.name for path in paths if path.suffix.lower() in ENDINGS}
 
 
 def read_over_white(path: Path | str) -> np.ndarray:
-    """Float64 (H, W, 3) image in [0, 1] of a file, over white. Raises UserError naming the file."""
+    """The image in a file, over white: (H, W, 3) float64 in [0, 1]. Raises UserError naming it."""
     rgba = read_rgba(path) / 255.0
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + (1 - alpha)

@@ -30,48 +30,50 @@ def lpips_program(dev: Device) -> Program:
 
 
 class Lpips:
-    """The network, prepared for images of one size at a time. weights: of load_weights()."""
+    """The network, prepared for one image size at a time. weights: as from load_weights()."""
 
     def __init__(self, dev: Device, weights: dict[str, np.ndarray] | None = None):
         weights = load_weights() if weights is None else weights
         self.dev, self.program = dev, lpips_program(dev)
         self._heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
-        # of each block, [(channels in, out, weights, biases)]
+        # for each block, [(channels in, out, weights, biases)]
         self._layers: list[list[tuple]] = [[] for _ in BLOCKS]
         for i, block in enumerate(np.repeat(range(len(BLOCKS)), BLOCKS)):
             kernel, bias = weights[f"kernel{i}"], dev.upload(weights[f"bias{i}"])
             co, ci = kernel.shape[:2]
             self._layers[block].append((ci, co, dev.upload(pack_weights(kernel)), bias))
         self._size: tuple[int, int] | None = None
-        # of each block, its convolutions and its tiles
+        # for each block, its convolutions and its tiles
         self._blocks: list[tuple[list[Conv], Any]] = []
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> float:
-        """LPIPS of two (H, W, 3) images in [0, 1]. Raises UserError for images of less than
-        LEAST_SIZE pixels a side, ValueError for different shapes.
+        """LPIPS of two (H, W, 3) images in [0, 1]. Raises UserError if a side has less than
+        LEAST_SIZE pixels, ValueError for different shapes.
         """
         if a.shape != b.shape:
             raise ValueError(f"a {a.shape}, b {b.shape}")
         height, width = a.shape[:2]
         if min(height, width) < LEAST_SIZE:
             raise UserError(
-                f"{width}x{height} pixels, LPIPS needs {LEAST_SIZE}x{LEAST_SIZE}: "
+                f"{width}x{height} pixels, but LPIPS needs {LEAST_SIZE}x{LEAST_SIZE}: "
                 "take larger images or leave lpips out of --metrics"
             )
         self._prepare(height, width)
-        # Both images go through a block before either goes on, so that the features of one block
-        # only are held.
+        # Both images pass a block before either enters the next, so that memory holds the features
+        # of a single block.
         features = [
             self._features(self.dev.upload(image, np.float32), name)
             for name, image in (("a", a), ("b", b))
         ]
         total = 0.0
-        for block, (one, other) in enumerate(zip(*features, strict=True)):
-            total += float(self._compare(block, one, other).get().mean(dtype=np.float64))
+        for block, (a_features, b_features) in enumerate(zip(*features, strict=True)):
+            total += float(
+                self._compare(block, a_features, b_features).get().mean(dtype=np.float64)
+            )
         return total
 
     def _features(self, image: Array, name: str) -> Iterator[Array]:
-        """Computes and yields each block's features (H, W, C) of an image, block by block."""
+        """Compute and yield the features (H, W, C) of an image, block by block."""
         turns = cycle((0, 1))
         h, w, _ = image.shape
         x = self._place(next(turns), image.shape)
@@ -90,14 +92,14 @@ class Lpips:
             yield x
 
     def _place(self, name, shape):
-        """Memory for a map: an image's features have their own, the other maps take turns in two,
-        where nothing is read once a block is done. New memory took a quarter of the time.
+        """Memory for a map. Each image's features have their own; the other maps alternate between
+        two buffers, which nobody reads after a block. Allocating anew took a quarter of the time.
         """
         n = math.prod(shape)
         return self.dev.scratch(("lpips", name), n)[:n].reshape(shape)
 
     def _compare(self, block, a, b):
-        """(H, W) distances of the features a and b (H, W, C) of a block."""
+        """(H, W) distances between a block's features a and b (H, W, C)."""
         height, width, channels = a.shape
         n, distance = height * width, self._place("distance", (height, width))
         self.program.launch(
@@ -113,7 +115,7 @@ class Lpips:
         return distance
 
     def _prepare(self, height, width):
-        """Variants, weights as they read them, and tiles for images of this size."""
+        """Choose variants, lay out their weights and make tiles for images of this size."""
         if (height, width) == self._size:
             return
         self._size, self._blocks = None, []

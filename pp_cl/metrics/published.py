@@ -1,5 +1,5 @@
-"""Published results for benchmark scenes, which an evaluation puts beside its own: Tables 1 to 7 of
-the PlenopticPoints supplemental, in published.json.
+"""Published results for benchmark scenes, which an evaluation shows next to its own: Tables 1 to 7
+of the PlenopticPoints supplemental, stored in published.json.
 """
 
 import json
@@ -11,8 +11,8 @@ from typing import Any
 from pp_cl.engine.camera import Camera
 
 FILE = Path(__file__).with_name("published.json")
-SYNTHETIC_SIZE, SYNTHETIC_FOCAL = 800, 1111.11  # pixels, of all eight scenes' stored images
-SYNTHETIC_VIEWS = 200  # of the test split
+SYNTHETIC_SIZE, SYNTHETIC_FOCAL = 800, 1111.11  # pixels, for the stored images of all eight scenes
+SYNTHETIC_VIEWS = 200  # in the test split
 # the four sequences of Tables 1 to 3
 CO3D_SEQUENCES = {
     "590_88941_178115": "car",
@@ -25,17 +25,17 @@ METRICS = ("psnr", "ssim", "lpips")
 
 @cache
 def tables() -> dict[str, Any]:
-    """published.json. synthetic (Tables 5 to 7) and co3d (1 to 3): {"scenes": names, "methods":
-    {name: {"psnr": [...], "ssim": [...], "lpips": [...] of the scenes or null, "mean": {...}}}};
-    lpips_net: of LPIPS where it is not VGG16. shape (Table 4): rows by scene.
+    """The content of published.json. synthetic (Tables 5 to 7) and co3d (1 to 3): {"scenes": names,
+    "methods": {name: {"psnr": [...], "ssim": [...], "lpips": [...] by scene or null, "mean":
+    {...}}}}; lpips_net: LPIPS's network if it is not VGG16. shape (Table 4): rows by scene.
     """
     return json.loads(FILE.read_text("utf-8"))
 
 
 def published_rows(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict[str, float]]:
-    """{method: {"psnr", "ssim", "lpips"}} of a published scene, by PSNR from the best on, else {}.
-    LPIPS of another net is lpips_alex. A scene of NeRF-synthetic is recognised by its name and the
-    cameras of its stored images, one of CO3D by the name of its sequence.
+    """{method: {"psnr", "ssim", "lpips"}} for a published scene, the highest PSNR first; {} for
+    other scenes. LPIPS by another network is lpips_alex. NeRF-synthetic's scenes are recognised by
+    their names and the cameras of their stored images, CO3D's by the names of their sequences.
     """
     if scene_name in CO3D_SEQUENCES:
         return _rows(tables()["co3d"], CO3D_SEQUENCES[scene_name])
@@ -50,8 +50,8 @@ def published_rows(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict
 def differences(
     scene_name: str, cameras: Sequence[Camera], downscale: int, split: str = "test"
 ) -> str:
-    """How a measurement of a published scene differs from the published ones; "" if it does not.
-    cameras: of the stored images of the views measured.
+    """How a measurement of a published scene differs from the published measurements; "" if it does
+    not. cameras: cameras of the measured views' stored images.
     """
     if scene_name in CO3D_SEQUENCES:
         said = [f"split {split}"] * (split != "test")

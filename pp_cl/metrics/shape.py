@@ -1,4 +1,4 @@
-"""How well points on a grid fill the surface of a mesh (PlenopticPoints supplemental, Table 4)."""
+"""Measures how well points fill a mesh's surface (PlenopticPoints supplemental, Table 4)."""
 
 import math
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from pp_cl.engine.grid import Grid
 from pp_cl.errors import UserError
 from pp_cl.files.untrusted import refusal
 
-SAMPLES = 1024**3  # of the supplemental
-RUN = 256  # samples of a work-item
-LAUNCH = 2**24  # samples of a launch
+SAMPLES = 1024**3  # as in the supplemental
+RUN = 256  # samples per work-item
+LAUNCH = 2**24  # samples per launch
 WHOLE_AREA = 1 << 60
-MOST_FILE = 2**28  # bytes of a file with a mesh, for each of which trimesh takes up to 11 of memory
-MOST_VERTICES = 2**33  # of the grid around mesh and points: a bitset of 1 GiB
+MOST_FILE = 2**28  # bytes of a mesh file; trimesh takes up to 11 bytes of memory for each
+MOST_VERTICES = 2**33  # in the grid around mesh and points: a bitset of 1 GiB
 
 
 @dataclass(frozen=True)
@@ -31,23 +31,23 @@ class Mesh:
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """The triangles of a file that trimesh reads, of all its objects. Raises UserError."""
+    """The triangles of all objects in a file that trimesh can read. Raises UserError."""
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a triangle mesh")
     if path.stat().st_size > MOST_FILE:
         raise UserError(f"{path}: is larger than {MOST_FILE} bytes; save it as PLY, or decimate it")
     try:
-        # the warnings are of numbers that are refused below
+        # the warnings concern numbers that are refused below
         with np.errstate(all="ignore"):
             mesh: Any = trimesh.load(path, force="mesh", process=False)
             made = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
-    except Exception as error:  # loaders meet broken files with whatever comes up
+    except Exception as error:  # loaders raise all kinds of exceptions on broken files
         raise refusal(path, error, "a mesh") from error
     if made.faces.size == 0 or not made.vertices.shape[1:] == made.faces.shape[1:] == (3,):
         raise UserError(f"{path}: holds no triangles; export it as a triangle mesh")
     if made.faces.min() < 0 or made.faces.max() >= len(made.vertices):
-        raise UserError(f"{path}: a face names a vertex that is not there; export it again")
+        raise UserError(f"{path}: a face names a missing vertex; export it again")
     if not np.isfinite(made.vertices).all():
         raise UserError(f"{path}: a vertex is NaN or infinite; export it again")
     return made
@@ -55,9 +55,9 @@ def read_mesh(path: Path | str) -> Mesh:
 
 @dataclass(frozen=True)
 class Surface:
-    """The vertices of a grid that are nearest to some point of a mesh. grid: around the mesh and
-    the grid asked for, in step with it. bits: (ny nz, words) uint32: bit b of word w in a row is
-    vertex 32 w + b. count: of the vertices.
+    """The vertices of a grid that are nearest to some point of a mesh. grid: the given grid,
+    extended to hold the mesh. bits: (ny nz, words) uint32: bit b of word w in a row is vertex 32 w
+    + b. count: number of vertices.
     """
 
     grid: Grid
@@ -65,7 +65,7 @@ class Surface:
     count: int
 
     def holds(self, grid: Grid, ids: np.ndarray) -> np.ndarray:
-        """(N,) bool: which vertices of the grid asked for, by their ids (N,), are among them."""
+        """(N,) bool: which of the given grid's vertices, by ids (N,), belong to the surface."""
         steps = np.rint(np.subtract(grid.origin, self.grid.origin) / grid.voxel_size).astype(
             np.int64
         )
@@ -75,8 +75,8 @@ class Surface:
 
 
 def overlap(surface: Surface, grid: Grid, ids: np.ndarray) -> dict[str, float]:
-    """{"points", "iou", "recall", "precision"} of the points with ids (N,), N > 0, on the grid that
-    the surface was sampled for, against the surface's vertices.
+    """{"points", "iou", "recall", "precision"} of the points with ids (N,), N > 0, compared with
+    the surface's vertices, on the grid for which the surface was sampled.
     """
     shared, points = int(surface.holds(grid, ids).sum()), len(ids)
     return {
@@ -95,8 +95,9 @@ def sample_surface(
     *,
     advance: Callable[[int], object] = lambda samples: None,
 ) -> Surface:
-    """The Surface of a mesh for a grid, by 1 to SAMPLES samples spread evenly over the mesh's area,
-    of whose numbers advance() is told. Raises UserError for a mesh without area or too large.
+    """The Surface of a mesh for a grid, from 1 to SAMPLES samples spread evenly over the mesh's
+    area; advance(n) is called after every n samples. Raises UserError for a mesh without area or
+    too large.
     """
     around = _grid_around(mesh, grid)
     area_end, corners = _triangles(mesh, around)
@@ -124,13 +125,13 @@ def sample_surface(
         )
         dev.finish()
         advance(count)
-    found = bits.get()
-    parts = np.array_split(found, -(-found.size // 2**20))  # a bit takes a byte for a moment
-    return Surface(around, found, sum(int(np.unpackbits(p.view(np.uint8)).sum()) for p in parts))
+    marked = bits.get()
+    parts = np.array_split(marked, -(-marked.size // 2**20))  # a bit takes a byte for a moment
+    return Surface(around, marked, sum(int(np.unpackbits(p.view(np.uint8)).sum()) for p in parts))
 
 
 def _grid_around(mesh, grid):
-    """The grid in step with another that holds the mesh and all of the other. Raises UserError."""
+    """A grid, extended by whole voxels to hold the mesh, too. Raises UserError."""
     origin = np.asarray(grid.origin)
     low = np.floor((mesh.vertices.min(0) - origin) / grid.voxel_size)
     high = np.ceil((mesh.vertices.max(0) - origin) / grid.voxel_size)

@@ -1,1 +1,1 @@
-"""Float64 numpy versions of the kernels: the truth for tests, selftest and bench."""
+"""Float64 numpy versions of the kernels, with which tests, selftest and bench compare them."""

@@ -1,5 +1,5 @@
-"""Float64 twins of project, pairs, blend and shade: every point against every pixel, as matrices
-(N, HW).
+"""Float64 twins of project, pairs, blend and shade, which compute every point at every pixel, as
+(N, HW) matrices.
 """
 
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 Arrays = dict[str, np.ndarray]
 
 EPS = 1e-6
-DEPTH_RANGE = (2.0, 6.0)  # (near, far) where a test gives no other
+DEPTH_RANGE = (2.0, 6.0)  # (near, far) if a test gives no other
 LEAST_RADIUS = 0.75
 LOW_PASS, DEVIATIONS, LEAST_ALPHA, MOST_ALPHA = 0.3, 3.33, 1 / 255, 0.99  # of Gaussians
 
@@ -25,7 +25,7 @@ def drawn(
     radius: np.ndarray | float,
     depth_range: tuple[float, float] = DEPTH_RANGE,
 ) -> np.ndarray:
-    """(N,) bool: finite, in front of the eye, and t - radius in [near, far]."""
+    """(N,) bool: the point is finite, in front of the eye, and t - radius is in [near, far]."""
     near, far = depth_range
     with np.errstate(all="ignore"):
         c = camera_space(camera, positions)
@@ -46,7 +46,9 @@ def rays(camera: Any) -> np.ndarray:
 def surface_depth(
     camera: Any, geometry: Arrays, radius: np.ndarray | float, kind: str
 ) -> np.ndarray:
-    """(N, HW) along the camera's axis, where a ray meets a point; a soft one's ball, by falloff."""
+    """(N, HW) depth along the camera's axis at which a ray meets a point; for a soft point, the
+    depth of its ball, computed from the falloff.
+    """
     ranges, d = geometry["depth"], np.maximum(geometry["falloff"], 0)
     if kind == "soft":
         radius = np.broadcast_to(np.asarray(radius, np.float64), len(ranges))
@@ -63,9 +65,9 @@ def geometry(
     covariance: np.ndarray | None = None,
     depth_range: tuple[float, float] = DEPTH_RANGE,
 ) -> Arrays:
-    """Dict of (N, HW) arrays: fragment, falloff, depth, z = normalised depth, and margin = distance
-    of the test of coverage from its border, in pixels. radius: (N,). covariance: (N, 3, 3) of
-    Gaussians; None: round ones.
+    """Dict of (N, HW) arrays: fragment, falloff, depth, z (normalised depth), and margin (pixels by
+    which the coverage test passes or fails). radius: (N,). covariance: (N, 3, 3) of Gaussians;
+    None: round ones.
     """
     radius = np.broadcast_to(np.asarray(radius, np.float64), (len(positions),))
     c, r = camera_space(camera, positions), rays(camera)
@@ -116,7 +118,7 @@ def geometry(
 def gaussians(
     camera: Any, vertices: np.ndarray, voxel_size: float, offset: np.ndarray, radius: float
 ) -> Arrays:
-    """geometry() of Gaussians at vertices (N, 3) of a grid; offset: (N, 9), as in cl/cloud.h."""
+    """geometry() for Gaussians at vertices (N, 3) of a grid; offset: (N, 9), as in cl/cloud.h."""
     lower = np.zeros((len(offset), 3, 3))
     lower[:, range(3), range(3)] = radius * np.exp(offset[:, 3:6])
     lower[:, [1, 2, 2], [0, 0, 1]] = radius * offset[:, 6:9]
@@ -128,8 +130,9 @@ def gaussians(
 def screen_gaussians(
     camera: Any, c: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((N, HW, 2) from centres of Gaussians to pixels', (N, 2, 2) inverse covariances on the
-    screen, (N,) falloff in the centre). c: (N, 3) in camera axes. covariance: in world axes.
+    """((N, HW, 2) vectors from centres of Gaussians to centres of pixels, (N, 2, 2) inverse
+    covariances on the screen, (N,) falloff in the centre). c: (N, 3) in camera axes. covariance:
+    (N, 3, 3) in world axes.
     """
     (x, y, z), focal = c.T, (camera.fx, camera.fy)
     jacobian = np.zeros((len(c), 2, 3))
@@ -148,7 +151,9 @@ def screen_gaussians(
 
 
 def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """(N, HW) bool: the pixel lies in Pulsar's box of the sphere, unbounded at the eye's plane."""
+    """(N, HW) bool: the pixel is in Pulsar's box of the sphere, unbounded if that meets the eye's
+    plane.
+    """
     y, x = np.mgrid[: camera.height, : camera.width]
     inside = np.ones((len(c), x.size), bool)
     for u, focal, centre, pixel in (
@@ -166,14 +171,15 @@ def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:
 
 
 def order(geometry_: Arrays) -> np.ndarray:
-    """(N, HW) int: each fragment's place in its pixel by (depth, index), from 0."""
+    """(N, HW) int: each fragment's rank in its pixel by (depth, index), from 0."""
     depth = np.where(geometry_["fragment"], geometry_["depth"], np.inf)
     return np.argsort(np.argsort(depth, axis=0, kind="stable"), axis=0)
 
 
 def blend(geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.0) -> Arrays:
-    """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; by_opacity (N, HW), what the
-    logarithm's derivative by o is times b; z (N, HW); background (HW,) b_0; fragment (N, HW) used.
+    """Dict: weight (N, HW) b; share (N, HW) b/o, or its limit at o = 0; by_opacity (N, HW), b times
+    the derivative of its logarithm by o; z (N, HW); background (HW,) b_0; fragment (N, HW), the
+    used ones.
     """
     fragment, d, z = geometry_["fragment"], geometry_["falloff"], geometry_["z"]
     o = np.asarray(opacity, np.float64)[:, None]
@@ -222,8 +228,8 @@ def features(blend_: Arrays, point_features: np.ndarray) -> np.ndarray:
 
 
 def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
-    """Dict of front-to-back compositing, (N, HW) each: alpha; weight b; through, T in front;
-    fragment, those where T >= least; and background (HW,), what is left.
+    """Dict of front-to-back compositing, (N, HW) each: alpha; weight b; through, the transmittance
+    T in front; fragment, where T >= least; and background (HW,), T behind all of them.
     """
     fragment, ranks = geometry_["fragment"], order(geometry_)
     least_alpha, most_alpha = geometry_["limits"]
@@ -256,17 +262,17 @@ def blend_by_rule(
 
 
 def distances(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
-    """(N, HW) sum_j b_j |z_i - z_j| of the fragments that are used; 0 elsewhere."""
+    """(N, HW) sum_j b_j |z_i - z_j| over the used fragments; 0 elsewhere."""
     depth, weight, fragment = geometry_["depth"], blend_["weight"], blend_["fragment"]
-    found = np.zeros(fragment.shape)
+    sums = np.zeros(fragment.shape)
     for q in np.flatnonzero(fragment.any(axis=0)):
         z = depth[fragment[:, q], q]
-        found[fragment[:, q], q] = np.abs(z[:, None] - z) @ weight[fragment[:, q], q]
-    return found
+        sums[fragment[:, q], q] = np.abs(z[:, None] - z) @ weight[fragment[:, q], q]
+    return sums
 
 
 def distortion(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
-    """(HW,) sum_ij b_i b_j |z_i - z_j| of the fragments that are used (Mip-NeRF 360, Eq. 15)."""
+    """(HW,) sum_ij b_i b_j |z_i - z_j| over the used fragments (Mip-NeRF 360, Eq. 15)."""
     return (blend_["weight"] * distances(geometry_, blend_)).sum(axis=0)
 
 
@@ -279,8 +285,8 @@ def gradients(
     max_tracked: int = 0,
     distortion_weight: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the tracked() fragments, and of the
-    distortion loss times its weight, of alpha() alone.
+    """(dL/df (N, C), dL/do (N,)) through the tracked() fragments, given grad_features (HW, C).
+    With alpha(), distortion_weight times the distortion loss is added.
     """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
@@ -295,18 +301,18 @@ def gradients(
 
 
 def tracked(geometry_: Arrays, blend_: Arrays, max_tracked: int) -> np.ndarray:
-    """(N, HW) bool: the max_tracked nearest fragments of each pixel that are used, 0: all."""
+    """(N, HW) bool: the max_tracked nearest used fragments of each pixel; 0: all of them."""
     return (
         blend_["fragment"] & (order(geometry_) < max_tracked) if max_tracked else blend_["fragment"]
     )
 
 
 def _alpha_derivative(blend_, own, background, ranks):
-    """(N, HW) dL/dalpha. own, background: G times a point's features, and what is behind all."""
+    """(N, HW) dL/dalpha. own: G times each point's features. background: G times the background."""
     derivative = np.zeros_like(own)
     for q in np.flatnonzero(blend_["fragment"].any(axis=0)):
         points = np.flatnonzero(blend_["fragment"][:, q])
-        rest = background[q]  # G times what is composited behind a fragment
+        rest = background[q]  # G times the colour composited behind a fragment
         for i in points[np.argsort(-ranks[points, q])]:
             if blend_["shows"][i, q]:
                 derivative[i, q] = blend_["through"][i, q] * (own[i, q] - rest)
@@ -315,7 +321,7 @@ def _alpha_derivative(blend_, own, background, ranks):
 
 
 def sh_basis(directions: np.ndarray) -> np.ndarray:
-    """(N, 9) real harmonics of degrees 0 to 2 of unit directions (N, 3), as cl/sh.h orders them."""
+    """(N, 9) real harmonics of degrees 0 to 2 for unit directions (N, 3), in cl/sh.h's order."""
     x, y, z = np.asarray(directions, np.float64).T
     first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))
     return np.stack(
@@ -335,22 +341,22 @@ def sh_basis(directions: np.ndarray) -> np.ndarray:
 
 
 def directions(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """(N, 3) float64 of length 1, from the eye (3,) to positions (N, 3)."""
+    """(N, 3) float64 unit vectors from the eye (3,) to positions (N, 3)."""
     towards = np.asarray(positions, np.float64) - eye
     return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
 def opacities(positions: np.ndarray, eye: np.ndarray, learned: np.ndarray) -> np.ndarray:
-    """(N,) float64 from the eye, of PointCloud.opacity (N, 9)."""
+    """(N,) float64 opacities seen from the eye. learned: PointCloud.opacity, (N, 9)."""
     return np.clip(unbounded_opacities(directions(positions, eye), learned), 0, 1)
 
 
 def unbounded_opacities(towards: np.ndarray, learned: np.ndarray) -> np.ndarray:
-    """(N,) float64 in the unit directions (N, 3), of PointCloud.opacity (N, 9)."""
+    """(N,) float64 opacities in the unit directions (N, 3), not clipped. learned: (N, 9)."""
     return learned[:, 0] + (learned[:, 1:] * sh_basis(towards)[:, 1:]).sum(1)
 
 
 def shade(positions: np.ndarray, eye: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """(N, C) features of coefficients (N, K, C), K = 1, 4 or 9."""
+    """(N, C) features from coefficients (N, K, C), K = 1, 4 or 9."""
     basis = sh_basis(directions(positions, eye))
     return np.einsum("nk,nkc->nc", basis[:, : coefficients.shape[1]], coefficients)

@@ -11,7 +11,7 @@ def numeric_gradient(
     step: float,
     indices: Iterable[int] | None = None,
 ) -> np.ndarray:
-    """(len(indices),) central differences of a function of an array, at flat indices (all)."""
+    """(len(indices),) central differences of a function of an array at flat indices; None: all."""
     values = np.array(values, np.float64)
     indices = range(values.size) if indices is None else indices
     gradient = []

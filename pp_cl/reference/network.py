@@ -1,4 +1,4 @@
-"""Float64 convolutions and U-Nets in numpy: what `pp-cl bench` measures errors against."""
+"""Float64 convolutions and U-Nets in numpy, against which `pp-cl bench` measures errors."""
 
 from collections import defaultdict
 from typing import Any
@@ -9,27 +9,27 @@ import numpy as np
 def convolution(x: np.ndarray, weight: np.ndarray, bias: np.ndarray | float = 0.0) -> np.ndarray:
     """(H, W, CO) convolution of x (H, W, CI) by weight (CO, CI, K, K), padded by zeros."""
     out = np.zeros((x.shape[0] * x.shape[1], len(weight)))
-    for ky, kx, seen in _taps(x, weight.shape[2]):
-        out += seen @ weight[:, :, ky, kx].T.astype(np.float64, order="C")
+    for ky, kx, inputs in _taps(x, weight.shape[2]):
+        out += inputs @ weight[:, :, ky, kx].T.astype(np.float64, order="C")
     return out.reshape(*x.shape[:2], -1) + bias
 
 
 def flipped(weight: np.ndarray) -> np.ndarray:
-    """(CI, CO, K, K) weights by which the convolution of dL/dout is dL/dx."""
+    """(CI, CO, K, K) weights with which a convolution turns dL/dout into dL/dx."""
     return weight.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
 
 
 def convolution_backward_weights(x: np.ndarray, grad_out: np.ndarray, k: int) -> np.ndarray:
-    """(CO, CI, K, K) gradient of the weights, of x (H, W, CI) and grad_out (H, W, CO)."""
+    """(CO, CI, K, K) gradient of the weights, given x (H, W, CI) and grad_out (H, W, CO)."""
     columns = grad_out.reshape(-1, grad_out.shape[2]).astype(np.float64).T
     gradient = np.empty((len(columns), x.shape[2], k, k))
-    for ky, kx, seen in _taps(x, k):
-        gradient[:, :, ky, kx] = columns @ seen
+    for ky, kx, inputs in _taps(x, k):
+        gradient[:, :, ky, kx] = columns @ inputs
     return gradient
 
 
 def _taps(x, k):
-    """Yields (ky, kx, (H W, CI) float64: what each pixel sees through that tap)."""
+    """Yield (ky, kx, (H W, CI) float64: the input that this tap gives each pixel)."""
     height, width, channels = x.shape
     around = (k // 2, k // 2)
     padded = np.pad(np.asarray(x, np.float64), (around, around, (0, 0)))
@@ -45,7 +45,7 @@ def gate(x: np.ndarray) -> np.ndarray:
 
 
 def gate_backward(x: np.ndarray, grad_out: np.ndarray) -> np.ndarray:
-    """(H, W, 2 C) gradient of the input of gate(), given that of its output (H, W, C)."""
+    """(H, W, 2 C) gradient of gate()'s input, given the gradient (H, W, C) of its output."""
     features, gates = np.split(x, 2, 2)
     derivative = np.exp(np.minimum(features, 0))
     grad_features = grad_out * derivative * _sigmoid(gates)
@@ -59,24 +59,24 @@ def pool(x: np.ndarray) -> np.ndarray:
 
 
 def pool_backward(grad_out: np.ndarray) -> np.ndarray:
-    """(2 H, 2 W, C) gradient of the input of pool(), given that of its output (H, W, C)."""
+    """(2 H, 2 W, C) gradient of pool()'s input, given the gradient (H, W, C) of its output."""
     return 0.25 * grad_out.repeat(2, 0).repeat(2, 1)
 
 
 def upsample(x: np.ndarray) -> np.ndarray:
-    """(2 H, 2 W, C): x (H, W, C) enlarged, bilinear, the border repeated."""
+    """(2 H, 2 W, C): x (H, W, C) enlarged bilinearly, with the border repeated."""
     return _along_both(_bilinear(x.shape[0]), _bilinear(x.shape[1]), x)
 
 
 def upsample_backward(grad_out: np.ndarray) -> np.ndarray:
-    """(H, W, C) gradient of the input of upsample(), given that of its output (2 H, 2 W, C)."""
+    """(H, W, C) gradient of upsample()'s input, given the gradient (2 H, 2 W, C) of its output."""
     height, width = grad_out.shape[:2]
     return _along_both(_bilinear(height // 2).T, _bilinear(width // 2).T, grad_out)
 
 
 def network(layers: list, parameters: dict, x: np.ndarray) -> dict[str, np.ndarray]:
-    """{layer: its output} of a network; "image" is the image, "x" the input (H, W, C). layers: of
-    unet_layers(). parameters: {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
+    """{layer: its output} of a network; "image" is the image, "x" the input (H, W, C). layers: as
+    from unet_layers(). parameters: {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
     """
     outputs = {"x": np.asarray(x, np.float64)}
     for layer in layers:
@@ -89,8 +89,8 @@ def network_gradients(
     layers: list, parameters: dict, outputs: dict, active: dict, *, grad_image: np.ndarray
 ) -> dict[str, np.ndarray]:
     """{"x" or parameter: its gradient}, given the outputs of network() and dL/dimage (H, W, 3).
-    active: {layer: where its ReLU lets the gradient pass}, of the network that is to be judged:
-    near 0 one place of another rounding weighs more than the rounding of all others.
+    active: {layer: bool array, where its ReLU passes the gradient}, from the network under test:
+    near 0, a single value that it rounds otherwise weighs more than the rounding of all others.
     """
     gradients: dict[str, Any] = {}  # of parameters
     grads: dict[str, Any] = defaultdict(float)  # of outputs, summed over their uses
@@ -111,7 +111,7 @@ def network_gradients(
 
 
 def _forward(layer, source, parameters):
-    """Output from the inputs' concatenation (H, W, CI)."""
+    """The layer's output, given its concatenated inputs (H, W, CI)."""
     if layer.kind != "conv":
         return {"gate": gate, "pool": pool, "upsample": upsample}[layer.kind](source)
     weight, bias = parameters[layer.name + ".weight"], parameters[layer.name + ".bias"]
@@ -120,7 +120,7 @@ def _forward(layer, source, parameters):
 
 
 def _backward(layer, source, grad_out, parameters):
-    """(gradient of the joined inputs, {parameter: its gradient}), of that before the ReLU."""
+    """(gradient of the joined inputs, {parameter: its gradient}). grad_out: before the ReLU."""
     if layer.kind == "gate":
         return gate_backward(source, grad_out), {}
     if layer.kind != "conv":
@@ -147,7 +147,7 @@ def _sigmoid(x):
 
 
 def _bilinear(n):
-    """(2n, n) matrix that doubles a line: weights 3/4 and 1/4, the border repeated."""
+    """(2n, n) matrix that doubles a line with weights 3/4 and 1/4 and repeats the border."""
     matrix = np.zeros((2 * n, n))
     for i in range(2 * n):
         matrix[i, i // 2] += 0.75
@@ -160,7 +160,7 @@ def _along_both(rows, columns, x):
 
 
 def encoded_directions(directions: np.ndarray, octaves: int = 4) -> np.ndarray:
-    """(..., 3 + 6 octaves): unit vectors (..., 3) as cl/layers/specular.h encodes them."""
+    """(..., 3 + 6 octaves): unit vectors (..., 3), encoded as in cl/layers/specular.h."""
     angles = [2.0**k * np.pi / 2 * directions for k in range(octaves)]
     waves = [wave(angle) for angle in angles for wave in (np.sin, np.cos)]
     return np.concatenate([directions, *waves], -1)
@@ -169,8 +169,8 @@ def encoded_directions(directions: np.ndarray, octaves: int = 4) -> np.ndarray:
 def specular(
     layers: list, parameters: dict, features: np.ndarray, directions: np.ndarray
 ) -> np.ndarray:
-    """(H, W, 3): what the specular layer adds to pixels of alpha 1, by their features (H, W, 16)
-    and directions (H, W, 3). layers, parameters: of network().
+    """(H, W, 3) colour that the specular layer adds to pixels of alpha 1, given their features
+    (H, W, 16) and directions (H, W, 3). layers, parameters: as in network().
     """
     x = np.concatenate([features, encoded_directions(directions)], -1)
     return network(layers, parameters, x)["image"] - 0.5

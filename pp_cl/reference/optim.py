@@ -1,12 +1,12 @@
-"""Float64 twins of what changes parameters: Adam as torch computes it, RMSprop of the points, grid
-smoothing.
+"""Float64 twins of the kernels that change parameters: Adam as in torch, RMSprop for the points,
+and grid smoothing.
 """
 
 import numpy as np
 
 from pp_cl.reference.dense import sh_basis, unbounded_opacities
 
-BETA2 = 0.999  # of both
+BETA2 = 0.999  # of both optimisers
 
 
 class Adam:
@@ -27,9 +27,9 @@ class Adam:
 
 
 class RmsProp:
-    """The step of cl/training/rmsprop.cl, for all points in every step. values: {"sh": (N, count,
-    16), "offset": (N, 4 or 16), "opacity": (N, 9)}. directions: (N, 3) from the eye. most, most_sh:
-    of an offset, and of coefficients above degree 0.
+    """The step of cl/training/rmsprop.cl, applied to all points in every step. values: {"sh": (N,
+    count, 16), "offset": (N, 4 or 16), "opacity": (N, 9)}. directions: (N, 3) from the eye. most,
+    most_sh: bounds of offsets, and of coefficients above degree 0.
     """
 
     def __init__(
@@ -47,8 +47,8 @@ class RmsProp:
     def step(
         self, t: int, gradients: dict[str, np.ndarray], rates: dict, eps: dict[str, float]
     ) -> None:
-        """Step t with gradients "sh", (N, 16) of the features, "offset" and "opacity"; those
-        between it and the last were 0. rates: {"sh", "offset", "opacity", "lobe"}.
+        """Step t with gradients "sh", (N, 16) of the features, "offset" and "opacity"; in the steps
+        since the last call, gradients were 0. rates: {"sh", "offset", "opacity", "lobe"}.
         """
         moves = {}
         for name, values in gradients.items():
@@ -65,8 +65,8 @@ class RmsProp:
         sh[:, 1:] = np.clip(sh[:, 1:], -self.most_sh, self.most_sh)
         offset = self.values["offset"] - rates["offset"] * moves["offset"]
         self.values["offset"] = np.clip(offset, -self.most, self.most)
-        seen, move = unbounded_opacities(self.directions, opacity), moves["opacity"]
-        inward = np.where(np.where(move < 0, seen >= 1, seen <= 0), 0, move)
+        unclipped, move = unbounded_opacities(self.directions, opacity), moves["opacity"]
+        inward = np.where(np.where(move < 0, unclipped >= 1, unclipped <= 0), 0, move)
         by_degree = np.repeat([rates["lobe"], rates["lobe"] / 2], (3, 5))
         opacity[:, 0] = np.clip(opacity[:, 0] - rates["opacity"] * move, 0, 1)
         lobes = opacity[:, 1:] - by_degree * basis[:, 1:] * inward[:, None]
@@ -74,15 +74,15 @@ class RmsProp:
 
 
 def neighbours(vertices: np.ndarray) -> list[list[int | None]]:
-    """The indices of each vertex's neighbours -x, +x, -y, +y, -z, +z; None where there is none."""
+    """The indices of each vertex's neighbours -x, +x, -y, +y, -z, +z; None for missing ones."""
     index = {tuple(map(int, vertex)): n for n, vertex in enumerate(vertices)}
     offsets = [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)]
     return [[index.get((x + a, y + b, z + c)) for a, b, c in offsets] for x, y, z in index]
 
 
 def smoothed(values: np.ndarray, vertices: np.ndarray, amount: float) -> np.ndarray:
-    """Array (N, ...) moved by `amount` towards the mean of the grid neighbours: first the points
-    whose indices have an even sum, then the others.
+    """The array (N, ...), each value moved by `amount` towards the mean of its grid neighbours:
+    first points whose coordinates have an even sum, then the others.
     """
     new = np.array(values, np.float64)
     around, colours = neighbours(vertices), vertices.sum(1) % 2

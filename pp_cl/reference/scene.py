@@ -1,5 +1,5 @@
-"""Float64 twins of a scene's preparation: which positions the masks keep, training targets, and the
-demo's object, built from segments and circles, with the hits of its rays.
+"""Float64 twins of the kernels that prepare a scene: the visual hull, undistortion, training
+targets and the demo's object, built from segments and circles.
 """
 
 from collections.abc import Sequence
@@ -30,10 +30,10 @@ def in_hull(
     forgiven: int,
     doubts: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((N,) bool in the hull, as scene.hull.Carver has it, (N,) pixels to the nearest pixel border
-    of any view that has the position before it).
+    """((N,) bool: in the hull, as in scene.hull.Carver, (N,) distance in pixels to the nearest
+    pixel border, over all views that have the position in front of them).
     """
-    seen, rejecting = np.zeros((2, len(positions)), int)
+    seeing, rejecting = np.zeros((2, len(positions)), int)
     border = np.full(len(positions), np.inf)
     for view in views:
         camera, mask = (
@@ -60,15 +60,15 @@ def in_hull(
         if max(alpha[[0, -1]].max(), alpha[:, [0, -1]].max()) <= threshold:
             counted[:] = True  # the object ends within the image
             doubting = doubting[:0]
-        seen[doubting] -= doubts
-        seen += counted
+        seeing[doubting] -= doubts
+        seeing += counted
         rejecting += counted & ~held
-    return (seen >= least) & (rejecting * len(views) <= forgiven * seen), border
+    return (seeing >= least) & (rejecting * len(views) <= forgiven * seeing), border
 
 
 def undistorted(image: np.ndarray, camera: Any, lens: Any, factor: int = 1) -> np.ndarray:
-    """(H // factor, W // factor, 4), of 255 levels: an image (H, W, 4) uint8, read by cubic splines
-    where the lens puts the pixels of a pinhole camera, premultiplied, then reduced by area.
+    """(H // factor, W // factor, 4), from 0 to 255: a premultiplied image (H, W, 4) uint8, sampled
+    by cubic splines where the lens puts the pixels of a pinhole camera, then reduced by area.
     """
     height, width = (side // factor for side in image.shape[:2])
     x = (np.arange(factor * width) + 0.5 - camera.cx) / camera.fx
@@ -80,7 +80,7 @@ def undistorted(image: np.ndarray, camera: Any, lens: Any, factor: int = 1) -> n
     planes = np.stack(
         [map_coordinates(planes[..., i], places, order=3, mode="nearest") for i in range(4)]
     )
-    planes /= np.maximum(planes[3], 1)  # what overshoots beside a mask's border keeps its colour
+    planes /= np.maximum(planes[3], 1)  # overshoots near a mask's border keep their colour
     blocks = np.clip(planes, 0, 1).reshape(4, height, factor, width, factor)
     colour, alpha = np.split(blocks.mean((2, 4)).transpose(1, 2, 0), [3], axis=2)
     return 255 * np.concatenate([np.clip(colour / np.maximum(alpha, 1e-3), 0, 1), alpha], axis=2)
@@ -89,7 +89,7 @@ def undistorted(image: np.ndarray, camera: Any, lens: Any, factor: int = 1) -> n
 def target_forward(
     image: np.ndarray, downscale: int, left: int, top: int, *, width: int, height: int
 ) -> np.ndarray:
-    """(height, width, 3): means over white of the blocks of an (H, W, 4) uint8 image."""
+    """(height, width, 3): means of the blocks of an (H, W, 4) uint8 image over white."""
     colour, alpha = image[..., :3] / 255.0, image[..., 3:] / 255.0
     over_white = colour * alpha + (1 - alpha)
     target = np.ones((height, width, 3))
@@ -108,41 +108,42 @@ def target_forward(
 def target_between(
     image: np.ndarray, left: float, top: float, *, width: int, height: int
 ) -> np.ndarray:
-    """(height, width, 4): colour over white and alpha of a uint8 image, by the polynomial
-    through the five nearest pixels each way; white and 0 where the nearest is outside.
+    """(height, width, 4): colour over white and alpha of a uint8 image, interpolated by the
+    polynomial through the five nearest pixels on each axis; white and alpha 0 if the nearest pixel
+    is outside.
     """
     alpha = image[..., 3:] / 255.0
     planes = np.concatenate([image[..., :3] / 255.0 * alpha + 1 - alpha, alpha], axis=2)
-    found = np.empty((height, width, 4))
+    target = np.empty((height, width, 4))
     for y, x in np.ndindex(height, width):
         column, row = round(left) + x, round(top) + y
         if not (0 <= column < image.shape[1] and 0 <= row < image.shape[0]):
-            found[y, x] = 1, 1, 1, 0
+            target[y, x] = 1, 1, 1, 0
             continue
         rows, columns = (np.arange(middle - 2, middle + 3) for middle in (row, column))
         near = planes[
             np.clip(rows, 0, image.shape[0] - 1)[:, None], np.clip(columns, 0, image.shape[1] - 1)
         ]
         lines = BarycentricInterpolator(rows, near)(top + y)
-        found[y, x] = BarycentricInterpolator(columns, lines)(left + x)
-    return np.clip(found, 0, 1)
+        target[y, x] = BarycentricInterpolator(columns, lines)(left + x)
+    return np.clip(target, 0, 1)
 
 
 def _segment(p, a, b):
-    """Distances of (N, 3) places to the segment from a to b."""
+    """(N,) distances of places (N, 3) to the segment from a to b."""
     share = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
     return np.linalg.norm(p - a - share[:, None] * (b - a), axis=1)
 
 
 def _circle(p, normal, radius):
-    """Distances of (N, 3) places to a circle around the origin."""
+    """(N,) distances of places (N, 3) to a circle around the origin."""
     height = p @ normal
     in_plane = np.linalg.norm(p - height[:, None] * normal, axis=1)
     return np.hypot(in_plane - radius, height)
 
 
 def _rounded_rectangle(a, b, half, radius):
-    """Signed distances of (a, b) to a rectangle grown by a radius."""
+    """Signed distances of (a, b) to a rectangle enlarged by a radius."""
     u, v = np.abs(a) - half[0], np.abs(b) - half[1]
     outside = np.hypot(np.maximum(u, 0), np.maximum(v, 0))
     return np.where((u > 0) | (v > 0), outside, np.maximum(u, v)) - radius

@@ -1,4 +1,4 @@
-"""Scenes: images with cameras and masks, and the visual hull where the points start."""
+"""Scenes: images with cameras and masks, and the visual hull in which the points start."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Finds masks that contradict those of the other views, and words the warning."""
+"""Finds masks that contradict those of the other views, and writes the warning."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,17 +9,18 @@ from pp_cl.engine.grid import Grid, smallest_voxel_size
 from pp_cl.engine.views import MASK_THRESHOLD, View
 from pp_cl.errors import few_names
 
-# pp-cl warns about a view that alone rejects more than this share of the object, and several times
-# the usual share: each view carves a little that no other does, more so where there are few. Lego's
-# views reach 0.03 with all 100 of them, and 0.15 with 20; a mask shifted by 15 % of the image 0.35.
+# pp-cl warns about a view if it alone rejects more than this share of the object and several times
+# the usual share. Each view carves away a little that no other view does, and more if there are
+# few: lego's views reach 0.03 with all 100 of them and 0.15 with 20, and a mask shifted by 15 % of
+# the image reaches 0.35.
 LEAST_SHARE, TIMES_MEDIAN, TIMES_EVEN = 0.05, 4.0, 4.0
 PROBED_CELLS = 32**3  # positions at which the masks are looked up
-AGREEING = 0.75  # of the other views that see a place, whose masks hold it
+AGREEING = 0.75  # share of the other views seeing a place whose masks must contain it
 
 
 class Disagreement(NamedTuple):
-    """A view whose mask alone rejects a share of the places that the others agree on, which are the
-    vertices `ids` (M,) of a coarse grid.
+    """A view whose mask alone rejects a share of the places that the others agree on. ids: (M,) the
+    rejected places, as vertices of the coarse grid.
     """
 
     view: View
@@ -30,7 +31,7 @@ class Disagreement(NamedTuple):
 
 def disagreements(views: Sequence[View], box: np.ndarray) -> list[Disagreement]:
     """The views whose masks disagree with the others, the worst first. box: (2, 3), around the
-    hull; its double is searched, since a wrong mask has carved it.
+    hull; a box twice as large is searched, since a wrong mask has shrunk the hull.
     """
     if not any(view.has_mask for view in views):
         return []
@@ -48,7 +49,9 @@ def disagreements(views: Sequence[View], box: np.ndarray) -> list[Disagreement]:
 
 
 def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
-    """One line on why the masks leave no point in a (2, 3) box: which contradict most others."""
+    """One line that says which masks contradict the most others, so that a (2, 3) box has no point
+    left.
+    """
     _, on_mask, beside = mask_votes(views, box)
     agreeing = on_mask.sum(0).max()
     objections = beside[:, on_mask.sum(0) == agreeing].mean(1)
@@ -59,7 +62,7 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
             " its alpha and its camera"
         )
     return (
-        f"{few_names([view.name for view in views])}: the masks leave no point, at most"
+        f"{few_names([view.name for view in views])}: the masks leave no point, as at most"
         f" {agreeing} of {len(views)} meet in one place:"
         " check the masks and the camera poses (camera-to-world; in transforms files x right, y"
         " up, z backward)"
@@ -67,8 +70,8 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
 
 
 def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray, np.ndarray]:
-    """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its lattice() fall onto
-    each view's mask, and which into its image beside it).
+    """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: the vertices of its lattice()
+    that each view's mask covers, (V, N) bool: the vertices that its image shows beside the mask).
     """
     grid = Grid.centred_in(box, smallest_voxel_size(box, PROBED_CELLS))
     vertices = grid.lattice()

@@ -11,16 +11,16 @@ from pp_cl.scene.agreement import explain_empty_hull
 
 # how far, in image sizes, an object that the image border cuts off may reach beyond the border
 CROPPED_MARGIN = 0.5
-# of the box of the eyes, world units: what float32 computes with (docs/scenes.md)
+# sizes of the eyes' box that float32 can compute with, world units (docs/scenes.md)
 LEAST_REACH, MOST_REACH = 1e-12, 1e15
-LEAST_SHARE = 1e-9  # of a distance: less of it is rounding
-LEAST_SLACK = 1e-6  # of the cameras' reach: less is the solver's rounding
+LEAST_SHARE = 1e-9  # a smaller share of a distance is rounding
+LEAST_SLACK = 1e-6  # a smaller share of the cameras' reach is the solver's rounding
 SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog
 
 
 def reach_of(views: Sequence[View]) -> float:
-    """Longest side of the box of the cameras' eyes, world units. Raises UserError naming views
-    where all are in one place, one is much too far away, or all are too close.
+    """Longest side of the box around the cameras' eyes, world units. Raises UserError naming views
+    if all cameras are in one place or too close together, or one is much too far away.
     """
     eyes = np.stack([view.camera.eye for view in views])
     reach, all_views = float(np.ptp(eyes, axis=0).max()), _all_of(views)
@@ -34,15 +34,15 @@ def reach_of(views: Sequence[View]) -> float:
         )
     if reach < LEAST_REACH:
         raise UserError(
-            f"{all_views}: their cameras are within {reach:.3g} world units, and"
-            f" {LEAST_REACH:g} is the least that float32 computes with; scale their positions up"
+            f"{all_views}: their cameras are within {reach:.3g} world units, but"
+            f" float32 needs {LEAST_REACH:g} or more; scale their positions up"
         )
     if reach > MOST_REACH:
         distances = np.abs(eyes - np.median(eyes, axis=0)).max(1)
         raise UserError(
             f"{views[int(distances.argmax())].name}: its camera is {distances.max():.3g} world"
-            f" units from the others' middle, and {MOST_REACH:g} is the most that float32 computes"
-            " with; correct its pose, or scale all positions down"
+            f" units from the middle of the others, but float32 allows {MOST_REACH:g} at most;"
+            " correct its pose, or scale all positions down"
         )
     return reach
 
@@ -52,10 +52,11 @@ def _all_of(views):
 
 
 def bounding_box(views: Sequence[View]) -> np.ndarray:
-    """(2, 3) box around the intersection of the views' pyramids, each through the rectangle around
-    its mask, by linear programs. A side where the mask reaches the image border does not bound the
-    object, unless nothing else does: then it ends CROPPED_MARGIN image sizes outside. Raises
-    UserError when the pyramids do not meet, do not end or meet in a point, and as reach_of does.
+    """(2, 3) box around the intersection of the views' pyramids, found by linear programs. A view's
+    pyramid runs from its eye through the rectangle around its mask. A side on which the mask
+    reaches the image border does not bound the object, unless nothing else does: then the bound
+    lies CROPPED_MARGIN image sizes outside. Raises UserError if the pyramids do not meet, do not
+    end or meet in a point, and as reach_of() does.
     """
     from scipy.optimize import linprog  # takes long to import
 
@@ -80,8 +81,8 @@ def bounding_box(views: Sequence[View]) -> np.ndarray:
 
 
 def looking_elsewhere(views: Sequence[View]) -> list[View]:
-    """The views whose pyramids miss the place that is the least outside of all, as a sum: that is
-    where most of them meet, however far off the others are.
+    """The views whose pyramids miss the place where most pyramids meet: the place with the least
+    sum of distances to all pyramids, which a few views do not move, however far off they are.
     """
     from scipy.optimize import linprog  # takes long to import
 
@@ -89,21 +90,22 @@ def looking_elsewhere(views: Sequence[View]) -> list[View]:
     planes = [_silhouette_planes(view, None) for view in views]
     owner = np.repeat(np.arange(len(views)), [len(some) for some in planes])
     stacked = np.concatenate(planes)
-    outside = (owner[:, None] == np.arange(len(views))).astype(float)  # how far, by view
-    found = linprog(
+    outside = (owner[:, None] == np.arange(len(views))).astype(float)  # each view's distance
+    solution = linprog(
         np.append(np.zeros(3), np.ones(len(views))),
         -np.column_stack([stacked[:, :3], outside]),
         -stacked[:, 3] / unit,
         bounds=[(None, None)] * 3 + [(0, None)] * len(views),
     )
-    if found.status != SOLVED:
+    if solution.status != SOLVED:
         return []
-    return [v for v, far in zip(views, found.x[3:], strict=True) if far > LEAST_SLACK]
+    return [v for v, far in zip(views, solution.x[3:], strict=True) if far > LEAST_SLACK]
 
 
 def _silhouette_planes(view, cropped_margin):
-    """(P, 4) normals n and offsets o: n.x >= o holds for all x in the rectangle around the mask;
-    sides at the image border are left out, or cropped_margin image sizes further out.
+    """(P, 4) normals n and offsets o: n.x >= o holds for every x that projects into the rectangle
+    around the mask. Sides at the image border are left out (cropped_margin None) or moved outwards
+    by cropped_margin image sizes.
     """
     camera, mask = view.stored_camera, view.hull_alpha > MASK_THRESHOLD
     normals = []

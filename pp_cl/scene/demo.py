@@ -1,5 +1,5 @@
-"""The scene `demo`: images and a mesh of an object that cl/scene/demo.cl defines, so that nothing
-must be downloaded.
+"""The scene `demo`: images and a mesh of an object that cl/scene/demo.cl defines, so that there is
+nothing to download.
 """
 
 import math
@@ -16,7 +16,7 @@ from pp_cl.scene.image_file import ImageFile
 
 SPLITS = ("train", "test")
 SIZE = 400  # pixels
-ANGLE = 0.6911112  # of view across the image, radians: NeRF-synthetic's
+ANGLE = 0.6911112  # of view across the image, radians, as in NeRF-synthetic
 DISTANCE = 3.4  # of the cameras from the origin; the object fills the image
 TRAIN_VIEWS, TEST_VIEWS = 64, 16
 NO_DEPTH_RANGE = (0.0, math.inf)  # the rays are traced through the whole object
@@ -24,8 +24,8 @@ OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
 def demo_views(dev: Device, split: str, most: int | None = None, size: int = SIZE) -> list[View]:
-    """The 64 training or 16 test views of size x size pixels, rendered on the device, or `most` of
-    them, spread evenly.
+    """The 64 training or 16 test views, or at most `most` of them, spread evenly, rendered on the
+    device with size x size pixels.
     """
     return [
         View(frame.name, frame.camera, render(dev, frame.camera))
@@ -34,7 +34,7 @@ def demo_views(dev: Device, split: str, most: int | None = None, size: int = SIZ
 
 
 def demo_frames(split: str, size: int = SIZE) -> list[ImageFile]:
-    """A split's views, without their images. Raises UserError for a split that there is not."""
+    """A split's views, without their images. Raises UserError if there is no such split."""
     if split not in SPLITS:
         raise UserError(f"demo has no split {split}; its splits are {', '.join(SPLITS)}")
     if split == "train":  # on a spiral whose steps have equal areas of the sphere
@@ -48,7 +48,7 @@ def demo_frames(split: str, size: int = SIZE) -> list[ImageFile]:
 
 
 def render(dev: Device, camera: Camera) -> np.ndarray:
-    """(H, W, 4) uint8 straight RGBA image of the object, by 4x4 rays a pixel."""
+    """(H, W, 4) uint8 straight RGBA image of the object, from 4x4 rays per pixel."""
     image = dev.empty((camera.height, camera.width, 4), np.uint8)
     dev.program("scene/demo", LANES=lanes(dev)).launch(
         "render_demo",
@@ -63,7 +63,7 @@ def render(dev: Device, camera: Camera) -> np.ndarray:
 
 def demo_mesh(dev: Device, resolution: int = 256) -> tuple[np.ndarray, np.ndarray]:
     """((V, 3) float32 vertices, (F, 3) int32 faces, counter-clockwise from outside) of the object,
-    by marching cubes. resolution: grid vertices along the box's longest side.
+    found by marching cubes. resolution: grid vertices along the box's longest side.
     """
     from skimage.measure import marching_cubes  # takes long to import
 
@@ -91,7 +91,7 @@ def distances(dev: Device, grid: Grid) -> np.ndarray:
 
 
 def _camera(azimuth, elevation, size):
-    """Camera at two angles in radians that looks at the origin; look_at() has other last bits."""
+    """Camera at two angles in radians that looks at the origin; look_at() would round otherwise."""
     level = math.cos(elevation)
     forward = -np.array([math.cos(azimuth) * level, math.sin(azimuth) * level, math.sin(elevation)])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])

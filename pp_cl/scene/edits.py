@@ -1,5 +1,5 @@
-"""What a user has decided about a scene: the object's box and the views to leave out, in a small
-file in its folder that scenes of every format obey.
+"""A user's decisions about a scene (the object's box, views to leave out, camera axes), in a small
+file in its folder, which readers of every format obey.
 """
 
 from pathlib import Path
@@ -16,8 +16,8 @@ EDITS = "pp_cl.json"
 
 
 class Edits(NamedTuple):
-    """box: (2, 3) lower and upper corner in world units. dropped: names of images, as a scene lists
-    them. axes: how its cameras are to be read, one of readings.WORDS or several.
+    """box: (2, 3) lower and upper corner in world units. dropped: names of images, as the scene
+    lists them. axes: how to read its cameras: one or more of readings.WORDS.
     """
 
     box: np.ndarray | None = None
@@ -26,28 +26,30 @@ class Edits(NamedTuple):
 
 
 def read_edits(folder: Path) -> Edits:
-    """The edits of a scene. Raises UserError naming the file and the key that is wrong."""
+    """The edits of a scene. Raises UserError naming the file and the wrong key."""
     file = folder / EDITS
     if not file.exists():
         return Edits()
-    found = read_json(file)
-    if not isinstance(found, dict) or not found.keys() <= set(Edits._fields):
+    stored = read_json(file)
+    if not isinstance(stored, dict) or not stored.keys() <= set(Edits._fields):
         keys = " and ".join(f'"{key}"' for key in Edits._fields)
-        raise fail_at(file)(f"must be a JSON object with no other keys than {keys}; correct it")
-    axes = found.get("axes")
+        raise fail_at(file)(f"must be a JSON object with no keys other than {keys}; correct it")
+    axes = stored.get("axes")
     if axes is not None and not (isinstance(axes, str) and {*axes.split()} <= {*WORDS} and axes):
-        what = f"is {quoted(axes, 40)}; must be of the words {', '.join(WORDS)}"
+        what = f"is {quoted(axes, 40)}; must be one or more of the words {', '.join(WORDS)}"
         raise fail_at(file, "axes")(what)
-    dropped = found.get("dropped", [])
+    dropped = stored.get("dropped", [])
     if not isinstance(dropped, list) or not all(type(name) is str for name in dropped):
-        raise fail_at(file, "dropped")("must be a list of names of images; correct it")
-    corners = found.get("box")
+        raise fail_at(file, "dropped")("must be a list of image names; correct it")
+    corners = stored.get("box")
     box = None if corners is None else checked_box(corners, fail_at(file, "box"))
     return Edits(box, frozenset(dropped), axes)
 
 
 def write_edits(folder: Path, edits: Edits) -> None:
-    """Write the edits into a scene's folder; none at all remove the file. Raises UserError."""
+    """Write the edits into a scene's folder, or remove the file if there are none. Raises
+    UserError.
+    """
     file, box = folder / EDITS, None
     if edits.box is not None:
         box = checked_box(np.array(edits.box).tolist(), fail_at(file, "box")).tolist()

@@ -1,4 +1,4 @@
-"""Where cameras look, and what is up in their images."""
+"""Finds the place that cameras look at and the direction that is up in their images."""
 
 from collections.abc import Sequence
 
@@ -6,25 +6,26 @@ import numpy as np
 
 from pp_cl.engine.camera import Camera
 
-MOST = 0.9  # of the cameras, that have before them what all look at, or have one side up
-RING = 0.2  # of the spread of eyes along a ring, that they have across it
-ASIDE = 35.0  # degrees between a camera's axis and what all look at, in the median
-SPREAD = 0.2  # of the distance to what they look at, by which eyes differ around an object
-# the length of the mean of the axes: of cameras that go 90 degrees around an object on an arc. Of
-# those that look the same way from a wall, 0.97 and more, the place all look at is of no use.
+MOST = 0.9  # share of the cameras that must have the place looked at ahead, or the same side up
+RING = 0.2  # eyes form a ring if they spread less than this across it, relative to along it
+ASIDE = 35.0  # most degrees between a camera's axis and the place that all look at, in the median
+SPREAD = 0.2  # eyes are around the object if they spread by this share of their distance to it
+# The mean of the cameras' axes has this length if they go 90 degrees around an object on an arc. It
+# is 0.97 and more if they look the same way from a wall; then the place looked at is of no use.
 ONE_WAY = 0.9
 
 
 def up_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) unit vector that is up in the images, as upward() finds it."""
+    """(3,) unit vector pointing up in the images, as upward() finds it."""
     return upward(cameras)[0]
 
 
 def upward(cameras: Sequence[Camera]) -> tuple[np.ndarray, str]:
-    """((3,) unit vector that is up, "" or from what else than upper edges it is taken): across all
-    horizontal edges of the images, as far as possible, on the side of their mean upper edge. Where
-    upper edges contradict each other, as those of pictures on their side do, it is across all
-    vertical edges, or else the axis of the cameras' ring or of the world; then cameras are above.
+    """((3,) unit vector pointing up, its source if the upper edges of the images are not, or ""):
+    as nearly perpendicular to all horizontal edges of the images as possible, on the side of their
+    mean upper edge. If upper edges contradict each other, as with pictures on their side, it is
+    perpendicular to all vertical edges, or else an axis of the cameras' ring or of the world, and
+    points to the side where the cameras are.
     """
     right, down = (np.stack([camera.pose[:, axis] for camera in cameras]) for axis in (0, 1))
     up, side = _across(right, -down), _across(down, right)
@@ -43,16 +44,16 @@ def upward(cameras: Sequence[Camera]) -> tuple[np.ndarray, str]:
 
 
 def _across(edges, ends):
-    """(3,) unit vector across (N, 3) edges, on the side of the mean of (N, 3) vectors."""
+    """(3,) unit vector most perpendicular to (N, 3) edges, on the side of the mean (N, 3) end."""
     mean = ends.mean(axis=0)
-    # the mean decides where the edges leave more than one direction open
+    # the mean decides if the edges leave more than one direction open
     spread = edges.T @ edges / len(edges) - 0.1 * np.outer(mean, mean)
     direction = np.linalg.eigh(spread)[1][:, 0]
     return direction if direction @ mean >= 0 else -direction
 
 
 def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) the world position nearest to the optical axes of all cameras, by least squares."""
+    """(3,) the world position nearest to the optical axes of all cameras, in least squares."""
     forward = np.stack([camera.pose[:, 2] for camera in cameras])
     eyes = np.stack([camera.eye for camera in cameras])
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (N, 3, 3) projectors
@@ -60,7 +61,7 @@ def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def meeting(cameras: Sequence[Camera]) -> float:
-    """ahead(), but 0 for cameras that do not look at it from around."""
+    """ahead(), but 0 for cameras that are not around the place they look at."""
     towards = looked_at(cameras) - np.stack([camera.eye for camera in cameras])
     along = np.stack([camera.pose[:, 2] for camera in cameras])
     spread = np.linalg.norm(towards - towards.mean(0), axis=1).mean()
@@ -70,7 +71,9 @@ def meeting(cameras: Sequence[Camera]) -> float:
 
 
 def ahead(cameras: Sequence[Camera]) -> float:
-    """The median cosine between cameras' axes and what they look at, 0 where it is not ahead."""
+    """The median cosine between the cameras' axes and the direction of the place they look at; 0 if
+    the place is not ahead of them.
+    """
     towards = looked_at(cameras) - np.stack([camera.eye for camera in cameras])
     along = np.stack([camera.pose[:, 2] for camera in cameras])
     cosine = (along * towards).sum(1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-30)

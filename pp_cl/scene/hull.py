@@ -1,4 +1,4 @@
-"""The visual hull: the grid vertices inside all training masks, where the points start."""
+"""The visual hull: the grid vertices inside all training masks, at which the points start."""
 
 import math
 from bisect import bisect_left
@@ -17,36 +17,37 @@ from pp_cl.errors import UserError
 from pp_cl.scene.agreement import Disagreement, disagreements, explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, looking_elsewhere, reach_of
 
-# PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
+# PlenopticPoints supplemental, Table 4: all grids stay below this, one with too few points
 CELL_CAP = 2**27
-COARSE_CELLS = 2**21  # of the first carving, which only finds the object: about 128^3
+COARSE_CELLS = 2**21  # about 128^3, for the first carving, which only finds the object
 ROUNDS = 8  # carvings after the coarse one
-AIM = 1.01  # times the points asked for; Table 4: most scenes have 1.01 times 4 million points
-TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends the search
+AIM = 1.01  # times the requested points; Table 4: most scenes have 1.01 times 4 million points
+TOLERANCE = 1.02  # the search ends at 1 to this many times the requested points
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
-LEAST_SEEING = 3  # images that see a vertex: what lies behind the object is in few
-# A view is left out if more than this share of its mask, and several times the usual, is beside
-# the hull: masks moved by 6 % of the image have 0.05 to 0.13 there, right ones 0.03 at most.
+LEAST_SEEING = 3  # images that must see a vertex: few images show the space behind the object
+# A view is left out if more than this share of its mask, and several times the usual share, lies
+# beside the hull: 0.05 to 0.13 if a mask is moved by 6 % of the image, at most 0.03 if it is right.
 MOST_BESIDE, TIMES_USUAL = 0.05, 3.0
 MOST_LEFT_OUT = 1 / 8  # of the views
-# A mask is wrong by the share of it that lies beside the hull: 0 for rendered masks, 0.0001 to
-# 0.016 for those of photographs. Where the mean share is larger than MOST_MISSED, a vertex stays
-# though some masks reject it: as few masks as bring the mean below, but at most MOST_FORGIVEN of
-# them. What the hull lacks is lost, while training prunes what it has too much: mary_rose's sound
-# views gain 1.4 dB where 12 of 60 masks may reject, in place of 4.
+# The share of a mask beside the hull measures its error: 0 for rendered masks, 0.0001 to 0.016 for
+# masks of photographs. If the mean share exceeds MOST_MISSED, a vertex may stay although some masks
+# reject it: as few masks as bring the mean below, but at most MOST_FORGIVEN of all. Training cannot
+# restore a missing part of the hull, but it prunes superfluous points: mary_rose's sound views gain
+# 1.4 dB if 12 of 60 masks may reject a vertex instead of 4.
 MOST_MISSED, MOST_FORGIVEN = 0.0002, 1 / 4
-COMPARED_POINTS, COMPARED_SIZE = 60_000, 128  # pixels of the images in which this is looked up
+# points of the hull, and pixels of the images, with which masks are compared
+COMPARED_POINTS, COMPARED_SIZE = 60_000, 128
 SAMPLED_POINTS = 1000
-VERTEX_WORK = 10  # multiply-adds that project a vertex into a view, and find its pixel
-CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size of the eyes' box
+VERTEX_WORK = 10  # multiply-adds that project a vertex into a view and find its pixel
+CORNER_BITS = 16  # carving's origin is a whole multiple of 2^-16 of the size of the eyes' box
 
 
 @dataclass(frozen=True)
 class Hull:
     """Vertices inside the visual hull. grid: the smallest Grid that holds them. ids: (N,) uint32,
-    ascending. capped: there are fewer points than asked for, by the cap on the grid's cells.
+    ascending. capped: the cap on the grid's cells left fewer points than requested.
     """
 
     grid: Grid
@@ -55,11 +56,12 @@ class Hull:
 
 
 class Carver:
-    """Masks and cameras of the stored images, on the device, to carve any grid with. Masks are
-    widened by a pixel, which keeps vertices that touch the silhouette, and by one of the reduced
-    image, as poses and masks are wrong. least: images that must see a vertex. doubts: 1 where few
-    masks end within their image; then an image takes one away from what lies beside it, if the
-    nearest pixel of its border is beside the mask: so images cropped to the object bound it.
+    """Masks and cameras of the stored images, on the device, which carve any grid. Masks are
+    widened by a pixel, which keeps vertices that touch the silhouette, and by a pixel of the
+    reduced image, since poses and masks are inexact. least: images that must see a vertex. doubts:
+    1 if few masks end within their image. Then an image also takes one from the count of images
+    that see a vertex outside it, if the nearest pixel of its border is beside the mask: so images
+    cropped to the object bound it.
     """
 
     def __init__(self, dev: Device, views: Sequence[View]):
@@ -78,11 +80,12 @@ class Carver:
         self.view_masks = dev.upload(table, np.uint32)
         is_whole = [not (border(view.hull_alpha) > MASK_THRESHOLD).any() for view in views]
         self.view_is_whole = dev.upload(is_whole, np.uint32)
-        # else these bound the object, and close-ups must not take away what lies beside them
+        # enough whole masks bound the object; close-ups must not take away vertices they do not
+        # show
         self.doubts = int(sum(is_whole) < self.least)
 
     def _add_mask(self, view, height, words, first):
-        """Write the widened mask of a view from word `first` on."""
+        """Write a view's widened mask, starting at word `first`."""
         mask, other = (self.dev.empty((height * words,), np.uint32) for _ in range(2))
         self.program.launch(
             "pack_mask",
@@ -107,8 +110,8 @@ class Carver:
             mask, other = other, mask
 
     def carve(self, grid: Grid, forgiven: int = 0) -> np.ndarray:
-        """(nz, ny, nx) bool: the vertices of a grid that enough images see and no larger share of
-        their masks rejects than `forgiven` of all.
+        """(nz, ny, nx) bool: the vertices of a grid that enough images see, and whose masks reject
+        them in no larger share of these images than `forgiven` is of all.
         """
         nx, ny, nz = grid.dims
         rows, words = ny * nz, -(-nx // 32)
@@ -132,8 +135,8 @@ class Carver:
             masks=self.masks,
             bits=bits,
         )
-        found = self.dev.download(bits).view(np.uint8)
-        inside = np.unpackbits(found, axis=1, count=nx, bitorder="little")
+        packed = self.dev.download(bits).view(np.uint8)
+        inside = np.unpackbits(packed, axis=1, count=nx, bitorder="little")
         return inside.view(bool).reshape(nz, ny, nx)
 
 
@@ -144,15 +147,15 @@ def build_grid(
     box: np.ndarray | None = None,
     forgiven: int = 0,
 ) -> Hull:
-    """Hull with about `points` vertices: the rule that fits Table 4 of the PlenopticPoints
-    supplemental. box: (2, 3), which holds all vertices; None: what the masks allow, and where no
-    view has one what all cameras see. forgiven: as agreeing() has it.
+    """Hull with about `points` vertices, by a rule that fits Table 4 of the PlenopticPoints
+    supplemental. box: (2, 3) box that holds all vertices; None: the box that the masks allow, or
+    without masks the box that all cameras see. forgiven: as in Agreement.
 
     The search starts from the box that the masks allow and rescales the voxel size from the
-    measured count, until that is `points` to 1.02 points. At CELL_CAP vertices of the grid, or
-    after 8 rounds, the smallest carving with enough points is taken, else the largest. Raises
-    UserError for an impossible `points`, masks or poses that leave no vertex, cameras that make no
-    scene.
+    measured count until that is between `points` and 1.02 `points`. At CELL_CAP vertices of the
+    grid, or after 8 rounds, it takes the smallest carving with enough points, or else the largest.
+    Raises UserError for an impossible `points`, for masks or poses that leave no vertex, and as
+    reach_of() and bounding_box() do.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
@@ -171,7 +174,7 @@ def build_grid(
     if not count:
         raise UserError(explain_empty_hull(near, box))
     while rounds < ROUNDS and not points <= count <= TOLERANCE * points:
-        if count:  # the next carving searches a voxel around
+        if count:  # the next carving searches one voxel further on each side
             box = last.grid.box + last.grid.voxel_size * np.array([[-1], [1]])
         if limit is not None:
             box = np.stack([np.maximum(box[0], limit[0]), np.minimum(box[1], limit[1])])
@@ -179,7 +182,7 @@ def build_grid(
         voxel_size = max(wanted, smallest_voxel_size(box, CELL_CAP))
         capped = voxel_size > wanted
         if capped and voxel_size > 0.99 * last.grid.voxel_size:
-            break  # the box shrinks no more
+            break  # the box no longer shrinks
         last = carve(voxel_size)
         count, rounds = last.total, rounds + 1
         best = min(best, last, key=lambda c: (c.total < points, abs(c.total - points)))
@@ -188,7 +191,7 @@ def build_grid(
 
 
 def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -> np.ndarray:
-    """(N,) ascending ids of the vertices of a grid inside the hull, as build_grid() has it."""
+    """(N,) ascending ids of a grid's vertices inside the hull that build_grid() finds."""
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     carver = Carver(dev, _farthest_point_order(near, grid.centre - corner))
@@ -196,7 +199,9 @@ def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -
 
 
 def _box(views, given, forgiven):
-    """The given box as far as the masks allow it, or twice that, where some are forgiven."""
+    """The part of the given box within the bounding box of the masks, which is doubled if some
+    masks are forgiven.
+    """
     if given is not None and not any(view.has_mask for view in views):
         return given
     box = bounding_box(views)
@@ -209,14 +214,16 @@ def _box(views, given, forgiven):
 
 
 def _corner(views, reach):
-    """(3,) world position near the cameras, in whole units: views moved alike give one hull."""
+    """(3,) world position near the cameras, in whole units, so that a scene moved by whole units
+    gives the same hull.
+    """
     eyes = np.stack([view.camera.eye for view in views])
     unit = 2.0 ** (math.frexp(reach)[1] - CORNER_BITS)
     return unit * np.floor(eyes.min(0) / unit)
 
 
 class _Carving(NamedTuple):
-    """The smallest grid that holds all `total` vertices inside (nz, ny, nx)."""
+    """The smallest grid that holds all `total` carved vertices. inside: (nz, ny, nx) bool."""
 
     grid: Grid
     inside: np.ndarray
@@ -224,7 +231,7 @@ class _Carving(NamedTuple):
 
 
 def _tight(grid, inside):
-    """The _Carving of the vertices inside, (nz, ny, nx) bool; of the whole grid without any."""
+    """The _Carving of a grid's vertices inside, (nz, ny, nx) bool; the whole grid if none is."""
     used = [np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 1), (0, 2), (1, 2))]
     if not len(used[0]):
         return _Carving(grid, inside, 0)
@@ -236,13 +243,14 @@ def _tight(grid, inside):
 
 
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
-    """(near, far) for all views, as Euclidean distances in world units (docs/scenes.md): around the
-    hull's ball, DEPTH_MARGIN times enlarged, near at least half the distance to its box and one
-    voxel size. A range that the dataset states for most views is widened to the ball itself.
+    """(near, far) for all views, as Euclidean distances in world units (docs/scenes.md): the range
+    of the hull's ball, enlarged DEPTH_MARGIN times; near is at least one voxel and half the
+    distance to the hull's box. If the dataset states ranges for most views, they are widened to
+    contain the ball itself.
     """
     stated, grid = [view.depth_range for view in views if view.depth_range], hull.grid
     stated = stated if 2 * len(stated) > len(views) else []
-    half = grid.voxel_size * np.asarray(grid.dims) / 2  # of the box of the vertices' cells
+    half = grid.voxel_size * np.asarray(grid.dims) / 2  # half the box of the vertices' cells
     offsets = np.stack([view.camera.eye for view in views]) - grid.centre
     from_centre = np.linalg.norm(offsets, axis=1)
     from_box = np.linalg.norm(np.maximum(np.abs(offsets) - half, 0), axis=1)
@@ -253,14 +261,14 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
 
 
 def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
-    """Voxel size in pixels of the cameras' images, at the middle of the grid, in the mean."""
+    """Mean voxel size at the middle of the grid, in pixels of the cameras' images."""
     distances = [np.linalg.norm(camera.eye - grid.centre) for camera in cameras]
     pixels = [c.fx * grid.voxel_size / d for c, d in zip(cameras, distances, strict=True)]
     return float(np.mean(pixels))
 
 
 def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W) bool: the pixels that points with ids (N,) cover, gaps between neighbours closed."""
+    """(H, W) bool: the pixels that points with ids (N,) cover, with gaps between them closed."""
     gap = math.ceil(spacing_pixels(grid, [camera])) + 1
     wide = camera.crop(-gap, -gap, camera.width + 2 * gap, camera.height + 2 * gap)
     column, row, is_shown = wide.pixels(grid.positions(ids))
@@ -270,8 +278,8 @@ def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 class Agreement(NamedTuple):
-    """views: those whose masks agree. left_out: {name: share of its mask} of the others. forgiven:
-    how many masks may reject a vertex, as build_grid() takes it.
+    """views: the views whose masks agree. left_out: {name of another view: share of its mask beside
+    the hull}. forgiven: how many of the masks may reject a vertex.
     """
 
     views: list[View]
@@ -280,8 +288,9 @@ class Agreement(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """The mean share of a mask that lies beside the hull: where no mask is forgiven, 1 where no
-    hull is left; where MOST_FORGIVEN of them are, which mends wrong masks, but no wrong cameras.
+    """The mean share of a mask that lies beside the hull. strictly: if no mask is forgiven, or 1 if
+    that leaves no hull. forgiving: if MOST_FORGIVEN of them are, which helps against wrong masks
+    but not against wrong cameras.
     """
 
     strictly: float
@@ -289,60 +298,64 @@ class Beside(NamedTuple):
 
 
 def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) -> Agreement:
-    """agreement_of() alone."""
+    """The Agreement that agreement_of() finds."""
     return agreement_of(dev, views, box)[0]
 
 
 def agreement_of(
     dev: Device, views: Sequence[View], box: np.ndarray | None = None
 ) -> tuple[Agreement, Beside]:
-    """How far masks agree, by what share of each lies where their hull does not. Views that look
-    elsewhere, or whose masks lie beside it by MOST_BESIDE and several times the usual share, are
-    left out. Where all do a little, as many are forgiven as it takes. Raises UserError as
+    """How far masks agree, measured by the share of each mask beside the hull. Views are left out
+    if they look elsewhere, or if that share exceeds MOST_BESIDE and several times the usual share.
+    If all masks deviate a little, as many as necessary are forgiven. Raises UserError as
     build_grid() does.
     """
-    if not any(one.has_mask for one in views):
+    if not any(view.has_mask for view in views):
         return Agreement(list(views), {}, 0), Beside(0.0, 0.0)
     most = int(MOST_LEFT_OUT * len(views))
     elsewhere = looking_elsewhere(views)
     left_out = {view.name: 1.0 for view in elsewhere if len(elsewhere) <= most}
-    left, forgiven = [view for view in views if view.name not in left_out], most // 2
+    kept, forgiven = [view for view in views if view.name not in left_out], most // 2
     beside = 1.0
     try:
-        shares = shares_beside(dev, left, box, 0)
+        shares = shares_beside(dev, kept, box, 0)
         beside = float(shares.mean())
         if shares.max() <= MOST_BESIDE / 2:
-            return Agreement(left, left_out, 0), Beside(beside, beside)
+            return Agreement(kept, left_out, 0), Beside(beside, beside)
     except UserError:  # no place is in all masks
         forgiven = most
     while len(left_out) < most:
-        shares = shares_beside(dev, left, box, forgiven)
+        shares = shares_beside(dev, kept, box, forgiven)
         worst = int(shares.argmax())
         if shares[worst] <= max(MOST_BESIDE, TIMES_USUAL * np.median(shares)):
             break
-        left_out[left.pop(worst).name] = float(shares[worst])
-    # the more masks are forgiven, the less of them lies beside the hull
+        left_out[kept.pop(worst).name] = float(shares[worst])
+    # the more masks are forgiven, the smaller is their share beside the hull
     least = bisect_left(
-        range(int(MOST_FORGIVEN * len(left))),
+        range(int(MOST_FORGIVEN * len(kept))),
         True,
-        key=lambda forgiven: shares_beside(dev, left, box, forgiven).mean() <= MOST_MISSED,
+        key=lambda forgiven: shares_beside(dev, kept, box, forgiven).mean() <= MOST_MISSED,
     )
-    quarter = int(MOST_FORGIVEN * len(left))
-    forgiving = shares_beside(dev, left, box, quarter).mean() if beside > MOST_BESIDE else beside
-    return Agreement(left, left_out, least), Beside(beside, float(forgiving))
+    quarter = int(MOST_FORGIVEN * len(kept))
+    forgiving = shares_beside(dev, kept, box, quarter).mean() if beside > MOST_BESIDE else beside
+    return Agreement(kept, left_out, least), Beside(beside, float(forgiving))
 
 
 def contradicting(views: Sequence[View], hull: Hull, agreement: Agreement) -> list[Disagreement]:
-    """disagreements() around a hull. Where no mask need be forgiven, of views left out alone: what
-    one alone carves away, no other shows.
+    """disagreements() around a hull. If no mask has to be forgiven, only those of views left out:
+    any other view that carves alone is the only one to show that the place is empty.
     """
-    found = disagreements(views, hull.grid.box)
-    return [one for one in found if agreement.forgiven or one.view.name in agreement.left_out]
+    contradictions = disagreements(views, hull.grid.box)
+    return [
+        disagreement
+        for disagreement in contradictions
+        if agreement.forgiven or disagreement.view.name in agreement.left_out
+    ]
 
 
 def misplaced(grid: Grid, ids: np.ndarray, views: Sequence[View]) -> list[View]:
-    """The views on whose mask a share of the shown points with ids (N,) falls that is several times
-    smaller than usual: their cameras, or masks, are of another place.
+    """The views whose mask covers a much smaller share than usual of the points with ids (N,) that
+    the view shows: their cameras or masks belong to another place.
     """
     places = grid.positions(ids[:: max(1, len(ids) // SAMPLED_POINTS)])
     masked, shares = [view for view in views if view.has_mask], []
@@ -361,8 +374,8 @@ def shares_beside(
     forgiven: int,
     points: int = COMPARED_POINTS,
 ) -> np.ndarray:
-    """(V,) the share of each view's mask that is further than a pixel from their silhouette, by a
-    hull of so many points. Raises UserError as build_grid() does.
+    """(V,) the share of each view's mask that is more than a pixel outside the silhouette of the
+    views' hull with `points` points. Raises UserError as build_grid() does.
     """
     hull = build_grid(dev, views, min(points, CELL_CAP), box, forgiven)
     shares = []
@@ -376,7 +389,9 @@ def shares_beside(
 
 
 def _farthest_point_order(views, centre):
-    """The views in farthest-point order of their directions: the first few reject most vertices."""
+    """The views in farthest-point order of their directions, so that the first few reject most
+    vertices.
+    """
     directions = np.stack([view.camera.eye - centre for view in views])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     order, nearest = [], np.full(len(views), np.inf)

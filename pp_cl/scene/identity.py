@@ -1,5 +1,5 @@
-"""The names, cameras and pixel digests of the training views in a checkpoint: to render without the
-scene, and to check that a training resumes with the same images.
+"""The names, cameras and pixel digests of the training views in a checkpoint, with which pp-cl
+renders without the scene and checks that a training resumes with the same images.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ from pp_cl.errors import few_names
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.readers.common import MOST, numbers
 
-POSE, LENS, RANGE = 12, 6, 2  # numbers of a stored view; it may have no depth range
-CLOSE = 1e-6  # world units or pixels: cameras are the same, as another processor rounds them
-MOST_SIDE = 2**24  # what float32 holds as whole numbers
+POSE, LENS, RANGE = 12, 6, 2  # numbers of a stored view, which may lack the depth range
+CLOSE = 1e-6  # world units or pixels: a smaller difference is another processor's rounding
+MOST_SIDE = 2**24  # float32 holds whole numbers up to this
 
 
 def identity(views: Sequence[View]) -> dict[str, Any]:
-    """{"pixels": {name: digest} of the views, None where the program makes them, "views": for
-    unpacked_views()}, for a checkpoint's header.
+    """Entries of a checkpoint's header: "pixels": {name: digest} of the views, None if the program
+    makes the images; "views": the list that unpacked_views() reads.
     """
     made = any(view.digest is None for view in views)
     pixels = None if made else {view.name: view.digest for view in views}
@@ -29,13 +29,13 @@ def identity(views: Sequence[View]) -> dict[str, Any]:
 
 
 def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> list[float]:
-    """The numbers of a camera and its depth range, which JSON keeps to the bit."""
+    """The numbers of a camera and its depth range, which JSON stores exactly."""
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
     return [float(number) for number in (*camera.pose.ravel(), *lens, *(depth_range or ()))]
 
 
 def unpacked_views(views: Any) -> list[ImageFile]:
-    """The training views that identity() has kept. Raises ValueError or TypeError."""
+    """The training views that identity() stored. Raises ValueError or TypeError."""
     if not isinstance(views, list) or not views:
         raise ValueError("no list of views")
     return [_unpacked(*view) for view in views]
@@ -60,10 +60,10 @@ def _unpacked(name, stored):
 def difference(
     header: dict[str, Any], listed: Sequence[ImageFile], views: Sequence[View] = ()
 ) -> str:
-    """How the training views of a checkpoint's header differ from those that a scene lists; ""
-    where all are listed with the same cameras. views: of which the pixels are compared, too.
+    """How the training views of a checkpoint's header differ from those that a scene lists; "" if
+    all are listed with the same cameras. views: views whose pixels are compared, too.
     """
-    cameras = {one.name: packed_camera(one.camera) for one in listed}
+    cameras = {image_file.name: packed_camera(image_file.camera) for image_file in listed}
     for name, packed in header["views"]:
         now = cameras.get(name)
         if now is None or not np.allclose(now, packed[: POSE + LENS], rtol=0, atol=CLOSE):

@@ -1,4 +1,4 @@
-"""Images that a scene lists, and reading one: its pixels, its mask, without distortion."""
+"""Images that a scene lists; reads the pixels and the mask of one, and removes its distortion."""
 
 import hashlib
 from collections.abc import Sequence
@@ -16,20 +16,20 @@ from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.scene.masks import OPAQUE, cut_out, is_by_colour, read_mask_of_size
 from pp_cl.settings import SceneConfig
 
-# Of a scene's images in memory, as RGBA; more than this is reduced while it is read. A fixed
-# number, not what happens to be free: the same command gives the same bits on every machine.
+# Images that take more memory than this, as RGBA, are reduced while they are read. The number is
+# fixed and does not depend on free memory, so that a command gives the same bits on every machine.
 MOST_IMAGE_BYTES = 2**29
-STRAIGHT = LensDistortion()  # of a lens without distortion
-DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
+STRAIGHT = LensDistortion()  # a lens without distortion
+DIGITS = 16  # hexadecimal digits of a view's digest: they show changed pixels, not forged ones
 
 
 @dataclass(frozen=True)
 class ImageFile:
     """An image that a scene lists, before its pixels are read. name, mask: paths relative to the
-    scene's folder, no mask: the image's own alpha. camera: of the stored image, freed of
-    distortion. depth_range: (near, far), Euclidean distances in world units, if stated. lens: of
-    the image as it lies in the file. ignore: path of an image that is white, or black, where this
-    one says nothing. turned: the picture is turned as its EXIF says, though its size does not ask.
+    scene's folder; mask None: the image's own alpha. camera: camera of the image without
+    distortion. depth_range: (near, far), Euclidean distances in world units, if stated. lens: the
+    distortion of the stored image. ignore: path of an image that is white (ignores_black: black)
+    on pixels to ignore. turned: apply the EXIF orientation although the size fits without it.
     """
 
     name: str
@@ -43,8 +43,8 @@ class ImageFile:
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], downscale: int) -> int:
-    """How many times to reduce images of these (width, height) while they are read: the least
-    divisor of `downscale` with which they take MOST_IMAGE_BYTES at most, else all of it.
+    """The factor by which to reduce images of these (width, height) while they are read: the least
+    divisor of `downscale` with which they fit in MOST_IMAGE_BYTES, or `downscale` if none does.
     """
     divisors = (f for f in range(1, downscale + 1) if downscale % f == 0)
     return next((f for f in divisors if image_bytes(sizes, f) <= MOST_IMAGE_BYTES), downscale)
@@ -56,8 +56,8 @@ def image_bytes(sizes: Sequence[tuple[int, int]], factor: int) -> int:
 
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:
-    """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): means of blocks of factor x
-    factor pixels on premultiplied colour, rounded.
+    """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): rounded means of the
+    premultiplied colours of factor x factor pixels.
     """
     if factor == 1:
         return image
@@ -79,7 +79,7 @@ def read_view(
     folder: Path, image_file: ImageFile, masks: SceneConfig, dev: Device | None, factor: int = 1
 ) -> View:
     """The View of an image of the scene in a folder, with its mask, reduced `factor` times. dev:
-    removes distortion. Raises Unusable where the image or a mask cannot be used.
+    the device that removes distortion. Raises Unusable if the image or a mask cannot be used.
     """
     camera = image_file.camera
 
@@ -123,7 +123,7 @@ def read_view(
 def pixel_digest(
     image: np.ndarray, lens: LensDistortion = STRAIGHT, ignored: np.ndarray | None = None
 ) -> str:
-    """Hex digest of a uint8 image with its mask, its distortion, and which pixels are ignored."""
+    """Hex digest of a uint8 image with its mask, its distortion and its ignored pixels."""
     digest = hashlib.sha256(np.ascontiguousarray(image).data)
     digest.update(repr(lens).encode() if lens else b"")
     digest.update(b"" if ignored is None else np.packbits(ignored).data)

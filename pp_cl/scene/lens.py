@@ -1,4 +1,4 @@
-"""Lens distortion models, and undistorting images."""
+"""Models of lens distortion, and the removal of distortion from images."""
 
 from dataclasses import astuple, dataclass
 
@@ -7,17 +7,17 @@ import numpy as np
 from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 
-PROBED = 65  # places along each axis
-BAND_BYTES = 2**23  # of the spline's coefficients that are on the device at a time
-MARGIN = 8  # coefficients beyond the image's left and right border, as cl/scene/lens.cl has it
-# rows beyond those that are read, after which nothing is left of where the recursion began (3e-7)
+PROBED = 65  # places along each axis at which a lens is tested for folds
+BAND_BYTES = 2**23  # bytes of the spline's coefficients on the device at a time
+MARGIN = 8  # coefficients beyond the image's left and right border, as in cl/scene/lens.cl
+# extra rows around those that are read, over which the recursion forgets its start (to 3e-7)
 RUN_UP = 12
-ROWS_PROBED = 9  # of a band, to find the rows of the image that it shows
+ROWS_PROBED = 9  # rows of a band that are traced to find the rows of the image that it shows
 
 
 @dataclass(frozen=True)
 class LensDistortion:
-    """Coefficients of OpenCV's models: of a perspective lens, or k1 to k4 of a fisheye."""
+    """Coefficients of OpenCV's models: the perspective one, or the fisheye one with k1 to k4."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -30,7 +30,7 @@ class LensDistortion:
     fisheye: bool = False
 
     def __bool__(self) -> bool:
-        """Whether it changes anything."""
+        """Whether there is any distortion."""
         return any(astuple(self))
 
     def apply(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -65,14 +65,14 @@ class LensDistortion:
 def undistort(
     dev: Device, image: np.ndarray, camera: Camera, lens: LensDistortion, factor: int = 1
 ) -> np.ndarray:
-    """(H // factor, W // factor, 4) uint8 straight RGBA that the camera would have taken without
-    distortion, of an image (H, W, 4): means of factor x factor samples, each by cubic spline on
-    premultiplied colour; beyond the image's border its edge goes on.
+    """(H // factor, W // factor, 4) uint8 straight RGBA: the image (H, W, 4) as the camera would
+    have taken it without distortion. Pixels are means of factor x factor samples of a cubic spline
+    through the premultiplied colours; beyond the image's border its edge is repeated.
     """
     width, height = camera.width // factor, camera.height // factor
     program, columns = dev.program("scene/lens"), camera.width + 2 * MARGIN
     packed = [camera.fx, camera.fy, camera.cx, camera.cy, *astuple(lens)]
-    numbers, found = dev.upload(packed, np.float32), np.empty((height, width, 4), np.uint8)
+    numbers, undistorted = dev.upload(packed, np.float32), np.empty((height, width, 4), np.uint8)
     most = max(1, BAND_BYTES // (16 * columns * factor))
     for top in range(0, height, most):
         bottom = min(top + most, height)
@@ -112,13 +112,13 @@ def undistort(
             coefficients=coefficients,
             image=band,
         )
-        found[top:bottom] = dev.download(band)
-    return found
+        undistorted[top:bottom] = dev.download(band)
+    return undistorted
 
 
 def _source_rows(camera, lens, top, bottom):
-    """(first, last + 1) row that the rows top to bottom need, with the RUN_UP on both sides; maybe
-    outside of the image, by as little as its edge takes to be constant.
+    """(first, last + 1) source rows for the rows top to bottom, with RUN_UP rows on both sides.
+    They may lie outside the image, where its edge is repeated, but no further than needed.
     """
     x = (np.arange(camera.width + 1) - camera.cx) / camera.fx
     y = (np.linspace(top, bottom, ROWS_PROBED) - camera.cy) / camera.fy

@@ -1,4 +1,4 @@
-"""Scenes: images of one object with cameras and masks, from a folder or made by the program."""
+"""Loads a scene: images of one object with cameras and masks, from a folder or made by pp-cl."""
 
 import math
 import mimetypes
@@ -49,42 +49,42 @@ from pp_cl.scene.readings import STATED, read_as
 from pp_cl.scene.silhouette import within_silhouettes
 from pp_cl.settings import Config, SceneConfig
 
-DEMO = "demo"  # the word that names the scene which the program makes itself
+DEMO = "demo"  # the word that names the scene that pp-cl makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, read_split(folder, split, left_out) gives a list of ImageFile of one of them
-# without reading pixels and adds the views that cannot be used to left_out. STATES is the kind of
-# its matrices and of their axes, out of readings.MATRICES and opengl or opencv. Only some have
-# splits(folder), the names of its splits, and box(folder), the box that the files state around the
-# object. The first that recognises a folder reads it.
+# holds such files, read_split(folder, split, left_out) lists a split's images as ImageFile without
+# reading pixels and adds the views that cannot be used to left_out. STATES is the format's kind of
+# matrices, one of readings.MATRICES, and their axes, opengl or opencv. Some modules also have
+# splits(folder), the names of the splits, and box(folder), the box that the files state around the
+# object. The first module that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
-# Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
-# mask; a mask by colour of the reduced image, in float64
+# Bytes per pixel that reading takes at its peak, measured with 12 megapixels: to decode an image
+# and its mask; to make a mask by colour, of the reduced image, in float64
 DECODED, CUT_OUT = 18, 160
-BAND_COPIES = 2  # BAND_BYTES of a spline's coefficients, and the pixels before and after
-READING_BYTES = 3 * 2**28  # of the images that are read side by side
+BAND_COPIES = 2  # BAND_BYTES for a spline's coefficients, and for the pixels before and after
+READING_BYTES = 3 * 2**28  # bytes for the images that are read side by side
 
-LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
+LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md has the measurements
 
-MEASURED = 12  # views whose masks are looked at for soft edges
-# of what masks hold: sharp ones have 0 at any size, those blurred with a sigma of 5 pixels 0.4
+MEASURED = 12  # views whose masks are tested for soft edges
+# half-transparent share of a mask: 0 at any size if it is sharp, 0.4 if blurred by 5 pixels (sigma)
 SOFT = 0.05
-INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
-BESIDE = 0.5  # of what is transparent, that a mask which is not of the object holds
-WRONG = "what the scene's files say of it is wrong"  # of a view whose error is no Unusable
-OF_OTHERS = "without a mask, views are used inside the hull of the others' masks, but for a rim"
+INVERTED = 0.95  # share of an image's border that hardly any object's mask covers
+BESIDE = 0.5  # share of the transparent pixels that only a mask not of the object covers
+WRONG = "the scene's files describe them wrongly"  # for a view whose error is not Unusable
+OF_OTHERS = "views without a mask are used inside the hull of the others' masks, except for a rim"
 OF_TRAINING = "pictures that are in training, too, so that figures flatter"
-FITS = 1.2  # times better that masks fit pictures which are turned, in the median
-TURNED = "pictures are turned as their EXIF says, as their masks fit only so"
+FITS = 1.2  # median factor by which masks must fit turned pictures better
+TURNED = "pictures are turned as their EXIF says, as only then their masks fit"
 STORED = "pictures are taken as they are stored, not turned as their EXIF says"
-LEAST_VIEWS = 8  # for training that are left where some are left out
+LEAST_VIEWS = 8  # training views that must remain if others are left out
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 
 
 class SplitFiles(NamedTuple):
-    """The images of a split, without their pixels. left_out: the names of those that cannot be
-    used, and why. done: (name of an image, what was done to use it).
+    """The images of a split, without their pixels. left_out: names of images that cannot be used,
+    with the reason. done: (name of an image, how it was changed to be usable).
     """
 
     image_files: list[ImageFile]
@@ -94,8 +94,8 @@ class SplitFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Views of one object, by split ("train", "val", "test"). folder: None for a scene that the
-    program makes itself. notes: lines of what was done to use them, such as views left out.
+    """Views of one object, by split ("train", "val", "test"). folder: None for the scene that pp-cl
+    makes itself. notes: one line per warning, such as on views left out.
     """
 
     name: str
@@ -111,8 +111,8 @@ def open_scene(
     most: int | None = None,
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
-    """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
-    `demo` is rendered on the device. most, listed: as load_scene() takes them.
+    """The Scene at config.scene.path with the given splits, reduced config.scene.downscale times;
+    `demo` is rendered on the device. most, listed: as in load_scene().
     """
     path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
@@ -123,31 +123,31 @@ def open_scene(
     )
     views = scene.splits.get("train", [])
     masked = [view for view in views if view.has_mask]
-    shares, told = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked], []
+    shares, lines = [(border(view.image[..., 3]) > OPAQUE // 2).mean() for view in masked], []
     if masked and np.median(shares) > INVERTED:
-        told.append(
-            "most masks hold the border of their image, as if they were inverted: they must be"
+        lines.append(
+            "most masks cover the border of their image, as if they were inverted: they must be"
             " white on the object and black around it"
         )
     alphas = [shrink(view.image, view.downscale)[..., 3] for view in evenly(masked, MEASURED)]
     if masked and (soft := np.mean([half_transparent(alpha) for alpha in alphas])) > SOFT:
-        told.append(
-            f"{soft:.0%} of what the masks hold is half transparent, edges not counted: where the"
-            " object is opaque, sharp masks give a sharper model"
+        lines.append(
+            f"{soft:.0%} of the masks' area is half transparent, not counting edges: if the object"
+            " is opaque, sharp masks give a sharper model"
         )
     if views and not masked and most is None and config.scene.mask_from != "box":
-        told.append(
+        lines.append(
             "no image has a mask: points fill the box that all cameras see; --mask-from color cuts"
-            " out a uniform background, --masks FOLDER takes masks, --mask-from box says that it is"
-            " meant"
+            " out a uniform background, --masks FOLDER takes masks, --mask-from box confirms that"
+            " the box is intended"
         )
-    _tell(path, told)
+    _tell(path, lines)
     return scene
 
 
 def scene_box(config: Config) -> np.ndarray | None:
-    """(2, 3) lower and upper corner of the setting scene.box, else of the user's edits, else
-    of what the scene's format states, or None. Raises UserError for a box without volume.
+    """(2, 3) lower and upper corner of the box that the setting scene.box, the user's edits or the
+    scene's format state, in this order, or None. Raises UserError for a box without volume.
     """
     corners, path = np.array(config.scene.box, np.float64).reshape(2, 3), config.scene.path
     if not corners.any():
@@ -162,12 +162,12 @@ def scene_box(config: Config) -> np.ndarray | None:
 
 
 def scene_format(path: str) -> str:
-    """The name of the reader of a scene; of `demo` the word itself. Raises UserError."""
+    """The name of a scene's reader, or "demo" for that scene. Raises UserError."""
     return DEMO if path == DEMO else find_reader(path).__name__.rpartition(".")[2]
 
 
 def scene_splits(path: Path | str) -> list[str]:
-    """The names of a scene's splits. Raises UserError where there is no scene."""
+    """The names of a scene's splits. Raises UserError if there is no scene."""
     if path == DEMO:
         return list(demo.SPLITS)
     reader = find_reader(path)
@@ -178,15 +178,15 @@ def scene_splits(path: Path | str) -> list[str]:
 
 
 def scene_frames(path: str | Path, split: str = "train", *, edited: bool = True) -> list[ImageFile]:
-    """list_split()'s image_files; what it left out and did becomes warnings."""
-    found = list_split(path, split, edited=edited)
-    _tell(Path(path), _lines(split, *found))
-    return found.image_files
+    """The image_files of list_split(), with warnings on images left out or changed."""
+    split_files = list_split(path, split, edited=edited)
+    _tell(Path(path), _lines(split, *split_files))
+    return split_files.image_files
 
 
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> SplitFiles:
-    """The images of a split; edited: but for those that the user has dropped. Raises UserError
-    where too few are left.
+    """The images of a split, without those that the user has dropped if `edited`. Raises UserError
+    if too few remain.
     """
     if path == DEMO:
         return SplitFiles(demo.demo_frames(split), [], [])
@@ -201,32 +201,34 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     if edits.axes and edits.axes != STATED:
         image_files = _as_edited(folder, reader, split, image_files, edits)
     if edited:
-        image_files = [one for one in image_files if one.name not in edits.dropped]
+        image_files = [image for image in image_files if image.name not in edits.dropped]
     if not image_files and not left_out:
         lacks = f"; {EDITS} drops some" if edited and edits.dropped else ""
         raise UserError(f"{folder}: split {split} has no images{lacks}; add some")
 
     check = partial(with_sound_lens, folder)
-    image_files = list(usable(image_files, check, lambda one: one.name, left_out))
+    image_files = list(usable(image_files, check, lambda image: image.name, left_out))
     _check_left(image_files, left_out, LEAST_VIEWS if split == "train" else 1)
-    image_files, told = _masked(folder, reader, image_files, split)
-    done += told
+    image_files, done_to_masks = _masked(folder, reader, image_files, split)
+    done += done_to_masks
     image_files = _ignoring(folder, IGNORE_FOLDERS, image_files, split)
     ignored = "pixels are ignored where the masks in ignore are white"
-    done += [(one.name, ignored) for one in image_files if one.ignore and not one.ignores_black]
-    if split != "train" and present is not SPLITS:  # else hold_out() has dealt out pictures
+    done += [
+        (image.name, ignored) for image in image_files if image.ignore and not image.ignores_black
+    ]
+    if split != "train" and present is not SPLITS:  # hold_out() never puts a picture in both
         trained: list[ImageFile] = []
         with suppress(UserError):
             trained = reader.read_split(folder, "train", []) if "train" in present else []
-        pictures = pictures_of([folder / one.name for one in (*trained, *image_files)])
+        pictures = pictures_of([folder / image.name for image in (*trained, *image_files)])
         known = set(pictures[: len(trained)])
-        found = zip(image_files, pictures[len(trained) :], strict=True)
-        done += [(one.name, OF_TRAINING) for one, picture in found if picture in known]
+        pairs = zip(image_files, pictures[len(trained) :], strict=True)
+        done += [(image.name, OF_TRAINING) for image, picture in pairs if picture in known]
     return SplitFiles(image_files, left_out, done)
 
 
 def _as_edited(folder: Path, reader: ModuleType, split: str, image_files: list, edits: Edits):
-    """The images of a split with cameras as `axes` of the edits has them, of all splits."""
+    """The images of a split, with the cameras that all splits have by the `axes` of the edits."""
     others: list[ImageFile] = []
     for other in scene_splits(folder):
         if other != split:
@@ -237,27 +239,29 @@ def _as_edited(folder: Path, reader: ModuleType, split: str, image_files: list, 
 
 
 def _right_handed(folder, image_files, left_out, done):
-    """The images; where most poses are left-handed, those in the world's mirror image."""
-    is_left = [np.linalg.det(one.camera.pose[:, :3]) < 0 for one in image_files]
+    """The images with right-handed poses: mirrored with the world if most poses are left-handed.
+    Images whose handedness differs from most go to left_out.
+    """
+    is_left = [np.linalg.det(image.camera.pose[:, :3]) < 0 for image in image_files]
     are_most, kept = 2 * sum(is_left) >= len(is_left), []
-    for one, left in zip(image_files, is_left, strict=True):
-        if left != are_most:
+    for image, is_mirrored in zip(image_files, is_left, strict=True):
+        if is_mirrored != are_most:
             text = (
-                f"{folder / one.name}: its camera's axes have another handedness than the others'"
+                f"{folder / image.name}: its camera's axes have another handedness than the others'"
             )
-            left_out.append((one.name, Unusable(f"{text}; write them again", "a mirrored pose")))
-        elif not left:
-            kept.append(one)
+            left_out.append((image.name, Unusable(f"{text}; write them again", "a mirrored pose")))
+        elif not is_mirrored:
+            kept.append(image)
         else:
-            pose = one.camera.pose * [[-1], [1], [1]]
-            kept.append(replace(one, camera=replace(one.camera, pose=pose)))
-            what = "poses are left-handed (determinant -1), and read in the world's mirror image"
-            done.append((one.name, what))
+            pose = image.camera.pose * [[-1], [1], [1]]
+            kept.append(replace(image, camera=replace(image.camera, pose=pose)))
+            what = "poses are left-handed (determinant -1), so they and the world are mirrored"
+            done.append((image.name, what))
     return kept
 
 
 def with_sound_lens(folder: Path, image_file: ImageFile) -> ImageFile:
-    """The same image of a folder. Raises Unusable where its camera shows nothing in float32, or its
+    """The given image of a folder. Raises Unusable if its camera shows nothing in float32 or its
     distortion folds.
     """
     file, camera = folder / image_file.name, image_file.camera
@@ -280,43 +284,44 @@ def with_sound_lens(folder: Path, image_file: ImageFile) -> ImageFile:
     return image_file
 
 
-def _check_left(left, left_out, least):
-    """Raise the first error of left_out where fewer than `least`, or less than half, are left."""
-    if left_out and len(left) < max(least, len(left_out)):
+def _check_left(kept, left_out, least):
+    """Raise the first error of left_out if fewer than `least` images, or less than half, remain."""
+    if left_out and len(kept) < max(least, len(left_out)):
         raise left_out[0][1]
 
 
 def _masked(folder, reader, image_files, split):
-    """(The images, with the masks of a folder of masks where the format names none; what was
-    done). Images of a transforms.json have their own alpha, if any, and where masks are of the
-    object, masks that it names say where images are of use, as nerfstudio takes it.
+    """(The images, with masks from a folder of masks if the format names none; what was done). For
+    a transforms.json, the images' own alpha goes before a folder, and if there are other masks of
+    the object, the masks that it names mark the usable pixels, as in nerfstudio.
     """
-    named, done = [one for one in image_files if one.mask], []
+    named, done = [image for image in image_files if image.mask], []
     if named:
         if reader is not transforms or not _are_besides(folder, named[0]):
             return image_files, done
-        what = "masks that frames name are taken for where images are of use"
-        done = [(one.name, what) for one in named]
+        what = "masks that frames name are taken to mark the usable pixels"
+        done = [(image.name, what) for image in named]
         image_files = [
-            replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in image_files
+            replace(image, mask=None, ignore=image.mask, ignores_black=True)
+            for image in image_files
         ]
     place = folder_named(folder, MASK_FOLDERS)
-    for one in image_files if place and reader is transforms else ():
-        with suppress(Unusable):  # the first image that can be read tells of all
-            if is_transparent(folder / one.name):
+    for image in image_files if place and reader is transforms else ():
+        with suppress(Unusable):  # the first readable image stands for all
+            if is_transparent(folder / image.name):
                 return image_files, done
             break
     masks = _masks_in(folder, image_files, split, MASK_FOLDERS)
     if masks and reader is transforms:
         what = f"masks are taken from {folder / place}, which no frame names"
         done += [(name, what) for name in masks]
-    return [replace(one, mask=masks.get(one.name)) for one in image_files], done
+    return [replace(image, mask=masks.get(image.name)) for image in image_files], done
 
 
 def _masks_in(folder, image_files, split, places):
-    """find_masks(); {} for other splits than train where no image has one."""
+    """find_masks(), but {} if no image of a split other than train has a mask."""
     try:
-        return find_masks(folder, [one.name for one in image_files], places) or {}
+        return find_masks(folder, [image.name for image in image_files], places) or {}
     except UserError:
         if split == "train":
             raise
@@ -328,7 +333,9 @@ def _absolute(folder, masks):
 
 
 def _are_besides(folder, image_file):
-    """Whether the mask that a frame names is none of the object, by alpha or a folder of masks."""
+    """Whether the mask that a frame names is not of the object, judged by the image's alpha or a
+    folder of masks.
+    """
     place, image = folder_named(folder, MASK_FOLDERS), folder / image_file.name
     if place and not image_file.mask.startswith(f"{place}/"):
         return True
@@ -341,30 +348,36 @@ def _are_besides(folder, image_file):
 
 
 def _ignoring(folder, places, image_files, split):
-    """The images, with the masks of what says nothing in one of the places in a folder."""
+    """The images, each with its mask of ignored pixels, if the first of the places that exists in a
+    folder has one.
+    """
     files = _absolute(folder, _masks_in(folder, image_files, split, places))
     return [
-        replace(one, ignore=files[one.name], ignores_black=False) if one.name in files else one
-        for one in image_files
+        replace(image, ignore=files[image.name], ignores_black=False)
+        if image.name in files
+        else image
+        for image in image_files
     ]
 
 
 def _lines(split, used, left_out, done):
-    """One line for each kind of thing that was left out or done in a split."""
-    told: dict[str, list[str]] = {}
+    """One line for each reason to leave out or change images of a split."""
+    names_of: dict[str, list[str]] = {}
     for name, error in left_out:
-        told.setdefault(f"views left out: {getattr(error, 'why', WRONG)}", []).append(name)
-    count, gone = len(used) + len(left_out), len(told)
+        names_of.setdefault(f"views left out: {getattr(error, 'why', WRONG)}", []).append(name)
+    count, gone = len(used) + len(left_out), len(names_of)
     for name, what in done:
-        told.setdefault(what, []).append(name)
+        names_of.setdefault(what, []).append(name)
     return [
         f"{split}: {f'{len(names)} of {count} ' * (i < gone)}{what} ({few_names(names)})"
-        for i, (what, names) in enumerate(told.items())
+        for i, (what, names) in enumerate(names_of.items())
     ]
 
 
 def _tell(folder, lines):
-    """Warn of each line once, however often a command asks: equal warnings of one line are one."""
+    """Warn once for each line, however often a command asks: Python shows equal warnings from one
+    place once.
+    """
     for line in lines:
         warnings.warn(one_line(f"{folder}: {line}"), stacklevel=1)
 
@@ -373,7 +386,9 @@ def _tell(folder, lines):
 
 
 def measured_split(path: str) -> str:
-    """The split that tells how a training goes: val, else test. Raises UserError without either."""
+    """The split that measures a running training: val, or else test. Raises UserError if there is
+    neither.
+    """
     present = scene_splits(path)
     if split := next((split for split in ("val", "test") if split in present), ""):
         return split
@@ -381,7 +396,7 @@ def measured_split(path: str) -> str:
 
 
 def find_reader(path: str | Path) -> ModuleType:
-    """The module of READERS for a folder. Raises UserError where it holds no scene."""
+    """The module of READERS for a folder. Raises UserError if the folder holds no scene."""
     folder = Path(path)
     check_folder(folder)
     if os.access(folder, os.R_OK | os.X_OK) and (reader := _reader_of(folder)):
@@ -393,11 +408,11 @@ def find_reader(path: str | Path) -> ModuleType:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise UserError where a scene's folder is missing, no folder, or cannot be read."""
+    """Raise UserError if a scene's folder is missing, is not a folder, or cannot be read."""
     if folder.is_file():
         is_video = (mimetypes.guess_type(folder.name)[0] or "").startswith("video/")
         mend = f"a scene is a folder, maybe {folder.absolute().parent}"
-        mend = f"`pp-cl capture {folder} --out SCENE` makes a scene of it" if is_video else mend
+        mend = f"`pp-cl capture {folder} --out SCENE` makes a scene from it" if is_video else mend
         mend = "unpack it and give the folder in it" if folder.suffix.lower() in ARCHIVES else mend
         raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
@@ -407,7 +422,7 @@ def check_folder(folder: Path) -> None:
 
 
 def _reader_of(folder):
-    """The reader of a folder, None where it holds no scene."""
+    """The reader of a folder, or None if it holds no scene."""
     return next((reader for reader in READERS if reader.recognises(folder)), None)
 
 
@@ -424,36 +439,35 @@ def load_scene(
     downscale: int | None = None,
     listed: Mapping[str, SplitFiles] | None = None,
 ) -> Scene:
-    """Scene of the given splits from a folder. most: views to read of each
-    split, spread evenly; None: all. dev: removes distortion, and finds silhouettes for training
-    views without masks, which are left out without it. downscale: how many times images are
-    reduced; None: as they are stored. listed: what list_split() gave of some splits. Raises
-    UserError naming the file, and the key, for whatever is missing, broken or contradictory, and
-    for distortion without a device.
+    """The Scene in a folder with the given splits. most: views to read of each split, spread
+    evenly; None: all. dev: the device that removes distortion and finds silhouettes for training
+    views without masks; without it they are left out. downscale: factor by which images are
+    reduced; None: as stored. listed: results of list_split(), by split. Raises UserError naming the
+    file and the key for missing, broken or contradictory data, and for distortion without a device.
     """
     folder, lines = Path(path), []
     for option, given in (("--masks", masks.masks), ("--ignore", masks.ignore)):
         if given and not os.path.isdir(given):
-            raise UserError(f"{given}: no such folder; {option} takes one of masks")
+            raise UserError(f"{given}: no such folder; {option} takes a folder of masks")
     chosen: dict[str, list[ImageFile]] = {}
     left_out: dict[str, LeftOut] = {}
     for split in splits:
-        found = (listed or {}).get(split) or list_split(folder, split)
-        lines += _lines(split, *found)
+        split_files = (listed or {}).get(split) or list_split(folder, split)
+        lines += _lines(split, *split_files)
         chosen[split], left_out[split] = [], []
-        chosen_files = _by_rule(masks, evenly(found.image_files, most), split)
+        chosen_files = _by_rule(masks, evenly(split_files.image_files, most), split)
         chosen_files, done = _as_masks_fit(folder, chosen_files)
-        lines += _lines(split, found.image_files, [], done)
-        for one in chosen_files:
+        lines += _lines(split, split_files.image_files, [], done)
+        for image in chosen_files:
             try:
                 if downscale:
-                    check_downscale(one.name, one.camera, downscale)
-                chosen[split].append(one)
+                    check_downscale(image.name, image.camera, downscale)
+                chosen[split].append(image)
             except UserError as error:
-                left_out[split].append((one.name, error))
+                left_out[split].append((image.name, error))
         _check_left(chosen[split], left_out[split], 1)
-    image_files = [one for some in chosen.values() for one in some]
-    if dev is None and any(one.lens for one in image_files):
+    image_files = [image for some in chosen.values() for image in some]
+    if dev is None and any(image.lens for image in image_files):
         raise UserError(f"{folder}: its images have distortion, which only a device removes")
     factor = shrink_factor([(p.camera.width, p.camera.height) for p in image_files], downscale or 1)
     views = {
@@ -477,42 +491,43 @@ def _reduced(splits, downscale):
 
 
 def _by_rule(rule, image_files, split):
-    """The images, with the masks of the rule's folders, and none where its masks are no files."""
+    """The images, with masks from the rule's folders, or none if its masks are not files."""
     if rule.masks:
         files = _absolute(Path(rule.masks), _masks_in(Path(rule.masks), image_files, split, ["."]))
-        image_files = [replace(one, mask=files.get(one.name)) for one in image_files]
+        image_files = [replace(image, mask=files.get(image.name)) for image in image_files]
     elif rule.mask_from != "given":
-        image_files = [replace(one, mask=None) for one in image_files]
+        image_files = [replace(image, mask=None) for image in image_files]
     if rule.ignore:
         image_files = _ignoring(Path(rule.ignore), ["."], image_files, split)
     return image_files
 
 
 def _as_masks_fit(folder, image_files):
-    """(The images, what was done): pictures whose EXIF turns them though their size does not ask
-    for it are turned where their masks fit only so.
+    """(The images, what was done): pictures that fit their camera with and without the EXIF
+    orientation are turned if only then their masks fit.
     """
     asked = []
-    for one in image_files:
-        with suppress(Unusable):  # what cannot be read is left out later
-            turns, is_square = exif_turns(folder / one.name), one.camera.width == one.camera.height
-            asked += [one] if turns == 2 or (turns and is_square) else []
+    for file in image_files:
+        with suppress(Unusable):  # an unreadable image is left out later
+            turns = exif_turns(folder / file.name)
+            is_square = file.camera.width == file.camera.height
+            asked += [file] if turns == 2 or (turns and is_square) else []
     fits = []
-    for one in evenly([one for one in asked if one.mask], MEASURED):
+    for file in evenly([file for file in asked if file.mask], MEASURED):
         with suppress(UserError):
             image, turned = (
-                read_rgba(folder / one.name, turned=is_turned) for is_turned in (False, True)
+                read_rgba(folder / file.name, turned=is_turned) for is_turned in (False, True)
             )
-            mask = read_mask_of_size(folder / str(one.mask), image.shape[1::-1])
+            mask = read_mask_of_size(folder / str(file.mask), image.shape[1::-1])
             fits.append(fits_turned(image, turned, mask))
     is_turned = bool(fits) and np.median(fits) > FITS
-    turned = {one.name for one in asked if one.mask and is_turned}
-    image_files = [replace(one, turned=one.name in turned) for one in image_files]
-    return image_files, [(one.name, TURNED if one.name in turned else STORED) for one in asked]
+    turned = {file.name for file in asked if file.mask and is_turned}
+    image_files = [replace(file, turned=file.name in turned) for file in image_files]
+    return image_files, [(file.name, TURNED if file.name in turned else STORED) for file in asked]
 
 
 def _read_views(folder, image_files, masks, dev, factor, left_out):
-    """The views of the images that can be used, several read at a time."""
+    """The views of the usable images, several read at a time; the others go to left_out."""
 
     def read(image_file):
         try:
@@ -523,17 +538,17 @@ def _read_views(folder, image_files, masks, dev, factor, left_out):
     views = []
     with ThreadPoolExecutor(reading_cost(image_files, masks, factor)[0]) as pool:
         reads = track(pool.map(read, image_files), "reading images", "image", len(image_files))
-        for image_file, found in zip(image_files, reads, strict=True):
-            if isinstance(found, UserError):
-                left_out.append((image_file.name, found))
+        for image_file, result in zip(image_files, reads, strict=True):
+            if isinstance(result, UserError):
+                left_out.append((image_file.name, result))
             else:
-                views.append(found)
+                views.append(result)
     return views
 
 
 def _all_masked(folder, views, dev, left_out):
-    """(views that all have masks, what was done): those without are used inside the hull of the
-    others' masks, on a device, and left out else.
+    """(views that all have masks, what was done). Views without a mask get the silhouette of the
+    others' hull, if there is a device and there are enough masks; otherwise they are left out.
     """
     bare = [view for view in views if not (view.is_masked or view.has_mask)]
     masked = [view for view in views if view.is_masked or view.has_mask]
@@ -543,7 +558,7 @@ def _all_masked(folder, views, dev, left_out):
             views = [filled.get(view.name, view) for view in views]
             return views, [(name, OF_OTHERS) for name in filled]
     for view in bare:
-        text = f"{folder / view.name}: has no mask, as others have; add it, or remove all"
+        text = f"{folder / view.name}: has no mask, but others have; add it, or remove all"
         left_out.append((view.name, Unusable(text, "no mask")))
     return masked, []
 
@@ -551,12 +566,12 @@ def _all_masked(folder, views, dev, left_out):
 def reading_cost(
     image_files: Sequence[ImageFile], masks: SceneConfig = AS_GIVEN, factor: int = 1
 ) -> tuple[int, int]:
-    """(how many images are read side by side, bytes that this takes beside the images that stay):
-    as many as there are cores and READING_BYTES hold.
+    """(number of images to read side by side, bytes that this takes besides the images themselves):
+    as many images as there are cores and as READING_BYTES hold.
     """
     per_pixel = DECODED + (CUT_OUT / factor**2 if is_by_colour(masks) else 0)
-    pixels = max(one.camera.width * one.camera.height for one in image_files)
+    pixels = max(image.camera.width * image.camera.height for image in image_files)
     most = math.ceil(per_pixel * pixels)
     workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(image_files)))
-    is_bent = any(one.lens for one in image_files)
+    is_bent = any(image.lens for image in image_files)
     return workers, workers * most + (BAND_COPIES * BAND_BYTES if is_bent else 0)

@@ -16,34 +16,36 @@ from pp_cl.files.image import read_mask, same_shape
 from pp_cl.scene.found import find_mask
 from pp_cl.settings import SceneConfig
 
-BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
+BORDER_SHARE = 0.5  # share of the border's pixels that must have its median colour
 OPAQUE = 255
 BAD_MASK = "a mask that cannot be used"
-HOLE = 5e-5  # of the image: smaller regions are none
+HOLE = 5e-5  # share of the image; a smaller region is no hole
 HALF = 16, 239  # alphas between which a pixel is half transparent
-EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
+EDGE = 2.5  # pixels over which lens and demosaicing mix colours
 
 
-AS_GIVEN = SceneConfig()  # the masks of the scene's format, else alpha
+AS_GIVEN = SceneConfig()  # the masks of the scene's format, or alpha without them
 
 
 def is_by_colour(masks: SceneConfig) -> bool:
-    """Whether cut_out() makes the masks, of images as they are used, since it takes long."""
+    """Whether cut_out() makes the masks, from the reduced images, since it takes long."""
     return masks.mask_from == "color" and not masks.masks
 
 
 def named_mask(folder: Path, *names: str) -> Path:
-    """The mask of an image in a folder, by one of its names, paths or not. Raises UserError."""
+    """The file in a folder with the mask of an image, which may have several names or paths. Raises
+    UserError if there is none.
+    """
     for name in names:
-        if found := find_mask(folder, name) or find_mask(folder, PurePosixPath(name).name):
-            return folder / found
+        if mask := find_mask(folder, name) or find_mask(folder, PurePosixPath(name).name):
+            return folder / mask
     usual = PurePosixPath(names[0]).stem
     raise UserError(f"{folder}: no mask for {names[0]}; add {usual}.png, white where the object is")
 
 
 def read_mask_of_size(file: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) uint8 mask of a file, 255 where the object is, resized to an image of (width, height),
-    whose shape it must have. Raises Unusable.
+    """(H, W) uint8 mask in a file, 255 on the object, resized to its image's (width, height).
+    Raises Unusable, also if the mask has another aspect ratio.
     """
     try:
         mask = read_mask(file)
@@ -63,10 +65,11 @@ def read_mask_of_size(file: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = False) -> np.ndarray:
-    """(H, W, 4) uint8: the image without the uniform background that reaches its border, no further
-    than `tolerance` from the border's median in CIELAB. Places of that colour which the object
-    encloses are opaque; with_holes: but for the smallest they are holes. Pixels at the edge are a
-    mixture with the nearest colour within. Raises Unusable where the border has several colours.
+    """(H, W, 4) uint8: the image without its uniform background, which consists of the pixels that
+    are connected to the border and within `tolerance` of its median colour in CIELAB. Regions of
+    that colour inside the object stay opaque; with_holes makes all but the smallest transparent.
+    Pixels at the edge count as mixtures of the background with the nearest colour of the object.
+    Raises Unusable if the border has several colours.
     """
     colour = image[..., :3] / 255.0
     behind = np.median(border(colour), axis=0)
@@ -74,7 +77,7 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
     share = (border(distance) < 2 * tolerance).mean()
     if share < BORDER_SHARE:
         raise Unusable(
-            f"{name}: only {share:.0%} of its border have one colour, so --mask-from color finds no"
+            f"{name}: only {share:.0%} of its border has one colour, so --mask-from color finds no"
             " background; give masks with --masks FOLDER, or a higher scene.mask_tolerance",
             "no uniform background",
         )
@@ -101,16 +104,20 @@ def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = F
 
 
 def half_transparent(alpha: np.ndarray) -> float:
-    """The share of what a mask (H, W) uint8 holds that is half transparent with all around it."""
+    """The share of a mask's area, (H, W) uint8, in which a pixel and all its neighbours are half
+    transparent.
+    """
     within = erosion((alpha > HALF[0]) & (alpha < HALF[1]), np.ones((3, 3)))
     return float(within.sum() / max((alpha > MASK_THRESHOLD).sum(), 1))
 
 
 def fits_turned(image: np.ndarray, turned: np.ndarray, mask: np.ndarray) -> float:
-    """How many times better a mask (H, W) fits the second of two images (H, W, 4): by what their
-    brightness changes at the edge of the mask, compared with elsewhere.
+    """How many times better a mask (H, W) fits the second of two images (H, W, 4), judged by how
+    much more their brightness changes at the mask's edge than elsewhere.
     """
     edge = dilation(mask > OPAQUE // 2) ^ erosion(mask > OPAQUE // 2)
-    changes = (np.hypot(*np.gradient(one[..., :3].mean(2))) + 1e-3 for one in (image, turned))
+    changes = (
+        np.hypot(*np.gradient(picture[..., :3].mean(2))) + 1e-3 for picture in (image, turned)
+    )
     before, after = (change[edge].mean() / change.mean() for change in changes)
     return float(after / before)

@@ -20,7 +20,7 @@ from pp_cl.scene.image_file import shrink
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # images of the sheet, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
 MASK_OUTLINE = (0, 150, 255)
-REJECTED = np.array([127, 60, 0], np.uint8)  # added to what a mask should have held
+REJECTED = np.array([127, 60, 0], np.uint8)  # added where a mask lacks a part of the object
 
 
 def outline(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
@@ -35,12 +35,15 @@ def outline_sheet(
     disagreeing: Sequence[Disagreement] = (),
 ) -> np.ndarray:
     """uint8 (H, W, 3) contact sheet of up to 12 views over white, with the outlines of the mask and
-    of the points; those of `disagreeing` come first, tinted where they reject what others hold.
+    of the points. Views of `disagreeing` come first, tinted where they reject places that the
+    others agree on.
     """
     target, images = Target(dev), []
-    tinted = {one.view.name: one for one in disagreeing[:SHOWN_VIEWS]}
+    tinted = {disagreement.view.name: disagreement for disagreement in disagreeing[:SHOWN_VIEWS]}
     others = [view for view in views if view.name not in tinted]
-    shown = [one.view for one in tinted.values()] + evenly(others, SHOWN_VIEWS - len(tinted))
+    shown = [disagreement.view for disagreement in tinted.values()] + evenly(
+        others, SHOWN_VIEWS - len(tinted)
+    )
     for view in shown:
         small = view.near_size(SHOWN_SIZE)
         image = to_8bit(target.whole(small))

@@ -1,4 +1,4 @@
-"""Images without a mask among others that have one: what the others' visual hull tells of them."""
+"""Gives images without a mask the silhouette of the other masks' visual hull."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,20 +11,20 @@ from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.scene.hull import agreeing, build_grid, silhouette
 
-POINTS, SIDE = 250_000, 400  # of the hull, and pixels of the images in which it is looked at
-# The rim of a silhouette that is ignored: the hull is larger than the object, by 1 to 4 % of its
-# pixels. Outside a few pixels tell that its points are of some size.
-INWARD, OUTWARD = 0.05, 0.005  # of the image's longer side
+POINTS, SIDE = 250_000, 400  # points of the hull, and pixels of the images that show it
+# The ignored rim of a silhouette, as shares of the image's longer side: inwards, since the hull is
+# larger than the object, by 1 to 4 % of its pixels; outwards, since its points have a size.
+INWARD, OUTWARD = 0.05, 0.005
 
 
 def within_silhouettes(dev: Device, views: Sequence[View], bare: Sequence[View]) -> list[View]:
-    """The views without a mask, transparent outside of the hull that the masks of the others leave,
-    opaque well inside of it; between, in a rim, they are ignored. Raises UserError as build_grid()
-    does, and where the masks contradict each other: then these views cost more than they win.
+    """The views without a mask, made transparent outside the hull that the masks of the others
+    leave and opaque well inside it; the rim in between is ignored. Raises UserError as build_grid()
+    does, and if the masks contradict each other, since such views then do more harm than good.
     """
     agreement = agreeing(dev, views)
     if agreement.forgiven:
-        raise UserError("the masks contradict each other; add those that are missing")
+        raise UserError("the masks contradict each other; add the missing masks")
     hull = build_grid(dev, agreement.views, POINTS)
     filled = []
     for view in bare:
@@ -45,14 +45,14 @@ def within_silhouettes(dev: Device, views: Sequence[View], bare: Sequence[View])
 
 
 def _distance(covered):
-    """(H, W) pixels from each covered one to the nearest that is not."""
+    """(H, W) distances in pixels from each covered pixel to the nearest uncovered one."""
     if covered.all():
         return np.full(covered.shape, np.inf)
     return distance_transform_edt(covered)
 
 
 def _enlarged(values, shape, times):
-    """(H, W) of the pixels of a reduced image, for those of the image of a shape (H, W, 4)."""
+    """(H, W) values of a reduced image's pixels, repeated for the image of a shape (H, W, 4)."""
     whole = values.repeat(times, axis=0).repeat(times, axis=1)
     beyond = [(0, n - m) for n, m in zip(shape, whole.shape, strict=False)]
     return np.pad(whole, beyond, mode="edge")

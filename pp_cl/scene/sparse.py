@@ -1,4 +1,4 @@
-"""The sparse points that a scene brings along: COLMAP's, or the .ply that transforms.json names."""
+"""Reads the sparse points of a scene: COLMAP's, or the .ply that transforms.json names."""
 
 import os
 from itertools import islice
@@ -13,15 +13,15 @@ from pp_cl.scene.found import find_image
 from pp_cl.scene.readers import colmap, transforms
 from pp_cl.scene.readers.common import MOST, fail_at, numbers, read_json
 
-MOST_POINTS = 2**20  # that are read
+MOST_POINTS = 2**20  # later points are not read
 MOST_PLY = 2**28  # bytes
 COLOURS = ("red", "green", "blue")
-GREY = 150  # of points without colour
+GREY = 150  # colour of points that have none
 
 
 def sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """((N, 3) float64 world positions, (N, 3) uint8 colours), maybe none. Raises UserError naming a
-    file that is broken.
+    """((N, 3) float64 world positions, (N, 3) uint8 colours); N may be 0. Raises UserError naming a
+    broken file.
     """
     shared = {}
     if (file := folder / transforms.SINGLE).is_file():
@@ -54,7 +54,7 @@ def _read_ply(file):
         colours = np.full((len(points), 3), GREY)
         if set(COLOURS) <= set(vertices.dtype.names):
             colours = np.stack([vertices[name] for name in COLOURS], axis=1)
-    except Exception as error:  # plyfile meets broken bytes with whatever comes up
+    except Exception as error:  # plyfile raises all kinds of exceptions on broken bytes
         raise refusal(file, error, "points of a .ply") from None
     if not (np.abs(points) < MOST).all():
         raise UserError(f"{file}: holds NaN, Inf or a huge number; write it again")

@@ -1,5 +1,5 @@
-"""Whether a scene's cameras are right, by how much of its masks lies beside their hull, and in
-which reading they would be.
+"""Judges whether a scene's cameras are right, by the share of its masks beside their hull, and
+finds the reading in which they would be right.
 """
 
 import warnings
@@ -22,27 +22,27 @@ from pp_cl.scene.load import DEMO, find_reader, list_split, scene_box, scene_spl
 from pp_cl.scene.readings import EXIF, MEANING, SQUARE, STATED, Stated, read_as, readings
 from pp_cl.settings import Config
 
-# Of the masks, in the mean, beside their hull: 0 to 0.016 in sound scenes, 0.15 and more with wrong
-# cameras (docs/scenes.md). With a quarter of the masks forgiven, 0.016 and more with wrong cameras,
-# 0 where half of the masks lack a part.
+# The mean share of a mask beside the hull is 0 to 0.016 in sound scenes, and 0.15 and more with
+# wrong cameras (docs/scenes.md). With a quarter of the masks forgiven it is 0.016 and more with
+# wrong cameras, and 0 if half of the masks lack a part.
 MOST_BESIDE, PERSISTING = 0.06, 0.005
-NOWHERE = Beside(1.0, 1.0)  # of masks that leave no hull
+NOWHERE = Beside(1.0, 1.0)  # for masks that leave no hull
 INEXACT, EXACT = MOST_BESIDE / 3, MOST_BESIDE / 30
-# Of a reading in which cameras are right: this little beside, so many times less than as stated.
+# A reading is right if its share is at most MEETS, and TIMES_LESS times smaller than as stated.
 MEETS, TIMES_LESS = 0.01, 4.0
-TRIED_VIEWS, TRIED_SIZE, TRIED_POINTS = 32, 160, 20_000  # of a coarse hull: a quarter of a second
+TRIED_VIEWS, TRIED_SIZE, TRIED_POINTS = 32, 160, 20_000  # a coarse hull takes a quarter of a second
 LEAST_CAMERAS = 4
-OBLONG = 1.1  # times as wide as high, or as high as wide, that pixels seldom are
+OBLONG = 1.1  # ratio of a pixel's sides that real cameras seldom exceed
 
 
 class WrongCameras(UserError):
-    """A scene's cameras cannot be right. The message names the reading in which they are."""
+    """A scene's cameras cannot be right. The message names the reading in which they would be."""
 
 
 def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreement, float]:
     """(agreeing() of a scene's training views, the share of their masks beside the hull). Raises
-    WrongCameras where cameras cannot be right, by masks, or without these by where they look;
-    UserError as agreeing() does.
+    WrongCameras if cameras cannot be right, judged by masks or, without masks, by where they look;
+    raises UserError as agreeing() does.
     """
     path, box, fault = config.scene.path, scene_box(config), None
     axes = STATED if path == DEMO else read_edits(Path(path)).axes
@@ -59,21 +59,21 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     if box is not None and beside.strictly > MOST_BESIDE:  # the box may cut the object off
         with suppress(UserError):
             _, whole = agreement_of(dev, views)
-    what = f"{whole.strictly:.0%} of its masks lie beside their hull"
+    what = f"{whole.strictly:.0%} of its masks' area lies beside their hull"
     what = "its masks leave no point" if whole == NOWHERE else what
     if axes is None and whole.strictly > INEXACT:
         reading = fitting_reading(dev, path, views)
-        told = _told(path, what, reading, cameras) if reading else ""
+        message = _told(path, what, reading, cameras) if reading else ""
         if reading and whole.strictly > MOST_BESIDE:
-            raise WrongCameras(told)
+            raise WrongCameras(message)
         if whole.strictly <= MOST_BESIDE:
-            told = told or f"{path}: {what}: cameras or masks are inexact"
-            warnings.warn(told, stacklevel=2)
+            message = message or f"{path}: {what}: cameras or masks are inexact"
+            warnings.warn(message, stacklevel=2)
     is_wrong = whole.strictly > MOST_BESIDE and whole.forgiving > PERSISTING
     if is_wrong and axes != STATED and not fault:
         raise WrongCameras(
-            f"{path}: {what}, so cameras or masks are wrong, in no way that is known: check the"
-            " order of poses and images, focal lengths and masks; if all are right, write"
+            f"{path}: {what}, so cameras or masks are wrong, in a way that pp-cl does not know:"
+            " check the order of poses and images, focal lengths and masks; if all are right, write"
             f' {{"axes": "{STATED}"}} into {Path(path) / EDITS}'
         )
     if fault:
@@ -81,13 +81,13 @@ def judged(dev: Device, config: Config, views: Sequence[View]) -> tuple[Agreemen
     if (oblong := _oblong(cameras)) and not (has_masks and beside.strictly < EXACT):
         warnings.warn(f"{path}: {oblong}; are both focal lengths right?", stacklevel=2)
     if by := upward([view.camera for view in agreement.views])[1]:
-        told = f"upper edges of the images contradict each other; up is taken from {by}"
-        warnings.warn(f"{path}: {told}", stacklevel=2)
+        message = f"upper edges of the images contradict each other; up is taken from {by}"
+        warnings.warn(f"{path}: {message}", stacklevel=2)
     return agreement, beside.strictly
 
 
 def _told(path, what, reading, cameras):
-    """What is said of cameras that would be right in a reading."""
+    """The message on cameras that would be right in a reading."""
     words, file = reading.split(), Path(path) / EDITS
     would = " and ".join(MEANING[word] for word in words)
     if words[0] == SQUARE:
@@ -98,12 +98,12 @@ def _told(path, what, reading, cameras):
     return (
         f"{path}: {what}; its cameras would be right as {would}. If they are of the"
         f' kind "{reading}", write {{"axes": "{reading}"}} into {file}{mend}; if they are right as'
-        f' stated, {{"axes": "{STATED}"}}'
+        f' stated, write {{"axes": "{STATED}"}}'
     )
 
 
 def _oblong(cameras):
-    """Words on pixels that are not square; "" where they are."""
+    """Half a sentence on pixels that are not square; "" if they are."""
     wide = float(np.median([camera.fy / camera.fx for camera in cameras]))
     sides = "wide as high" if wide > 1 else "high as wide"
     ratio = max(wide, 1 / wide)
@@ -111,27 +111,31 @@ def _oblong(cameras):
 
 
 def other_axes(cameras: Sequence[Camera], stated: Stated) -> str | None:
-    """The reading of matrices and their axes by which cameras would best look at one place from
-    around it. None where they do so as they are, or in no reading.
+    """The reading of matrices and their axes in which cameras best look at one place from around
+    it. None if they already do so as stated, or in no reading.
     """
     if len(cameras) < LEAST_CAMERAS or meeting(cameras):
         return None
     files = [ImageFile("", camera) for camera in cameras]
     other = "opengl" if stated[1] == "opencv" else "opencv"
     inverse = "world-to-camera" if stated[0] == "camera-to-world" else "camera-to-world"
-    found = {
-        reading: meeting([one.camera for one in read_as(files, reading, stated)])
+    scores = {
+        reading: meeting([image_file.camera for image_file in read_as(files, reading, stated)])
         for reading in (other, inverse, f"{other} {inverse}")
     }
-    best = max(found, key=lambda reading: found[reading])
-    return best if found[best] else None
+    best = max(scores, key=lambda reading: scores[reading])
+    return best if scores[best] else None
 
 
 def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None:
-    """The reading in which a scene's cameras meet on the masks of its training views, if any."""
+    """The reading in which a scene's cameras agree with its training views' masks, or None."""
     stated, small = find_reader(path).STATES, _small(evenly(views, TRIED_VIEWS))
     splits = scene_splits(path)
-    files = [one for split in splits for one in list_split(path, split, edited=False).image_files]
+    files = [
+        image_file
+        for split in splits
+        for image_file in list_split(path, split, edited=False).image_files
+    ]
     forgiven = int(MOST_LEFT_OUT * len(small))
     as_stated = _beside(dev, small, forgiven)
     if as_stated < PERSISTING:
@@ -139,13 +143,16 @@ def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None
     best, least = None, min(MEETS, as_stated / TIMES_LESS)
     for reading in readings(stated):
         if best and " " in reading:
-            break  # a simpler one will do
-        cameras = {one.name: one.camera for one in read_as(files, reading, stated, Path(path))}
+            break  # a simpler reading is good enough
+        cameras = {
+            image_file.name: image_file.camera
+            for image_file in read_as(files, reading, stated, Path(path))
+        }
         tried = [
             replace(view, stored_camera=cameras[view.name].downscaled(view.shrunk))
             for view in small
         ]
-        # what is not meant for these files is as they state it
+        # a reading that does not apply to these files leaves the cameras as stated
         if ahead([view.camera for view in tried]) and not _alike(tried, small):
             share = _beside(dev, tried, forgiven)
             best, least = (reading, share) if share < least else (best, least)
@@ -153,7 +160,7 @@ def fitting_reading(dev: Device, path: str, views: Sequence[View]) -> str | None
 
 
 def _small(views):
-    """The views as reduced images, which are carved with quickly."""
+    """The views with reduced images, which carve quickly."""
     small = []
     for view in views:
         stored = view.stored_camera
@@ -175,7 +182,7 @@ def _alike(views, others):
 
 
 def _beside(dev, views, forgiven):
-    """The mean share of the views' masks beside their hull, 1 where there is none."""
+    """The mean share of the views' masks beside their hull, 1 if there is no hull."""
     try:
         return float(shares_beside(dev, views, None, forgiven, TRIED_POINTS).mean())
     except UserError:

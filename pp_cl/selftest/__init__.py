@@ -1,1 +1,1 @@
-"""The cases of `pp-cl selftest`: every kernel against float64, numerically hard inputs included."""
+"""The cases of `pp-cl selftest`, which compare every kernel with float64, also on hard inputs."""

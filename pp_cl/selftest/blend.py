@@ -35,18 +35,18 @@ from pp_cl.selftest.points import (
     some_ids,
 )
 
-# alpha: a falloff is off by 1e-6, as the places are (project); the product of some ten 1 - alpha
-# of them by as many times that. softmax: exponents o z / gamma of up to 100 are off by 100 EPS
+# alpha: a falloff has an error of 1e-6, like the projected places; a product of some ten 1 - alpha
+# has ten times that. softmax: exponents o z / gamma of up to 100 have errors of 100 EPS
 WEIGHT = {"alpha": 1e-5, "softmax": 2e-5}
-GRADIENT = 2e-5  # alpha: T, and what is composited behind, each off by its WEIGHT
-# softmax: dL/do = share (1 + o z / gamma) s, two factors that are each off by its WEIGHT
+GRADIENT = 2e-5  # alpha: T and the colour behind both have errors of WEIGHT
+# softmax: dL/do = share (1 + o z / gamma) s, in which two factors have errors of WEIGHT
 OPACITY = {"alpha": GRADIENT, "softmax": 5e-5}
-MANY = 1e-4  # a sum of 20000 terms one by one: each rounds all those before it
-UNIT = 2.0**-24  # a float's rounding
-ROUNDINGS = 4  # of an exponent, and in a row of a product of 16 terms
-LEAST = 2.0**-126  # the least float that every device has
+MANY = 1e-4  # a sum of 20000 terms, added one by one: each addition rounds the sum
+UNIT = 2.0**-24  # rounding error of a float
+ROUNDINGS = 4  # of an exponent, and in a product of 16 terms
+LEAST = 2.0**-126  # the smallest float that every device has
 STEP = 1e-6
-DIFFERENCES = 2e-3  # depths and falloff are steep at the rim, where that step is no small one
+DIFFERENCES = 2e-3  # depth and falloff are steep at the rim, where the step is not small
 
 
 def _forward(rule, kind, dev, rng):
@@ -88,7 +88,7 @@ def _sizes(rule, dev, rng):
 
 
 def _early_stop(rule, dev, rng):
-    """Nothing in front of the stop is dropped, all behind it is."""
+    """Fragments in front of the stop are kept, and all behind it are dropped."""
     for stop in (0.001, 0.05, 0.5):
         blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, early_stop=stop)
         fragment, used = blended.geometry["fragment"], blended.blend["fragment"]
@@ -98,7 +98,7 @@ def _early_stop(rule, dev, rng):
 
 
 def _zero_opacity(rule, dev, rng):
-    """The image is the background; every opacity has a gradient by which it can come back."""
+    """The image is the background; every opacity has a gradient with which it can grow again."""
     for gamma, stop in ((0.1, 0.0), (0.01, 0.0), (1e-5, 0.0), (0.1, 1e-3)):
         scene, weight = blend_on_axis(
             dev, [0.9, 0.5, 0.2], [0.0] * 3, gamma, rule=rule, early_stop=stop
@@ -107,7 +107,7 @@ def _zero_opacity(rule, dev, rng):
         yield exact(scene.features.get(), np.ones((1, 1, 16)))
         gradients = scene.gradients(np.ones((1, 1, 16)))
         by_opacity = weight / np.zeros(3, np.float32)
-        # d G.(f - bg), of a softmax exp(-M) / D with D = 1: a handful of roundings
+        # d G.(f - bg), for a softmax exp(-M) / D with D = 1: a handful of roundings
         expected = scene.geometry()["falloff"][:, 0] * (1 - 16)
         if rule == "softmax":
             expected *= np.exp(-1e-6 / gamma)
@@ -116,7 +116,9 @@ def _zero_opacity(rule, dev, rng):
 
 
 def _spheres(dev, rng):
-    """Gradients of positions and radii, against finite differences; one sphere is below a pixel."""
+    """Gradients of positions and radii, compared with finite differences; one sphere is smaller
+    than a pixel.
+    """
     camera, n, gamma = make_camera(), 30, 0.1
     positions, radius = make_points(rng, n), rng.uniform(0.05, 0.5, n).astype(np.float32)
     positions[-1], radius[-1] = 0, 0.01
@@ -140,7 +142,9 @@ def _spheres(dev, rng):
 
 
 def _missed_sphere(dev, rng):
-    """A sphere below a pixel covers one whose ray misses it, at a depth that no radius changes."""
+    """A sphere smaller than a pixel covers a pixel whose ray misses it, at a depth that does not
+    depend on the radius.
+    """
     radius, x = np.float32(1e-3), np.float32(0.01)
     scene = PairedPoints(dev, AXIS, np.array([[x, 0, 3.0]]), radius, kind="sphere")
     scene.blend([0.5], 0.1, np.zeros((1, 16)))
@@ -151,7 +155,7 @@ def _missed_sphere(dev, rng):
 
 
 def _on_the_ray(dev, rng):
-    """A point in the middle of its pixel: it may move to any side."""
+    """A point in the middle of its pixel, which may move to any side."""
     scene = PairedPoints(dev, AXIS, np.array([[0, 0, 3.0]]), 0.2)
     scene.blend([0.5], 0.1, np.zeros((1, 16)), rule="alpha")
     found = scene.gradients(np.ones((1, 1, 16)), voxel_size=0.3)["offset"]
@@ -160,12 +164,12 @@ def _on_the_ray(dev, rng):
 
 
 def _offsets(dev, rng):
-    """Gradients of offsets, against finite differences of what the falloff changes."""
+    """Gradients of offsets, compared with finite differences through the falloff."""
     camera, n, voxel_size = make_camera(), 40, 0.3
     positions, opacity = make_points(rng, n), rng.uniform(0, 1, n).astype(np.float32)
     features = rng.normal(size=(n, 16))
     grad = rng.normal(size=(camera.width * camera.height, 16))
-    # 1e-3: of the least size
+    # a radius of 1e-3 gives the least size
     for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0)):
         scene = PairedPoints(dev, camera, positions, radius)
         scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
@@ -186,8 +190,9 @@ def _offsets(dev, rng):
 
 
 def _gaussians(dev, rng):
-    """Of all shapes: their images, and the gradients of places and shapes, against finite
-    differences; features that were clamped to 0 have none. 1e-3: far below a pixel.
+    """Gaussians of all shapes: their images, and the gradients of positions and shapes, compared
+    with finite differences; clamped features have no gradient. A radius of 1e-3 is far below a
+    pixel.
     """
     shapes = (33, 0.1, 0.0), (17, 0.1, 0.05), (17, 1e-3, 0.0), (1, 0.2, 0.0)
     for shape, samples in product(shapes, (1.0, 3.5)):
@@ -227,7 +232,7 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
 
 
 def _needles(dev, rng):
-    """Gaussians up to a million times as long as they are wide, across the image."""
+    """Gaussians across the image that are up to a million times as long as wide."""
     camera, grid = make_camera(), Grid((0.0, 0.0, 0.0), 0.3, (2, 2, 2))
     ids, learned = some_ids(rng, grid, 8), np.zeros((8, 16), np.float32)
     learned[:, 3:6] = -5
@@ -244,8 +249,8 @@ def _needles(dev, rng):
 
 
 def _by_determinant(camera, centres, lower):
-    """(N, HW) float32: falloffs of Gaussians, whose determinant is xx yy - xy^2. centres: in camera
-    axes.
+    """(N, HW) float32: falloffs of Gaussians, with the determinant computed as xx yy - xy^2.
+    centres: (N, 3) in camera axes.
     """
     x, y, z = centres.astype(np.float32).T
     jacobian = np.zeros((len(x), 2, 3), np.float32)
@@ -262,7 +267,7 @@ def _by_determinant(camera, centres, lower):
 
 
 def _smallest_gamma(dev, rng):
-    """gamma = 1e-5 makes exponents of 1e5, which are off by 1e-2: so are the weights."""
+    """gamma = 1e-5 makes exponents of 1e5, so that exponents and weights have errors of 1e-2."""
     for opacity in (1.0, 0.3, 1e-3, 1e-38):
         scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
         yield finite(*scene.gradients(np.ones((1, 1, 16))).values())
@@ -271,7 +276,7 @@ def _smallest_gamma(dev, rng):
 
 
 def _plain_softmax(scene, gamma):
-    """(N,) float32: the weights of a pixel by its exponents as they are."""
+    """(N,) float32: a pixel's weights, computed without shifting the exponents."""
     view = scene.geometry()
     d, z, o = (
         array.astype(np.float32)
@@ -282,15 +287,15 @@ def _plain_softmax(scene, gamma):
 
 
 def _opacity_bound(blended):
-    """(N,) how far float32 may be from dL/do (docs/maths.md): a product G.f rounds by its terms'
-    size, an exponent o z/gamma by 1/gamma, and a numerator below the least float is 0.
+    """(N,) bound of float32's error in dL/do (docs/maths.md): a product G.f rounds by the size of
+    its terms, an exponent o z/gamma by 1/gamma, and a numerator below the smallest float becomes 0.
     """
     features, grad = blended.point_features, blended.grad
     blend, inverse = blended.blend, 1 / blended.gamma
     mean = dense.features(blend, features)
     size = np.abs(features) @ np.abs(grad).T + np.abs(mean * grad).sum(axis=1)
     dL_db = np.abs(features @ grad.T - (mean * grad).sum(axis=1))
-    dL_db += (blend["weight"] * dL_db).sum(axis=0)  # what an exponent's rounding moves the mean by
+    dL_db += (blend["weight"] * dL_db).sum(axis=0)  # an exponent's rounding moves the mean, too
     factor = 1 + blended.opacity[:, None] * np.abs(blend["z"]) * inverse
     rounded = blend["share"] * (size + (1 + inverse) * dL_db) * UNIT * ROUNDINGS
     underflow = LEAST * size
@@ -298,7 +303,7 @@ def _opacity_bound(blended):
 
 
 def _sharp(dev, rng):
-    """Where one fragment has nearly all of the weight, dL/do is a rounding of 0 times 1/gamma."""
+    """If one fragment has nearly all the weight, dL/do is a rounded 0 times 1/gamma."""
     for kind, gamma in product(FOOTPRINTS, (1e-3, 1e-5)):
         blended = Blended(dev, rng, kind=kind, gamma=gamma)
         expected = blended.reference_gradients()[1]
@@ -306,7 +311,7 @@ def _sharp(dev, rng):
 
 
 def _many_fragments(rule, dev, rng):
-    """20000 in a pixel: a transmittance falls below the smallest number, and nothing is NaN."""
+    """20000 fragments in a pixel: transmittance falls below the smallest number without NaN."""
     z, opacity = rng.uniform(0.1, 0.99, 20_000), rng.uniform(0, 1, 20_000).astype(np.float32)
     for gamma, stop in ((0.1, 0.0), (0.01, 1e-3 if rule == "alpha" else 0.0)):
         scene, weight = blend_on_axis(dev, z, opacity, gamma, rule=rule, early_stop=stop)
@@ -327,8 +332,8 @@ def _many_fragments(rule, dev, rng):
 
 
 def _divided(geometry, opacity, own, background):
-    """(N,) float32: dL/do of a pixel, from the back, where the transmittance in front of a fragment
-    is that behind it divided by 1 - alpha. own, background: as in dense.gradients().
+    """(N,) float32: a pixel's dL/do, computed from the back: the transmittance in front of a
+    fragment is the one behind it divided by 1 - alpha. own, background: as in dense.gradients().
     """
     falloff, found = geometry["falloff"][:, 0].astype(np.float32), np.zeros(len(own), np.float32)
     alpha, own, behind = opacity * falloff, own.astype(np.float32), np.float32(background)
@@ -352,14 +357,14 @@ def _opaque(dev, rng):
 
 
 def _behind(dev, rng):
-    """A hundred fragments, of which the last ones hardly show."""
+    """A hundred fragments, the last of which hardly show."""
     z, opacity = np.linspace(0.9, 0.1, 100), np.full(100, 0.15, np.float32)
     scene, weight = blend_on_axis(dev, z, opacity, 0.1, rule="alpha")
     geometry, grad, features = scene.geometry(), rng.normal(size=(1, 16)), np.eye(16)
     blend, features = dense.alpha(geometry, opacity), np.resize(features, (100, 16))
     own = features @ grad[0]
     expected = dense.gradients(geometry, blend, features, grad)[1]
-    # what is behind, as the difference of all and of what is in front
+    # the colour behind, as the total minus the colour in front
     b, single = weight.astype(np.float32), own.astype(np.float32)
     T = np.cumprod(np.append(np.float32(1), 1 - opacity), dtype=np.float32)
     parts = np.append(b * single, T[-1] * np.float32(grad.sum())).cumsum(dtype=np.float32)
@@ -385,7 +390,9 @@ def _far_distortion(dev, rng):
 
 
 def _gradient_of_alpha(dev, rng):
-    """One of alpha is one of a feature that is 0 in all points, since the background's is 1."""
+    """The gradient of alpha equals that of a feature which is 0 in all points, since the background
+    has 1.
+    """
     for stop in (0.0, 0.05):
         blended = Blended(dev, rng, rule="alpha", early_stop=stop)
         grad_alpha = rng.normal(size=len(blended.grad))
@@ -401,7 +408,7 @@ def _gradient_of_alpha(dev, rng):
 
 
 def _distortion(dev, rng):
-    """Of fragments of all weights, of those before an early stop, and of the tracked ones."""
+    """The distortion loss of all fragments, of those before an early stop, and of tracked ones."""
     for n, tracked, stop in ((257, 0, 0), (257, 0, 0.05), (257, 3, 0), (33, 0, 0), (31, 0, 0)):
         blended = Blended(dev, rng, n, rule="alpha", max_tracked=tracked, early_stop=stop)
         blended.grad[:] = 0
@@ -415,7 +422,7 @@ def _distortion(dev, rng):
 
 
 def _samples(dev, rng):
-    """Of 2 x 2 samples: what the mean of as many pixels has; points cover all, some and none."""
+    """2 x 2 samples give the mean of as many pixels; points cover all, some or none of them."""
     shapes = (257, None, 0.0), (257, None, 0.3), (33, 1e-3, 0.0), (31, 0.4, 0.05), (1, 0.4, 0.0)
     for kind, (n, radius, stop) in product(("soft", "disc"), shapes):
         of_samples = {"rule": "alpha", "early_stop": stop}
@@ -438,8 +445,9 @@ def _samples(dev, rng):
         yield relative(gradients["opacity"], opacity, GRADIENT)
         distortion = dense.distortion(fine.geometry, fine.blend).sum()
         found = scene.backward.distortion.get().sum()
-        yield each(found, distortion, GRADIENT, floor=1e-3)  # of one fragment a pixel: roundings
-        if kind == "soft":  # as those of one sample are, which _offsets() has
+        # a pixel with one fragment has only roundings
+        yield each(found, distortion, GRADIENT, floor=1e-3)
+        if kind == "soft":  # like the offsets of one sample, which _offsets() tests
             expected = fine.scene.gradients(fine.grad, voxel_size=0.3)["offset"]
             yield relative(scene.gradients(grad, voxel_size=0.3)["offset"], expected, GRADIENT)
         alpha = rng.normal(size=scene.shape)
@@ -449,13 +457,13 @@ def _samples(dev, rng):
 
 
 def _means(samples, shape):
-    """(H, W, C) of (4 H W, C) samples, two by two."""
+    """(H, W, C) means of 2 x 2 samples, (4 H W, C)."""
     height, width = shape
     return samples.reshape(height, 2, width, 2, -1).mean((1, 3))
 
 
 def _of_both(what, function, **hard):
-    """A case of each blend. hard: what is hard, by blend."""
+    """A case for each blend. hard: the naive formula's failure, by blend."""
     return [
         Case(f"{rule}: {what}", partial(function, rule), hard=hard.get(rule, "")) for rule in BLENDS
     ]

@@ -1,4 +1,4 @@
-"""A case of the selftest, and how the error of its results is measured."""
+"""A case of the selftest, and functions that measure the error of its results."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 
 from pp_cl.engine.device.device import Device
 
-EPS = 2.0**-23  # float32's distance from 1 to the next number; a rounding is half of it at most
-SIZES = (1, 31, 33, 257)  # below, at and beside every vector width and work-group size
+EPS = 2.0**-23  # float32's distance from 1 to the next number; a rounding error is at most half
+SIZES = (1, 31, 33, 257)  # below, at and above every vector width and work-group size
 
 
 class Check(NamedTuple):
-    """A result's error, infinite where the result is not finite, and what it may be. naive: the
-    error of a naive formula for the same result, NaN where that is one; None: there is none.
+    """A result's error, infinite if the result is not finite, and its bound. naive: the error of a
+    naive formula for the same result, NaN if its result is NaN; None: there is no such formula.
     """
 
     error: float
@@ -24,12 +24,12 @@ class Check(NamedTuple):
 
     @property
     def share(self) -> float:
-        """The error as a share of the bound; 0 of 0 is 0."""
+        """The error as a share of the bound; an error of 0 gives 0."""
         return _share(self.error, self.bound)
 
     @property
     def naive_share(self) -> float:
-        """The same of the naive formula; infinite for NaN, below 0 where there is none."""
+        """The share for the naive formula: infinite for NaN, -1 if there is no such formula."""
         if self.naive is None:
             return -1.0
         return np.inf if np.isnan(self.naive) else _share(self.naive, self.bound)
@@ -37,9 +37,9 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """name: "wing: what", unique. run(dev, rng) yields the checks. variant: the only one of the
-    convolutions that the case is of; devices to which it is not offered leave the case out. hard:
-    of a hard case, what the naive formula does, computed in float32, that a check compares with.
+    """name: "wing: subject", unique. run(dev, rng) yields the checks. variant: the convolution that
+    the case tests; devices to which it is not offered skip the case. hard: for a hard case, how the
+    naive formula fails, which is computed in float32 and with which a check compares.
     """
 
     name: str
@@ -48,16 +48,16 @@ class Case:
     hard: str = ""
 
 
-Naive = np.ndarray | None  # what a naive formula gives in place of the actual result
+Naive = np.ndarray | None  # the result of a naive formula
 
 
 def relative(actual: ArrayLike, expected: ArrayLike, bound: float, *, naive: Naive = None) -> Check:
-    """The largest error over the largest expected value. bound: of that."""
+    """A check of the largest error divided by the largest expected value."""
     return _check(actual, expected, np.abs(expected).max(initial=0), bound, naive)
 
 
 def absolute(actual: ArrayLike, expected: ArrayLike, bound: float, *, naive: Naive = None) -> Check:
-    """The largest error. bound: of that."""
+    """A check of the largest error."""
     return _check(actual, expected, 1.0, bound, naive)
 
 
@@ -69,24 +69,24 @@ def each(
     *,
     naive: Naive = None,
 ) -> Check:
-    """The largest error of a value over that value, or over `floor` more. bound: of that."""
+    """A check of the largest error of a value divided by the expected value plus `floor`."""
     return _check(actual, expected, np.abs(expected) + floor, bound, naive)
 
 
 def allowed(
     actual: ArrayLike, expected: ArrayLike, most: np.ndarray, *, naive: Naive = None
 ) -> Check:
-    """The largest error as a share of what it may be at that place, so that the bound is 1."""
+    """A check of the largest error as a share of its bound `most` at each place, so of bound 1."""
     return _check(actual, expected, most, 1.0, naive)
 
 
 def exact(actual: ArrayLike, expected: ArrayLike, *, naive: Naive = None) -> Check:
-    """How many values differ. The bound is 0."""
+    """A check that no value differs; the error is the number of those that do."""
     return Check(_differing(actual, expected), 0.0, _of_naive(_differing, naive, expected))
 
 
 def finite(*arrays: np.ndarray, naive: Naive = None) -> Check:
-    """How many values are NaN or infinite. The bound is 0."""
+    """A check that no value is NaN or infinite; the error is the number of those that are."""
     return Check(_not_finite(arrays), 0.0, _of_naive(_not_finite, naive))
 
 
@@ -96,7 +96,7 @@ def _check(actual, expected, scale, bound, naive):
 
 
 def _of_naive(measure, naive, *others):
-    """Its error; NaN where it is one. Raises ValueError where it was computed in float64."""
+    """The naive formula's error, or NaN. Raises ValueError if it was computed in float64."""
     if naive is None:
         return None
     if naive.dtype == np.float64:
@@ -121,7 +121,7 @@ def _not_finite(arrays):
 
 
 def _largest(actual, expected, scale):
-    """The largest error over the scale at its place; infinite for what is not finite."""
+    """The largest error divided by the scale at its place; infinite if a result is not finite."""
     actual, expected = np.asarray(actual, np.float64), np.asarray(expected, np.float64)
     _same_shape(actual, expected)
     with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""Cases of prefix sums and of rows that are moved: exact, as all of it is integers and copies."""
+"""Cases of prefix sums and moved rows; they are exact, since all values are integers or copies."""
 
 from itertools import product
 
@@ -11,13 +11,13 @@ from pp_cl.selftest.case import SIZES, Case, exact
 
 
 def _scan(dev, rng):
-    """One block, its edges, and many; sums beyond 32 bits."""
+    """Sizes of one block, near its end, and of many blocks; sums beyond 32 bits."""
     for n in (*SIZES, BLOCK, BLOCK + 1, 700 * BLOCK + 1):
         values = rng.integers(0, 9, n, dtype=np.uint32)
         offsets = dev.empty((n + 1,), np.uint32)
         exclusive_scan(dev, dev.upload(values), offsets)
         yield exact(offsets.get(), np.concatenate([[0], np.cumsum(values)]))
-    # within a group, and from one block to the next, sums above the largest uint stay there
+    # within a group, and from one block to the next, sums stay at the largest uint
     for n in (3, LARGEST_GROUP, 2 * BLOCK + 7):
         for value in (2**31 - 1, 2**29 + 1):
             offsets = dev.empty((n + 1,), np.uint32)
@@ -40,7 +40,7 @@ def _nonzero(dev, rng):
 
 
 def _compact(dev, rng):
-    """Every bit is kept, those of NaN among them."""
+    """Every bit is kept, also of NaN."""
     for n in SIZES:
         source = rng.integers(0, 2**32, (n, 3, 16), dtype=np.uint32)
         chosen = np.flatnonzero(rng.random(n) < 0.6) if n > 1 else np.zeros(1, int)

@@ -12,9 +12,9 @@ from pp_cl.engine.network.tile_plan import halve
 from pp_cl.reference import lpips, network
 from pp_cl.selftest.case import EPS, Case, Check, allowed, each, exact, relative
 
-# (size, channels of each part of the input, channels out, side of the kernel): tails of tiles, of
-# rows and of work-groups; groups of one, two and four blocks of 16 channels; parts of the gradient
-# of the weights by tiles and by channels
+# (size, channels of each part of the input, channels out, side of the kernel). They have incomplete
+# tiles, rows and work-groups, groups of one, two and four blocks of 16 channels, and split the
+# gradient of the weights by tiles and by channels.
 SHAPES = (
     ((1, 1), (16,), 16, 3),
     ((1, 31), (16,), 32, 3),
@@ -32,21 +32,21 @@ DIRECT_SHAPES = (
     ((31, 33), (16, 32), 48, 1),
     ((1, 1), (3,), 3, 1),
 )
-# of the largest value: sums of up to 4608 products, each rounded by half EPS, grow as their root,
-# 4e-6, of which the largest of the values seen has the more the longer the sum; those of F(4x4)
-# pass through transforms that enlarge it. In a gradient of weights a sum is as long as the image.
+# Shares of the largest value. The error of a sum of up to 4608 products, each rounded by half EPS,
+# grows as the root of their number, to 4e-6; the largest of many values has more of it the longer
+# the sum. Transforms of F(4x4) enlarge it. Sums in a gradient of weights are as long as the image.
 BOUNDS = {"local": 3e-6, "direct": 3e-6, "winograd": 8e-6}
 WEIGHTS_BOUND = 5e-6
-# of the largest value: the transforms of F(4x4) add up 36 numbers of a few times its size, and a
-# sum over 4608 products is off by the root of so many roundings
+# Share of the largest value: the transforms of F(4x4) add 36 numbers of a few times its size, and
+# the error of a sum of 4608 products is the root of so many roundings.
 HARD_SHARE = 1e-5
 ONE_COLOUR = "one colour"
 
 PLANES = ((1, 1, 16), (1, 5, 3), (31, 33, 17), (3, 257, 32))  # (H, W, C)
 FOUR = 4 * EPS  # means and interpolations of four values
 GATED = 4 * EPS  # exp, expm1 and a division: some units in the last place each
-# where gates are extreme: OpenCL allows exp and expm1 three units each; what float32 holds as a
-# subnormal may be 0
+# for extreme gates: OpenCL allows exp and expm1 an error of three units each, and subnormals of
+# float32 may become 0
 EXTREME, SUBNORMAL = 3e-6, 1e-32
 
 
@@ -56,14 +56,14 @@ def _normal(rng, *shape):
 
 @cache
 def _layers():
-    """[Layer] of DIRECT_SHAPES, the first of which are SHAPES, computed once for all variants."""
+    """[Layer] for DIRECT_SHAPES, which begin with SHAPES, computed once for all variants."""
     rng = np.random.default_rng(3)
     return [Layer.random(rng, *shape) for shape in DIRECT_SHAPES]
 
 
 @cache
 def _hard_layers():
-    """3x3 convolutions whose inputs or weights are made to hurt float32 or Winograd."""
+    """{name: 3x3 convolution} with inputs or weights that are hard for float32 or Winograd."""
     rng = np.random.default_rng(7)
 
     def layer(x, weight, bias=None, grad_out=None):
@@ -107,13 +107,15 @@ def _hard_layers():
 
 
 def within(actual: np.ndarray, expected: np.ndarray, naive: np.ndarray | None = None) -> Check:
-    """Each value against HARD_SHARE of the largest: of its channel, in a feature map (H, W, C)."""
+    """A check of each value's error against HARD_SHARE of the largest value; in a feature map (H,
+    W, C), of the largest in its channel.
+    """
     most = HARD_SHARE * np.abs(expected).max((0, 1) if expected.ndim == 3 else None)
     return allowed(actual, expected, np.broadcast_to(most, expected.shape), naive=naive)
 
 
 def _convolution(variant, dev, rng):
-    """All directions; awkward sizes, two sources, a masked gradient."""
+    """Output and all gradients, with awkward sizes, two sources and a masked gradient."""
     bound = BOUNDS[variant]
     layers = _layers() if can_run(variant, 1) else _layers()[: len(SHAPES)]
     for layer in layers:
@@ -148,7 +150,7 @@ def _pool(dev, rng):
 
 
 def _max_pool(dev, rng):
-    """Cells of zeros and of equal values; odd borders drop."""
+    """Cells of zeros and of equal values; odd borders are dropped."""
     for shape in ((2, 2, 16), (3, 5, 3), (31, 33, 17), (257, 2, 32)):
         x = np.maximum(rng.integers(-3, 3, shape), 0).astype(np.float32)
         out = dev.empty((shape[0] // 2, shape[1] // 2, shape[2]))
@@ -188,7 +190,7 @@ def _output(dev, rng):
 
 
 def _first_features(dev, rng):
-    """Colours that are features, and the gradient."""
+    """Features used as colours, and the gradient."""
     for height, width in ((1, 1), (31, 33), (3, 257)):
         features, grad = _normal(rng, height, width, 16), _normal(rng, height, width, 3)
         image, grad_features = dev.empty(grad.shape), dev.empty(features.shape)
@@ -210,7 +212,7 @@ def _gate(dev, rng):
 
 
 def _extreme_gate():
-    """(1, N, 2) float32: features and gates from 1e-12 to 60, all with all."""
+    """(1, N, 2) float32: all pairs of features and gates from 1e-12 to 60."""
     powers = 10.0 ** np.arange(-12, 2)
     values = [*-powers, 0, *powers, -40, 40, -60, 60]
     return np.stack(np.meshgrid(values, values), -1).reshape(1, -1, 2).astype(np.float32)
@@ -236,7 +238,7 @@ def _closed_gates(dev, rng):
 
 
 def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(output, gradient of x) of a gate, from the device; x, grad_out: float32."""
+    """A gate's (output, gradient of x), computed by the device; x, grad_out: float32."""
     out, grad_x, device_x = dev.empty(grad_out.shape), dev.empty(x.shape), dev.upload(x)
     simple.gate_forward(dev, device_x, out)
     simple.gate_backward(dev, device_x, dev.upload(grad_out), grad_x)
@@ -244,7 +246,9 @@ def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray,
 
 
 def _tiles(dev, rng):
-    """Which tiles hold something, which have fragments, copies of them, also at the border."""
+    """Tiles that differ from the background, tiles that have fragments, and copies of tiles, also
+    at the border.
+    """
     for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
         odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))
         x = np.where(rng.random((h, w, c)) < 0.02, odd, 1).astype(np.float32)
@@ -267,7 +271,7 @@ def _copied_tiles(dev, rng, x):
     number = np.arange(rows * columns).reshape(cut.shape)
     chosen = (rng.random(cut.shape) < 0.5) & (source != number)
     copies, array = tiles.copy_list(source, chosen), dev.upload(x)
-    behind = np.full((3, 2), 2**30, np.int32)  # not to be read
+    behind = np.full((3, 2), 2**30, np.int32)  # must not be read
     tiles.tiles_copy(dev, array, dev.upload(np.concatenate([copies, behind])), len(copies))
     tile = np.where(chosen, source, number)[y // tiles.SIDE, z // tiles.SIDE]
     expected = x[
@@ -276,7 +280,7 @@ def _copied_tiles(dev, rng, x):
     return exact(array.get(), expected)
 
 
-# Those for GPUs run on CPUs as well, slowly; those for CPUs might hang a GPU.
+# Variants for GPUs also run on CPUs, slowly; variants for CPUs might hang a GPU.
 _ONLY = {name: None if name in OFFERED["GPU"] else name for name in VARIANTS}
 
 CASES = (

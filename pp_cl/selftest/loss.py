@@ -12,12 +12,12 @@ from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
 ONE = np.uint8(1)
-FULL = 2e-5  # of matrices: normal equations of a condition of some hundred, in float32
-FLAT = 3e-6  # variances of nothing: rounding of Var[d] over C2 = 0.03^2
+FULL = 2e-5  # for matrices: normal equations with a condition of some hundred, in float32
+FLAT = 3e-6  # for variances of 0: rounding of Var[d] divided by C2 = 0.03^2
 
 
 def _loss(dev, rng):
-    """L1 and SSIM; at sizes below a window L1 alone."""
+    """L1 and SSIM; images smaller than a window have L1 alone."""
     for size in ((11, 11), (12, 33), (33, 31), (40, 257), (1, 1), (1, 257), (10, 40)):
         prediction, target = images(rng, *size)
         for weight, beta in ((0.2, 0.0), (1.0, 0.0), (0.1, 0.05)):
@@ -33,7 +33,7 @@ def images(rng: np.random.Generator, height: int, width: int) -> tuple[np.ndarra
 
 
 def _loss_checks(dev, prediction, target, weights, *bounds, is_hard=False):
-    """weights: of 1 - SSIM, and beta. bounds: of the terms, maybe another of the gradient."""
+    """Checks of the loss's terms and gradient. weights: the weight of 1 - SSIM, and beta."""
     loss, images = Loss(dev, *weights), (prediction, target)
     grad, _ = loss.forward_backward(*map(dev.upload, images))
     terms, expected = reference_loss.loss(*images, *weights)
@@ -43,14 +43,14 @@ def _loss_checks(dev, prediction, target, weights, *bounds, is_hard=False):
 
 
 def four_terms(loss: Loss) -> np.ndarray:
-    """(4,) of the last image: L, L1, 1 - SSIM and the mean squared error."""
+    """(4,) terms of the last image: L, L1, 1 - SSIM and the mean squared error."""
     found = loss.read(1).get()
     mse = 10 ** (-found["psnr"] / 10)
     return np.array([found["loss"], found["l1"], 1 - found["ssim"], mse])
 
 
 def _flat(dev, rng):
-    """Flat images, and variances far below the squares they are the difference of."""
+    """Flat images, and variances far smaller than the squares whose difference they are."""
     for levels in ((0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)):
         prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
         yield from _loss_checks(dev, prediction, target, (0.2, 0.0), FLAT, is_hard=True)
@@ -81,7 +81,9 @@ def _millions(dev, rng):
 
 
 def _mask_loss(dev, rng):
-    """Of a part of the image, where alpha is too low times the shortfall's; nothing outside."""
+    """The mask loss of a part of the image, times the shortfall's weight where alpha is too low; no
+    loss outside.
+    """
     weight, shortfall, width, left, top = 0.7, 0.3, 29, 3, 1
     for side in SIZES:
         size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
@@ -102,7 +104,7 @@ def _mask_loss(dev, rng):
 
 
 def _ignored(dev, rng):
-    """What a part of an image is compared with where pixels are ignored, and no gradient there."""
+    """Ignored pixels of a part of an image: the target there, and no gradient."""
     for side in SIZES:
         prediction, target = images(rng, side + 3, 36)[0], images(rng, side, 29)[1]
         inside, offset = np.s_[1 : 1 + side, 3:32], (3, 1)
@@ -121,11 +123,11 @@ def _ignored(dev, rng):
 
 
 def _sum_of_terms(dev, rng):
-    """The loss is that of the image and what is added."""
+    """The loss is the image's loss plus the added terms."""
     for n in SIZES:
         prediction, target = images(rng, 12, n)
         loss, (terms, _) = Loss(dev, 0.2), reference_loss.loss(prediction, target, 0.2)
-        for _ in range(2):  # each time anew
+        for _ in range(2):  # the second sum must not contain the first
             loss.forward_backward(dev.upload(prediction), dev.upload(target))
             values = rng.random(12 * n).astype(np.float32)
             loss.add_distortion(dev.upload(values), 1.5, scale=1 / n)
@@ -136,8 +138,8 @@ def _sum_of_terms(dev, rng):
 
 
 def _exposure(dev, rng, is_full):
-    """The matrices of three views, one seen twice and one never, and images that they are undone
-    in.
+    """The matrices of three views, one of them seen twice and one never, and images corrected with
+    them.
     """
     sums, left, top = np.zeros((3, 2, 8, 4)), 3, 1
     exposure = Exposure(dev, 3, is_applied=True)
@@ -176,7 +178,7 @@ def _exposure(dev, rng, is_full):
 
 
 def _matrices(sums, prior, is_full):
-    """(views, 3, 4) of sums (views, 8, 4), relative to their mean."""
+    """(views, 3, 4) matrices from sums (views, 8, 4), relative to their mean."""
     squares, mixed = sums[:, :4] + prior * np.eye(4), sums[:, 4:7] + prior * np.eye(3, 4)
     if not is_full:
         squares, mixed = squares * np.eye(4), mixed * np.eye(3, 4)

@@ -16,7 +16,7 @@ QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 
 def _distance(dev, rng):
-    """Features whose lengths differ a millionfold; none; equal ones."""
+    """Features whose lengths differ a millionfold, features of 0, and equal ones."""
     for n, channels in product(SIZES, (16, 512)):
         features = np.maximum(rng.normal(size=(2, n, channels)), 0)
         a, b = (features * 10 ** rng.uniform(-3, 3, (2, n, 1))).astype(np.float32)
@@ -25,7 +25,7 @@ def _distance(dev, rng):
         program, ranges = lpips_program(dev), group_ranges(dev, n, row_parts(dev))
         arrays = {"a": dev.upload(a), "b": dev.upload(b), "head": dev.upload(head)}
         program.launch("lpips_distance", *ranges, n=n, c=channels, distance=distance, **arrays)
-        # sums over 512 channels in 16 lanes: 32 roundings in a row, and those of a root
+        # sums over 512 channels in 16 lanes: 32 roundings in sequence, and a root's
         expected = lpips.pixel_distance(*(array.astype(np.float64) for array in (a, b, head)))
         units = [x / np.sqrt((x * x).sum(1, keepdims=True)) for x in (a, b)]
         naive = (units[0] - units[1]) ** 2 @ head
@@ -33,7 +33,7 @@ def _distance(dev, rng):
 
 
 def _lpips(dev, rng):
-    """A network of VGG16's shape with few channels: thirteen convolutions, each within 3e-6."""
+    """VGG16's layers with few channels: thirteen convolutions with errors of 3e-6 each."""
     weights = lpips.random_weights(rng)
     for size in ((16, 16), (17, 33)):
         a = rng.uniform(0, 1, (*size, 3))
@@ -42,7 +42,7 @@ def _lpips(dev, rng):
 
 
 def _box(dev, rng):
-    """Sides at 0.39, 0.29 and 0.19 are nearest to the layers at 0.35, 0.25 and 0.15."""
+    """Sides of a box at 0.39, 0.29 and 0.19 are nearest to grid layers at 0.35, 0.25 and 0.15."""
     faces = np.array([t for a, b, c, d in QUADS for t in ((a, b, c), (a, c, d))])
     grid = Grid((-0.45, -0.35, -0.25), 0.1, (10, 8, 6))
     surface = sample_surface(dev, Mesh(BOX, faces), grid, 200_000)

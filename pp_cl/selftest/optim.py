@@ -1,4 +1,4 @@
-"""Cases of what changes parameters: Adam, RMSprop, moving averages, smoothing, splits."""
+"""Cases of the kernels that change parameters: Adam, RMSprop, averages, smoothing, splits."""
 
 from dataclasses import replace
 from functools import partial
@@ -29,8 +29,8 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 
 class Cloud:
-    """n random points on the grid, and their float64 twin. width: of an offset. start, learned():
-    of "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
+    """n random points on the grid, and their float64 twin. width: numbers of an offset. start,
+    learned(): arrays "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
     """
 
     def __init__(
@@ -71,7 +71,9 @@ class Cloud:
         *,
         rates: Rates = RATES,
     ) -> None:
-        """One step, or that of another number. grads: of gradients(), used of the visible."""
+        """Take the next step, or the given one. grads: as from gradients(); only those of visible
+        points are used.
+        """
         self.steps = step or self.steps + 1
         rows = {name: self.dev.upload(g[visible], np.float32) for name, g in grads.items()}
         rmsprop_update(
@@ -95,18 +97,18 @@ class Cloud:
         self.twin.step(self.steps, grads, by_basis, EPSILONS)
 
     def learned(self) -> dict[str, np.ndarray]:
-        """float32 on the host."""
+        """The parameters, float32 on the host."""
         sh = np.concatenate([array.get() for array in self.cloud.sh], axis=1)
         return {"sh": sh, "offset": self.cloud.offset.get(), "opacity": self.cloud.opacity.get()}
 
     def second_moments(self) -> dict[str, np.ndarray]:
-        """float64: with the decay that waits."""
+        """The second moments, float64, including decay that is still to be applied."""
         waited = 0.999 ** (self.steps - self.state.last_step.get().astype(np.float64))
         return {name: (v.get().T * waited).T for name, v in self.state.second_moments.items()}
 
 
 def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> ProjectedPoints:
-    """Points (N, 3) in the camera's axes; a view's other arrays are absent."""
+    """Points (N, 3) in camera axes as a view has them, without its other arrays."""
     towards = positions - camera.eye
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
@@ -115,7 +117,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
 
 
 def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4, width: int = 4) -> Gradients:
-    """{"sh": (n, 16), "offset": (n, width), "opacity": (n,)}; every third point's are 0."""
+    """{"sh": (n, 16), "offset": (n, width), "opacity": (n,)}, 0 for every third point."""
     grads = {}
     for name, shape in (("sh", (n, 16)), ("offset", (n, width)), ("opacity", (n,))):
         grads[name] = (scale * rng.standard_normal(shape)).astype(np.float32)
@@ -130,14 +132,14 @@ def _adam(dev, rng):
         for eps in (1e-8, 1e-15):
             start = rng.standard_normal(n)
             twin, parameter, state = adam_steps(dev, start, grads, rate=0.01, eps=eps)
-            # the parameter is rounded in each step, by half EPS of its size; rarely the same way
+            # each step rounds the parameter by half EPS of its size, rarely always the same way
             yield relative(parameter, twin.parameter, 3e-7)
             yield each(state["m"], twin.m, 8 * EPS, floor=1e-3)
             yield each(state["v"], twin.v, 8 * EPS)
 
 
 def _adam_first(dev, rng):
-    """The first step is the rate."""
+    """The first step has the size of the rate."""
     grad, rate = np.full((1, 257), -3e-4, np.float32), 0.5
     _, parameter, _ = adam_steps(dev, np.zeros(257), grad, rate=rate, eps=1e-15)
     v = (np.float32(1) - np.float32(optim.BETA2)) * grad[0] * grad[0]
@@ -148,8 +150,8 @@ def _adam_first(dev, rng):
 def adam_steps(
     dev: Device, start: np.ndarray, grads: np.ndarray, **options: Any
 ) -> tuple[optim.Adam, np.ndarray, dict[str, np.ndarray]]:
-    """(float64 twin, parameters, moments "m" and "v") after a step with each gradient, halved and
-    in two parts: of weights, and the last 16 of biases.
+    """(float64 twin, parameters, moments "m" and "v") after a step with each halved gradient, in
+    two parts: weights, and the last 16 numbers as biases.
     """
     n, rows = grads.shape[1], -(-grads.shape[1] // 16)
     whole = np.zeros((16 * rows,), np.float32)
@@ -167,7 +169,7 @@ def adam_steps(
 
 
 def _adam_extremes(dev, rng):
-    """Gradients of 1e-20 to 1e10, of which float32 cannot square all; and of 0."""
+    """Gradients from 1e-20 to 1e10, not all of which float32 can square, and of 0."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         for eps in (1e-8, 1e-15):
             grads = scale * rng.standard_normal((10, 31))
@@ -181,7 +183,7 @@ def _adam_extremes(dev, rng):
 
 
 def _adam_huge(dev, rng):
-    """Gradients whose squares float32 has not."""
+    """Gradients whose squares overflow float32."""
     grads = (1e30 * rng.choice([-1, 1], (5, 31))).astype(np.float32)
     twin, parameter, _ = adam_steps(dev, np.zeros(31), grads, rate=0.1, eps=1e-8)
     naive = _textbook_adam(np.zeros(31, np.float32), grads, rate=0.1, eps=1e-8)
@@ -224,7 +226,7 @@ def _rmsprop_checks(cloud):
 
 
 def _rmsprop_extremes(dev, rng):
-    """Some squares leave float32."""
+    """Gradients some of whose squares overflow or underflow float32."""
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         cloud = Cloud(dev, rng, 31)
         for _ in range(10):
@@ -234,7 +236,7 @@ def _rmsprop_extremes(dev, rng):
 
 
 def _rmsprop_huge(dev, rng):
-    """Gradients whose squares float32 has not."""
+    """Gradients whose squares overflow float32."""
     cloud = Cloud(dev, rng, 31)
     grads = {name: np.sign(g) * np.float32(1e30) for name, g in gradients(rng, 31).items()}
     for _ in range(5):
@@ -247,7 +249,7 @@ def _rmsprop_huge(dev, rng):
 
 
 def _rmsprop_nothing(dev, rng):
-    """NaN stays where it is; a gradient of one parameter alone moves it alone."""
+    """NaN does not spread; a gradient of a single parameter moves only that parameter."""
     cloud, grads = Cloud(dev, rng, 33), gradients(rng, 33, 0.0)
     grads["sh"][1] = -0.0
     grads["sh"][2, 5] = grads["opacity"][4] = grads["offset"][7, 1] = np.nan
@@ -262,7 +264,7 @@ def _rmsprop_nothing(dev, rng):
 
 
 def _bounded(dev, rng):
-    """Huge gradients keep opacities, offsets and Gaussians' SH above degree 0 in their bounds."""
+    """Huge gradients leave opacities, offsets and Gaussians' SH above degree 0 in their bounds."""
     for footprint in ("soft", "gaussian"):
         width = offset_width(footprint)
         cloud = Cloud(dev, rng, 257, width=width)
@@ -291,12 +293,12 @@ def _huge_rates(dev, rng):
     learned, naive = cloud.learned(), before - np.float32(1e30) * np.sign(grads["offset"])
     yield exact(learned["offset"], cloud.twin.values["offset"], naive=naive)
     yield exact(learned["opacity"][:, 0], cloud.twin.values["opacity"][:, 0])
-    # a harmonic that is 0 in float64 is a rounding here: either bound is right
+    # a harmonic of 0 in float64 is a rounding error in float32, so either bound is right
     yield exact(abs(learned["opacity"]).max(), 1.0)
 
 
 def _from_bounds(dev, rng):
-    """Opacities of 0 and 1 move away from there at the first gradient that says so."""
+    """Opacities of 0 and 1 leave these bounds with the first gradient that points inwards."""
     cloud, grads = Cloud(dev, rng, 257), gradients(rng, 257)
     grads["opacity"][:] = np.where(np.arange(257) % 2, 1e-4, -1e-4)
     for _ in range(12):
@@ -333,13 +335,13 @@ def _smooth(dev, rng):
             sh = dev.upload(values)
             smoother.smooth(sh, amount)
             expected = optim.smoothed(values, vertices, amount)
-            # of a point that has no neighbours
+            # for a point without neighbours
             naive = values + (0 * values / np.float32(0) - values) if n == 1 else None
             yield relative(sh.get(), expected, 4 * EPS, naive=naive)  # a mean of up to six
 
 
 def _refine(dev, rng):
-    """1 - sqrt(1 - o), which cancels for small opacities; what depends on the direction alike."""
+    """Opacities become 1 - sqrt(1 - o), which cancels if they are small; harmonics change alike."""
     for n in SIZES:
         opacity = some_opacities(rng, n)
         opacity[::5, 0], opacity[1::5, 0], opacity[2::5, 0] = 0, 1, 1e-7

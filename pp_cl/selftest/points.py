@@ -1,4 +1,4 @@
-"""Runs the rasteriser's stages on explicit points, with every intermediate at hand."""
+"""Runs the rasteriser's stages on explicit points and gives access to all intermediate results."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,17 +40,17 @@ def some_ids(rng: np.random.Generator, grid: Grid, n: int) -> np.ndarray:
 
 
 def some_opacities(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 9) float32 of a PointCloud, anywhere in their bounds."""
+    """(n, 9) float32 opacities of a PointCloud, random within their bounds."""
     least = np.repeat([0.0, -1.0], (1, OPACITIES - 1))
     return rng.uniform(least, 1, (n, OPACITIES)).astype(np.float32)
 
 
 class PairedPoints:
-    """Points (N, 3) of radius, one or (N,), projected and paired with the pixels of a camera, or
-    with pixels of side x side of these as samples.
+    """Points (N, 3) with one radius or (N,), projected and paired with a camera's pixels, or with
+    pixels of side x side samples.
     """
 
-    backward: BlendGradients  # of the last gradients()
+    backward: BlendGradients  # from the last gradients()
 
     def __init__(
         self,
@@ -86,16 +86,16 @@ class PairedPoints:
 
     @property
     def seen(self) -> np.ndarray:
-        """(?,) the points with a pair, ascending."""
+        """(?,) indices of the points that have a pair, ascending."""
         return np.flatnonzero(np.diff(self.pairs.point_offset.get()))
 
     def pair_points(self) -> np.ndarray:
-        """(P,) the point of each pair, from the offsets alone."""
+        """(P,) the point of each pair, computed from the offsets alone."""
         counts = np.diff(self.pairs.point_offset.get().astype(np.int64))
         return np.repeat(np.arange(self.n), counts)
 
     def dense(self, pair_values: np.ndarray, missing: float = 0.0) -> np.ndarray:
-        """(N, HW) of values by pair: (P, ...) on the host."""
+        """(N, HW) array of the pairs' values, (P, ...) on the host."""
         total = self.pairs.total
         pixels = self.camera.width * self.camera.height
         matrix = np.full((self.n, pixels), missing, pair_values.dtype)
@@ -103,8 +103,8 @@ class PairedPoints:
         return matrix
 
     def geometry(self) -> dict[str, np.ndarray]:
-        """dense.geometry with the device's fragments, falloff and depth: at the rim of a footprint
-        a falloff is rounding, and a softmax may make it half a pixel.
+        """dense.geometry() with the device's fragments, falloff and depth, since a falloff at the
+        rim of a footprint is rounding, which a softmax may turn into half a pixel.
         """
         total, fragment = self.pairs.total, self.fragments()
         falloff = self.pairs.pair_point_falloff.get()[:total, 1].view(np.float32)
@@ -117,7 +117,7 @@ class PairedPoints:
         return geometry | {"fragment": fragment, "z": 1 - (geometry["depth"] - near) / (far - near)}
 
     def fragments(self) -> np.ndarray:
-        """(N, HW) bool."""
+        """(N, HW) bool: the pixels that each point covers."""
         return self.dense(np.ones(max(1, self.pairs.total), bool), False)
 
     def blend(
@@ -129,7 +129,7 @@ class PairedPoints:
         rule: str = "softmax",
         **drops: Any,
     ) -> np.ndarray:
-        """(H, W, 16) blended features. rule: of BLENDS. drops: max_tracked and early_stop."""
+        """(H, W, 16) blended features. rule: one of BLENDS. drops: max_tracked and early_stop."""
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
         view = self.buffers, self.pairs, self.projected.camera_buffer
         self.weights = blend_weights(
@@ -137,7 +137,7 @@ class PairedPoints:
         )
         self.weights.read_visible(self.dev)
         visible = self.weights.visible.get()
-        rows = np.full((len(visible) + 1, 16), np.nan)  # as if there was room for one more
+        rows = np.full((len(visible) + 1, 16), np.nan)  # with room for one more point
         rows[:-1] = np.asarray(point_features)[visible]
         self.visible_features = self.dev.upload(rows, np.float32)
         self.features = self.dev.empty((*self.shape, 16))
@@ -146,7 +146,7 @@ class PairedPoints:
         return self.features.get()
 
     def weight(self) -> np.ndarray:
-        """(N, HW) the blend weights, 0 where a fragment was dropped."""
+        """(N, HW) blend weights, 0 for dropped fragments."""
         return self.weight_and_dropped()[0]
 
     def weight_and_dropped(self) -> tuple[np.ndarray, np.ndarray]:
@@ -166,8 +166,9 @@ class PairedPoints:
         voxel_size: float = 0.0,
         max_weight: Array | None = None,
     ) -> Gradients:
-        """{"features": (N, 16), "opacity": (N,), on a grid of a voxel size "offset": (N, 4)} of
-        sum(features * grad_features), sum(alpha * grad_alpha) and the weighted distortion loss.
+        """{"features": (N, 16), "opacity": (N,), and if a voxel size is given "offset": (N, 4)}:
+        gradients of sum(features * grad_features), sum(alpha * grad_alpha) and the weighted
+        distortion loss.
         """
         grad_features = np.reshape(grad_features, (*self.shape, 16))
         view = self.projected, self.pairs, self.weights
@@ -188,13 +189,13 @@ class PairedPoints:
         if found.offset is not None:
             rows["offset"] = found.offset
         visible, gradients = self.weights.visible.get(), {}
-        for name, array in rows.items():  # of the visible points; those of all others are 0
+        for name, array in rows.items():  # rows of visible points; all other points have 0
             gradients[name] = np.zeros((self.n, *array.shape[1:]), np.float32)
             gradients[name][visible] = array.get()[: len(visible)]
         return gradients
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
-        """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
+        """gradients(), and {"positions": (N, 3), "radius": (N,)} of sum(features * grad)."""
         gradients, view = self.gradients(grad_features), (self.projected, self.pairs, self.weights)
         pair_gradient = self.backward.pair_gradient
         positions, radius = spheres_backward(
@@ -232,7 +233,7 @@ class PairedGaussians(PairedPoints):
 
 
 NEAR, FAR = dense.DEPTH_RANGE
-AXIS_RADIUS = 0.001  # of points on the axis, world units
+AXIS_RADIUS = 0.001  # radius of points on the axis, world units
 # a camera of one pixel that looks along z from the origin
 AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 
@@ -240,8 +241,8 @@ AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5,
 def blend_on_axis(
     dev: Device, z: Sequence[float] | np.ndarray, opacity: ArrayLike, gamma: float, **options: Any
 ) -> tuple[PairedPoints, np.ndarray]:
-    """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
-    in its own channel.
+    """(PairedPoints, weights) of points at normalised depths z in front of a one-pixel camera, each
+    with its own channel.
     """
     positions = np.zeros((len(z), 3))
     positions[:, 2] = FAR - np.asarray(z) * (FAR - NEAR)
@@ -289,5 +290,5 @@ class Blended:
         return self.scene.gradients(self.grad, distortion_weight=distortion_weight)
 
     def reference_gradients(self, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The same in float64: (features, opacity). options: of dense.gradients()."""
+        """(features, opacity) gradients in float64. options: as for dense.gradients()."""
         return dense.gradients(self.geometry, self.blend, self.point_features, self.grad, **options)

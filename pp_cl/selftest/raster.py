@@ -31,11 +31,11 @@ from pp_cl.selftest.points import (
 
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 PLACED = 1e-6  # a rotation of a difference: 8 roundings of half EPS, and the camera's own two
-BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
-FALLOFF = 1e-4  # that band's: of a radius of at least 0.75 pixels
+BAND = 1e-4  # pixels around the edge of a footprint in which rounding may decide
+FALLOFF = 1e-4  # a falloff in that band, with a radius of at least 0.75 pixels
 RIM = 1e-3  # the depth of a sphere is steep at its rim
-SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
-SHOWN = [0, 0, 3.0], [0.001, 0, 4.0]  # positions before the eye of AXIS
+SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, divided by another sum
+SHOWN = [0, 0, 3.0], [0.001, 0, 4.0]  # positions in front of the eye of AXIS
 BY_SQUARES = {
     "soft": "c.c - (c.r)^2 cancels",
     "sphere": "sqrt(R^2 - w^2) where the ray misses",
@@ -43,8 +43,8 @@ BY_SQUARES = {
 
 
 def _project(dev, rng):
-    """Points in the cells of a grid, and spheres, of which the depth range culls some. Those that
-    lie in the image cover a pixel, however small they are, and the places of these are known.
+    """Points in the cells of a grid, and spheres; the depth range culls some. Points in the image
+    cover a pixel, however small they are, and their places are compared.
     """
     camera, depth_range = make_camera(), (3.5, 4.8)
     for n in SIZES:
@@ -77,7 +77,7 @@ def _project(dev, rng):
 
 
 def _opacities(dev, rng):
-    """Random ones; along the axes, where harmonics take opacities to their bounds and beyond."""
+    """Random opacities, and opacities seen along the axes, where harmonics exceed the bounds."""
     for n in SIZES:
         ids = some_ids(rng, GRID, n)
         yield from _check_opacities(dev, make_camera(), ids, some_opacities(rng, n))
@@ -95,7 +95,7 @@ def _check_opacities(dev, camera, ids, learned):
     points = _projected(dev, "soft", camera, ids, np.zeros((len(ids), 4)), learned, 0.05)
     covers = points.point_count.get() > 0
     expected = dense.opacities(GRID.positions(ids), camera.eye, learned)
-    # eight products of about 1/2, by harmonics of a direction of four roundings
+    # eight products of about 1/2 with harmonics of a direction that has four roundings
     yield absolute(points.point_opacity.get()[covers], expected[covers], 8 * EPS)
 
 
@@ -107,7 +107,7 @@ def _far_away(dev, rng):
 
 
 def _many_vertices(dev, rng):
-    """Points of a grid of 4 billion vertices."""
+    """Points on a grid of 4 billion vertices."""
     grid = Grid((-1.0, -1.0, -1.0), 2 / 1600, (1600, 1600, 1600))
     ids = np.sort(rng.integers(grid.id_count, size=257)).astype(np.uint32)
     naive = grid.positions(ids.astype(np.float32)).astype(np.float32)
@@ -115,7 +115,7 @@ def _many_vertices(dev, rng):
 
 
 def _check_places(dev, camera, grid, ids, naive):
-    """Of points in camera axes. naive: (N, 3) float32, world positions."""
+    """A check of the points' places in camera axes. naive: (N, 3) float32 world positions."""
     opacity, offset = np.zeros((len(ids), OPACITIES)), np.zeros((len(ids), 4))
     points = _projected(dev, "soft", camera, ids, offset, opacity, 0.01, grid)
     covers, pose = points.point_count.get() > 0, camera.pose.astype(np.float32)
@@ -125,7 +125,7 @@ def _check_places(dev, camera, grid, ids, naive):
 
 
 def _projected(dev, footprint, camera, ids, offset, opacity, radius, grid=GRID):
-    """The points of a grid by project_grid()."""
+    """The points of a grid, as projected by project_grid()."""
     return project_grid(
         dev,
         Buffers(dev),
@@ -148,13 +148,13 @@ def _inside(camera, place):
 
 
 def _at_the_eye(dev, rng):
-    """Points behind the eye, on its plane and at it reach nothing."""
+    """Points behind the eye, on its plane and at the eye cover no pixel."""
     positions = np.array([*SHOWN, [0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9]], np.float32)
     yield from _check_left_out(dev, positions, slopes=positions[:, 0] / positions[:, 2])
 
 
 def _no_positions(dev, rng):
-    """Points at NaN, infinite or too far away reach nothing."""
+    """Points whose position is NaN, infinite or too far away cover no pixel."""
     positions = list(SHOWN)
     for bad in (np.nan, np.inf, -np.inf, 3e38, -3e38):
         positions += [[bad, 0, 3.0], [0, bad, 3.0], [0, 0, bad]]
@@ -164,7 +164,7 @@ def _no_positions(dev, rng):
 
 
 def _no_sizes(dev, rng):
-    """Gaussians of an infinite size or of none that is a number reach nothing."""
+    """Gaussians whose size is infinite or NaN cover no pixel."""
     grid, learned = Grid((0.0, 0.0, 0.0), 0.3, (2, 2, 2)), np.zeros((8, 16), np.float32)
     learned[2::3, 3], learned[1::3, 4] = np.inf, np.nan
     scene = PairedGaussians(dev, make_camera(), grid, some_ids(rng, grid, 8), learned, 0.1)
@@ -174,7 +174,9 @@ def _no_sizes(dev, rng):
 
 
 def _check_left_out(dev, positions, *, shown=None, slopes=None):
-    """Only the first two are shown. shown, slopes: naive formulas' (N,) bool and float32."""
+    """Checks that only the first two points are shown. shown, slopes: naive formulas' (N,) bool and
+    float32.
+    """
     n, ones = len(positions), np.ones((1, 1, 16))
     for kind in FOOTPRINTS:
         scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
@@ -186,7 +188,7 @@ def _check_left_out(dev, positions, *, shown=None, slopes=None):
 
 
 def _pairs(kind, dev, rng):
-    """Which pixels a point covers, how close to its centre, at which depth, in which order."""
+    """The pixels that a point covers, its falloff and depth there, and the order of points."""
     camera = replace(make_camera(33, 31), fy=26.0)
     for n in SIZES:
         positions, radius = make_points(rng, n), (10.0 ** rng.uniform(-3, 0, n)).astype(np.float32)
@@ -196,7 +198,7 @@ def _pairs(kind, dev, rng):
 
 
 def _by_squares(kind, camera, positions, radius):
-    """{what: (N, HW) float32} as a ray's distance from a centre, |c|^2 - (c.r)^2, has it."""
+    """{name: (N, HW) float32}, with a ray's distance from a centre computed by |c|^2 - (c.r)^2."""
     c, r = (
         array.astype(np.float32)
         for array in (dense.camera_space(camera, positions), dense.rays(camera))
@@ -212,7 +214,7 @@ def _by_squares(kind, camera, positions, radius):
 
 
 def _check_pairs(scene, expected, naive):
-    """tests/engine/raster/test_pairs.py says more of each. naive: of what a formula has."""
+    """Checks that tests/engine/raster/test_pairs.py explains. naive: arrays from a formula."""
     pairs, fragments, measured = scene.pairs, scene.fragments(), scene.geometry()
     clear = expected["margin"] > BAND
     yield exact(fragments[clear], expected["fragment"][clear])
@@ -247,7 +249,7 @@ def _equal_depths(dev, rng):
 
 
 def _close_depths(dev, rng):
-    """Points that lie one float behind another, in any order."""
+    """Points each one float behind another, in random order."""
     positions = np.zeros((5000, 3), np.float32)
     positions[:, 2] = (
         np.float32(3).view(np.uint32) + rng.permutation(5000).astype(np.uint32)
@@ -285,7 +287,9 @@ def _beside_the_eye(dev, rng):
 
 
 def _shade(dev, rng):
-    """Harmonics of all degrees, of Gaussians at least 0. No row but of listed points is written."""
+    """Harmonics of all degrees; features of Gaussians are at least 0. Only rows of listed points
+    are written.
+    """
     camera = make_camera()
     for n, degree in product(SIZES, SH_DEGREES):
         positions = make_points(rng, n)
@@ -306,7 +310,7 @@ def _shade(dev, rng):
 
         features = shade([block.astype(np.float32) for block in sh])
         expected = dense.shade(positions, camera.eye, np.concatenate(sh, axis=1))
-        # nine products of a direction's squares: 5 roundings each, of values of up to 4
+        # nine products of a direction's squares, with 5 roundings each, of values of up to 4
         yield relative(features[:-3], expected[seen], 1e-5)
         yield exact(features[-3:], np.full((3, 16), 7))
         gaussians = replace(scene.projected, footprint="gaussian")
@@ -315,7 +319,7 @@ def _shade(dev, rng):
 
 
 def _depth(rule, dev, rng):
-    """Alpha, mean and median depth by the blend weights."""
+    """Alpha, and mean and median depth from the blend weights."""
     for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
         blended = Blended(
             dev, rng, n, gamma=0.02, radius=0.4, rule=rule, early_stop=1e-2, kind=kind
@@ -345,7 +349,7 @@ def _depth_of_nothing(dev, rng):
 
 
 def _depth_of_samples(dev, rng):
-    """Of 2 x 2 samples: the mean of what as many pixels have within a voxel of the nearest."""
+    """2 x 2 samples give the mean depth of those within a voxel of the nearest."""
     for n, kind, stop in ((257, "soft", 0.0), (257, "soft", 1e-2), (33, "disc", 0.0)):
         fine = Blended(dev, rng, n, radius=0.4, rule="alpha", early_stop=stop, kind=kind)
         scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, kind=kind, side=2)
@@ -363,20 +367,20 @@ def _depth_of_samples(dev, rng):
 
 
 def _fours(values, shape):
-    """(H W, 4) samples of the pixels of an image (H, W), of (4 H W,)."""
+    """(H W, 4) samples of each pixel of an image (H, W), from (4 H W,)."""
     height, width = shape
     return values.reshape(height, 2, width, 2).swapaxes(1, 2).reshape(-1, 4)
 
 
 def _medians(blended, weight, z):
-    """Two (HW,) between which the medians lie: of shares just below and above one half."""
+    """Two (HW,) between which the medians lie, at shares just below and above one half."""
     fragments = blended.geometry["fragment"] & ~blended.dropped
     bounds = np.zeros((2, len(weight.T)))
     for q in np.flatnonzero(weight.any(axis=0)):
         order = np.argsort(blended.geometry["depth"][:, q], kind="stable")
         listed = order[fragments[order, q]]
         reached = np.concatenate([[0], np.cumsum(weight[listed, q])])
-        depths = z[np.concatenate([listed[:1], listed]), q]  # the first fragment alone has no slope
+        depths = z[np.concatenate([listed[:1], listed]), q]  # the first fragment has no slope
         bounds[:, q] = np.interp(np.array([0.499999, 0.500001]) * reached[-1], reached, depths)
     return np.sort(bounds, axis=0)
 
@@ -388,8 +392,8 @@ def _depths(dev, scene, voxel_size=0.0):
 
 
 def _record(rule, dev, rng):
-    """The highest weight of each point, also as the backward pass finds it, and how often it was
-    seen, by the tracked fragments.
+    """Each point's highest weight, also as the backward pass finds it, and how often it was seen,
+    from the tracked fragments.
     """
     drops = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **drops)

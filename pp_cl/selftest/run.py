@@ -1,4 +1,4 @@
-"""Runs the cases of the selftest one by one; their results as a table and as JSON."""
+"""Runs the cases of the selftest one by one, and writes the results as a table or as JSON."""
 
 import os
 import platform
@@ -36,8 +36,8 @@ CASES: tuple[Case, ...] = (
 
 @dataclass(frozen=True)
 class Hard:
-    """Of a hard case: what the naive formula does, and of the check in which it is worst its error,
-    NaN where that is one, ours, and the bound.
+    """The naive formula of a hard case. what: how it fails. naive, error, bound: from the check in
+    which it is worst, its error (NaN if its result is), our error, and the bound.
     """
 
     what: str
@@ -46,15 +46,15 @@ class Hard:
     bound: float
 
     def shown(self) -> list[str]:
-        """The three numbers; errors are counts where the bound is 0."""
+        """The three numbers as text; errors are counts if the bound is 0."""
         form = ".2g" if self.bound else ".0f"
         return [f"{number:{form}}" for number in (self.naive, self.error, self.bound)]
 
 
 @dataclass(frozen=True)
 class Row:
-    """error, bound: of the case's worst check; None where it ended with an exception. reason: of a
-    failure that numbers do not say, one line, else "". hard: None also after an exception.
+    """The result of a case. error, bound: from its worst check; None after an exception. reason:
+    one line on a failure that the numbers do not show, or "". hard: None also after an exception.
     """
 
     case: str
@@ -67,16 +67,16 @@ class Row:
 
 
 def run_cases(dev: Device, cases: Iterable[Case]) -> Iterator[Row]:
-    """The row of each case, but of variants that are not offered to the device."""
+    """Yield the row of each case, except for variants that are not offered to the device."""
     variants = (None, *OFFERED[device_class(dev)])
     yield from (run_case(dev, case) for case in cases if case.variant in variants)
 
 
 def run_case(dev: Device, case: Case) -> Row:
-    """The row of one case, which an exception fails."""
+    """Run a case and return its row; an exception makes it fail."""
     start = time.perf_counter()
     try:
-        with np.errstate(all="ignore"):  # what is not finite is a result here
+        with np.errstate(all="ignore"):  # infinite values and NaN are results here
             checks = list(case.run(dev, np.random.default_rng(SEED)))
         worst = max(checks, key=lambda check: check.share)
     except Exception as fault:
@@ -92,12 +92,12 @@ def run_case(dev: Device, case: Case) -> Row:
 
 
 def _naive_rank(check):
-    """By which checks are compared: first the naive formula's error, then ours."""
+    """The sort key of checks: first the naive formula's error, then ours."""
     return check.naive_share, np.nan_to_num(check.naive or 0.0, nan=np.inf), check.share
 
 
 def setup(dev: Device) -> dict[str, str]:
-    """{what: its name or version} of the device and of what runs on it."""
+    """{part: name or version} of the device, its driver and our software."""
     # pyopencl adds the variable's options to each build
     options = [*dev.build_options, os.environ.get("PYOPENCL_BUILD_OPTIONS", "")]
     units, gibibytes = dev.info["compute_units"], dev.info["memory_bytes"] / 2**30
@@ -116,13 +116,13 @@ def setup(dev: Device) -> dict[str, str]:
 
 
 def line(row: Row) -> str:
-    """A line of the table; below it, indented, the reason of a failure that has one."""
+    """A row's line in the table, followed by an indented line with the reason of a failure."""
     numbers = ["-" if n is None else f"{n:.2g}" for n in (row.error, row.bound)]
     return COLUMNS(row.case, *numbers, _passed(row)) + _reason(row)
 
 
 def hard_line(row: Row) -> str:
-    """The same of a hard case, beside the naive formula."""
+    """A hard case's line in the table, which shows the naive formula, too."""
     hard = row.hard
     numbers = hard.shown() if hard else ["-"] * 3
     what = hard.what if hard else ""
@@ -138,8 +138,8 @@ def _reason(row):
 
 
 def as_json(dev: Device, rows: Iterable[Row]) -> dict[str, Any]:
-    """{"setup", "passed", "seconds", "cases": [a Row's fields]}; null for what is no number, but
-    "nan" or "inf" for what the naive formula gives.
+    """{"setup", "passed", "seconds", "cases": [a Row's fields]}. NaN and Inf become null, but "nan"
+    or "inf" for the naive formula.
     """
     rows = list(rows)
     return {
@@ -151,7 +151,7 @@ def as_json(dev: Device, rows: Iterable[Row]) -> dict[str, Any]:
 
 
 def _plain(row):
-    """A row without numbers that JSON has not."""
+    """A row without numbers that JSON lacks."""
     hard = row["hard"] or {"error": 0.0, "naive": 0.0}
     for fields in (row, hard):
         fields["error"] = fields["error"] if np.isfinite(fields["error"] or 0) else None

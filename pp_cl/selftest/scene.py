@@ -1,4 +1,4 @@
-"""Cases of a scene's preparation: hull, targets, the demo."""
+"""Cases of the kernels that prepare a scene: hull, targets, distortion, the demo."""
 
 import itertools
 from dataclasses import replace
@@ -17,14 +17,14 @@ from pp_cl.selftest.case import SIZES, Case, absolute, exact
 
 BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
 TARGET = 5e-7  # a few roundings of a float32 in [0, 1]
-ROUNDED = 0.5 + 0.1  # levels: to 8 bits; and 2e-4 pixels, of a place in float32, in steep noise
+ROUNDED = 0.5 + 0.1  # levels: 8 bits round by half, and 2e-4 pixels of float32's in steep noise
 LENSES = (
     LensDistortion(-0.15, 0.04, 0.004, -0.003, 0.01),
     LensDistortion(k1=0.3),
     LensDistortion(k1=0.5, k2=0.1, k4=0.4, k5=0.05, k6=-0.01),
     LensDistortion(0.04, -0.02, 0.0, 0.0, 0.01, -0.004, fisheye=True),
 )
-DEMO = 2e-6  # distances of up to 2, by some ten roundings
+DEMO = 2e-6  # distances of up to 2, with some ten roundings
 
 
 def _views(rng, share):
@@ -46,7 +46,7 @@ def _views(rng, share):
 
 
 def _masks(dev, rng):
-    """Widened by two pixels, of a reduced image by more, and packed to bits."""
+    """Masks widened by two pixels, or by more for a reduced image, and packed into bits."""
     for view, downscale in itertools.product(_views(rng, 0.002), (1, 2, 35)):
         height, width = view.image.shape[:2]
         words = Carver(dev, [replace(view, downscale=downscale)]).masks.get().reshape(height, -1)
@@ -55,7 +55,7 @@ def _masks(dev, rng):
 
 
 def _hull(dev, rng):
-    """Which vertices enough images see and few enough masks reject, and their numbers."""
+    """The vertices that enough images see and few enough masks reject, and their numbers."""
     views = _views(rng, 0.05)
     carver = Carver(dev, views)
     for nx, forgiven, carver.doubts in itertools.product(SIZES, (0, 1, 2), (0, 1)):
@@ -70,7 +70,7 @@ def _hull(dev, rng):
 
 
 def _target(dev, rng):
-    """Means over white of blocks of pixels, some of which reach outside of the image."""
+    """Means over white of blocks of pixels, some of which reach outside the image."""
     image = rng.integers(0, 256, (83, 97, 4), np.uint8)
     image[..., 3] = rng.choice([0, 255, 7, 130], (83, 97), p=[0.33, 0.33, 0.17, 0.17])
     view = View("noise", Camera(np.eye(3, 4), 90.0, 95.0, 45.6, 45.7, 97, 83), image)
@@ -82,13 +82,13 @@ def _target(dev, rng):
         expected = twin.target_forward(image, 3, 3 + 2, 6 + 1, **crop)
         colour, alpha = target.crop(view.reduced(3), box, (2, 1))
         yield absolute(colour.get(), expected, TARGET)
-        # over white, the object's share is what a black object would hide
+        # over white, a black object hides as much as the object's share
         hidden = 1 - twin.target_forward(black, 3, 3 + 2, 6 + 1, **crop)[..., 0]
         yield absolute(alpha.get(), hidden, TARGET)
 
 
 def _target_between(dev, rng):
-    """Shifted by parts of a pixel, also where the crop reaches outside of the image."""
+    """Targets shifted by parts of a pixel, also if the crop reaches outside the image."""
     image = rng.integers(0, 256, (40, 97, 4), np.uint8)
     view = View("noise", Camera(np.eye(3, 4), 90.0, 95.0, 45.6, 20.2, 97, 40), image)
     target = Target(dev)
@@ -109,7 +109,9 @@ def _target_between(dev, rng):
 
 
 def _distortion(dev, rng):
-    """Noise, at its size and at a half and a third; a tall image takes several bands."""
+    """Images of noise, at full size and reduced two and three times; a tall one takes several
+    bands.
+    """
     sizes = [(n, 31) for n in SIZES] + [(33, 257), (1030, 700)]
     for (width, height), lens in itertools.product(sizes, LENSES):
         camera = Camera(np.eye(3, 4), 0.9 * height, 0.8 * height, 0.53 * width, 14.2, width, height)
@@ -121,7 +123,7 @@ def _distortion(dev, rng):
 
 
 def _transparent(dev, rng):
-    """A lens that distorts nothing, over pixels some of which are transparent: these are black."""
+    """A lens without distortion, over pixels some of which are transparent; these become black."""
     image = rng.integers(0, 256, (31, 33, 4), np.uint8)
     image[..., 3] *= rng.random((31, 33)) < 0.5
     camera, lens = Camera(np.eye(3, 4), 30.0, 30.0, 16.5, 15.5, 33, 31), LensDistortion()

@@ -1,4 +1,4 @@
-"""Cases of the specular layer: of an image, and of what it is fitted to."""
+"""Cases of the specular layer: its image, and the pixels to which it is fitted."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -15,12 +15,12 @@ from pp_cl.engine.training.specular import ROW, draw_batch, gradient_of_squares,
 from pp_cl.reference import network
 from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 
-BOUND = 2e-6  # sums of up to 43 products; the formulas of doubled angles add their errors up
-PADDED = 2, 1  # (left, top) of an image in what is rendered
+BOUND = 2e-6  # sums of up to 43 products; errors of the double-angle formulas add up
+PADDED = 2, 1  # (left, top) of an image within the rendered one
 
 
 def random_layer(dev: Device, rng: np.random.Generator) -> tuple[Specular, dict[str, np.ndarray]]:
-    """A layer, and its parameters as the float64 twin takes them."""
+    """A layer, and its parameters for the float64 twin."""
     layer, parameters = Specular(dev), {}
     for one in convolutions(layer.layers):
         shape = one.weight_shape()
@@ -35,15 +35,15 @@ def random_layer(dev: Device, rng: np.random.Generator) -> tuple[Specular, dict[
 
 
 def _view(dev, rng, height, width, side):
-    """(what renderer.forward() would have made of random pixels, its (H, W, 3) directions): alpha 0
-    and 1 among them, and below what the layer is added from. The middle one looks along an axis.
+    """(a result like renderer.forward()'s with random pixels, its (H, W, 3) directions). Some
+    pixels have alpha 0, 1, or less than the layer needs. The middle one looks along an axis.
     """
     pose = np.eye(3, 4)[[2, 0, 1]]
     sizes = width / 2, height / 2, width, height
     camera = Camera(pose, 0.9 * width, 1.1 * width, *sizes)
     alpha = rng.choice([0.0, 0.005, 0.01, 0.5, 1.0, -1.0], (height, width))
     alpha = np.where(alpha < 0, rng.random(alpha.shape), alpha)
-    alpha[np.abs(alpha - 0.02) < 1e-3] = 1  # either is right there
+    alpha[np.abs(alpha - 0.02) < 1e-3] = 1  # near the threshold, rounding may decide
     features, image = rng.normal(size=(height, width, 16)), rng.random((height, width, 3))
     rays = camera.rays()
     view: Any = SimpleNamespace(
@@ -60,7 +60,7 @@ def _view(dev, rng, height, width, side):
 
 
 def _forward(dev, rng):
-    """Images whose pixels show all, something, too little and nothing."""
+    """Images whose pixels show the object fully, partly, too little or not at all."""
     layer, parameters = random_layer(dev, rng)
     for n in SIZES:
         for height, width, side in ((1, n, 1), (n, 3, 2)):
@@ -79,7 +79,7 @@ def _forward(dev, rng):
 
 
 def _batches(dev, rng):
-    """Pixels that are kept of two views, batches of them, and a step's gradient."""
+    """The pixels kept from two views, batches of them, and a step's gradient."""
     for n in SIZES:
         rows, expected = dev.zeros((2 * n + 1, ROW)), np.zeros((2 * n + 1, ROW))
         for first, side in ((0, 1), (n + 1, 2)):

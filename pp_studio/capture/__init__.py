@@ -1,6 +1,6 @@
-"""From photographs or a video of an object to a scene: cameras, box and masks."""
+"""Makes a scene with cameras, box and masks from photographs or a video of an object."""
 
-# {stage: what it finds}, in their order
+# {stage: its result}, in the order of the stages
 STAGES = {
     "frames": "upright photographs, the sharpest frames of a video",
     "features": "what can be found again in other images",

@@ -1,5 +1,5 @@
-"""The box of the object that all cameras look at, from sparse points, and the world in which it is
-upright, centred and of unit size.
+"""Finds the box of the object that all cameras look at, from sparse points, and a world in which it
+is upright, centred and of unit size.
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,21 @@ from pp_cl import Camera
 from pp_cl.scene import looked_at, up_of
 from pp_studio.camera_path import level
 
-SEEN = 0.75  # of the cameras that see what most of them see: what the object's points have
-NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from which on it is alone
-CUT = 0.005  # of the points at each end of an axis: what may be wrong
-MARGIN = 0.06  # of the box's diagonal, added on every side: smooth parts have no points
+SEEN = 0.75  # an object's point is seen by this share of the cameras that see the best-seen points
+NEIGHBOURS, LONELY = 8, 3.0  # a point is alone if its 8th neighbour is 3 median distances away
+CUT = 0.005  # share of the points at each end of an axis that may be wrong
+MARGIN = 0.06  # of the box's diagonal, added on every side, as smooth parts have no points
 LEAST_POINTS = 100
-FILLED = 0.55  # of the images, by an object whose sides may have no points
-SLOPES = np.tan(np.radians(np.arange(-10, 11, 2)))  # of the plane that carries the object
-THICK = 0.01  # of the cameras' distance: points of a plane are no further from it
-TABLE, BELOW = 0.08, 0.03  # of the points: on a table at least, and below it at most
-LEAST_SPREAD = 0.9  # of the width of what stands on it
+FILLED = 0.55  # share of the images that an object fills whose sides may have no points
+SLOPES = np.tan(np.radians(np.arange(-10, 11, 2)))  # tried for the plane that carries the object
+THICK = 0.01  # of the cameras' distance: most distance of a plane's points from the plane
+TABLE, BELOW = 0.08, 0.03  # shares of the points: on a table at least, and below it at most
+LEAST_SPREAD = 0.9  # width of a table at least, in widths of the points above it
 
 
 class World(NamedTuple):
-    """A similarity to the scene's world, x -> scale * rotation @ x + shift, and there the (2, 3)
-    lower and upper corner of the object.
+    """A similarity to the scene's world, x -> scale * rotation @ x + shift. box: (2, 3) lower and
+    upper corner of the object in that world.
     """
 
     scale: float
@@ -37,21 +37,21 @@ class World(NamedTuple):
 
 
 def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
-    """The world whose z axis is up, whose origin is the middle of the object, and where its box
-    fits into [-1, 1]. points: (N, 3).
+    """The world whose z axis points up, whose origin is the middle of the object, and in which the
+    object's box fits into [-1, 1]. points: (N, 3).
     """
     up = up_of(cameras)
     centre = looked_at(cameras)
     eyes = np.stack([camera.eye for camera in cameras])
     reach = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
     ahead = level(eyes[0] - centre, up)
-    rotation = np.stack([ahead, np.cross(up, ahead), up])  # the first camera to the side of x
+    rotation = np.stack([ahead, np.cross(up, ahead), up])  # the first camera is towards x
     upright = (points - centre) @ rotation.T / reach
     seen = np.mean([camera.pixels(points)[2] for camera in cameras], axis=0)
     on_object = _on_object(upright, seen)
     angles = [np.arctan(min(one.width / one.fx, one.height / one.fy) / 2) for one in cameras]
     away = [np.linalg.norm(eye - centre) for eye in eyes]
-    # of the ball around the centre that all cameras see as a whole
+    # radius of the largest ball around the centre that every camera sees as a whole
     ball = min(far * np.sin(angle) for far, angle in zip(away, angles, strict=True)) / reach
     low, high = np.outer([-ball, ball], np.ones(3))
     if len(on_object) >= LEAST_POINTS:
@@ -61,7 +61,7 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
             np.minimum(ends[0] - margin, FILLED * low),
             np.maximum(ends[1] + margin, FILLED * high),
         )
-        low[2] = ends[0, 2] - margin  # what it stands on
+        low[2] = ends[0, 2] - margin  # not FILLED below, where the object stands on something
     middle, size = (low + high) / 2, (high - low).max() / 2
     scale = 1 / (reach * size)
     shift = -scale * rotation @ centre - middle / size
@@ -69,7 +69,7 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
 
 
 def _on_object(points, seen):
-    """(M, 3) of the points that nearly all cameras see and that are not alone, without a table."""
+    """(M, 3) the points that nearly all cameras see and that are not alone, without a table's."""
     near = np.linalg.norm(points, axis=1) < 1
     if not near.any():
         return points[near]
@@ -83,13 +83,13 @@ def _on_object(points, seen):
 
 
 def _table(points):
-    """(4,) normal and height of the level plane that the points stand on, None without one."""
+    """(4,) normal and height of the nearly level plane on which the points stand, or None."""
     best, found = TABLE * len(points), None
     for x, y in product(SLOPES, SLOPES):
         normal = np.array([x, y, 1]) / np.sqrt(x * x + y * y + 1)
         height = points @ normal
         order = np.sort(height)
-        first = order[: int(BELOW * len(points)) + 1]  # as the lowest point of the layer
+        first = order[: int(BELOW * len(points)) + 1]  # candidates for the layer's lowest point
         inside = np.searchsorted(order, first + 2 * THICK) - np.arange(len(first))
         if inside.max() <= best:
             continue
@@ -97,7 +97,7 @@ def _table(points):
         on, above = np.abs(height - middle) <= THICK, height > middle + THICK
         if not above.any():
             continue
-        # widths in x and y, but for some at the ends
+        # widths in x and y, without some points at the ends
         ends = [np.quantile(points[some, :2], [0.05, 0.95], axis=0) for some in (on, above)]
         if (np.ptp(ends[0], axis=0) > LEAST_SPREAD * np.ptp(ends[1], axis=0)).all():
             best, found = inside.max(), np.append(normal, middle)
@@ -105,7 +105,7 @@ def _table(points):
 
 
 def corners_of(box: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of a (2, 3) box: bit i of a row's number says whether it lies on the upper
-    side of axis i.
+    """(8, 3) corners of a (2, 3) box: bit i of a row's index says whether the corner lies on the
+    upper side of axis i.
     """
     return np.array([[box[n >> axis & 1][axis] for axis in range(3)] for n in range(8)])

@@ -1,10 +1,10 @@
-"""Cuts an object out of photographs with known cameras: GrabCut by view, with colours that all
-views share, from the sparse points, then by what stands out from the background, then by a vote of
-the views with a forgiving hull.
+"""Cuts an object out of photographs with known cameras. GrabCut cuts each view, with colours that
+all views share: first from the sparse points, then with the pixels that stand out from the
+background, then after a vote of the views by a forgiving hull.
 
-What stands out: a photograph against what others show of the wall behind the object, which they see
-beside it; or at the same pixels, where the object turns before a wall that stands still. Parts and
-gaps too thin for a cut by colour are found in this way.
+To find pixels that stand out, a photograph is compared with the background that other photographs
+show beside the object, or at the same pixels if the object turns before a still background. This
+finds parts and gaps that are too thin for a cut by colour.
 """
 
 from collections.abc import Sequence
@@ -25,43 +25,43 @@ from pp_studio.capture.packages import needed
 
 cv2 = needed("cv2")
 
-CUT_SIDE = 400  # pixels of what is cut: the projected box and what is around it
-AROUND = 0.2  # of the projected box, on each side: shows what the background looks like
-# Of the box's diagonal: points lower in it may be on what the object stands on, or on what lies
-# around it. The object's own lowest are at 0.05, as box.MARGIN is below them.
+CUT_SIDE = 400  # longer side, pixels, of the image that is cut: the projected box and its margin
+AROUND = 0.2  # of the projected box: margin on each side, which shows the background
+# Of the box's diagonal: lower points may lie on the object's support or on things around it. The
+# object's own lowest points are at 0.05, since box.MARGIN lies below them.
 FOOT = 0.08
 SEED = 1 / 150  # radius of a sparse point, of CUT_SIDE
-ROUGH = 2  # pixels at the border of what is surely the object that may show the background
-NEAR = 1 / 20  # of CUT_SIDE: sparse points so close show a surface between them
-SAMPLES = 160  # squared: pixels of each side that the colours are learned from
+ROUGH = 2  # pixels at the border of certain object regions that may show the background
+NEAR = 1 / 20  # of CUT_SIDE: between sparse points so close there is a surface
+SAMPLES = 160  # squared: pixels from which the colours of each side are learned
 FITTED = 3  # times that the colours are fitted to their samples
-ISLAND = 0.02  # of the largest region: smaller ones of a mask are dropped
+ISLAND = 0.02  # of the largest region of a mask; smaller regions are dropped
 ROUNDS = 2  # of votes
 STANDS_OUT, IS_WALL = 3.0, -4.0  # log-odds above and below which colours are overruled
-LIKE_WALL = -2.0  # below which not even nearly all other views are believed
-CROWDED = 0.3  # of 3x3 pixels that look like the background: the object has single ones
-CELLS = 112**3  # vertices that are voted on
-FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
-SLIPS = 0.08  # of them, too: where no more do, their cuts are wrong; but see LIKE_WALL
-LEAST_SEEING = 3  # views that see a vertex, or all of fewer
-# A side of the box cuts the object if its outermost layer holds this share of the vertices of the
-# fullest one: then it moves out by so much of the box's diagonal, at most so often.
+LIKE_WALL = -2.0  # log-odds below which not even nearly all other views are believed
+CROWDED = 0.3  # share of 3x3 pixels like the background; on the object only single pixels are
+CELLS = 112**3  # vertices on which views vote
+FORGIVEN = 0.15  # share of the views that see a vertex whose masks may reject it
+SLIPS = 0.08  # the same: if no more masks reject it, these are cut wrongly; but see LIKE_WALL
+LEAST_SEEING = 3  # views that must see a vertex, or all if there are fewer
+# A side of the box cuts the object if its outermost layer holds TOUCHING times the vertices of the
+# fullest layer. Then it moves out by GROWTH of the box's diagonal, at most GROWTHS times.
 TOUCHING, GROWTH, GROWTHS = 0.03, 0.05, 4
 MOSTLY_SEEN = 0.5  # of the windows
 SOFT = 1.0  # pixels of the cut image over which a border is refined
 FLAT = 1e-3  # variance of colours, of 1, below which a border follows no edge
-# Of what stands out
-NEAREST = 10  # photographs that one is compared with
+# To find pixels that stand out
+NEAREST = 10  # photographs with which a photograph is compared
 STEP = 8  # pixels between places whose depth is interpolated
-MARGIN = 0.1  # of a window's size: sparse points so far outside it still tell depths in it
-LEAST, MOST = 50, 800  # sparse points behind a window: needed, and looked at
-AMONG = 6  # points whose median depth each has, since some are wrong
+MARGIN = 0.1  # of a window's size: sparse points so far outside it still give depths in it
+LEAST, MOST = 50, 800  # sparse points behind a window: needed, and used
+AMONG = 6  # neighbours whose median depth a point gets, since some points are wrong
 HIDING = 2  # pixels around a mask that may show the object
-UNSEEN = 255  # as a difference: no other photograph shows the background
-# Of an object that turns
-COMPARED = 64  # photographs that one is compared with
-ALIKE, SLIGHT = 2.0, 3.0  # times what is usual, and levels: differences of the same still wall
-LEAST_ALIKE = 5  # photographs that show the same
+UNSEEN = 255  # in place of a difference: no other photograph shows the background
+# If the object turns
+COMPARED = 64  # photographs with which a photograph is compared
+ALIKE, SLIGHT = 2.0, 3.0  # times the usual difference, and levels, for the same still background
+LEAST_ALIKE = 5  # photographs that show the same background
 SHOWN = 0.15, 0.4, 0.9  # few, some and nearly all of them
 BLUR = 2.0  # levels over which differences are counted
 RARE = 1e-3  # share of the pixels that are spread over all levels
@@ -71,8 +71,8 @@ RARE = 1e-3  # share of the pixels that are spread over all levels
 class Window:
     """The part of a photograph around the projected box, reduced for cutting.
 
-    image: (H, W, 3) uint8. camera: of it. place: (x0, y0, x1, y1) in the photograph. mask: (H, W)
-    bool, None until it is known.
+    image: (H, W, 3) uint8. camera: the image's camera. place: (x0, y0, x1, y1) in the photograph.
+    mask: (H, W) bool, None until it is known.
     """
 
     name: str
@@ -88,13 +88,13 @@ class Window:
         return np.where(depth > 0, [x, y], np.nan).T
 
     def reduced(self, image: np.ndarray) -> np.ndarray:
-        """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
+        """The window's part of an image of the photograph's size, (H, W) or (H, W, C), reduced."""
         x0, y0, x1, y1 = self.place
         size = self.camera.width, self.camera.height
         return cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
 
     def inside(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """((M,) indices of the positions that lie in the image, their rows, their columns)."""
+        """((M,) indices of the positions that the image shows, their rows, their columns)."""
         column, row, is_shown = self.camera.pixels(positions)
         return np.flatnonzero(is_shown), row[is_shown], column[is_shown]
 
@@ -107,7 +107,7 @@ class Window:
 
 
 def place_of(image_file: ImageFile, box: np.ndarray) -> tuple[int, int, int, int] | None:
-    """(x0, y0, x1, y1) around the box (2, 3) in a photograph; None where it is outside."""
+    """(x0, y0, x1, y1) around the box (2, 3) in a photograph; None if the box is outside."""
     camera = image_file.camera
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y, depth = camera.project(corners_of(box))
@@ -120,7 +120,7 @@ def place_of(image_file: ImageFile, box: np.ndarray) -> tuple[int, int, int, int
 
 
 def window(image: np.ndarray, image_file: ImageFile, box: np.ndarray) -> Window:
-    """The Window of a photograph, (H, W, 3) uint8. Raises UserError where the box is outside."""
+    """The Window of a photograph, (H, W, 3) uint8. Raises UserError if the box is outside."""
     place = place_of(image_file, box)
     if place is None:
         raise UserError(f"{image_file.name}: the object's box is outside; give another with --box")
@@ -137,13 +137,13 @@ def window(image: np.ndarray, image_file: ImageFile, box: np.ndarray) -> Window:
 
 
 def _grown(places, size):
-    """(first, last + 1) pixel of the places, grown by AROUND, within an image's side."""
+    """(first, last + 1) pixel of places, widened by AROUND, within an image of `size` pixels."""
     margin = AROUND * np.ptp(places)
     return max(0, int(places.min() - margin)), min(size, int(places.max() + margin) + 1)
 
 
 def dilated(marked: np.ndarray, radius: int) -> np.ndarray:
-    """(H, W) bool: the marked pixels and those no further than a radius from one."""
+    """(H, W) bool: the marked pixels and all pixels within a radius of them."""
     return cv2.dilate(marked.astype(np.uint8), disc(radius)) > 0
 
 
@@ -160,8 +160,8 @@ def cut_out_all(
     seen: Sequence[np.ndarray],
     turns: bool,
 ) -> None:
-    """Set the masks of the windows that have none. box, points, seen, turns: of write_masks().
-    inside: (N,) bool, the object's points. Raises UserError for a box in which nothing stands.
+    """Set the masks of the windows that have none. box, points, seen, turns: as in write_masks().
+    inside: (N,) bool, the points in the box. Raises UserError for a box without an object.
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
@@ -170,7 +170,7 @@ def cut_out_all(
         for one, some in zip(track(windows, "finding the object", "image"), seen, strict=True)
     ]
     seeds = list(labels)
-    if not any((label & 1).any() for label in labels):  # the lowest bit: it is the object's
+    if not any((label & 1).any() for label in labels):  # the lowest bit marks the object
         raise UserError(
             "no point lies in the object's box above what it stands on; give another with --box"
         )
@@ -181,7 +181,7 @@ def cut_out_all(
             colours = _colours(windows, labels)
         for i in track(left, text, "image"):
             label, (background, front) = labels[i].copy(), (some.copy() for some in colours)
-            how = cv2.GC_EVAL_FREEZE_MODEL  # the colours are not changed
+            how = cv2.GC_EVAL_FREEZE_MODEL  # keeps the colours
             cv2.grabCut(windows[i].image, label, None, background, front, 1, how)
             windows[i].mask = label & 1 == 1
 
@@ -192,7 +192,7 @@ def cut_out_all(
         return [some & ~one.mask for some, one in zip(around, windows, strict=True)]
 
     found = differences(windows, points[~inside], beside() if turns else None)
-    agreed = [np.zeros(label.shape, bool) for label in labels]  # by nearly all views
+    agreed = [np.zeros(label.shape, bool) for label in labels]  # object, say nearly all views
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
@@ -201,7 +201,7 @@ def cut_out_all(
         surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
         with Progress("what stands out"):
             standing_out = evidence(found, beside(), surely)
-        for i in left:  # what stands out, or does not, is no longer open
+        for i in left:  # pixels that clearly stand out, or do not, are no longer open
             label, wall = labels[i].copy(), standing_out[i] < IS_WALL
             crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
             label[(standing_out[i] > STANDS_OUT) & (label != cv2.GC_BGD)] = cv2.GC_FGD
@@ -214,9 +214,9 @@ def cut_out_all(
 
 
 def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
-    """(2, 3) box whose sides are moved out where they cut the object off, but for what it stands
-    on; None where no side does. The object is the hull of the masks as far as most windows see it,
-    as beyond that hardly any mask bounds it.
+    """(2, 3) box whose sides are moved outwards where they cut the object, except below; None if no
+    side does. The object is the part of the masks' hull that most windows see, since hardly any
+    mask bounds the rest.
     """
     hull, *_, voxel_size = forgiving_hull(windows, box)
     seen = np.bincount(np.concatenate([one.inside(hull)[0] for one in windows]), None, len(hull))
@@ -235,8 +235,8 @@ def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
 
 
 def without_islands(mask: np.ndarray) -> np.ndarray:
-    """(H, W) bool: the mask but for regions smaller than ISLAND times the largest, which are mostly
-    things beside the object in its colours.
+    """(H, W) bool: the mask without regions smaller than ISLAND times the largest, which are mostly
+    things near the object in its colours.
     """
     _, regions, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     areas = facts[:, cv2.CC_STAT_AREA]
@@ -245,7 +245,7 @@ def without_islands(mask: np.ndarray) -> np.ndarray:
 
 
 def _seeds(one, box, points, inside, seen):
-    """(H, W) uint8 of GrabCut's labels, by the box and the sparse points in a photograph."""
+    """(H, W) uint8 GrabCut labels from the box and the sparse points in a photograph."""
     labels = np.full(one.image.shape[:2], cv2.GC_BGD, np.uint8)
     outline = one.pixels(corners_of(box))
     if np.isnan(outline).any():
@@ -269,14 +269,14 @@ def _eroded(marked, radius):
 
 
 def _closed(marked, radius):
-    """(H, W) bool with gaps narrower than two radii closed; nothing is beyond the border."""
+    """(H, W) bool with gaps narrower than two radii closed; beyond the border all is unmarked."""
     padded = np.pad(marked.astype(np.uint8), radius)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc(radius))
     return closed[radius:-radius, radius:-radius] > 0
 
 
 def _colours(windows, labels):
-    """(the background's, the object's) mixture of GrabCut, (1, 65) each, of all windows' pixels."""
+    """GrabCut's mixtures of (background, object) colours in all windows, (1, 65) each."""
     rng, drawn = np.random.default_rng(0), []
     each = -(-(SAMPLES**2) // len(windows))
     for wanted in (0, 1):  # the lowest bit of a label
@@ -295,8 +295,8 @@ def _colours(windows, labels):
 def forgiving_hull(
     windows: Sequence[Window], box: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """((N, 3) positions in the box that no more than FORGIVEN of the masks reject of the windows
-    that see them, (N,) how many do, (N,) how many see them, the positions' spacing).
+    """((N, 3) positions in the box that are rejected by at most FORGIVEN of the masks whose windows
+    see them, (N,) number of rejections, (N,) number of windows that see them, their spacing).
     """
     grid = Grid.centred_in(box, smallest_voxel_size(box, CELLS))
     positions = grid.lattice()
@@ -318,8 +318,8 @@ def forgiving_hull(
 
 
 def _relabelled(one, seeds, hull, rejections, seen, voxel_size):
-    """((H, W) uint8 of GrabCut's labels, by the hull, and by what no other view of it rejects;
-    (H, W) bool, what hardly any other does).
+    """((H, W) uint8 GrabCut labels from the hull and its part that no other view rejects, (H, W)
+    bool: the part that hardly any other view rejects).
     """
     gap = gap_of(one, hull, voxel_size)
     found, rows, columns = one.inside(hull)
@@ -338,19 +338,19 @@ def _relabelled(one, seeds, hull, rejections, seen, voxel_size):
 
 
 def gap_of(one: Window, hull: np.ndarray, voxel_size: float) -> int:
-    """Pixels between the vertices of a hull, (N, 3) of this voxel_size, in a window."""
+    """Pixels between neighbouring vertices of a hull, (N, 3) with this voxel_size, in a window."""
     middle = np.linalg.norm(hull.mean(0) - one.camera.eye)
     return max(1, int(np.ceil(voxel_size * one.camera.fx / middle)))
 
 
 def silhouette(one: Window, hull: np.ndarray, gap: int) -> np.ndarray:
-    """(H, W) bool: where a window shows vertices of a hull (N, 3), so many pixels apart."""
+    """(H, W) bool: where a window shows vertices of a hull (N, 3), which are `gap` pixels apart."""
     return _closed(one.marked(hull), gap)
 
 
 def whole_mask(one: Window, image: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 mask of the whole photograph (H, W, 3): the window's, whose border follows the
-    photograph's edges (guided filter, He et al. 2010) and is soft where they are.
+    """(H, W) uint8 mask of the whole photograph (H, W, 3): the window's mask, with a border that
+    follows the photograph's edges (guided filter, He et al. 2010) and is as soft as they are.
     """
     x0, y0, x1, y1 = one.place
     guide = image[y0:y1, x0:x1].astype(np.float32) / 255
@@ -378,12 +378,12 @@ def differences(
     background: np.ndarray,
     beside: Sequence[np.ndarray] | None = None,
 ) -> list[np.ndarray]:
-    """For each window (H, W) uint8, by how many levels its most different channel differs from what
-    others show of the background there; or UNSEEN.
+    """For each window (H, W) uint8: the levels by which its most different channel differs from the
+    background that other windows show at the same place; or UNSEEN.
 
-    background: (N, 3) sparse points around the object. beside: where the object turns before a
-    background that stands still, and that others show at the same pixels: (H, W) bool each, what
-    surely shows it.
+    background: (N, 3) sparse points around the object. beside: if the object turns before a still
+    background, which others show at the same pixels: (H, W) bool for each window, the pixels that
+    surely show it.
     """
     eyes = np.stack([one.camera.eye for one in windows])
     found = []
@@ -398,7 +398,7 @@ def differences(
 
 
 def _difference(one, others, background):
-    """From what the others show at the same places, beside their masks: the median."""
+    """The median difference from the background that others show beside their masks."""
     places = _places_behind(one, background)
     if places is None:
         return np.full(one.mask.shape, UNSEEN, np.uint8)
@@ -412,10 +412,12 @@ def _difference(one, others, background):
 
 
 def _difference_of_still(one, others, beside):
-    """From those that show the same wall: what some do not exceed, whatever their masks say."""
+    """The difference that some of the others with the same still background do not exceed; their
+    masks do not matter.
+    """
     found, off = [], []
     for other in others:
-        at = []  # x and y of this one's pixels at the same places of the other's photograph
+        at = []  # x and y of this window's pixels in the other window, at the same pixels
         for axis in (0, 1):
             (begin, end), (first, last) = one.place[axis::2], other.place[axis::2]
             size, there = one.image.shape[1 - axis], other.image.shape[1 - axis]
@@ -433,14 +435,14 @@ def _difference_of_still(one, others, beside):
         return np.full(beside.shape, UNSEEN, np.uint8)
     few, some, nearly_all = _smallest(found, SHOWN)
     usual, most = (ALIKE * np.median(one[beside]) + SLIGHT for one in (some, nearly_all))
-    # few show the wall that is mostly hidden; nearly all, a part of the object without a pattern
+    # few others show a mostly hidden wall; nearly all show a part of the object without a pattern
     rarely, always = (few <= usual) & (some > usual), nearly_all <= most
     some[rarely | (always & ~beside)] = UNSEEN
     return some
 
 
 def _levels(one, other, at, usable):
-    """(H, W) uint8 differences from usable pixels of another window at (H, W, 2), else UNSEEN."""
+    """(H, W) uint8 differences from another window's pixels at (H, W, 2); UNSEEN if not usable."""
     usable = cv2.remap(255 * usable.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=0)
     behind = cv2.remap(other.image, at, None, cv2.INTER_LINEAR)
     levels = np.maximum.reduce(cv2.split(cv2.absdiff(one.image, behind)))
@@ -448,7 +450,7 @@ def _levels(one, other, at, usable):
 
 
 def _smallest(found, shares):
-    """(H, W) uint8 each: the difference that a share of those that are seen do not exceed."""
+    """(H, W) uint8 for each share: the level that this share of seen differences do not exceed."""
     found = np.sort(np.stack(found, axis=-1), axis=-1)
     seen = (found < UNSEEN).sum(-1, keepdims=True)
     places = (np.maximum(np.ceil(share * seen).astype(int) - 1, 0) for share in shares)
@@ -456,7 +458,7 @@ def _smallest(found, shares):
 
 
 def _places_behind(one, background):
-    """(rows, columns, 3) positions between the background's points, None where these are few."""
+    """(rows, columns, 3) positions interpolated between background points; None if they are few."""
     camera = one.camera
     size = np.array([camera.width, camera.height])
     depth = (background - camera.eye) @ camera.pose[:, 2]
@@ -483,11 +485,11 @@ def _places_behind(one, background):
 def evidence(
     found: Sequence[np.ndarray], beside: Sequence[np.ndarray], surely: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """For each window (H, W) float32: how much likelier its differences are on the object than
-    beside it, as a logarithm; 0 where they are UNSEEN.
+    """For each window (H, W) float32: the logarithm of how much likelier its differences are on the
+    object than beside it; 0 where they are UNSEEN.
 
-    beside, surely: (H, W) bool each, what shows the background and the object for sure.
-    What cannot be predicted says nothing: its differences are the same on both.
+    beside, surely: (H, W) bool each, pixels that surely show the background and the object. An
+    unpredictable background decides nothing, as its differences are the same on both.
     """
     counts = np.zeros((2, UNSEEN + 1))
     for difference, *sides in zip(found, beside, surely, strict=True):

@@ -1,6 +1,6 @@
-"""Features of the images by OpenCV and their matches by NumPy, both many times faster than those of
-pycolmap on a CPU, which checks and keeps them; without those of what is behind an object that turns
-before a camera that stays, which would hide how the object moves.
+"""Finds features of the images with OpenCV and matches them with NumPy, both many times faster on a
+CPU than pycolmap, which checks and stores them. If an object turns before a fixed camera, matches
+on the still background are removed, which would hide how the object moves.
 """
 
 import os
@@ -21,31 +21,32 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files import mend
 from pp_studio.capture.packages import needed
 
-LENS = "SIMPLE_RADIAL"  # with more, few photographs agree on a wrong focal length
-LARGEST = 1600  # pixels, longer side; larger images are reduced for their features
-FEATURES = 4096  # of an image, at most: the largest
-CONTRAST = 0.02  # of a feature, of 1, at least; three layers of an octave share it
-UNIT = 512  # length of a descriptor of bytes, as COLMAP has them
-RATIO, FARTHEST = 0.8, 0.7  # of the second best match's angle, and radians
-PAIRS_AT_ONCE = 40  # between two states of the bar and where a stopped run goes on
-EXHAUSTIVE = 25  # photographs of which each is compared with each
-OVERLAP = 5  # images before and after that one is compared with
-BEST = 10  # others that one is compared with, whose large features are most alike
-LARGE = 256  # features that tell these: the largest, as they are found in most images
-MOVED = 0.01  # of the longer side: what stands still, as behind a turntable, tells nothing
+LENS = "SIMPLE_RADIAL"  # with more parameters, few photographs agree on a wrong focal length
+LARGEST = 1600  # longer side, pixels; larger images are reduced for their features
+FEATURES = 4096  # most features of an image: the largest are taken
+CONTRAST = 0.02  # least contrast of a feature, of 1; three layers of an octave share it
+UNIT = 512  # length of a descriptor of bytes, as in COLMAP
+RATIO, FARTHEST = 0.8, 0.7  # largest angle of a match, in second best angles and in radians
+PAIRS_AT_ONCE = 40  # pairs after which the bar moves and a stopped run can continue
+EXHAUSTIVE = 25  # up to this many photographs, each is compared with all others
+OVERLAP = 5  # images before and after an image with which it is compared
+BEST = 10  # other images with which it is compared: those with the most similar large features
+LARGE = 256  # the largest features, as they are found in most images, choose these
+MOVED = 0.01  # of the longer side; features that move less may be still, as behind a turntable
 LEAST_ALIKE = 4  # large features
-# Of what stands still
-SAMPLED = 30  # matches of a pair
-LEAST_MATCHES = 15  # of a pair, of which at least a half stand still
-LEAST_PAIRS = 0.4  # of all pairs with so many matches, of photographs of an object that turns
-STILL = 0.006  # of the longer side: what stands still moves no further, once images are aligned
-ROUNDS, WIDEST, NARROWER = 30, 0.05, 0.7  # of the alignment: matches that it believes
+# Of still features
+SAMPLED = 30  # matches of a pair, for the alignment
+LEAST_MATCHES = 15  # of a pair, at least half of them still
+LEAST_PAIRS = 0.4  # share of pairs with these, of all with enough matches, if the object turns
+STILL = 0.006  # of the longer side: once images are aligned, still features move less
+# rounds of the alignment; distance, of the longer side, up to which a match counts, which shrinks
+ROUNDS, WIDEST, NARROWER = 30, 0.05, 0.7
 HELD = 0.001  # how strongly images without such matches are kept in place
 
 
 @contextmanager
 def quiet(work: Path) -> Iterator[Any]:
-    """pycolmap without its log. What it says of a disk that cannot be written is a UserError."""
+    """pycolmap without its log. Its errors, such as of a full disk, become UserErrors."""
     colmap = needed("pycolmap")
     colmap.logging.minloglevel = colmap.logging.FATAL
     try:
@@ -62,10 +63,11 @@ def quiet(work: Path) -> Iterator[Any]:
 def find_features(
     database: Path, images: Path, taken: Sequence[dict[str, Any]], masks: Path | None = None
 ) -> dict[str, int]:
-    """Add the features of each image to the database, the largest first, where they are not there.
+    """Add the features of each image, the largest first, to the database, unless it has them.
 
-    taken: what take_images() says of the images; those of equal lens and size have one camera.
-    masks: NAME.png of each image, black where no features are wanted. Returns {name: features}.
+    taken: take_images()'s facts about the images; images of equal lens and size share a camera.
+    masks: a folder with NAME.png for each image, black where no features are wanted. Returns {name:
+    number of features}.
     """
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         for _, alike in groupby(sorted(taken, key=_camera), _camera):
@@ -74,8 +76,8 @@ def find_features(
             if focal := of_camera[0]["focal"]:
                 width, height = of_camera[0]["size"]
                 options.camera_params = f"{focal},{width / 2},{height / 2},0"
-            # numbers them by name; later COLMAP would, as their features happen to be found, and
-            # matches and poses depend on the numbers
+            # This numbers the images by name. Otherwise COLMAP would number them in the order in
+            # which their features are found, and matches and poses depend on the numbers.
             names = [one["name"] for one in of_camera]
             with Progress("reading what EXIF tells of lenses"):
                 colmap.import_images(database, images, colmap.CameraMode.SINGLE, names, options)
@@ -87,7 +89,7 @@ def find_features(
             made = track(made, "features", "image", len(found), done=len(found) - len(left))
             for image, (keypoints, descriptors) in zip(left, made, strict=True):
                 kind = colmap.FeatureExtractorType.SIFT
-                with colmap.DatabaseTransaction(db):  # a stopped run leaves both or none
+                with colmap.DatabaseTransaction(db):  # a stopped run leaves both or neither
                     db.write_keypoints(image.image_id, keypoints)
                     db.write_descriptors(
                         image.image_id, colmap.FeatureDescriptors(kind, descriptors)
@@ -116,26 +118,27 @@ def _features(file, masks):
     if not found:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
     keypoints = np.array([(*one.pt, one.size / 2, np.radians(one.angle)) for one in found])
-    # of photographs of a shining head twice as many of the largest match as of the strongest
+    # in photographs of a shiny head, twice as many of the largest features match as of the
+    # strongest
     best = np.argsort(-keypoints[:, 2], kind="stable")[:FEATURES]
     keypoints, descriptors = keypoints[best], descriptors[best]
     larger = size / reduced
     keypoints[:, :2] = (keypoints[:, :2] + 0.5) * larger  # COLMAP's first pixel is centred at 0.5
     keypoints[:, 2] *= larger.mean()
-    # the root of what they share, by which a few strong gradients count less (Arandjelovic 2012)
+    # square roots of the shares, so that a few strong gradients count less (Arandjelovic 2012)
     shares = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     rounded = np.minimum(np.rint(UNIT * shares), 255).astype(np.uint8)
     return keypoints.astype(np.float32), rounded
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def match(database: Path) -> int:
-    """Match the features of pairs of images, where that is not done yet, and keep the pairs whose
-    matches fit one motion of the camera. Returns their number.
+    """Match the features of pairs of images that are not matched yet, and keep the pairs whose
+    matches fit one motion of the camera. Returns the number of pairs kept in all.
     """
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         images = sorted(db.read_all_images(), key=lambda image: image.name)
@@ -166,8 +169,8 @@ def match(database: Path) -> int:
 
 
 def matches_of(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(M, 2) uint32 rows of descriptors (N, 128) and (K, 128) uint8 that are each other's best, and
-    clearly better than the second best of either.
+    """(M, 2) uint32 pairs of rows in descriptors (N, 128) and (K, 128) uint8 that are each other's
+    best match, and clearly better than the second best match of either.
     """
     none = np.zeros((0, 2), np.uint32)
     if min(len(one), len(other)) < 2:
@@ -183,7 +186,8 @@ def matches_of(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _best(products):
-    """((...) places of the largest of products (..., K), (...) whether it is close and the best).
+    """((...) indices of the largest of products (..., K), (...) bool: whether this match is close
+    and clearly the best).
 
     Products of descriptors, whole numbers below 2^24, are exact.
     """
@@ -198,14 +202,16 @@ def _best(products):
 
 
 def forget_matches(database: Path) -> None:
-    """Remove all matches, so that match() begins anew."""
+    """Remove all matches, so that match() starts again."""
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         db.clear_matches()
         db.clear_two_view_geometries()
 
 
 def forget_focal_lengths(database: Path) -> bool:
-    """Where EXIF told any, begin with COLMAP's guess, check the pairs anew, and return True."""
+    """If EXIF gave any focal lengths, replace them by COLMAP's guess, check the pairs again, and
+    return True.
+    """
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         factor = colmap.ImageReaderOptions().default_focal_length_factor
         told = [camera for camera in db.read_all_cameras() if camera.has_prior_focal_length]
@@ -220,7 +226,7 @@ def forget_focal_lengths(database: Path) -> bool:
 
 
 def verification(colmap: Any) -> Any:
-    """How pairs are checked; with a seed, so that the same matches give the same pairs."""
+    """Options for checking pairs, with a seed, so that the same matches give the same pairs."""
     options = colmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     return options
@@ -235,11 +241,11 @@ def _verify_anew(colmap, database, db):
 def pairs_of(
     places: Sequence[np.ndarray], descriptors: Sequence[np.ndarray]
 ) -> list[tuple[int, int]]:
-    """The pairs of images to match: all of few images; else those that follow each other, the last
-    and the first ones, too, and with each image those that are most alike.
+    """The pairs of images to match: all pairs if there are few images; otherwise images that follow
+    each other (the first follow the last), and the images most similar to each image.
 
-    places: (N, 2) of each image's features, its longer side being 1; descriptors: (N, 128) uint8.
-    Of both the largest come first.
+    places: (N, 2) positions of each image's features, whose longer side is 1; descriptors: (N, 128)
+    uint8. In both, the largest features come first.
     """
     count = len(places)
     if count <= EXHAUSTIVE:
@@ -247,7 +253,7 @@ def pairs_of(
     alike = _alikeness(places, descriptors)
     apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     near = np.minimum(apart, count - apart) <= OVERLAP
-    # of a row of images that are alike the best counts twice, or they would be of one place
+    # in a row of similar images the best counts twice, so that not all are from one place
     rows = np.pad(alike, ((0, 0), (1, 1)))
     score = np.where(near, 0, alike * (1 + (alike >= np.maximum(rows[:, :-2], rows[:, 2:]))))
     best = np.argsort(-score, axis=1, kind="stable")[:, :BEST]
@@ -258,9 +264,9 @@ def pairs_of(
 
 
 def _alikeness(places, descriptors):
-    """(V, V) how many of their LARGE features images share at different places; 0 for few."""
+    """(V, V) number of LARGE features that two images share at different places; few count as 0."""
     count = len(places)
-    large = np.zeros((count, LARGE, 128), np.float32)  # what is missing is like nothing
+    large = np.zeros((count, LARGE, 128), np.float32)  # zeros match no feature
     at = np.zeros((count, LARGE, 2), np.float32)
     for i, (place, some) in enumerate(zip(places, descriptors, strict=True)):
         large[i, : len(some)], at[i, : len(some)] = some[:LARGE], place[:LARGE]
@@ -278,17 +284,17 @@ def _alikeness(places, descriptors):
 
 
 def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
-    """Where most pairs of images share what stands still, remove its matches from the database,
-    check the pairs anew, and return True.
+    """If most pairs of images share a still background, remove its matches from the database, check
+    the pairs again, and return True.
 
-    Images are aligned by shifts, turns and scales, so that the camera may be moved a little.
-    begun: a file to be made before anything is removed. is_turntable: the object is known to turn.
+    Images are aligned by shifts, rotations and scales, so that the camera may move a little. begun:
+    a file that is created before anything is removed. is_turntable: the object is known to turn.
     """
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         images = db.read_all_images()
         sizes = {i.camera_id: np.array([i.width, i.height]) for i in db.read_all_cameras()}
         index = {image.image_id: k for k, image in enumerate(images)}
-        places = []  # complex numbers, 0 in the image's middle, the longer side being 1
+        places = []  # complex numbers: 0 is the image's middle, 1 its longer side
         for image in images:
             pixels, size = db.read_keypoints(image.image_id)[:, :2], sizes[image.camera_id]
             places.append((pixels.astype(float) - size / 2) @ [1, 1j] / max(size))
@@ -322,7 +328,7 @@ def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
 
 
 def _aligned(places: list[np.ndarray], pairs: list[Any]) -> tuple[np.ndarray, np.ndarray]:
-    """((V,) complex scales with turns, (V,) shifts) that lay images over each other, robustly."""
+    """((V,) complex scales with rotations, (V,) shifts) that align the images, robustly."""
     rng, count = np.random.default_rng(0), len(places)
     drawn = []
     for _, i, j, matches in pairs:

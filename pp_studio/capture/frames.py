@@ -1,5 +1,5 @@
-"""The images of a scene from what a camera gives: upright copies of photographs, or the sharpest
-frames of a video, without what is blurred, broken or there twice; then free of lens distortion.
+"""Makes the images of a scene: upright copies of photographs, or the sharpest frames of a video,
+without blurred, broken and repeated ones; later removes their lens distortion.
 """
 
 import logging
@@ -36,37 +36,37 @@ ENDINGS = (
     *(".jpg", ".jpeg", ".jfif", ".png", ".webp", ".tif", ".tiff", ".bmp"),
     *(".avif", ".heic", ".heif"),
 )
-# of Pillow; JPEG opens MPO, which phones write, too
+# Pillow's names of the formats; JPEG also opens the MPO of phones
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "HEIF")
 COPIED = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
 MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769
-FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
-# there, too: pixels across and down, pixels per unit, the unit
+FOCAL, FOCAL_35 = 0x920A, 0xA405  # tags in the part of EXIF about the exposure
+# tags there, too: pixels across and down, pixels per unit, the unit
 SENSOR = (0xA002, 0xA003, 0xA20E, 0xA210)
 PER_MM = {2: 25.4, 3: 10.0, 4: 1.0}  # millimetres in a unit
-REDUCED = 0.01  # difference of sizes, of the one in EXIF
-POSSIBLE = 0.2, 20.0  # focal lengths, of the longer side
+REDUCED = 0.01  # relative difference from EXIF's size that shows a reduced photograph
+POSSIBLE = 0.2, 20.0  # focal lengths, in longer sides of the image
 QUALITY = {"quality": 95, "subsampling": 0}  # of JPEGs
 LEAST = 8  # photographs
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef")  # of cameras
-DIGITS = 6  # of numbers in names, where 10 is to stand behind 9
-SEEN, SMALL = 640, 64  # pixels, longer side, at which sharpness and likeness are measured
-BLURRED = 0.2  # of the neighbours' median sharpness
-EMPTY = 1.0  # sharpness, levels squared: noise alone has more
+DIGITS = 6  # to which numbers in names are padded, so that 10 follows 9
+SEEN, SMALL = 640, 64  # longer side, pixels, at which sharpness and likeness are measured
+BLURRED = 0.2  # share of the neighbours' median sharpness below which an image is blurred
+EMPTY = 1.0  # sharpness, levels squared; noise alone has more
 NEIGHBOURS = 10  # on either side
-ALIKE = 0.15  # of the neighbours' usual difference
-SAME = 0.3  # levels of 255 by which small copies of one photograph differ at most
-DECODED, MOST_DECODED = 18, 3 * 2**28  # bytes of a pixel that is decoded, and of all at once
-FRAMES, GROUP = 120, 12  # of a video
-LOCAL = ["-protocol_whitelist", "file,pipe"]  # a video names no other machine
+ALIKE = 0.15  # share of the neighbours' usual difference below which images are alike
+SAME = 0.3  # levels of 255: small copies of the same photograph differ by less
+DECODED, MOST_DECODED = 18, 3 * 2**28  # bytes to decode a pixel, and for all decoding at once
+FRAMES, GROUP = 120, 12  # frames taken from a video; frames in a group of the filter
+LOCAL = ["-protocol_whitelist", "file,pipe"]  # so that a video cannot name another machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
-# Frames in which lines of two moments are woven are found by their content, as many state it not,
-# and lose those of one; pixels become square, whatever shape the film states.
+# Interlaced frames, which many videos do not declare, are recognised by their content and lose the
+# lines of one moment; pixels become square, whatever shape the video states.
 WHOLE = "idet,yadif=deint=interlaced"
 SQUARE = "scale=w='iw*max(sar,1)':h='ih*max(1/sar,1)',setsar=1"
-HDR = ("arib-std-b67", "smpte2084")  # transfers of phones: HLG and PQ
-WHITE = 203  # candela per square metre, of BT.2408's diffuse white
-# to sRGB: brighter than 0.7 of white is compressed; HLG and PQ are of BT.2020, tagged or not
+HDR = ("arib-std-b67", "smpte2084")  # transfer functions of phones: HLG and PQ
+WHITE = 203  # candela per square metre: BT.2408's diffuse white
+# to sRGB: light above 0.7 of white is compressed; HLG and PQ imply BT.2020, even if not tagged
 TONE_MAPPED = (
     f",setparams=color_primaries=bt2020:colorspace=bt2020nc,zscale=t=linear:npl={WHITE}"
     ",format=gbrpf32le,zscale=p=bt709,tonemap=mobius:param=0.7:desat=0"
@@ -80,8 +80,8 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
 
     Returns {"images": [{name, source, lens, focal, size, sharpness, uniform}], "left_out":
     [{source, reason}]}; lens is equal for photographs of one camera at one focal length; focal, in
-    pixels, is None where COLMAP may guess it by EXIF; uniform: whether the background is. Raises
-    UserError where too few are usable.
+    pixels, is None if COLMAP guesses it from EXIF; uniform: whether the background is. Raises
+    UserError if too few images are usable.
     """
     with atomic_folder(images) as unfinished:
         take = _photographs if source.is_dir() else _frames
@@ -106,7 +106,7 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
 
 
 def _photographs(folder, images):
-    """The facts of each photograph, written to `images` where it can be read, and of raw ones."""
+    """Yield the facts of each photograph, raw ones too; write readable ones to `images`."""
     needed("pillow_heif").register_heif_opener()
     files = listed(folder)
     if not files:
@@ -119,8 +119,8 @@ def _photographs(folder, images):
         stems = [re.sub(r"\d+", lambda digits: digits[0].zfill(DIGITS), stem) for stem in stems]
     targets, taken = [], set()
     for stem in stems:
-        # COLMAP's lists of pairs know no spaces, and take lines that begin with # for comments; its
-        # names are UTF-8, and Python stands for bytes that are not by these
+        # COLMAP's lists of pairs allow no spaces, and take lines that begin with # for comments;
+        # its names are UTF-8, and Python keeps other bytes as surrogates
         name = re.sub(r"[\s\udc80-\udcff]+|^#|/", "_", stem)
         while name.lower() in taken:
             name += "_"
@@ -135,8 +135,8 @@ def _photographs(folder, images):
 
 
 def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
-    """The photographs of a folder and of those in it, in the order of their names, 10 after 9.
-    Hidden ones are left out, and folders of masks and those that the program fills, as the scene.
+    """The photographs in a folder and its subfolders, in the order of their names, 10 after 9.
+    Hidden files are left out, and so are folders of masks and folders that pp-cl fills.
     """
     found = []
     for place, folders, files in os.walk(folder):
@@ -156,7 +156,7 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
 
 
 def _take(folder, file, target):
-    """A photograph's facts; it is written under target and a suffix."""
+    """The facts of a photograph, which is written to target with a suffix."""
     source = file.relative_to(folder)
     facts = {"source": source.as_posix()}
     try:
@@ -174,14 +174,14 @@ def _take(folder, file, target):
             )
             content = opened.seek(0) or opened.read() if is_copied else None
             lens, exif = _lens(told)
-            # folders are of a round each, or of a camera
+            # each folder has the photographs of one round, or of one camera
             facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
             facts["focal"] = _focal_of_larger(told.get_ifd(EXIF), image.size)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
     except UnidentifiedImageError:
         return facts | {"reason": f"is no image of a known kind ({', '.join(FORMATS)})"}
-    except Exception as error:  # decoders meet broken bytes with whatever comes up
+    except Exception as error:  # decoders raise all kinds of exceptions on broken bytes
         return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
     has_alpha = upright.has_transparency_data
     facts |= _look(upright) | {"uniform": not has_alpha and _is_uniform(upright)}
@@ -198,9 +198,9 @@ def _take(folder, file, target):
 
 
 def _lens(exif):
-    """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a length)."""
+    """(text that tells cameras and focal lengths apart, EXIF for COLMAP's guess of a length)."""
     exposure, copied = exif.get_ifd(EXIF), Image.Exif()
-    # the rest may be broken, or longer than a JPEG has room for
+    # the other tags may be broken, or too long for a JPEG
     copied.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
     wanted = (FOCAL, FOCAL_35, *SENSOR)
     copied.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
@@ -209,25 +209,25 @@ def _lens(exif):
 
 
 def _focal_of_larger(exposure, size):
-    """The focal length in pixels of a reduced photograph whose EXIF tells the sensor's, or None."""
+    """A reduced photograph's focal length in pixels, from EXIF's data of the sensor, or None."""
     try:
         across, down, density, unit = (float(exposure[tag]) for tag in SENSOR)
         reduced = max(size[0] / across, size[1] / down)
         focal = float(exposure[FOCAL]) * density / PER_MM[unit] * reduced
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None  # not told, or broken
+        return None  # EXIF lacks the tags, or is broken
     is_told = not exposure.get(FOCAL_35) and abs(reduced - 1) > REDUCED
     return focal if is_told and POSSIBLE[0] < focal / max(size) < POSSIBLE[1] else None
 
 
 def _frames(video, images):
-    """The facts of the sharpest frame of each interval, written to `images`."""
+    """Yield the facts of the sharpest frame of each interval, and write it to `images`."""
     chosen, is_hdr = _sharpest(video)
     equal = [f"eq(n,{number})" for number in chosen]
-    # in groups, since ffmpeg sums no more than a hundred
+    # in groups, since ffmpeg adds at most a hundred terms
     some = [f"({'+'.join(equal[i : i + GROUP])})" for i in range(0, len(equal), GROUP)]
     frames = _decoded(video, f"select='{'+'.join(some)}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
-    next(frames)  # what is said of the video
+    next(frames)  # the video's metadata
     for number, frame in zip(track(chosen, "frames", "image"), frames, strict=False):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
         with atomic_file(images / name) as file:
@@ -240,9 +240,9 @@ def _sharpest(video):
     """(the number of the sharpest frame of each of FRAMES intervals, whether the video is HDR)."""
     frames = _decoded(video, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
     meta = next(frames)
-    # an estimate, for the bar alone: what browsers record states no length
+    # an estimate, only for the bar: videos that browsers record state no length
     total = round(meta["duration"] * meta["fps"]) or None
-    sharpness, pictures, shown = [], [], None  # pictures: that each frame shows, numbered
+    sharpness, pictures, shown = [], [], None  # pictures: each frame's number among distinct ones
     for frame in track(frames, "looking at frames", "frame", total):
         look = _look(Image.fromarray(frame[..., 0]))
         is_new = shown is None or _difference(shown, look) >= SAME
@@ -251,7 +251,7 @@ def _sharpest(video):
         pictures.append(pictures[-1] + is_new if pictures else 0)
     if not sharpness:
         raise UserError(f"{video}: holds no frames; give another video")
-    # frames that repeat the one before, as films of a constant rate have them, lengthen none
+    # repeated frames, as in videos with a constant rate, do not lengthen an interval
     count = max(pictures[-1] + 1, FRAMES)
     intervals = groupby(range(len(pictures)), lambda number: pictures[number] * FRAMES // count)
     is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)
@@ -259,8 +259,8 @@ def _sharpest(video):
 
 
 def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[Any]:
-    """What ffmpeg says of the video, then its frames after the filters, (H, W, channels) uint8."""
-    # which tells of a video that is shown turned, as phones make them
+    """Yield the video's metadata, then its filtered frames, (H, W, channels) uint8."""
+    # it warns about rotated videos, which phones make
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     decoded = needed("imageio_ffmpeg").read_frames(
         video,
@@ -274,7 +274,7 @@ def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[
         for content in decoded:
             yield np.frombuffer(content, np.uint8).reshape(*meta["size"][::-1], channels)
     except (OSError, RuntimeError, ValueError, IndexError, KeyError, StopIteration) as error:
-        # ffmpeg's last line that says what is wrong, without its banner
+        # ffmpeg's last line that names an error, without its banner
         lines = [line for line in str(error).splitlines() if "rror" in line or "nvalid" in line]
         said = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
         raise UserError(
@@ -284,7 +284,7 @@ def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[
 
 
 def _look(image):
-    """Of an image: its sharpness (the variance of its Laplacian), its size and a small copy."""
+    """An image's sharpness (the variance of its Laplacian), size and small copy."""
     cv2 = needed("cv2")
     gray = image.convert("L")
     gray.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
@@ -294,14 +294,14 @@ def _look(image):
 
 
 def _is_uniform(image):
-    """Whether the border of an image shows one colour, that of what is behind the object."""
+    """Whether the border of an image shows one colour, which is the background's."""
     small = image.convert("RGB")
     small.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
     return is_uniform(np.array(small))
 
 
 def _leave_out(found):
-    """Give a reason to each image that is empty, blurred or there twice."""
+    """Add a reason to each image that is empty, blurred or like the one before."""
 
     def near(values, i):
         return np.median(values[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
@@ -325,17 +325,17 @@ def _leave_out(found):
 
 
 def _difference(one, other):
-    """Mean difference of the small copies, in levels, whatever their brightness."""
+    """Mean difference of two images' small copies, in levels, apart from their brightness."""
     a, b = (image["small"] - image["small"].mean() for image in (one, other))
     return float(np.abs(a - b).mean())
 
 
 def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[ImageFile]) -> int:
-    """Write those photographs that are not there yet, free of distortion, to the folder `images`:
-    each under the name, in the format and for the camera that it has; returns their number.
+    """Write the photographs without distortion into the folder `images`, except those already
+    there, with the same names and formats and for the given cameras. Returns the number written.
 
-    frames: the folder of the photographs as the lens has them. Raises UserError for one that its
-    distortion folds over, and as read_rgba() and write_png() do.
+    frames: the folder of the distorted photographs. Raises UserError if the distortion folds one
+    over, and as read_rgba() and write_png() do.
     """
     for one in image_files:
         if one.lens.folds(one.camera):
@@ -345,7 +345,7 @@ def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[
             )
     images.mkdir(exist_ok=True)
     left = [one for one in image_files if not (images / Path(one.name).name).is_file()]
-    lock = Lock()  # one of several threads uses the device
+    lock = Lock()  # only one thread at a time uses the device
 
     def write(one):
         name = Path(one.name).name
@@ -369,7 +369,7 @@ def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[
 
 
 def undistorted_mask(dev: Device, mask: np.ndarray, image_file: ImageFile) -> np.ndarray:
-    """(H, W) uint8 mask of a photograph as the lens has it, (H, W) uint8, for its image."""
+    """(H, W) uint8 mask of the undistorted image, from the (H, W) uint8 mask of a photograph."""
     if not image_file.lens:
         return mask
     planes = np.dstack([mask] * 4)

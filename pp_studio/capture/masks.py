@@ -1,5 +1,5 @@
-"""Masks of photographs with known cameras: given, of their alpha, of a uniform background, of a
-program of the user's; else cut out by colour around the sparse points and voted on by all views.
+"""Makes masks of photographs with known cameras: from given masks, alpha, a uniform background or a
+program of the user; otherwise by colour around the sparse points, with a vote of all views.
 """
 
 import os
@@ -31,19 +31,19 @@ from pp_studio.capture.uniform import uniform_mask
 
 cv2 = needed("cv2")
 
-OPAQUE = (".jpg", ".jpeg")  # files that have no alpha need not be read for it
-GLANCED_SIDE = 640  # pixels of a uniform background that only features are looked for within
-UNIFORM = 0.9  # of the photographs that have a uniform background
-SPOT = 0.9  # of a region that a mask encloses, behind which others see the object
-ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
-CHECKED_SIDE = 200  # pixels of the masks that are compared
+OPAQUE = (".jpg", ".jpeg")  # files without alpha, which need not be read to find that out
+GLANCED_SIDE = 640  # longer side, pixels, at which masks for finding features are made
+UNIFORM = 0.9  # share of the photographs that must have a uniform background
+SPOT = 0.9  # a hole of a mask is a spot on the object if other views see the object in this share
+ON_MASK = 0.9  # share of the object's points that the mask of a uniform background must cover
+CHECKED_SIDE = 200  # longer side, pixels, at which masks are compared
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of an image, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
-SECONDS = 600  # that a program may take for a mask
+SECONDS = 600  # a program may take so long for a mask
 
 
 def mask_file(scene: Path, name: str) -> Path:
-    """Where write_masks() writes the mask of a photograph."""
+    """The file to which write_masks() writes the mask of a photograph."""
     return scene / "masks" / f"{Path(name).stem}.png"
 
 
@@ -61,30 +61,30 @@ def write_masks(
     turns: bool = False,
     grows: bool = False,
 ) -> tuple[str, list[str], np.ndarray]:
-    """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
-    lies there is kept, and helps to make the others. Returns one line on what was done, the names
-    of photographs whose masks contradict the others, the worst first, and the box.
+    """Write the mask of each photograph to mask_file(), 8-bit gray, white on the object. Existing
+    masks are kept and help to make the others. Returns one line on what was done, the names of
+    photographs whose masks contradict the others, the worst first, and the box.
 
-    scene: the folder that the photographs' names are relative to; their images have no distortion.
+    scene: the folder to which the photographs' names are relative; their images have no distortion.
     box: (2, 3) around the object. points: (N, 3) in the scene's world. seen: for each photograph
-    the indices (M,) of the points that it shows. given: a folder of masks of the photographs as
-    they were taken, which may be named like the photographs' sources, as {name: source} has them;
-    fitted(name, mask) is such a mask, (H, W) uint8, for the image. command: of a program that makes
-    masks, which {image} and {mask} stand for. turns: the object turns before a background that
-    stands still. grows: whether the box is enlarged where it cuts off what is cut out. Raises
-    UserError for masks that are given and missing or broken, a program that fails, a box in which
-    nothing is seen, an object of the colour of its uniform background.
+    the indices (M,) of the points that it shows. given: a folder of masks of the distorted
+    photographs, whose names may be those of the photographs' sources; sources: {name: source};
+    fitted(name, mask): turns such a mask, (H, W) uint8, into the image's. command: runs a program
+    that makes masks; {image} and {mask} stand for the files. turns: the object turns before a
+    still background. grows: enlarge the box if it cuts off a part of the object. Raises UserError
+    for missing or broken given masks, a program that fails, a box in which nothing is seen, and an
+    object that has the colour of its uniform background.
     """
     words = None if command is None else program_words(command)
     (scene / "masks").mkdir(exist_ok=True)
     left = _without_mask(scene, image_files)
     how = {"kept": len(image_files) - len(left)}
     shown = [i for i, one in enumerate(image_files) if cut.place_of(one, box)]
-    shown = shown or list(range(len(image_files)))  # which window() refuses
+    shown = shown or list(range(len(image_files)))  # window() then raises the error
     beside = {one.name for one in image_files} - {image_files[i].name for i in shown}
     for one in track(left, "masks", "image"):
         source, mask = _found(scene, one, given, sources or {}, fitted, words)
-        if mask is None and one.name in beside:  # as videos have, where they begin or end
+        if mask is None and one.name in beside:  # such as at the beginning or end of a video
             source = "empty, as the object is outside"
             mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
         if mask is not None:
@@ -127,7 +127,7 @@ def _without_mask(scene, image_files):
 
 
 def _found(scene, image_file, given, sources, fitted, words):
-    """(where from, (H, W) uint8 mask, or None) of a photograph, without the others."""
+    """(its source, (H, W) uint8 mask or None) of a photograph, without looking at the others."""
     file, size = scene / image_file.name, (image_file.camera.width, image_file.camera.height)
     if given is not None:
         mask = named_mask(given, sources.get(file.name, file.name), file.name)
@@ -166,7 +166,7 @@ def program_words(command: str) -> list[str]:
     """The words of --mask-command. Raises UserError unless they name a program, {image}, {mask}."""
     lexer = shlex.shlex(command, posix=True)
     lexer.whitespace_split, lexer.commenters = True, ""
-    if os.name == "nt":  # where backslashes part folders, and names hold apostrophes
+    if os.name == "nt":  # on Windows, backslashes separate folders, and names hold apostrophes
         lexer.escape, lexer.quotes = "", '"'
     try:
         words = list(lexer)
@@ -178,13 +178,13 @@ def program_words(command: str) -> list[str]:
 
 
 def _written_mask(scene, image_file):
-    """(H, W) uint8: the mask of a photograph in the scene, which a user may have written."""
+    """(H, W) uint8 mask of a photograph, from the scene, where a user may have written it."""
     file = mask_file(scene, image_file.name)
     return read_mask_of_size(file, (image_file.camera.width, image_file.camera.height))
 
 
 def _window(scene, image_file, box):
-    """The Window of a photograph, with its mask if that is written."""
+    """The Window of a photograph, with its mask if that exists."""
     found = cut.window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
     if mask_file(scene, image_file.name).is_file():
         found.mask = found.reduced(_written_mask(scene, image_file)) > 127
@@ -192,16 +192,16 @@ def _window(scene, image_file, box):
 
 
 def _uniform(scene, image_files, windows, box, points):
-    """Write the masks of photographs where nearly all have a uniform background; their number."""
+    """If nearly all photographs have a uniform background, write their masks; returns how many."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    held = {}  # of each mask, whether it holds the points of the object that its view shows
-    with_holes = len(windows) * cut.FORGIVEN >= 1  # as one that is a spot has one view against it
+    held = {}  # for each mask, whether it covers the object's points that its view shows
+    with_holes = len(windows) * cut.FORGIVEN >= 1  # since one view votes against a hole in a spot
     found = {}
     for i in track(left, "looking for a uniform background", "image"):
         mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
         if mask is not None:
             mask, (_, rows, columns) = mask > 127, windows[i].inside(points[i])
-            # features of thin parts lie in gaps between them, too
+            # features of thin parts also lie in the gaps between these
             held[i] = (
                 binary_fill_holes(mask)[rows, columns] if len(rows) else np.array([mask.any()])
             )
@@ -231,14 +231,14 @@ def _uniform(scene, image_files, windows, box, points):
 
 
 def _spots(windows, numbers, box):
-    """{number of a window: (H, W) bool, holes of its mask where other views see the object}."""
+    """{index of a window: (H, W) bool, holes of its mask in which other views see the object}."""
     masked = [one for one in windows if one.mask is not None]
     hull, rejections, _, voxel_size = cut.forgiving_hull(masked, box)
     found = {}
     for i in numbers:
         one = windows[i]
         regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
-        # behind a gap all is rejected by views beside this, too
+        # neighbouring views, too, reject all places behind a gap
         shown, rows, columns = one.inside(hull)
         others = rejections[shown] - ~one.mask[rows, columns]
         held = cut.silhouette(one, hull[shown[others == 0]], cut.gap_of(one, hull, voxel_size))
@@ -249,9 +249,9 @@ def _spots(windows, numbers, box):
 
 
 def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: bool) -> None:
-    """Write to the new folder NAME.png, 8-bit gray, of each photograph, white where it shows the
-    object: by its alpha, which may hide a wall, or by its uniform background, if nearly all have
-    one; all white where neither is there. Nothing where no photograph has either.
+    """Write NAME.png, 8-bit gray, for each photograph into the new folder, white on the object: by
+    alpha, which may hide a wall, or by the uniform background, if nearly all photographs have one;
+    otherwise all white. If no photograph has either, write nothing.
     """
     with atomic_folder(folder) as unfinished:
         left, may_have = list(names), [n for n in names if not n.lower().endswith(OPAQUE)]
@@ -273,8 +273,8 @@ def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: b
 def outline_sheet(
     scene: Path, image_files: Sequence[ImageFile], first: Sequence[str] = ()
 ) -> np.ndarray:
-    """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks drawn
-    over them. first: names of those that come first; the others are spread evenly.
+    """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks.
+    first: names of the photographs that come first; the others are spread evenly.
     """
     wrong = [one for one in image_files if one.name in first][:SHOWN_VIEWS]
     others = [one for one in image_files if one.name not in first]
@@ -290,7 +290,7 @@ def outline_sheet(
 
 
 def _reduced(scene, one, side):
-    """(a View of a photograph's mask, whose longer side is about this; by which factor)."""
+    """(a View of a photograph's mask, reduced to a longer side of about `side`, the factor)."""
     mask = _written_mask(scene, one)
     factor = fitting_downscale(mask.shape, side)
     image = shrink(np.dstack([mask] * 4), factor)

@@ -1,4 +1,4 @@
-"""A drawing of a scene from the side and from above: points, cameras, and the object's box."""
+"""Draws a scene from the side and from above: its points, its cameras and the object's box."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from pp_cl import Camera
 from pp_cl.scene import up_of
 from pp_studio.capture.box import corners_of
 
-FINER = 2  # times the drawing is larger before it is reduced, each way, against jagged lines
-MARGIN = 0.08  # of a panel's width around what must be in it
-FRUSTUM = 0.12  # depth of a frustum, of the median distance of the cameras from their middle
+FINER = 2  # the drawing is this many times larger before it is reduced, against jagged lines
+MARGIN = 0.08  # of a panel's width, around its content
+FRUSTUM = 0.12  # depth of a frustum, in median distances of the cameras from their middle
 CAMERA, BOX, INK = (40, 90, 200), (220, 90, 0), (60, 60, 60)
-MOST_POINTS = 100_000  # drawn
+MOST_POINTS = 100_000  # that are drawn
 EDGES = [(a, b) for a, b in itertools.combinations(range(8), 2) if (a ^ b).bit_count() == 1]
 
 
@@ -25,14 +25,14 @@ def overview(
     colours: np.ndarray,
     width: int,
 ) -> np.ndarray:
-    """uint8 (width // 2, width, 3): the scene from the side and from above, white behind.
+    """uint8 (width // 2, width, 3): the scene from the side and from above, over white.
 
-    box: (2, 3) in world units, or None. points: (N, 3); colours: (N, 3) uint8. What is far beyond
-    the cameras is cut off.
+    box: (2, 3) in world units, or None. points: (N, 3); colours: (N, 3) uint8. Points far beyond
+    the cameras are cut off.
     """
     up, eyes = up_of(cameras), np.stack([camera.eye for camera in cameras])
     aside = np.cross(cameras[0].pose[:, 2], up)
-    if np.linalg.norm(aside) < 1e-6:  # it looks straight down
+    if np.linalg.norm(aside) < 1e-6:  # the camera looks straight down
         aside = cameras[0].pose[:, 0] - (cameras[0].pose[:, 0] @ up) * up
     aside /= np.linalg.norm(aside)
     corners = np.empty((0, 3)) if box is None else corners_of(box)
@@ -55,7 +55,7 @@ def overview(
         def place(positions, axes=axes, scale=scale, offset=offset):
             return scale * (positions @ axes) + offset
 
-        dots = np.full((side, side, 3), 255, np.uint8)  # of FINER x FINER pixels
+        dots = np.full((side, side, 3), 255, np.uint8)  # a dot takes FINER x FINER pixels
         for dx, dy in itertools.product(range(FINER), repeat=2):
             x, y = np.floor(place(points[::step])).T + [[dx], [dy]]
             inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)

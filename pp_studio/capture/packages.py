@@ -1,4 +1,4 @@
-"""The packages of the extra `capture`, imported where needed; pycolmap in a process of its own."""
+"""Imports the packages of the extra `capture` when needed, and runs pycolmap in its own process."""
 
 import importlib
 import os
@@ -27,7 +27,7 @@ DISTRIBUTIONS = {
 
 
 def needed(module: str) -> ModuleType:
-    """The imported module. Raises UserError with what installs it where it is missing."""
+    """The imported module. Raises UserError with the command that installs it if it is missing."""
     is_here = module in sys.modules or threading.current_thread() is not threading.main_thread()
     try:
         if is_here:
@@ -36,7 +36,7 @@ def needed(module: str) -> ModuleType:
         with deferred():
             try:
                 return importlib.import_module(module)
-            finally:  # pycolmap would else answer SIGTERM itself, with a stack trace
+            finally:  # pycolmap would otherwise answer SIGTERM itself, with a stack trace
                 signal.signal(signal.SIGTERM, answer)
     except ImportError as error:
         raise UserError(
@@ -46,8 +46,8 @@ def needed(module: str) -> ModuleType:
 
 
 def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
-    """What a function returns that runs in a process of its own: of a full disk pycolmap's threads
-    end their process. Raises UserError naming the folder where that happens.
+    """Run a function in a separate process and return its result, since pycolmap's threads end
+    their process when the disk is full. Raises UserError naming the folder if that happens.
     """
     needed("pycolmap")
     before = active_children()
@@ -56,7 +56,7 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
             with deferred():
                 found = pool.submit(function, *arguments)
             return found.result()
-        except KeyboardInterrupt:  # the pool would wait for what goes on
+        except KeyboardInterrupt:  # the pool would wait until the function ends
             for one in {*active_children()} - {*before}:
                 one.kill()
             raise
@@ -68,8 +68,10 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
 
 
 def _begin():
-    """The process ends with its parent, which alone answers signals; only Python tells anything."""
-    # NumPy's threads beside ours would wait for each other, long where the machine is busy
+    """Let the process end with its parent, which alone answers signals; only Python may write to
+    stderr.
+    """
+    # NumPy's threads and ours would wait for each other, for long on a busy machine
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stderr = os.fdopen(os.dup(2), "w")

@@ -1,4 +1,6 @@
-"""Where each image was taken, by pycolmap's incremental mapping, and why some have no place."""
+"""Finds where each image was taken, with pycolmap's incremental mapping, and why some images have
+no place.
+"""
 
 import shutil
 from collections.abc import Sequence
@@ -14,16 +16,17 @@ from pp_cl.scene import ImageFile, LensDistortion
 from pp_studio.capture.features import cores, forget_focal_lengths, quiet
 from pp_studio.capture.packages import needed
 
-LEAST_SHARE = 0.5  # of the images that have a place
-MANY = 0.75  # of the images of a turned object; with fewer they are placed as others are, too
+LEAST_SHARE = 0.5  # share of the images that must have a place
+MANY = 0.75  # if fewer images of a turned object have a place, usual placing is tried, too
 FEW_FEATURES, FEW_MATCHES = 200, 30
 GROWTH = 1.4  # COLMAP's 1.1 takes twice the time
-CLOSER = 8.0  # degrees between the two images of a turned object that the mapping begins with
-FEW = 0.15  # of the matches that images have with their best: pairs of a turned object with fewer
-# are far apart, or look alike where a pattern repeats
-BELIEVED = 2.0  # of the points' median error: observations that are further off count less
+CLOSER = 8.0  # degrees between the two images with which the mapping of a turned object begins
+# Pairs of images of a turned object with a smaller share of the usual number of matches are far
+# apart, or look alike because a pattern repeats.
+FEW = 0.15
+BELIEVED = 2.0  # median errors of the points: observations with larger errors count less
 CONVERGED = 1e-5  # relative change of the sum of errors
-MOST_ERROR = 20.0  # pixels by which points are off in their images, in the mean
+MOST_ERROR = 20.0  # pixels of mean reprojection error
 BLURRED = 0.4  # of the median sharpness
 
 
@@ -32,10 +35,10 @@ def place(
 ) -> dict[str, Any]:
     """Write the largest model that the matches give to the new folder `model`.
 
-    taken: what take_images() says of the images. turns: the object turns before a camera that
-    stays, and all matches are its own; where few images fit so, they are placed as usual. Returns
-    the numbers of images and points, the reprojection error in pixels, and {image: reason} of those
-    without a place. Raises UserError where more than a half have none.
+    taken: take_images()'s facts about the images. turns: the object turns before a fixed camera,
+    and all matches are on the object; if few images fit in this way, they are placed as usual.
+    Returns the numbers of images and points, the reprojection error in pixels, and {image: reason}
+    for images without a place. Raises UserError if these are more than half.
     """
     least = max(3, LEAST_SHARE * len(taken))
     with atomic_folder(model) as unfinished:
@@ -43,9 +46,9 @@ def place(
         if turns and all(one.num_reg_images() < MANY * len(taken) for one in found):
             (usual := unfinished / "usual").mkdir()
             found += _mapped(database, images, usual, len(taken), False)
-        if all(one.num_reg_images() < least for one in found):  # EXIF may be of another size
+        if all(one.num_reg_images() < least for one in found):  # EXIF may be for another size
             (again := unfinished / "again").mkdir()
-            copy = Path(shutil.copy(database, again))  # a stopped run finds its own as it was
+            copy = Path(shutil.copy(database, again))  # a stopped run must find its own unchanged
             if forget_focal_lengths(copy):
                 found += _mapped(copy, images, again, len(taken), turns)
         for folder in list(unfinished.iterdir()):
@@ -77,15 +80,15 @@ def place(
 
 
 def _mapped(database, images, folder, count, turns):
-    """pycolmap's models of what fits together."""
+    """pycolmap's models, each of images that fit together."""
     with quiet(database) as colmap:
         options = colmap.IncrementalPipelineOptions(
             min_model_size=3, num_threads=cores(), random_seed=0
         )
-        # all cameras are refined at the end, and before that whenever there are so many more
+        # all cameras are refined at the end, and before whenever their number has grown so much
         options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH
-        # Without a background, images as far apart as those that COLMAP begins with have fewer
-        # matches than a pattern has with itself; closer ones do not tell focal length from lens.
+        # Without a background, a pair as far apart as the one with which COLMAP begins has fewer
+        # matches than a pattern with itself; closer pairs do not tell focal length from distortion.
         if turns:
             usual = np.median(list(_most_matches(database).values()))
             options.min_num_matches = max(options.min_num_matches, int(FEW * usual))
@@ -99,8 +102,8 @@ def _mapped(database, images, folder, count, turns):
 
 
 def refine(model: Any) -> None:
-    """Adjust all cameras and points once more, with a loss by which the few wrong matches, mostly
-    of patterns that repeat, no longer pull at the cameras.
+    """Adjust all cameras and points once more, with a loss that keeps the few wrong matches, mostly
+    of repeating patterns, from pulling at the cameras.
     """
     colmap = needed("pycolmap")
     model.update_point_3d_errors()
@@ -115,7 +118,7 @@ def refine(model: Any) -> None:
 
 
 def _reasons(database, taken, placed):
-    """{image: why it has no place}."""
+    """{image without a place: the reason}."""
     best = _most_matches(database)
     with needed("pycolmap").Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
@@ -137,7 +140,7 @@ def _reasons(database, taken, placed):
 
 
 def _most_matches(database):
-    """{image's id: its matches with the image with which it has most}."""
+    """{image's id: the largest number of its matches with another image}."""
     colmap = needed("pycolmap")
     with colmap.Database.open(database) as db:
         best = {image.image_id: 0 for image in db.read_all_images()}
@@ -148,8 +151,8 @@ def _most_matches(database):
 
 
 def image_files(model: Any) -> list[ImageFile]:
-    """The images of pycolmap's model that have a place, in the order of their names, as a scene
-    lists them that has them in its folder `images`.
+    """The images of pycolmap's model that have a place, in the order of their names, as ImageFiles
+    of a scene with a folder `images`.
     """
     found = []
     for image in _placed(model):
@@ -162,8 +165,8 @@ def image_files(model: Any) -> list[ImageFile]:
 
 
 def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
-    """((N, 3) points of pycolmap's model that at least so many images show, for each of
-    photographs() the indices of those in it).
+    """((N, 3) points of pycolmap's model that at least `least` images show, for each of
+    image_files() the indices of the points in it).
     """
     chosen = [number for number, one in model.points3D.items() if one.track.length() >= least]
     index = {number: k for k, number in enumerate(chosen)}
@@ -179,8 +182,8 @@ def _placed(model):
 
 
 def undistort_model(model: Any) -> None:
-    """Give pycolmap's model of features.LENS cameras without distortion, and move what its images
-    show to where that is without.
+    """Give pycolmap's model, whose cameras are features.LENS, cameras without distortion, and move
+    the points in its images accordingly.
     """
     for image in model.images.values():
         lens = image.camera

@@ -1,5 +1,5 @@
-"""The stages from photographs or a video to a scene, each of which is done once: what it found lies
-in SCENE/capture/STAGE.json, an image of it in STAGE.png; the same command goes on after these.
+"""Runs the stages from photographs or a video to a scene, each of them once. A stage's result is in
+SCENE/capture/STAGE.json and an image of it in STAGE.png; the same command continues after these.
 """
 
 import shutil
@@ -35,13 +35,13 @@ from pp_studio.capture.overview import overview
 from pp_studio.capture.packages import isolated, needed
 
 SCENE_FILE = "transforms.json"
-FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
+FOLLOWED = 4  # images that must show a point, since wrong matches seldom occur in as many
 SHOWN_WIDTH = 1000  # pixels of the images of points and cameras
-# decimals of what the scene states: the last digits depend on how COLMAP's threads share a sum
+# decimals in the scene's file: the last digits depend on how COLMAP's threads share a sum
 DECIMALS = 9
-# stages that keep what was done when they are stopped
+# stages that keep their unfinished work when they are stopped
 RESUMED = ("features", "matches", "images", "masks")
-# what each stage leaves beside its JSON and its image, in the scene's folder
+# files and folders of each stage in the scene's folder, besides its JSON and its image
 LEFT = {
     "frames": ("capture/frames",),
     "features": ("capture/inside", *(f"capture/database.db{end}" for end in ("", "-shm", "-wal"))),
@@ -52,8 +52,8 @@ LEFT = {
     "masks": ("masks",),
     "scene": (SCENE_FILE, "sparse", "points.ply"),
 }
-CHANGING = (*LEFT["features"][1:], *LEFT["matches"])  # in place
-# {option: (the stage that depends on it, what it is where it is not given)}
+CHANGING = (*LEFT["features"][1:], *LEFT["matches"])  # files that change in place
+# {option: (the first stage that depends on it, its default)}
 OPTIONS: dict[str, tuple[str, Any]] = {
     "source": ("frames", None),
     "turntable": ("matches", False),
@@ -66,8 +66,8 @@ OPTIONS: dict[str, tuple[str, Any]] = {
 class Capture:
     """A capture in progress in the folder of a scene.
 
-    given: {name: value} of the OPTIONS that are given; others are as in the captures before. tell:
-    prints a line of a stage.
+    given: {name: value} of the given OPTIONS; others are as in the captures before. tell: prints a
+    stage's line.
     """
 
     def __init__(self, scene: Path, given: dict[str, Any], tell: Callable[[str], None]) -> None:
@@ -78,10 +78,11 @@ class Capture:
         self.source = Path()  # the photographs or the video
 
     def run(self, begin: str | None = None, *, replace_masks: bool = False) -> None:
-        """Do all stages that are not done, or one of them and all after it, and those that depend
-        on an option that has changed. Masks that the user has changed are kept, or replaced, too.
-        Raises UserError, before anything is removed, where a file of the user's would be lost or
-        what an option names is not there, and while another process captures into the folder.
+        """Run all stages that are not done, those that depend on a changed option, and the stage
+        `begin` and all after it. Masks that the user has changed are kept, or with replace_masks
+        replaced. Raises UserError, before anything is removed, if a user's file would be lost, if
+        a file or program that an option names is missing, and while another process captures into
+        the folder.
         """
         own(self.scene, alone=True)
         self.work.mkdir(exist_ok=True)
@@ -146,12 +147,12 @@ class Capture:
         return self._file(stage).is_file()
 
     def _names(self):
-        """Of the photographs that the source has now; none of a video."""
+        """The names of the photographs that the source has now; [] for a video."""
         files = frames.listed(self.source) if self.source.is_dir() else []
         return [file.relative_to(self.source).as_posix() for file in files]
 
     def _take_options(self, begin):
-        """Fill in the options of this capture; returns the names of those that have changed."""
+        """Fill in the options of this capture; returns the names of the changed options."""
         before, is_first = {name: value for name, (_, value) in OPTIONS.items()}, True
         if self._file("options").exists():
             before, is_first = self._found("options"), False
@@ -164,7 +165,7 @@ class Capture:
         self.source = Path(self.options["source"])
         changed = [name for name in OPTIONS if self.options[name] != before[name] and not is_first]
         if "source" in changed and begin != "frames" and self._is_done("frames"):
-            # photographs of the same names, or a video of the same name, where nothing is now
+            # a missing source may have moved: its photographs or video have the same names
             if self.source.is_dir():
                 taken = {one["source"] for one in self._found("frames")["images"]}
                 is_same = taken <= {*self._names()}
@@ -180,7 +181,7 @@ class Capture:
         return changed
 
     def _check_options(self, left, mended):
-        """Raise UserError where what the options of the stages that are left name is not there."""
+        """Raise UserError if a file or program in an option of the remaining stages is missing."""
         count, is_new = len(self._names()), "frames" in left and self._is_done("frames")
         if is_new and self.source.is_dir() and count < frames.LEAST:
             raise UserError(
@@ -201,8 +202,8 @@ class Capture:
                     named_mask(Path(given), one["source"], one["name"])
 
     def _files(self, stage):
-        """What lies in a stage's folders, but for masks of others and what changes in place."""
-        # its JSON comes first: without it the stage is not done
+        """The files of a stage, without masks by others and files that change in place."""
+        # its JSON is removed first: without it the stage is not done
         found = [self._file(stage), self._file(stage, ".png")]
         for path in (self.scene / name for name in LEFT[stage] if name not in CHANGING):
             inside = path.rglob("*") if path.is_dir() else [path]
@@ -211,7 +212,7 @@ class Capture:
         return found
 
     def _mended(self):
-        """The masks of the images that the user has made or changed, which are kept."""
+        """The images' masks that the user has made or changed, which are kept."""
         taken = self._found("frames")["images"] if self._is_done("frames") else []
         named = [masks.mask_file(self.scene, one["name"]) for one in taken]
         there = [path for path in named if path.is_file()]
@@ -219,11 +220,11 @@ class Capture:
 
     @cached_property
     def _dev(self):
-        """Where distortion is removed."""
+        """The device that removes distortion."""
         return open_device()
 
     def _model(self):
-        """pycolmap's model of the cameras, in the world of its own."""
+        """pycolmap's model of the cameras, in its own world."""
         return needed("pycolmap").Reconstruction(self.model)
 
     # ---- the stages
@@ -258,7 +259,7 @@ class Capture:
             begun.unlink()
         pairs = isolated(self.work, features.match, self.database)
         line = f"{pairs} pairs of images"
-        if _is_uniform(self._found("frames")["images"]):  # it has no features that stand still
+        if _is_uniform(self._found("frames")["images"]):  # such a background has no features
             turns, line = True, f"{line}, all of the object: placed as on a turntable"
         elif turns := isolated(self.work, features.remove_still, self.database, begun, turntable):
             line += "; a turntable: the background, which stands still, is ignored"
@@ -327,7 +328,7 @@ class Capture:
 
         used = [i for i, one in enumerate(image_files) if one.name not in edits.dropped]
         line, wrong, corners = write(used)
-        if edits.dropped:  # they have had no say in the others
+        if edits.dropped:  # dropped images have no vote in the masks of the others
             write(range(len(image_files)))
         sheet = masks.outline_sheet(self.scene, image_files, wrong)
         write_png(self._file("masks", ".png"), sheet)
@@ -357,14 +358,16 @@ class Capture:
         return {"line": f"wrote {self.scene / SCENE_FILE} with {len(found)} photographs"}
 
     def _show(self, stage, model, corners):
-        """Write the stage's image of a model's points and cameras, and a box (2, 3)."""
+        """Write a stage's image, which shows a model's points and cameras, and a box (2, 3)."""
         cameras = [one.camera for one in poses.image_files(model)]
         colours = np.array([point.color for point in model.points3D.values()])
         drawn = overview(cameras, corners, poses.points(model)[0], colours, SHOWN_WIDTH)
         write_png(self._file(stage, ".png"), drawn)
 
     def _world(self):
-        """(pycolmap's model in the scene's world, (2, 3) box: the user's, or that of the masks)."""
+        """(pycolmap's model in the scene's world, (2, 3) box from the user, the masks or the
+        stage).
+        """
         model, found = self._model(), self._found("box")
         _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
         edited = read_edits(self.scene).box
@@ -375,7 +378,7 @@ class Capture:
 
 
 def _is_uniform(taken):
-    """Whether nearly all images have a uniform background, by take_images()."""
+    """Whether nearly all images have a uniform background, according to take_images()."""
     return float(np.mean([one.get("uniform", False) for one in taken])) >= masks.UNIFORM
 
 
@@ -394,5 +397,5 @@ def _move(model, scale, rotation, shift):
 
 
 def _but(lines: Sequence[str], what: str) -> str:
-    """`; 3 left out: A, B and 1 more`, empty without lines."""
+    """Text such as `; 3 left out: A, B and 1 more`, empty without lines."""
     return f"; {len(lines)} {what}: {few_names(lines)}" if lines else ""

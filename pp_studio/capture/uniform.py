@@ -1,7 +1,8 @@
-"""Uniform backgrounds: whether an image's border shows one, and the mask that its colour gives.
+"""Recognises a uniform background at an image's border, and makes a mask from its colour.
 
-Light that falls off and a lens that darkens its corners change a uniform background smoothly: that
-is a quadratic function of the place, fitted to the border. Noise says how near to it is the same.
+Light that falls off and a lens that darkens its corners change a uniform background smoothly, which
+a quadratic function of the place describes, fitted to the border. The border's noise decides how
+far from it a colour may be.
 """
 
 import numpy as np
@@ -14,24 +15,24 @@ from pp_studio.capture.packages import needed
 
 cv2 = needed("cv2")
 
-SIDE = 1600  # pixels of what a background is told from
-SHARE = 0.9  # of a border, that shows the background alone
-PLAIN = 4.0  # CIELAB: noise is less once it is smoothed; texture that has features is more
+SIDE = 1600  # longer side, pixels, of the image in which the background is recognised
+SHARE = 0.9  # share of a border that must show the background alone
+PLAIN = 4.0  # CIELAB distance: smoothed noise has less, texture with features more
 GRAIN = 3  # pixels over which noise is smoothed
-NOISY = 10.0  # of the border's median distance: what is so far from the background is none of it
-SPECK = 5e-5  # of the image: smaller regions of a mask are none
-FITTED = 4  # times, to what of the border is near to the fit before
+NOISY = 10.0  # median distances of the border beyond which a colour is not the background's
+SPECK = 5e-5  # of the image; smaller regions of a mask are dropped
+FITTED = 4  # fits, each to the part of the border near the fit before
 
 
 def is_uniform(image: np.ndarray) -> bool:
-    """Whether the border of an image (H, W, 3) uint8 shows one colour, but for noise."""
+    """Whether the border of an image (H, W, 3) uint8 shows one colour, apart from noise."""
     smooth = cv2.blur(image, (GRAIN, GRAIN))
     return bool((_levelled(smooth)[1] < PLAIN).mean() >= SHARE)
 
 
 def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
-    """(H, W) uint8 mask of a photograph (H, W, 3 or 4), None where its border shows more than one
-    colour. with_holes: as cut_out() takes it.
+    """(H, W) uint8 mask of a photograph (H, W, 3 or 4), None if its border shows more than one
+    colour. with_holes: as in cut_out().
     """
     height, width = image.shape[:2]
     scale = min(1, SIDE / max(height, width))
@@ -45,15 +46,15 @@ def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.n
         return None
     if (mask[_border(mask)] < 128).mean() < SHARE:
         return None
-    # what compression leaves beside edges, in single pixels
+    # removes single pixels that compression leaves near edges
     _, regions, facts, _ = cv2.connectedComponentsWithStats((mask > 0).astype(np.uint8))
     mask[(facts[:, cv2.CC_STAT_AREA] < SPECK * mask.size)[regions]] = 0
     return cv2.resize(mask, (width, height))
 
 
 def _levelled(image):
-    """((H, W, 3) uint8, an image without what changes smoothly of its background; (N,) CIELAB
-    distances of its border from one colour then).
+    """((H, W, 3) uint8: an image without the smooth changes of its background, (N,) CIELAB
+    distances of its border from one colour after that).
     """
     height, width = image.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
@@ -77,6 +78,6 @@ def _border(image):
 
 
 def _distances(one, other):
-    """CIELAB distances of colours of 255."""
+    """CIELAB distances between colours from 0 to 255."""
     a, b = (rgb2lab(np.clip(some, 0, 255) / 255) for some in (one, other))
     return np.linalg.norm(a - b, axis=-1)

@@ -68,7 +68,7 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch
         assert (out / name).read_bytes() == (plain / name).read_bytes()
     assert not (out / "previews" / "step_000001.png").exists()
     told = failure(*arguments(scene, out, **words), "--preset", "tiny")
-    assert "preset is small there" in told
+    assert "preset is small in this run" in told
 
 
 def test_automatic_settings_are_chosen_anew(tmp_path, monkeypatch):

@@ -149,4 +149,4 @@ def test_a_cache_folder_in_which_nothing_runs_is_replaced(tmp_path, monkeypatch)
 
 def test_a_device_without_room_for_constants_does_not_work():
     problem = find_problem(SimpleNamespace(max_constant_buffer_size=63))
-    assert problem == "holds 63 bytes of constants, 64 needed"
+    assert problem == "holds 63 bytes of constants, but needs 64"

@@ -67,9 +67,9 @@ def test_a_log_of_at_most_so_many_bytes(folder, monkeypatch):
 )
 def test_a_damaged_log_is_cut_off_there(folder, line):
     write(folder, json.dumps(ROWS[0]).encode(), line, json.dumps(ROWS[2]).encode())
-    with pytest.warns(UserWarning, match="line 2 is no row of a log"):
+    with pytest.warns(UserWarning, match="line 2 is not a row of a log"):
         assert folder.rows() == ROWS[:1]
-    with pytest.warns(UserWarning, match="line 2 is no row of a log") as warned:
+    with pytest.warns(UserWarning, match="line 2 is not a row of a log") as warned:
         log = folder.open_log(20)
     with log:
         assert log.seconds == 0.5 and rows(folder) == ROWS[:1]
@@ -90,7 +90,7 @@ def test_a_full_disk_is_one_line_that_names_the_log(folder):
                 log.write(ROWS[2])
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    with pytest.warns(UserWarning, match="line 3 is no row"), folder.open_log(15):
+    with pytest.warns(UserWarning, match="line 3 is not a row"), folder.open_log(15):
         assert rows(folder) == ROWS[:2]
 
 

@@ -63,6 +63,6 @@ def test_bad_input_names_the_file(folders, tmp_path):
     refuse(pred, truth, "pred/a.png: 13x12 pixels, .*truth/a.png has 14x12")
     for folder in folders:
         write_png(folder / "a.png", np.zeros((9, 9, 3), np.uint8))
-    refuse(pred, truth, "pred/a.png: 9x9 pixels, SSIM needs 11x11")
+    refuse(pred, truth, "pred/a.png: 9x9 pixels, but SSIM needs 11x11")
     (pred / "b.png").unlink()
     refuse(pred, truth, "pred/b.png: missing")

@@ -20,7 +20,7 @@ def test_same_images_are_at_distance_zero_and_runs_agree_bit_for_bit(dev, rng):
 
 def test_images_that_are_too_small_or_differ_in_size_are_refused(dev, rng):
     network = Lpips(dev, random_weights(rng))
-    with pytest.raises(UserError, match="40x15 pixels, LPIPS needs 16x16"):
+    with pytest.raises(UserError, match="40x15 pixels, but LPIPS needs 16x16"):
         network.distance(np.zeros((15, 40, 3)), np.zeros((15, 40, 3)))
     with pytest.raises(ValueError, match="32"):
         network.distance(np.zeros((32, 32, 3)), np.zeros((32, 33, 3)))

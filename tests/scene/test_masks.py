@@ -182,7 +182,7 @@ def test_a_box_that_is_given():
 def test_a_mask_for_some_images_only(dev, tmp_path):
     write_ball_scene(tmp_path / "ball", views=6, size=40)
     write_png(tmp_path / "ball/train/r_2.png", read_rgba(tmp_path / "ball/train/r_2.png")[..., :3])
-    with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, as others have"):
+    with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, but others have"):
         load_scene(tmp_path / "ball")
     (tmp_path / "masks").mkdir()
     for i, camera in enumerate(ring_cameras(6, 40)):
@@ -191,7 +191,7 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
     rule = SceneConfig(masks=str(tmp_path / "masks"))
     views = load_scene(tmp_path / "ball", masks=rule).splits["train"]
     (tmp_path / "masks/r_2.png").rename(tmp_path / "masks/other.png")
-    with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, as others have"):
+    with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, but others have"):
         load_scene(tmp_path / "ball", masks=rule)
     agreed = agreeing(dev, views)  # a mask that is white says that the object fills the image
     assert (

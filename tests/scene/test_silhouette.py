@@ -44,7 +44,9 @@ def test_views_whose_masks_are_gone_are_used(dev, views, tmp_path, form):
     whole = load_scene(tmp_path, dev=dev).splits["train"]
     for file in sorted((tmp_path / "masks").iterdir())[2::4]:
         file.unlink()
-    with pytest.warns(UserWarning, match=r"train: without a mask, .* \(images/000002\.png") as told:
+    with pytest.warns(
+        UserWarning, match=r"train: views without a mask .* \(images/000002\.png"
+    ) as told:
         left = load_scene(tmp_path, dev=dev).splits["train"]
     assert len(told) == 1 and [view.name for view in left] == [view.name for view in whole]
     gone = [view for view in left if view.ignored is not None]

@@ -183,7 +183,7 @@ def test_cameras_that_no_reading_mends(dev, tmp_path, rng):
             lambda pose: pose @ np.block([[turn(rng), np.zeros((3, 1))], [np.eye(4)[3:]]])
         ),
     )
-    assert "in no way that is known" in refusal(dev, folder)
+    assert "in a way that pp-cl does not know" in refusal(dev, folder)
 
 
 def turn(rng):
@@ -205,7 +205,7 @@ def test_pictures_are_turned_where_their_masks_fit_only_so(dev, tmp_path):
     folder = written(tmp_path / "scene", "colmap", lambda views: [backed(one) for one in views])
     before = open_views(dev, folder)
     lying(folder / "images")
-    with pytest.warns(UserWarning, match="turned as their EXIF says, as their masks fit only so"):
+    with pytest.warns(UserWarning, match="turned as their EXIF says, as only then their masks fit"):
         after = open_views(dev, folder)
     for one, other in zip(before, after, strict=True):
         assert np.array_equal(one.image, other.image)

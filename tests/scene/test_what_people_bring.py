@@ -246,7 +246,7 @@ TRAINS = {
     "a workspace of COLMAP": (
         "colmap",
         workspace,
-        "of 2 models the largest beside images is read",
+        "of 2 models, the largest with images next to it is read",
     ),
     "undistorted images beside photographs": ("colmap", undistorted, ""),
     "cut-outs, masks for some": ("colmap", cut_out, ""),
@@ -264,7 +264,11 @@ TRAINS = {
         ],
         "masks are taken from",
     ),
-    "one opaque image among cut-outs": ("colmap", one_opaque, "but for a rim (images/000003.png)"),
+    "one opaque image among cut-outs": (
+        "colmap",
+        one_opaque,
+        "except for a rim (images/000003.png)",
+    ),
     "an empty mask": ("colmap", empty_mask, "1 of 12 views left out: an empty mask"),
     "a pose that is far off": (
         "nerfstudio",
@@ -309,7 +313,7 @@ def test_a_test_view_of_another_place_is_not_measured(tmp_path):
     (tmp_path / "ball/transforms_test.json").write_text(json.dumps(data))
     assert train(folder, tmp_path / "run")[0] == 0
     status, lines = spoken(["eval", tmp_path / "run"])
-    told = "test: 1 of 4 views left out: their masks are beside the model (train/r_6.png)"
+    told = "test: 1 of 4 views left out: their masks miss the model (train/r_6.png)"
     assert status == 0 and any(told in line for line in lines), lines
     measured = json.loads((tmp_path / "run/eval/metrics.json").read_text())["per_image"]
     assert [one["name"] for one in measured] == ["train/r_0.png", "train/r_3.png", "train/r_9.png"]

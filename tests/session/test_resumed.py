@@ -28,7 +28,7 @@ def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, cap
     assert capsys.readouterr().out.count("is finished (60 steps)") == 3
     assert failure("train", "--out", finished / "other").startswith("pp-cl: SCENE: ")
     told = failure(*words, "--points", "1600", "--iterations", "61")
-    assert "points.count is 1500 there, 1600 asked for" in told
+    assert "points.count is 1500 in this run, but 1600 is asked for" in told
 
 
 def measured_psnr(out):

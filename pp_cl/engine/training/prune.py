@@ -89,8 +89,7 @@ def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Co
 
 
 def points_of_large_parts(model: Model) -> Array:
-    """(M,) uint32, ascending: the points in connected parts large enough to belong to the object.
-    """
+    """(M,) uint32, ascending: the points in connected parts that are large enough to be kept."""
     is_large = model.grid.in_large_parts(model.dev.download(model.cloud.ids), SPECK)
     return model.dev.upload(np.flatnonzero(is_large), np.uint32)
 

@@ -205,8 +205,7 @@ def draw_batch(
 
 
 def gradient_of_squares(dev: Device, image: Array, wanted: Array, gradient: Array) -> None:
-    """Write the gradient of the mean square of image - wanted with respect to the image (H, W, 3).
-    """
+    """Write the gradient (H, W, 3), by the image, of the mean square of image - wanted."""
     dev.program(KERNELS).launch(
         "specular_gradient",
         image.size,

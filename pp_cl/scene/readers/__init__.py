@@ -1,1 +1,1 @@
-"""Readers of scenes: one module a format, and what they share in common.py and frame.py."""
+"""Readers of scenes: one module per format; common.py and frame.py hold their shared functions."""

@@ -1,5 +1,5 @@
-"""Cameras from a file of another program, without images: nerfstudio's camera_path.json, a
-transforms.json, and the cameras.json of 3D Gaussian Splatting and brush.
+"""Reads cameras without images from a file of another program: nerfstudio's camera_path.json, a
+transforms.json, or the cameras.json of 3D Gaussian Splatting and brush.
 """
 
 import math
@@ -30,8 +30,8 @@ MOST_PIXELS = 2**15  # a side; the pixel boxes of points are 16-bit
 def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera]:
     """The cameras of a file, in its order and world.
 
-    size: (width, height) for frames that do not state theirs. Raises UserError naming the file and
-    the key that is missing or wrong.
+    size: (width, height) of frames that state none. Raises UserError naming the file and the
+    missing or wrong key.
     """
     if not file.is_file():
         raise UserError(f"{file}: no such file; give orbit, spiral, a split, or {FORMATS}")
@@ -45,7 +45,7 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
     else:
         raise UserError(f"{file}: holds no cameras; give {FORMATS}")
     if not isinstance(frames, list) or not frames:
-        raise UserError(f"{file}: {listed or 'the list'}: must hold one camera or more")
+        raise UserError(f"{file}: {listed or 'the list'}: must hold at least one camera")
     cameras = [read(Frame(file, shared, own, i, listed), size) for i, own in enumerate(frames)]
     for i, camera in enumerate(cameras):
         if np.linalg.det(camera.pose[:, :3]) < 0:
@@ -54,14 +54,14 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
 
 
 def _transforms_camera(frame, size):
-    lens_distortion(frame)  # the model is checked; what it bends is an image's, not a rendering's
+    lens_distortion(frame)  # refuses unknown models; a rendering has no distortion
     return pinhole(frame, *_size(frame, ("w", "h"), size))
 
 
 def _path_camera(frame, size):
-    """Of nerfstudio's viewer: fov is the angle across the height, in degrees."""
+    """The Camera of a frame of nerfstudio's viewer; fov is the angle across the height, degrees."""
     if frame.get("camera_type") not in (None, "perspective"):
-        raise frame.error("camera_type", "only perspective is rendered; change it, and fov with it")
+        raise frame.error("camera_type", "must be perspective; change it, and fov with it")
     width, height = _size(frame, ("render_width", "render_height"), size)
     fov = frame.number("fov", above=math.degrees(LEAST_ANGLE), below=180)
     if fov is None:
@@ -75,7 +75,7 @@ def _path_camera(frame, size):
 
 
 def _splatting_camera(frame, size):
-    """Camera-to-world rotation with OpenCV's axes, and position."""
+    """The Camera of a frame with a camera-to-world rotation, OpenCV's axes, and a position."""
     width, height = _size(frame, ("width", "height"), size)
     matrix = np.column_stack([frame.array("rotation", (3, 3)), frame.array("position", (3,))])
     pose = rigid(matrix, partial(frame.error, "rotation"))
@@ -86,7 +86,7 @@ def _splatting_camera(frame, size):
 
 
 def _size(frame, keys, given):
-    """(width, height) in whole pixels as the frame states them, else as given."""
+    """(width, height) in whole pixels that the frame states, or else the given one."""
     stated = [frame.number(key, above=0, below=MOST_PIXELS) for key in keys]
     if None in stated:
         if given is None:

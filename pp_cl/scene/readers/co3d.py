@@ -1,5 +1,5 @@
 """Reader of single sequences of CO3D, versions 1 and 2: CATEGORY/SEQUENCE/ with images and masks,
-whose annotations lie in CATEGORY/, outside of the scene's folder.
+whose annotations lie in CATEGORY/, outside the scene's folder.
 """
 
 import gzip
@@ -26,30 +26,30 @@ STATES = "world-to-camera", "opencv"
 ANNOTATIONS = "frame_annotations.jgz"
 # characters of a file of annotations, and frames in it: the largest category has less than half
 MOST_TEXT, MOST_FRAMES = 2**30, 2**20
-MOST_SUM = 2**22  # characters of the frames of one sequence: 3,500 of them
-BETWEEN = re.compile(r"[\s,\[]*")  # objects of a list
+MOST_SUM = 2**22  # characters of the frames of one sequence, enough for 3,500 frames
+BETWEEN = re.compile(r"[\s,\[]*")  # characters between the objects of a list
 PIECE = 2**18  # characters that are unpacked at once; a frame takes some 1,200
 # PyTorch3D: x left, y up, z forwards; OpenCV: x right, y down, z forwards
 CV_FROM_P3D = np.diag([-1.0, -1.0, 1.0])
-# what focal lengths and principal points are multiplied with, of half the width and height
+# units of focal lengths and principal points: half the width and height, or the smaller of both
 NORMALISED, ISOTROPIC = "ndc_norm_image_bounds", "ndc_isotropic"
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder has images and the one above it annotations."""
+    """Whether the folder has images and its parent has annotations."""
     folder = _whole(folder)
     return (folder / "images").is_dir() and (folder.parent / ANNOTATIONS).is_file()
 
 
 def splits(folder: Path) -> list[str]:
-    """Train and test, and val where a set list has frames for it."""
+    """Train and test, and val if a set list has frames for it."""
     listed = _set_list(_whole(folder))
     return sorted(listed) if listed else SPLITS
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split, in the order of their frame numbers, as _set_list() has them; without
-    a list test is every eighth. Frames whose mask is empty are left out. Raises UserError.
+    """The images that _set_list() has for a split, in the order of their frame numbers; without a
+    list, every eighth is for test. Frames with an empty mask are left out. Raises UserError.
     """
     folder = _whole(folder)
     file, listed = folder.parent / ANNOTATIONS, _set_list(folder)
@@ -58,7 +58,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
         for index, own in _annotations(file, folder.name, file.stat().st_mtime_ns)
     ]
     if not frames:
-        raise UserError(f"{file}: has no frame of the sequence {folder.name}; give another folder")
+        raise UserError(f"{file}: has no frame of sequence {folder.name}; give another folder")
     for frame in frames:
         if frame.number("frame_number") is None:
             raise frame.error("frame_number", "is missing; copy the annotations again")
@@ -69,43 +69,47 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
     else:
         chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
     read = partial(_image_file, folder)
-    return list(usable(progress(chosen), read, lambda one: f"frame {one.index}", left_out))
+    return list(usable(progress(chosen), read, lambda frame: f"frame {frame.index}", left_out))
 
 
 def _whole(folder):
-    """The folder's path from the root. Links stay: the annotations lie beside the link."""
+    """The folder's absolute path. Links stay unresolved: the annotations lie next to the link."""
     return Path(os.path.abspath(folder))
 
 
 @lru_cache(maxsize=1)
 def _annotations(file, sequence, _changed):
-    """[(index, annotation)] of a sequence's frames, of a file last changed then."""
-    found, left = [], MOST_SUM
+    """[(index, annotation)] of a sequence's frames in a file. _changed: the file's time of change,
+    so that the cache is not stale.
+    """
+    annotations, characters_left = [], MOST_SUM
     try:
         with opened_regular(file) as packed, gzip.open(packed, "rt", encoding="utf-8") as opened:
             for index, (own, size) in enumerate(_objects(opened)):
                 if own.get("sequence_name") == sequence:
-                    found.append((index, own))
-                    left -= size
-                if left < 0 or index == MOST_FRAMES:
+                    annotations.append((index, own))
+                    characters_left -= size
+                if characters_left < 0 or index == MOST_FRAMES:
                     raise ValueError(
                         f"more than {MOST_FRAMES} frames, or {MOST_SUM} characters of one sequence"
                     )
     except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
         raise refusal(file, error, "gzipped JSON") from None
-    return found
+    return annotations
 
 
 def _objects(opened):
-    """(object, characters of it) of a JSON list of objects in a text file. Raises ValueError."""
+    """Yield (object, its number of characters) from a JSON list of objects in a text file. Raises
+    ValueError.
+    """
     decode, text, at = json.JSONDecoder().raw_decode, opened.read(PIECE), 0
-    left = MOST_TEXT - len(text)
+    characters_left = MOST_TEXT - len(text)
     if not text.lstrip().startswith("["):
         raise ValueError("is no list of annotations")
     while True:
         piece = opened.read(PIECE) if len(text) - at < PIECE else ""
-        left -= len(piece)
-        if left < 0:
+        characters_left -= len(piece)
+        if characters_left < 0:
             raise ValueError(f"more than {MOST_TEXT} characters")
         if piece:
             text, at = text[at:] + piece, 0
@@ -123,7 +127,7 @@ def _objects(opened):
 
 
 def _is_empty(frame):
-    """Whether a frame's mask is said to have no pixel."""
+    """Whether a frame's annotation says that its mask has no pixel."""
     mask = frame.get("mask")
     if not isinstance(mask, dict):
         return False
@@ -151,7 +155,7 @@ def _image_file(folder, frame):
 
 
 def _found(folder, frame, key):
-    """Path of an image or mask relative to the sequence's folder."""
+    """Path of an image or mask, relative to the sequence's folder."""
     path, fail = PurePosixPath(_path(frame, key)), partial(frame.error, key)
     if path.parts[:2] != (folder.parent.name, folder.name):
         raise fail(f"{str(path)!r} is not in {folder.parent.name}/{folder.name}; move it there")
@@ -180,23 +184,23 @@ def _camera(frame, size):
 
 
 def _set_list(folder):
-    """{split: paths of images} of the sequence, each in one split only; None without a list.
-    Version 1 calls them known and unseen; in version 2 lists of many views go before others.
+    """{split: paths of images} of the sequence, each image in one split only; None without a list.
+    Version 1 calls the splits known and unseen; in version 2, lists of many views go first.
     """
     category = folder.parent
     old = category / "set_lists.json"
     if old.is_file():
-        found = _listed(old, folder.name)
+        sets = _listed(old, folder.name)
         kinds = {"train": "known", "test": "unseen"}
-        named = {split: [found[name] for name in found if kinds[split] in name] for split in kinds}
+        named = {split: [sets[name] for name in sets if kinds[split] in name] for split in kinds}
         return _disjoint({split: set().union(*paths) for split, paths in named.items()})
     files = sorted((category / "set_lists").glob("*.json"), key=lambda f: ("many" not in f.name, f))
-    found = (_disjoint(_listed(file, folder.name)) for file in files)
-    return next(filter(None, found), None)
+    lists = (_disjoint(_listed(file, folder.name)) for file in files)
+    return next(filter(None, lists), None)
 
 
 def _listed(file, sequence):
-    """{name of the set: paths of the sequence's images in it}. Raises UserError."""
+    """{name of a set: paths of the sequence's images in it}. Raises UserError."""
     data = read_json(file)
     try:
         return {
@@ -209,9 +213,11 @@ def _listed(file, sequence):
         ) from None
 
 
-def _disjoint(found):
-    """The splits with frames, each once; None without training or test frames."""
-    train = found.get("train", set())
-    others = {name: found.get(name, set()) - train for name in ("val", "test")}
+def _disjoint(sets):
+    """The splits that have frames, without frames that train has, too; None without training or
+    test frames.
+    """
+    train = sets.get("train", set())
+    others = {name: sets.get(name, set()) - train for name in ("val", "test")}
     splits = {"train": train} | {name: paths for name, paths in others.items() if paths}
     return splits if train and "test" in splits else None

@@ -1,8 +1,8 @@
-"""Reader of COLMAP's sparse models: cameras and images, text or binary, beside a folder of images
-and, for objects, one of masks.
+"""Reader of COLMAP's sparse models: cameras and images, text or binary, next to a folder of images
+and, for objects, a folder of masks.
 
-Formats: https://colmap.github.io/format.html. Files are read piece by piece and points are passed
-over, since they are nearly all of a file.
+Formats: https://colmap.github.io/format.html. Files are read piece by piece and points are skipped,
+since they make up nearly the whole file.
 """
 
 import os
@@ -43,14 +43,14 @@ from pp_cl.scene.readers.common import (
     progress,
 )
 
-FILES = "a sparse model of COLMAP beside images"
+FILES = "a sparse model of COLMAP next to images"
 STATES = "world-to-camera", "opencv"
-# and in numbered folders in them; the folder itself has the model of RealityScan. Where none has
-# one, a model is looked for deeper.
+# usual places of models, which may also lie in numbered subfolders of these; RealityScan puts its
+# model into the folder itself. If none has a model, deeper folders are searched.
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", ".")
 IMAGES = "images"
 
-# number of parameters of every model of COLMAP, in the order of their ids
+# number of parameters of each camera model of COLMAP, in the order of their ids
 MODELS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -75,19 +75,19 @@ NOT_READ = (
     *("FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
     *("SIMPLE_DIVISION", "DIVISION", "EUCM", PANORAMIC),
 )
-ONE_FOCAL = ("SIMPLE_", "RADIAL")  # how models with one focal length begin
-MOST_PIXELS = 2**20  # a side; beyond it a number is no size
-MOST_RECORDS = 2**17  # of a file, cameras or images
+ONE_FOCAL = ("SIMPLE_", "RADIAL")  # the names of models with one focal length begin so
+MOST_PIXELS = 2**20  # a longer side is not believed
+MOST_RECORDS = 2**17  # cameras or images in a file
 MOST_NAME = 1024  # bytes of an image's name
 MOST_LINE = 2**22  # characters of a line: 150,000 2D points
-PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP
+PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in COLMAP's order
 UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it again"
 POINT2D_BYTES = 24  # x, y and the id of a 3D point
 TRACK_BYTES = 8  # the ids of an image and of a point in it
 
 
 class Lens(NamedTuple):
-    """A camera of the model, its parameters as COLMAP orders them."""
+    """A camera of the model, with its parameters in COLMAP's order."""
 
     model: str
     width: int
@@ -104,17 +104,17 @@ class Image(NamedTuple):
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder has a model in one of the usual places."""
+    """Whether the folder has a model in one of the usual places."""
     return bool(_usual_models(folder))
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split: test is every eighth in the order of names. Cameras are scaled to
-    images that were reduced since. Raises UserError naming the file, and the image.
+    """The images of a split: every eighth in the order of names is for test. Cameras are scaled to
+    images that were reduced afterwards. Raises UserError naming the file and the image.
     """
     model = model_folder(folder) or folder
     if (count := len(_models(folder))) > 1:
-        text = f"of {count} models the largest beside images is read ({model})"
+        text = f"of {count} models, the largest with images next to it is read ({model})"
         warnings.warn(f"{folder}: {text}", stacklevel=1)
     lenses, images = read_model(model)
     undistort = (
@@ -135,7 +135,9 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Where a scene's model lies, of several one with images beside it, and most, or None."""
+    """The folder of a scene's model, or None. Of several models, those with images next to them go
+    first, then the largest.
+    """
     models = _models(folder)
     if len(models) < 2:
         return next(iter(models), None)
@@ -143,28 +145,28 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def _images_of(folder, model):
-    """The folder of images nearest to a model, up to the scene's folder; None without one."""
+    """The folder of images nearest above a model, within the scene's folder, or None."""
     places = [model, *model.parents]
     for place in places[: places.index(folder) + 1]:
-        if found := folder_named(place, [IMAGES]):
-            return place / found
+        if images := folder_named(place, [IMAGES]):
+            return place / images
     return None
 
 
 def _models(folder):
-    """The folders of models in the usual places, else deeper."""
+    """The folders of models in the usual places, or else deeper."""
     return _usual_models(folder) or nested(folder, _suffix)
 
 
 def _usual_models(folder):
-    """Those in PLACES; the folder itself where it has images, too."""
+    """The folders of models in PLACES; the folder itself counts only if it has images, too."""
     places = [folder / place for place in PLACES if place != "." or holds_images(folder)]
     several = [near for place in PLACES[:-1] for near in sorted((folder / place).glob("[0-9]*"))]
     return [place for place in (*several, *places) if _suffix(place)]
 
 
 def _count(model):
-    """How many images a model has, by its header or its lines."""
+    """The number of images in a model, from its header or its lines."""
     file = model / f"images{_suffix(model)}"
     with file.open("rb") as opened:
         if file.suffix == ".bin":
@@ -173,7 +175,7 @@ def _count(model):
 
 
 def _suffix(folder):
-    """Of a model's files in a folder, where binary ones go before text; None without a model."""
+    """The suffix of a model's files in a folder, .bin before .txt; None without a model."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
             return suffix
@@ -197,7 +199,7 @@ def _image_file(folder, near, model, lenses, image):
     distortion = LensDistortion(**dict(zip(order, coefficients, strict=False)), fisheye=is_fisheye)
     w, x, y, z, *place = image.pose
     if not _are_numbers(image.pose) or abs(np.linalg.norm((w, x, y, z)) - 1) > 1e-3:
-        raise Unusable(fail("its pose is no unit quaternion and place; fix it"), "no pose")
+        raise Unusable(fail("its pose must be a unit quaternion and a place; fix it"), "no pose")
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ place])
     camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
@@ -209,8 +211,8 @@ def _image_file(folder, near, model, lenses, image):
 
 
 def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
-    """(cameras by id, or what is wrong with them, images) of a folder's model. Raises UserError
-    naming the file, and the line or the place in it.
+    """({id: camera, or the error about it}, images) of a folder's model. Raises UserError naming
+    the file and the line or place in it.
     """
     suffix = _suffix(folder)
     lenses: dict[int, Lens | Unusable] = {}
@@ -220,13 +222,13 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
         if model not in MODELS:
             raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
         if identity in lenses:
-            raise UserError(f"{file}: camera {identity} stands there twice; remove one")
+            raise UserError(f"{file}: camera {identity} is listed twice; remove one")
         if not 1 <= min(width, height) <= max(width, height) < MOST_PIXELS:
-            text = f"{where}: {width}x{height} pixels is no size; copy the file again"
+            text = f"{where}: {width}x{height} pixels is no valid size; copy the file again"
             lens = Unusable(text, BROKEN_CAMERA)
         elif len(parameters) != MODELS[model] or not _are_numbers(parameters):
             text = f"{MODELS[model]} parameters, finite and not huge; copy the file again"
-            lens = Unusable(f"{where}: {model} has {text}", BROKEN_CAMERA)
+            lens = Unusable(f"{where}: {model} must have {text}", BROKEN_CAMERA)
         lenses[identity] = lens
     images: dict[PurePosixPath, Image] = {}
     file = folder / f"images{suffix}"
@@ -234,10 +236,10 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
         # the name goes into messages of one line
         has_controls = any(unicodedata.category(letter) == "Cc" for letter in image.name)
         if has_controls or not 1 <= len(image.name) <= MOST_NAME:
-            raise UserError(f"{where}: {image.name[:80]!r} is no name of an image; rename it")
+            raise UserError(f"{where}: {image.name[:80]!r} is no valid image name; rename it")
         name = PurePosixPath(image.name)  # ./a.png is a.png
         if images.get(name, image)[1:] != image[1:]:
-            raise UserError(f"{file}: {image.name}: stands there twice; remove one")
+            raise UserError(f"{file}: {image.name}: is listed twice; remove one")
         images[name] = image
         if len(images) > MOST_RECORDS:
             raise UserError(f"{file}: holds more than {MOST_RECORDS} records; split the model")
@@ -247,7 +249,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
 
 
 def read_points(folder: Path) -> Iterator[Sequence[float]]:
-    """Each (x, y, z, red, green, blue) of the points3D in a model's folder. Raises UserError."""
+    """Yield (x, y, z, red, green, blue) of each of a model's points3D. Raises UserError."""
     files = (folder / f"points3D{suffix}" for suffix in (".bin", ".txt"))
     for file in [file for file in files if file.is_file()][:1]:
         yield from (point for _, point in _records(file, _binary_point, POINT, _text_point))
@@ -259,8 +261,8 @@ def _are_numbers(values):
 
 
 def _records(file, take, form, parse):
-    """(place in words, record) of each record of a file, which take(opened) reads of a binary one,
-    and parse(line) of a text file, whose lines are of a form.
+    """Yield (its place in words, the record) for each record of a file. take(opened) reads a record
+    from a binary file; parse(line) reads it from a line of a text file, whose fields are `form`.
     """
     is_binary = file.suffix == ".bin"
     try:
@@ -291,10 +293,10 @@ def _text_entries(file, form, parse):
                 record = parse(line.strip())
             except (IndexError, ValueError, OverflowError):
                 raise UserError(f"{where}: is not {form}; copy the file again") from None
-            if form == IMAGE:  # a second line has its 2D points
+            if form == IMAGE:  # the next line has its 2D points
                 number, line = next(lines, (0, ""))
                 points = line.split()
-                # else an image without its line of points would hide the next one
+                # an image without its line of points would otherwise hide the next image
                 if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
                     raise UserError(
                         f"{file}: line {number}: must be the 2D points of {record.name[:80]!r}, X Y"
@@ -323,10 +325,10 @@ def _text_point(line):
 
 
 def _binary_entries(file, take):
-    """take(opened) as often as the file's first number says; the file must end there."""
+    """Yield take(opened) as often as the file's first number says; the file must end there."""
     with opened_regular(file) as opened:
         (count,) = _take(opened, "Q")
-        for index in range(count):  # a count that is too large ends at the file's end
+        for index in range(count):  # too large a count ends at the file's end
             yield f"{file}: record {index + 1}", take(opened)
         size = os.fstat(opened.fileno()).st_size
         if opened.tell() != size:

@@ -1,4 +1,4 @@
-"""What readers share: splits, folders of images, numbers in files of JSON, numpy and text."""
+"""Functions that readers share: splits, images in order, numbers in JSON, numpy and text files."""
 
 import json
 import math
@@ -24,15 +24,15 @@ from pp_cl.progress import track
 from pp_cl.scene.found import Fail, LeftOut, natural, numbered, pictures_of, usable
 from pp_cl.scene.image_file import ImageFile
 
-HELD_OUT = 8  # one image of so many, the first among them, as LLFF and 3DGS do
-SPLITS = ["test", "train"]  # of a format that knows none
+HELD_OUT = 8  # every eighth image, from the first on, is for test, as in LLFF and 3DGS
+SPLITS = ["test", "train"]  # of a format without splits
 MOST_JSON = 2**26  # bytes of a JSON file: 100,000 frames of 670
-MOST_ARRAYS = 2**25  # bytes of all arrays of a file, as float64: 100,000 cameras need 25 million
+MOST_ARRAYS = 2**25  # bytes of all arrays in a file, as float64: 100,000 cameras need 25 million
 MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
-PANORAMIC = "EQUIRECTANGULAR"  # what COLMAP and nerfstudio call a lens that sees all around
+PANORAMIC = "EQUIRECTANGULAR"  # COLMAP's and nerfstudio's name for a lens that sees all around
 CUT_UP = "is panoramic; cut perspective images out of the panoramas and find their cameras"
-KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of numpy's savez and savez_compressed
+KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # used by numpy's savez and savez_compressed
 
 Item = TypeVar("Item")
 
@@ -41,8 +41,8 @@ Item = TypeVar("Item")
 
 
 def hold_out(items: Sequence[Item], split: str, files: Sequence[Path] = ()) -> list[Item]:
-    """The items of split train or test, which is every eighth picture. files: of the items' images,
-    which are one picture where they are copies.
+    """The items of a split: every eighth picture for test, the others for train. files: the items'
+    image files, if copies are to count as one picture.
     """
     pictures = pictures_of(files) if files else range(len(items))
     place = {picture: index for index, picture in enumerate(dict.fromkeys(pictures))}
@@ -55,7 +55,7 @@ def hold_out(items: Sequence[Item], split: str, files: Sequence[Path] = ()) -> l
 
 
 def progress(items: Sequence[Item]) -> Iterable[Item]:
-    """The items, under a bar: there may be thousands."""
+    """The items, with a progress bar, as there may be thousands."""
     return track(items, "checking images", "image")
 
 
@@ -70,26 +70,27 @@ def in_order(
     left_out: LeftOut,
     read: Callable[[int, str], ImageFile],
 ) -> list[ImageFile]:
-    """The images of a split whose cameras, called so in a file, stand there in the order of the
-    images' names, of their numbers where all names are numbers, by these where images are gone.
-    read(index, image) gives an ImageFile. Raises UserError where nothing tells which are gone.
+    """The images of a split, for a file whose cameras have no image names but the order of the
+    images' names, or of their numbers if all names are numbers. If images are missing, numbers in
+    the names tell which. cameras: their names in the file. read(index, image) gives an ImageFile.
+    Raises UserError if the names do not tell which images are missing.
     """
     if all(PurePosixPath(image).stem.isdecimal() for image in images):
         ordered = sorted(images, key=natural)
         if ordered != list(images):
-            what = "images, whose names are numbers, have the cameras in the order of these"
+            what = "cameras are taken in the order of the numbers that are the images' names"
             warnings.warn(f"{file}: {what}", stacklevel=1)
         images = ordered
     places = numbered(images, len(cameras))
     if places is None:
         raise UserError(
-            f"{file}: has {len(cameras)} cameras, but there are {len(images)} images beside"
-            f" {images[0]}; remove those without a camera, or copy both again"
+            f"{file}: has {len(cameras)} cameras, but there are {len(images)} images, such as"
+            f" {images[0]}; remove images without a camera, or copy both again"
         )
 
     def read_one(index):
         if index not in places:
-            raise Unusable(f"{file}: {cameras[index]}: its image is gone", "no image")
+            raise Unusable(f"{file}: {cameras[index]}: its image is missing", "no image")
         return read(index, places[index])
 
     files = [file.parent / places.get(index, "") for index in range(len(cameras))]
@@ -98,13 +99,13 @@ def in_order(
 
 
 def fail_at(*place: object) -> Fail:
-    """fail(text) of a place: the file, and the part of it."""
+    """A function fail(text) for errors at a place: the file, and parts of it."""
     return lambda text: UserError(f"{': '.join(map(str, place))}: {text}")
 
 
 def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
-    """The camera of an image of `size`, which must have its shape but for rounding. Raises Unusable
-    with the text of fail().
+    """The camera scaled to an image of (width, height) `size`. Raises Unusable with fail()'s text
+    if the aspect ratios differ by more than rounding.
     """
     width, height = camera.width, camera.height
     if not same_shape(size, (width, height)):
@@ -132,8 +133,8 @@ def checked_box(corners: object, fail: Fail) -> np.ndarray:
 
 
 def numbers(value: Any, shape: tuple[int, ...] | None = None) -> np.ndarray | None:
-    """float64 array of nested lists of numbers, or of an array; None for anything else. shape: the
-    only one allowed, of numbers that are finite and not huge.
+    """float64 array from nested lists of numbers or from an array; None from anything else. shape:
+    if given, the only shape allowed, and numbers must be finite and not huge.
     """
     try:
         leaves = np.array(value, object).ravel()
@@ -147,8 +148,8 @@ def numbers(value: Any, shape: tuple[int, ...] | None = None) -> np.ndarray | No
 
 
 def read_json(file: Path) -> Any:
-    """Content of a JSON file; bytes that are no UTF-8 may be names of images. Raises UserError
-    naming the file and the place that is broken.
+    """Content of a JSON file; image names need not be UTF-8. Raises UserError naming the file and
+    the broken place.
     """
     try:
         return json.loads(read_json_text(file, MOST_JSON, "utf-8-sig", "surrogateescape"))
@@ -166,38 +167,38 @@ def read_npy(file: Path) -> np.ndarray:
     try:
         with opened_regular(file) as opened:
             return _read_array(opened, MOST_ARRAYS)
-    except Exception as error:  # numpy meets broken bytes with whatever comes up
+    except Exception as error:  # numpy raises all kinds of exceptions on broken bytes
         raise refusal(file, error, "numpy's arrays") from None
 
 
 def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
-    """{name: float64 array} of a .npz file's members whose names begin with `wanted`. Raises
+    """{name: float64 array} of the members of a .npz file whose names begin with `wanted`. Raises
     UserError naming the file.
     """
-    arrays, left = {}, MOST_ARRAYS
+    arrays, bytes_left = {}, MOST_ARRAYS
     try:
         with opened_zip(file) as archive:
             for zip_info in archive.infolist():
                 name = zip_info.filename.removesuffix(".npy")
                 if name == zip_info.filename or not name.startswith(wanted):
                     continue
-                if zip_info.compress_type not in KINDS:  # others take memory of their own
-                    raise ValueError(f"{name} is packed as numpy does not")
+                if zip_info.compress_type not in KINDS:  # others may need much memory
+                    raise ValueError(f"{name} is compressed in a way that numpy does not use")
                 with archive.open(zip_info) as opened:
-                    arrays[name] = _read_array(opened, left)
-                left -= arrays[name].nbytes
-    except Exception as error:  # zipfile and numpy meet broken bytes with whatever comes up
+                    arrays[name] = _read_array(opened, bytes_left)
+                bytes_left -= arrays[name].nbytes
+    except Exception as error:  # zipfile and numpy raise all kinds of exceptions on broken bytes
         raise refusal(file, error, "numpy's arrays") from None
     return arrays
 
 
 def _read_array(opened, most):
-    """The array of an opened .npy file as float64, of which it takes at most so many bytes."""
-    if np.lib.format.read_magic(opened) != (1, 0):  # others have headers of up to 4 GiB
+    """The array of an opened .npy file as float64, if that takes at most `most` bytes."""
+    if np.lib.format.read_magic(opened) != (1, 0):  # other versions have headers of up to 4 GiB
         raise ValueError("is of another version than 1.0")
     shape, _, dtype = np.lib.format.read_array_header_1_0(opened)
     if dtype.kind not in "fiu":
-        raise ValueError(f"holds {dtype}, no numbers")
+        raise ValueError(f"holds {dtype} in place of numbers")
     if min(shape, default=0) < 0 or math.prod(shape) * max(dtype.itemsize, 8) > most:
         raise ValueError(f"claims the shape {shown(str(shape), 40)}, more than {most} bytes")
     opened.seek(0)
@@ -208,7 +209,7 @@ def _read_array(opened, most):
 
 
 def as_number(word: str) -> float:
-    """The value of a word of a text, which may have a decimal comma. Raises ValueError."""
+    """The number that a word of text means; it may have a decimal comma. Raises ValueError."""
     return float(word.replace(",", ".") if word.count(",") == 1 and "." not in word else word)
 
 
@@ -226,7 +227,7 @@ def read_numbers(file: Path) -> list[list[float]]:
             row = [math.nan]
         if not all(abs(value) < MOST for value in row):
             raise UserError(
-                f"{file}: line {number}: {line[:60]!r} are no finite numbers; write it again"
+                f"{file}: line {number}: {line[:60]!r} must be finite numbers; write it again"
             )
         rows.append(row)
     return [row for row in rows if row]

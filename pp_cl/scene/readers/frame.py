@@ -1,4 +1,4 @@
-"""One frame of a JSON file of cameras: its keys, checked, and the camera that they make."""
+"""One frame of a JSON file of cameras: checks its keys and makes a camera from them."""
 
 import math
 import warnings
@@ -19,26 +19,26 @@ from pp_cl.scene.readers.common import CUT_UP, MOST, PANORAMIC, numbers
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PANORAMAS = ("latlong", "equirectangular")
-# keys by which nerfstudio and instant-ngp name lenses, and the values that are modelled; null,
-# false and 0 are too
+# keys with which nerfstudio and instant-ngp name lenses, and their supported values; null, false
+# and 0 are always supported
 LENS_KEYS = {
     "camera_model": PINHOLES + FISHEYES,
     "camera_type": ("PERSPECTIVE",),
     "is_fisheye": ("TRUE", "1"),
     **dict.fromkeys(("ftheta_p0", *PANORAMAS, "orthographic"), ()),
 }
-CALIBRATE = "undistort the images with the program that found it, or let it fit the lens without"
+CALIBRATE = "undistort the images with the program that found it, or fit the lens without it"
 UNDISTORT = "undistort the images to PINHOLE, as `colmap image_undistorter` does"
 
-# largest eigenvalue of R^T R - 1 that is taken for rounding; NeRF-synthetic has 1e-6
+# largest eigenvalue of R^T R - 1 that counts as rounding; NeRF-synthetic has 1e-6
 ROTATION_TOLERANCE = 1e-3
-LEAST_ANGLE = 1e-7  # of view, radians: below it the tangent has no use for float32
+LEAST_ANGLE = 1e-7  # of view, radians: below it, focal lengths are too large for float32
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, z backward; OpenCV: y down, z forward
 
 
 @dataclass
 class Frame:
-    """The keys of one frame in the list `listed`; those that it lacks are the file's own."""
+    """The keys of one frame in the list `listed`, which go before the keys shared by all."""
 
     file: Path
     shared: dict
@@ -51,17 +51,17 @@ class Frame:
             raise UserError(f"{self.file}: {self.listed}[{self.index}]: must be a JSON object")
 
     def get(self, key: str) -> Any:
-        """Value of a key; None where it is absent or null."""
+        """Value of a key; None if it is absent or null."""
         return self.shared.get(key) if self.own.get(key) is None else self.own[key]
 
     def error(self, key: str, text: str) -> UserError:
-        """The UserError about a key, which names the file and the frame that the key stands in."""
+        """A UserError about a key, which names the file and the frame that has the key."""
         here = f"{self.listed}[{self.index}]."
         is_shared = key in self.shared and self.own.get(key) is None
         return UserError(f"{self.file}: {'' if is_shared else here}{key}: {text}")
 
     def number(self, key: str, above: float = -math.inf, below: float = math.inf) -> float | None:
-        """Finite float strictly between two bounds, or None if absent. Raises Unusable."""
+        """A key's finite float, strictly between two bounds, or None if absent. Raises Unusable."""
         value = self.get(key)
         if value is None:
             return None
@@ -74,7 +74,7 @@ class Frame:
         return float(value)
 
     def array(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Finite float64 array of a shape. Raises Unusable where there is none."""
+        """A key's finite float64 array of a shape. Raises Unusable if it is absent or different."""
         array = numbers(self.get(key), shape)
         if array is None:
             text = f"must be {'x'.join(map(str, shape))} finite numbers"
@@ -82,7 +82,7 @@ class Frame:
         return array
 
     def image(self, key: str, folder: Path) -> str | None:
-        """find_image() of the path that a key holds; None where it is absent. Raises UserError."""
+        """find_image() for the path that a key holds; None if it is absent. Raises UserError."""
         given = self.get(key)
         kind = "mask" if key == "mask_path" else "image"
         if given is None:
@@ -107,8 +107,8 @@ def frame_keys(camera: Camera) -> dict[str, Any]:
 
 
 def pinhole(frame: Frame, width: int, height: int) -> Camera:
-    """The camera of a frame in the format of NeRF-synthetic and nerfstudio whose image has this
-    many pixels. Raises UserError naming the key that is missing or wrong.
+    """The camera of a frame in NeRF-synthetic's or nerfstudio's format, for an image of width x
+    height pixels. Raises UserError naming the missing or wrong key.
     """
     fx = _focal_length(frame, "fl_x", "camera_angle_x", width)
     if fx is None:
@@ -127,7 +127,7 @@ def pinhole(frame: Frame, width: int, height: int) -> Camera:
 
 
 def _focal_length(frame, length_key, angle_key, size):
-    """In pixels, from its key or from that of the angle of view; None where both are absent."""
+    """The focal length in pixels, from its key or the angle of view's; None if both are absent."""
     length = frame.number(length_key, above=0)
     angle = frame.number(angle_key, above=LEAST_ANGLE, below=math.pi)
     if length is None and angle is not None:
@@ -136,8 +136,8 @@ def _focal_length(frame, length_key, angle_key, size):
 
 
 def lens_distortion(frame: Frame) -> LensDistortion:
-    """The lens distortion of a frame in the format of nerfstudio or instant-ngp. Raises UserError
-    for a lens other than OpenCV's perspective one and its fisheye.
+    """The lens distortion of a frame in nerfstudio's or instant-ngp's format. Raises UserError for
+    a lens other than OpenCV's perspective and fisheye ones.
     """
     for key, known in LENS_KEYS.items():
         value = frame.get(key)
@@ -155,8 +155,8 @@ def lens_distortion(frame: Frame) -> LensDistortion:
 
 
 def rigid(value: Any, fail: Fail) -> np.ndarray:
-    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its axes made orthonormal, without a scale that
-    all share; left-handed ones stay so. Raises Unusable with the text of fail().
+    """(3, 4) float64 pose from a 4x4 or 3x4 matrix, with orthonormal axes and without the scale
+    that all axes share; left-handed axes stay so. Raises Unusable with the text of fail().
     """
     matrix = numbers(value, (4, 4))
     if matrix is None:

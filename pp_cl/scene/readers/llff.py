@@ -1,4 +1,4 @@
-"""Reader of scenes as LLFF has them: poses_bounds.npy beside images/."""
+"""Reader of scenes in the format of LLFF: poses_bounds.npy next to images/."""
 
 from pathlib import Path
 
@@ -15,19 +15,19 @@ from pp_cl.scene.readers.frame import rigid
 FILES = "poses_bounds.npy (LLFF)"
 STATES = "camera-to-world", "opengl"
 POSES = "poses_bounds.npy"
-NUMBERS = 17  # 3x4 pose, (height, width, focal length) as its fifth column; near, far
+NUMBERS = 17  # a 3x4 pose with (height, width, focal length) as its fifth column; near, far
 # LLFF: down, right, backwards; OpenCV: right, down, forwards
 LLFF_FROM_CV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder has the file of poses."""
+    """Whether the folder has the file of poses."""
     return (folder / POSES).is_file()
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of a split, in the order of their names. Near and far bound all that was
-    photographed, and are left out. Raises UserError naming the file and the row.
+    """The images of a split, in the order of their names. Near and far are not used, as they bound
+    the whole photographed space. Raises UserError naming the file and the row.
     """
     file = folder / POSES
     rows = read_npy(file)
@@ -39,7 +39,7 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
         height, width, focal = matrix[:, 4]
         if not min(height, width, focal) > 0:
             raise fail(
-                f"height {height:g}, width {width:g}, focal length {focal:g}; must be above 0"
+                f"height {height:g}, width {width:g}, focal length {focal:g}: must be above 0"
             )
         pose = rigid(np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]]), fail)
         camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)

@@ -1,5 +1,5 @@
-"""Reader of scenes as NSVF has them, and Plenoxels (svox2): rgb/ or images/ with the split in front
-of the names, pose/, one intrinsics.txt, and near_and_far.txt where it is there.
+"""Reader of scenes in the format of NSVF and Plenoxels (svox2): rgb/ or images/, whose image names
+begin with the split, pose/, one intrinsics.txt, and maybe near_and_far.txt.
 """
 
 from pathlib import Path
@@ -19,13 +19,13 @@ IMAGES, POSES, INTRINSICS = ("rgb", "images", "image"), "pose", "intrinsics.txt"
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder has the two folders and the intrinsics."""
+    """Whether the folder has both subfolders and the intrinsics."""
     folders = (folder / image_folder(folder, IMAGES)).is_dir() and (folder / POSES).is_dir()
     return folders and (folder / INTRINSICS).is_file()
 
 
 def splits(folder: Path) -> list[str]:
-    """The splits that names of images begin with: 0_ train, 1_ val, 2_ test; without 2_, as in
+    """The splits whose prefix some image's name has: 0_ train, 1_ val, 2_ test; without 2_, as in
     NSVF's Tanks and Temples and BlendedMVS, 1_ is test.
     """
     return sorted(_names(folder))
@@ -58,14 +58,14 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def _names(folder):
-    """{split: names of its images}. Raises UserError where no name has a prefix."""
+    """{split: names of its images}. Raises UserError if no name has a prefix."""
     names, place = {}, image_folder(folder, IMAGES)
     for name in folder_images(folder, place):
         if split := PREFIXES.get(Path(name).name[:2]):
             names.setdefault(split, []).append(name)
     if not names:
         raise UserError(
-            f"{folder / place}: no image belongs to a split; begin their names with 0_ (train),"
+            f"{folder / place}: no image belongs to a split; begin the names with 0_ (train),"
             " 1_ (val) or 2_ (test)"
         )
     if "test" not in names and "val" in names:
@@ -74,8 +74,8 @@ def _names(folder):
 
 
 def _lens(file):
-    """((fx, fy, cx, cy), the (width, height) they are meant for or None): of a 4x4 or 3x3 matrix,
-    or `focal cx cy 0` first and the height and width last.
+    """((fx, fy, cx, cy), the (width, height) they are for, or None) from a file with a 4x4 or 3x3
+    matrix, or with `focal cx cy 0` first and maybe the height and width last.
     """
     rows, fail = read_numbers(file), fail_at(file)
     lengths, size = [len(row) for row in rows], None

@@ -1,5 +1,5 @@
-"""Reader of scenes in the format of NeRF-synthetic, transforms_<split>.json, and of nerfstudio,
-transforms.json, with the keys of both, and of sdfstudio; and a writer of the first.
+"""Reader of scenes in the formats of NeRF-synthetic (transforms_<split>.json) and nerfstudio
+(transforms.json), with the keys of both, and of sdfstudio; and a writer of the first format.
 """
 
 import math
@@ -32,17 +32,17 @@ from pp_cl.scene.readers.frame import GL_FROM_CV, Frame, frame_keys, lens_distor
 FILES = "transforms_train.json or transforms.json"
 STATES = "camera-to-world", "opengl"
 SINGLE, SDFSTUDIO = "transforms.json", "meta_data.json"
-ODD = 1 / 8  # of the images, that may have another shape by mistake
+ODD = 1 / 8  # share of the images that may have another shape by mistake
 NAMED = ("train", "val", "test")  # splits that transforms.json may list as <split>_filenames
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder holds a transforms.json or a transforms_<split>.json."""
+    """Whether the folder holds a transforms.json or a transforms_<split>.json."""
     return _single(folder) is not None or bool(_split_files(folder))
 
 
 def splits(folder: Path) -> list[str]:
-    """The names of the splits that the folder holds, but for those whose images are all missing."""
+    """The names of the splits that the folder holds, except splits whose images are all missing."""
     if files := _split_files(folder):
         return sorted(s for s, file in files.items() if s == "train" or _has_image(folder, file))
     listed = [split for split in NAMED if f"{split}_filenames" in _read(_single(folder))]
@@ -50,22 +50,23 @@ def splits(folder: Path) -> list[str]:
 
 
 def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
-    """The images of transforms_<split>.json, or those of transforms.json that its <split>_filenames
-    names, without such lists every eighth for test. Raises UserError naming the file and the key.
+    """The images of transforms_<split>.json, or the images of transforms.json that its
+    <split>_filenames lists; without such lists, every eighth is for test. Raises UserError naming
+    the file and the key.
     """
     files = _split_files(folder)
     file = files[split] if files else _single(folder)
     data = _read(file)
     unclear: dict[str, Unusable] = {}
-    frames: dict[str, Frame] = {}  # by the name of the image, or the path that finds none
+    frames: dict[str, Frame] = {}  # by the name of the image, or its path if there is no image
     for index, own in enumerate(progress(data["frames"])):
         frame = Frame(file, data, own if isinstance(own, dict) else {}, index)
         name = _image(folder, frame) or _path(frame)
         if frames.setdefault(name, frame).get("transform_matrix") != frame.get("transform_matrix"):
-            text = frame.error("file_path", f"{name!r} stands there with two poses; remove one")
+            text = frame.error("file_path", f"{name!r} is listed with two poses; remove one")
             unclear[name] = Unusable(text, "two poses")
     if len({str(frame.get("time")) for frame in frames.values()}) > 1:
-        what = "frames differ in time, but motion is not modelled: what moves will be blurred"
+        what = "frames differ in time, but motion is not modelled: moving parts will be blurred"
         warnings.warn(f"{file}: {what}", stacklevel=1)
     chosen = list(frames) if files else _of_split(file, data, frames, split)
 
@@ -78,14 +79,14 @@ def read_split(folder: Path, split: str, left_out: LeftOut) -> list[ImageFile]:
 
 
 def box(folder: Path) -> np.ndarray | None:
-    """(2, 3) box around the object that a transforms.json states as its `aabb`, or None."""
+    """(2, 3) box around the object, which a transforms.json states as its `aabb`, or None."""
     file = _single(folder)
     corners = None if _split_files(folder) else _read(file).get("aabb")
     return None if corners is None else checked_box(corners, fail_at(file, "aabb"))
 
 
 def _single(folder):
-    """The transforms.json, or sdfstudio's file in its place; None without either."""
+    """The transforms.json, or sdfstudio's file instead of it; None without either."""
     files = [folder / name for name in (SINGLE, "transform.json")]
     with suppress(OSError), opened_regular(folder / SDFSTUDIO) as opened:
         files += [folder / SDFSTUDIO] if b'"camtoworld"' in opened.read(2**16) else []
@@ -93,20 +94,20 @@ def _single(folder):
 
 
 def _split_files(folder):
-    """{split: transforms_<split>.json}, unless they are copies beside a transforms.json."""
-    found = [file for file in sorted(folder.glob("transform*_*.json")) if file.is_file()]
-    files = {file.stem.partition("_")[2]: file for file in found}
+    """{split: transforms_<split>.json}; {} if they only accompany a transforms.json."""
+    present = [file for file in sorted(folder.glob("transform*_*.json")) if file.is_file()]
+    files = {file.stem.partition("_")[2]: file for file in present}
     return {} if _single(folder) and "train" not in files else files
 
 
 def _read(file):
-    """The object of a transforms file, whose frames are a list."""
+    """The JSON object in a transforms file, with a list of frames. Raises UserError."""
     data = read_json(file)
     if not isinstance(data, dict):
         raise UserError(f"{file}: must hold a JSON object with the key frames")
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise UserError(f"{file}: frames: must be a list of one frame or more")
+        raise UserError(f"{file}: frames: must be a list of at least one frame")
     if file.name == SDFSTUDIO:
         frames = [_of_sdfstudio(frame) for frame in frames if isinstance(frame, dict)]
         return {"w": data.get("width"), "h": data.get("height"), "frames": frames}
@@ -114,7 +115,7 @@ def _read(file):
 
 
 def _of_sdfstudio(own):
-    """A frame of sdfstudio, whose axes are OpenCV's, with nerfstudio's keys."""
+    """A frame of sdfstudio, whose axes are OpenCV's, converted to nerfstudio's keys and axes."""
     pose, lens = numbers(own.get("camtoworld"), (4, 4)), numbers(own.get("intrinsics"))
     keys = {"file_path": own.get("rgb_path"), "mask_path": own.get("foreground_mask")}
     if pose is not None:
@@ -126,17 +127,17 @@ def _of_sdfstudio(own):
 
 
 def _has_image(folder, file):
-    """Whether one of the frames of a file has its image, or the file is to be refused when read."""
+    """Whether any frame of a file has its image; True for a broken file, which reading refuses."""
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
         return True
-    found = (Frame(file, data, own, i) for i, own in enumerate(frames) if isinstance(own, dict))
-    return any(_image(folder, frame) for frame in found)
+    parsed = (Frame(file, data, own, i) for i, own in enumerate(frames) if isinstance(own, dict))
+    return any(_image(folder, frame) for frame in parsed)
 
 
 def _image(folder, frame):
-    """The name of a frame's image, None where it is not there."""
+    """The name of a frame's image, or None if there is no such image."""
     try:
         return frame.image("file_path", folder)
     except Unusable:
@@ -144,7 +145,7 @@ def _image(folder, frame):
 
 
 def _path(frame):
-    """The path of a frame's image as it has it, in other words where it has none."""
+    """The path of its image that a frame states, or words on the frame if it states none."""
     path = frame.get("file_path")
     return _plain(path) if isinstance(path, str) else f"frames[{frame.index}]"
 
@@ -154,7 +155,7 @@ def _plain(path):
 
 
 def _of_split(file, data, frames, split):
-    """The names of those of a transforms.json's frames that belong to a split, in their order."""
+    """The image names of the frames of a transforms.json that belong to a split, sorted."""
     ordered = sorted(frames)
     names = data.get(f"{split}_filenames")
     if names is None:
@@ -164,37 +165,41 @@ def _of_split(file, data, frames, split):
     wanted, paths = set(map(_plain, names)), {name: _path(frames[name]) for name in ordered}
     missing = wanted - {*ordered, *paths.values()}
     if missing or not wanted:
-        what = f"{min(missing)!r} is the path of no frame" if missing else "is empty"
+        what = f"no frame has the path {min(missing)!r}" if missing else "is empty"
         raise UserError(f"{file}: {split}_filenames: {what}; list images of the frames")
     return [name for name in ordered if wanted & {name, paths[name]}]
 
 
 def _of_one_shape(file, data, image_files, left_out):
-    """The images of the shape that nearly all have, where one angle of view is stated for all."""
+    """The images with the shape that nearly all have; others go to left_out. This matters only if
+    one angle of view is stated for all.
+    """
     if data.get("camera_angle_x") is None or {"fl_x", "w"} & data.keys():
         return image_files
-    sizes = [(one.camera.width, one.camera.height) for one in image_files]
+    sizes = [(image_file.camera.width, image_file.camera.height) for image_file in image_files]
     usual = max(sizes, key=lambda size: sum(same_shape(size, other) for other in sizes), default=())
     others = [
-        o.name for o, size in zip(image_files, sizes, strict=True) if not same_shape(size, usual)
+        image_file.name
+        for image_file, size in zip(image_files, sizes, strict=True)
+        if not same_shape(size, usual)
     ]
     if len(others) > ODD * len(sizes):
         return image_files
     for name in others:
-        text = f"{file}: {name} has another shape than the others, of which camera_angle_x is"
+        text = f"{file}: {name} has another shape than the others, for which camera_angle_x is"
         left_out.append((name, Unusable(f"{text}; write it anew", "an image of another shape")))
-    return [one for one in image_files if one.name not in others]
+    return [image_file for image_file in image_files if image_file.name not in others]
 
 
 def _image_file(folder, frame):
-    """The ImageFile of one frame, its camera of the image's size. Raises Unusable."""
+    """The ImageFile of one frame, with its camera scaled to the image. Raises Unusable."""
     name = frame.image("file_path", folder)
     if name is None:
         raise frame.error("file_path", "is missing; add the path of the image")
     mask = frame.image("mask_path", folder)
     stated = frame.number("w", above=0), frame.number("h", above=0)
     size = image_size(folder / name, None if None in stated else stated)
-    whole = [one or side for one, side in zip(stated, size, strict=True)]
+    whole = [given or side for given, side in zip(stated, size, strict=True)]
     camera = fitted(pinhole(frame, *whole), size, partial(frame.error, "w"))
     near_far = frame.number("near", above=0), frame.number("far", above=0)
     is_stated = near_far != (None, None)
@@ -205,8 +210,8 @@ def _image_file(folder, frame):
 
 
 def write_scene(splits: dict[str, list[View]], folder: Path | str) -> None:
-    """Write the stored images of views as a scene of NeRF-synthetic, with nerfstudio's keys, too.
-    Raises UserError if the folder exists and is not empty, or cannot be written.
+    """Write the stored images of views as a scene in NeRF-synthetic's format, with nerfstudio's
+    keys, too. Raises UserError if the folder exists and is not empty, or cannot be written.
     """
     with atomic_folder(Path(folder)) as unfinished:
         for split, views in splits.items():

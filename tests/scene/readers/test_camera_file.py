@@ -87,7 +87,7 @@ def changed(name, key, value):
 @pytest.mark.parametrize(
     "content, named",
     [
-        ("[]", "must hold one camera"),
+        ("[]", "must hold at least one camera"),
         ("3", "holds no cameras"),
         ({"camera_path": [7]}, r"camera_path\[0\]: must be a JSON object"),
         (changed("cameras.json", "position", [1, 2]), r"\[1\].position"),

@@ -227,7 +227,7 @@ def test_of_several_models_the_largest_is_read(written):
             elif file.name == "images.bin":
                 content = (1).to_bytes(8, "little") + content[8 : 8 + 64 + len("000000.png") + 9]
             (folder / "sparse/0" / file.name).write_bytes(content)
-    with pytest.warns(UserWarning, match="of 2 models the largest beside images is read"):
+    with pytest.warns(UserWarning, match="of 2 models, the largest with images next to it is read"):
         assert len(scene_frames(folder)) == 9
     for file in (*(folder / "images").iterdir(), *(folder / "sparse/3").iterdir()):
         file.rename(folder / file.name)  # as RealityScan has it
@@ -284,4 +284,4 @@ def test_bad_bytes(binary, case):
 def test_a_name_in_no_code_page_costs_its_view(binary):
     file = binary / "sparse/0/images.bin"
     file.write_bytes(file.read_bytes().replace(b"000001.png", b"\xff00001.png"))
-    left_out(binary, file.parent, "rename the images in ASCII")
+    left_out(binary, file.parent, "give the images ASCII names")

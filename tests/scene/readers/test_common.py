@@ -71,7 +71,7 @@ HARM = {
     "cut": (cut, "a mask that cannot be used|an image that cannot be read"),
     "of another shape": (
         lambda file: write_png(file, np.zeros((4, 4))),
-        "a mask that cannot be|an image of another shape|what the scene's files say",
+        "a mask that cannot be|an image of another shape|the scene's files describe",
     ),
 }
 # Images that only their folder lists are not missed where they are gone. Nor are masks: the hull of
@@ -239,7 +239,7 @@ def test_what_numpy_writes(tmp_path, rng):
     assert list(read_npz(tmp_path / "a.npz", "cam_")) == ["cam_1"]
     with zipfile.ZipFile(tmp_path / "b.npz", "w", zipfile.ZIP_BZIP2) as archive:
         archive.write(tmp_path / "0.npy", "cam_1.npy")
-    with refusing(tmp_path / "b.npz", "is packed as numpy does not"):
+    with refusing(tmp_path / "b.npz", "is compressed in a way"):
         read_npz(tmp_path / "b.npz", "cam_")
 
 

@@ -128,5 +128,5 @@ def test_masks_belong_to_images_of_their_number(scene, dev):
         Path(name).stem[3:] for name in before
     ]
     (scene / "mask" / "010.png").rename(scene / "mask" / "011.png")
-    with pytest.warns(UserWarning, match=r"without a mask, .* .image/000010\.png"):
+    with pytest.warns(UserWarning, match=r"without a mask .* .image/000010\.png"):
         load_scene(scene, dev=dev)

@@ -250,7 +250,7 @@ def test_what_is_the_users_stays(captured, shot, tmp_path):
     before = changed(scene)
     assert capture(shot[0], scene, "--from", "frames") == (
         2,
-        [f"pp-cl: {own}: was not written by pp-cl, or was changed since; move it away"],
+        [f"pp-cl: {own}: pp-cl did not write this, or it was changed since; move it away"],
     )
     assert changed(scene) == before
     shutil.copy(captured / "capture" / "frames" / "003.png", own)
