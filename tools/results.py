@@ -201,6 +201,17 @@ WORK = [
     {"head": "network of a whole image's", "cell": "{computed:.0%}"},
     {"head": "points drawn, with gradients in a step", "cell": "{drawn:.0%}, {touched:.0%}"},
 ]
+MESHES = [
+    {"head": "run", "cell": "{name}"},
+    {"head": "faces", "cell": "{faces:,}"},
+    {"head": "of them guessed", "cell": "{guessed:.1%}"},
+    {"head": "parts", "cell": "{parts}"},
+    {"head": "Euler number", "cell": "{euler}"},
+    {"head": "roughness, degrees", "cell": "{roughness:.1f}"},
+    {"head": "from the surface: mean, median", "cell": "{mean:.2f}, {median:.2f}"},
+    {"head": "surface from it", "cell": "{back:.2f}"},
+]
+MESHED = {"demo_1500": "demo", "ethiopian_head": "ethiopian_head"}  # the trainings' parts
 DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
 
 
@@ -320,7 +331,7 @@ def memory(store: Path) -> list[dict]:
 
 
 def demo(store: Path) -> list[dict]:
-    """Rows of DEMO: depth and mesh of the demo's runs."""
+    """Rows of DEMO: depths of the demo's runs."""
     rows = []
     short, long = (store / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
@@ -328,11 +339,15 @@ def demo(store: Path) -> list[dict]:
         shares = f"median {found['median']:.1%}, mean {found['mean']:.1%}"
         rows.append({"what": f"depths within 1.5 spacings, {steps} steps", "result": shares})
         rows.append({"what": f"IoU of alpha, {steps} steps", "result": f"{found['overlap']:.3f}"})
-    found = read_found(store, *TOOL, "tools.export_quality", short)
-    mesh = next(row for row in found["mesh"] if "as exported" in row["field"])
-    near = f"{mesh['mean']} on average, median {mesh['median']}"
-    rows.append({"what": "exported mesh, spacings from the surface", "result": near})
     return rows
+
+
+def meshes(store: Path) -> list[dict]:
+    """Rows of MESHES."""
+    return [
+        {"name": name} | read_found(store, *TOOL, "tools.export_quality", store / run)
+        for run, name in MESHED.items()
+    ]
 
 
 def splats(store: Path) -> list[dict]:
@@ -398,6 +413,7 @@ PARTS: dict[str, Callable[[Path], Found]] = {
     "pytorch": pytorch,
     **{f"stages_{preset}": partial(stages, preset) for preset in STEPS},
     "memory": memory,
+    "meshes": meshes,
     "splats": splats,
     "stability": stability,
     "work": work,
@@ -538,6 +554,9 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     beside = "ours, PyTorch's, theirs over ours; medians of interleaved runs"
     if "pytorch" in found:
         beside += f", {found['pytorch'][0]['torch']}"
+    meshed = (
+        "exported meshes; roughness is the mean angle of neighbouring faces; distances in spacings"
+    )
     fitted = "processor seconds a core; means over five test views, drawn as viewers draw splats"
     parts = {
         "trainings": (quality, QUALITY),
@@ -547,6 +566,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
         "stages": (f"medians of a step on lego ({steps})", STAGES),
         "memory": ("the most memory that a few steps take", MEMORY),
         "demo": ("runs of the demo", DEMO),
+        "meshes": (meshed, MESHES),
         "splats": (fitted, SPLATS),
         "stability": ("errors against float64", STABILITY),
         "work": ("what runs compute; means over eight training views", WORK),

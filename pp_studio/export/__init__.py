@@ -29,7 +29,11 @@ FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
         (".ply", ".glb", ".obj", ".stl"),
         "the surface with coloured vertices, .ply, .glb, .obj or .stl (without colours) by --out",
     ),
-    "textured": ("model.glb", (".glb",), "the surface with few faces and a texture"),
+    "textured": (
+        "model.glb",
+        (".glb", ".obj"),
+        "the surface with few faces and a texture, .glb, or .obj with .mtl and .png by --out",
+    ),
     "html": (
         "view.html",
         (".html",),

@@ -42,6 +42,8 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
     check_file(path) if suffixes else check_new_folder(path)
     if out is None and suffixes:
         check_ours([path], "move it away, or choose another --out")
+    if name == "textured" and path.suffix.lower() == ".obj" and not path.exists():
+        check_ours(texture.companions(path), "move it away, or choose another --out")
     if out is not None and not path.parent.is_dir():
         raise UserError(f"--out {path}: {path.parent} is no folder; make it first")
     return path
@@ -87,12 +89,14 @@ def export_run(
         made = mesh.coloured_mesh(run, within)
         write = partial(mesh.write_mesh, path, replace(made, vertices=placed(made.vertices)))
         unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
-        told = f"{len(made.vertices)} vertices, {len(made.faces)} faces{unlit}{unit}"
+        told = f"{len(made.vertices)} vertices, {_faces(len(made.faces), made.seen)}{unlit}{unit}"
     elif name == "textured":
         solid = texture.textured_mesh(run, turn, within)
         solid.apply_scale(metres)
         write = partial(texture.write_textured, path, solid)
-        told = f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit{unit}"
+        faces = _faces(len(solid.faces), solid.metadata[mesh.SEEN_FACES])
+        unlit = ", unlit" if path.suffix.lower() == ".glb" else ", with its .mtl and .png"
+        told = f"{len(solid.vertices)} vertices, {faces}{unlit}{unit}"
     elif name == "html":
         fitted = gaussians.fitted_gaussians(run)
         text = page.page_text(fitted, run.cameras("train"), run.folder.name)
@@ -131,6 +135,12 @@ def export_run(
         own(path.parent)
     write()
     return told
+
+
+def _faces(count, seen):
+    """How many faces there are, and how many of them are guessed, in words."""
+    guessed = f" ({count - seen} of them guessed)" if seen < count else ""
+    return f"{count} faces{guessed}"
 
 
 def renderings(run: Run) -> dict[str, list[View]]:

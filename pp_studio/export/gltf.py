@@ -20,10 +20,12 @@ def write_glb(
     *,
     faces: np.ndarray | None = None,
     extension: tuple[str, dict[str, Any]] | None = None,
+    extras: dict[str, Any] | None = None,
 ) -> None:
     """Write vertices. attributes: {name: (M,) or (M, K) array of float32, or of uint16 for 0 to 1},
     POSITION (M, 3) among them, in world coordinates. faces: (F, 3) vertices of triangles; None:
-    points. extension: of the primitive, its name and JSON. Raises UserError as atomic_file does.
+    points. extension: of the primitive, its name and JSON. extras: JSON of the mesh. Raises
+    UserError as atomic_file does.
 
     Positions in glTF are float32, so those of float64 are moved to the origin, and the file's node
     moves them back.
@@ -60,6 +62,8 @@ def write_glb(
     if faces is not None:  # without a material it would be metal
         gltf["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
         make_unlit(gltf)
+    if extras:
+        gltf["meshes"][0]["extras"] = extras
     if extension:
         primitive["extensions"] = dict([extension])
         gltf["extensionsUsed"] = [extension[0]]

@@ -8,21 +8,40 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import (
+    distance_transform_edt,
+    map_coordinates,
+    maximum_filter,
+    minimum_filter,
+)
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+from trimesh.exchange.obj import export_obj
 from trimesh.visual import TextureVisuals
-from trimesh.visual.material import PBRMaterial
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from pp_cl import Progress, Run, track
-from pp_cl.errors import require
-from pp_cl.files import atomic_file, to_8bit
+from pp_cl.errors import UserError, require
+from pp_cl.files import atomic_file, to_8bit, write_png, write_text
+from pp_studio.export.fusion import COVERED, TRUNCATION
 from pp_studio.export.gltf import make_unlit
-from pp_studio.export.mesh import COVERED, surface
+from pp_studio.export.mesh import SEEN_FACES, of_faces, seen_first, surface
 
 FACES = 60_000  # at most: marching cubes make more of the same surface
 SIDE = 2048  # texels
 HIDDEN = 1.5  # voxel sizes behind what a view shows: a texel there is hidden
 LEAST_COSINE = 0.2  # between a texel's normal and the direction to an eye that sees it
-SHARPNESS = 6  # power of that cosine in a view's weight: the best views make up most of a colour
+SHARPNESS = 3  # power of that cosine in a view's weight, squared where colours agree
+VIEWS = 16  # of those that see a texel, how many of the largest weights decide its colour
+AT_EDGES = 0.05  # of a view's weight where its depths jump: neighbours there show something else
+# Weight of the views that are darker than what is taken for the colour: half would be the median,
+# but highlights, which move with the eye, add light. How far from it others may be, in luminance.
+DARKER, AGREEING = 0.4, 0.08
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+# Texels that some view shows whose colours those that none does have, weighted by the fourth power
+# of their distances: from a few of the nearest alone, a base would get rays.
+SAMPLES = 1024
+AT_ONCE = 1 << 13  # texels
 
 
 def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> trimesh.Trimesh:
@@ -33,12 +52,13 @@ def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> 
     import fast_simplification
     import xatlas
 
-    vertices, faces = surface(run, box)
-    middle = vertices.mean(0, dtype=np.float64)
-    vertices = (vertices - middle).astype(np.float32)
+    found = surface(run, box)
+    middle, faces = found.vertices.mean(0), found.faces
+    whole = vertices = (found.vertices - middle).astype(np.float32)
     if len(faces) > FACES:
         with Progress("simplifying the surface"):
             vertices, faces = fast_simplification.simplify(vertices, faces, target_count=FACES)
+    faces, seen = seen_first(faces, found.seen[cKDTree(whole).query(vertices)[1]])
     solid = trimesh.Trimesh(vertices, faces, process=False)
     normals = solid.vertex_normals.astype(np.float32)
     with Progress("unwrapping the surface"):
@@ -65,6 +85,7 @@ def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> 
         faces,
         vertex_normals=normals @ turn.T,
         visual=TextureVisuals(uv, material=material),
+        metadata={SEEN_FACES: seen},
         process=False,
     )
 
@@ -103,35 +124,78 @@ def _cross(u, v):
 
 
 def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(T, 3) sRGB colours of texels: the mean of what the training views show there, weighted by
-    how directly they look; where none does, those of all views weigh the same, hidden or not.
-    positions, normals: (T, 3), world.
+    """(T, 3) sRGB colours of texels: what most of the training views that look at them directly
+    show, without highlights. positions, normals: (T, 3), world. Texels that no view sees have those
+    of the others, the nearest most. Raises UserError where there is none.
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    seen, hidden = (np.zeros((len(positions), 4)) for _ in range(2))
-    for camera in track(run.cameras("train"), "texture", "view"):
-        rendered, (x, y, z) = run.render(camera), camera.project(positions)
-        shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        place = np.stack([np.where(shown, y, 0.5) - 0.5, np.where(shown, x, 0.5) - 0.5])
-        row, column = np.rint(place).astype(int).clip(0, [[camera.height - 1], [camera.width - 1]])
-        shown &= rendered.alpha[row, column] >= COVERED
-        rgba = rendered.rgba()
-        channels = [map_coordinates(rgba[..., c], place, order=1, mode="nearest") for c in range(3)]
-        colours = np.stack([*channels, np.ones(len(z))], 1) * shown[:, None]
-        towards = camera.eye - positions
-        cosine = (normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
-        behind = rendered.median_depth[row, column] + HIDDEN * run.model.grid.voxel_size
-        direct = shown & (z < behind) & (cosine > LEAST_COSINE)
-        seen += np.where(direct, np.maximum(cosine, 0) ** SHARPNESS, 0)[:, None] * colours
-        hidden += colours
-    total = np.where(seen[:, 3:] > 0, seen, hidden)
-    return total[:, :3] / np.maximum(total[:, 3:], 1e-12)
+    cameras, n = run.cameras("train"), len(positions)
+    kept = min(VIEWS, len(cameras))
+    weights, colours = np.zeros((n, kept), np.float32), np.zeros((n, kept, 3), np.uint8)
+    for camera in track(cameras, "texture", "view"):
+        rows, weight, seen = _looked_at(run, camera, positions, normals)
+        least = weights[rows].argmin(1)
+        better = weight > weights[rows, least]
+        rows, least = rows[better], least[better]
+        weights[rows, least], colours[rows, least] = weight[better], seen[better]
+    found = np.zeros((n, 3))
+    for first in range(0, n, AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        found[some] = agreed(weights[some], colours[some] / np.float32(255))
+    is_seen = weights.any(1)
+    if not is_seen.any():
+        raise UserError(f"{run.folder}: no training view shows its surface; train it longer")
+    rows = np.flatnonzero(is_seen)
+    rows = np.random.default_rng(0).choice(rows, min(SAMPLES, len(rows)), replace=False)
+    unseen = np.flatnonzero(~is_seen)
+    for some in np.array_split(unseen, len(unseen) // AT_ONCE + 1):
+        share = 1 / (cdist(positions[some], positions[rows]) + run.model.grid.voxel_size) ** 4
+        found[some] = share @ found[rows] / share.sum(1, keepdims=True)
+    return found
+
+
+def _looked_at(run, camera, positions, normals):
+    """((S,) texels that a view looks at, (S,) its weights by how directly it does, (S, 3) uint8
+    sRGB that it shows there).
+    """
+    rendered, voxel_size = run.render(camera), run.model.grid.voxel_size
+    solid = rendered.alpha >= COVERED
+    depth = np.where(solid, rendered.median_depth, 2 * rendered.median_depth[solid].max(initial=0))
+    jump = maximum_filter(depth, 3) - minimum_filter(depth, 3) > TRUNCATION * voxel_size
+    towards = camera.eye - positions
+    cosine = np.einsum("nc,nc->n", normals, towards)
+    cosine /= np.sqrt(np.einsum("nc,nc->n", towards, towards))
+    rows = np.flatnonzero(cosine > LEAST_COSINE)
+    column, row, shown = camera.pixels(positions[rows])
+    x, y, z = camera.project(positions[rows])
+    rows_seen = shown & solid[row, column] & (z < depth[row, column] + HIDDEN * voxel_size)
+    rows, row, column = rows[rows_seen], row[rows_seen], column[rows_seen]
+    rgba, place = rendered.rgba(), np.stack([y, x])[:, rows_seen] - 0.5
+    colours = [map_coordinates(rgba[..., c], place, order=1, mode="nearest") for c in range(3)]
+    weight = cosine[rows] ** SHARPNESS * np.where(jump[row, column], AT_EDGES, 1)
+    return rows, weight.astype(np.float32), to_8bit(np.stack(colours, 1))
+
+
+def agreed(weights: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """(T, 3): of K views' colours (T, K, 3) of each texel the mean of those that are about as light
+    as the one that views of DARKER of the weight (T, K) are darker than; 0 without weight.
+    """
+    light = colours @ LUMINANCE
+    order = np.argsort(light, axis=1)
+    below = np.cumsum(np.take_along_axis(weights, order, 1), axis=1)
+    at = (below >= DARKER * below[:, -1:]).argmax(1)[:, None]
+    middle = np.take_along_axis(light, np.take_along_axis(order, at, 1), 1)
+    share = np.where(np.abs(light - middle) <= AGREEING, weights**2, 0)[..., None]
+    return (share * colours).sum(1) / np.maximum(share.sum(1), 1e-12)
 
 
 def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:
     """Write a GLB, unlit, whose positions are float32: relative to the middle, to which its node
-    moves them. Raises UserError as atomic_file does.
+    moves them; or an OBJ with companions(). Raises UserError as atomic_file does.
     """
+    if path.suffix.lower() == ".obj":
+        _write_obj(path, mesh)
+        return
     middle = np.rint(mesh.vertices.mean(0))
     near, scene = mesh.copy(), trimesh.Scene()
     near.apply_translation(-middle)
@@ -139,3 +203,25 @@ def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:
     data: Any = scene.export(file_type="glb", include_normals=True, tree_postprocessor=make_unlit)
     with atomic_file(path) as file:
         file.write(data)
+
+
+def companions(path: Path) -> list[Path]:
+    """The files that a textured OBJ needs beside it: its materials, and their texture."""
+    return [path.with_suffix(".mtl"), path.with_suffix(".png")]
+
+
+def _write_obj(path, mesh):
+    materials, texture = companions(path)
+    image = mesh.visual.material.baseColorTexture
+    write_png(texture, np.asarray(image) / np.float32(255))
+    write_text(materials, f"newmtl {path.stem}\nillum 0\nKd 1 1 1\nmap_Kd {texture.name}\n")
+    near = mesh.copy()
+    near.visual.material = SimpleMaterial(image=image, name=path.stem)
+    text, _ = export_obj(
+        near,
+        include_normals=True,
+        return_texture=True,
+        mtl_name=materials.name,
+        header=of_faces(mesh.metadata[SEEN_FACES]),
+    )
+    write_text(path, text)

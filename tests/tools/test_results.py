@@ -37,6 +37,9 @@ TRADED |= {"is_default": True, "is_frontier": True}
 WORKED = {"name": "demo", "box": 9000, "hull": 0.3, "left": 0.1, "stored": 20.0, "whole": 90.0}
 WORKED |= {"fragments": 4e5, "blended": 0.6, "computed": 0.5, "drawn": 0.7, "touched": 0.2}
 FOUND |= {"work": [WORKED], "frontier": [TRADED]}
+MESH = {"name": "demo", "faces": 100_000, "guessed": 0.1, "parts": 1, "euler": -8}
+MESH |= {"roughness": 5.7, "mean": 0.22, "median": 0.18, "back": 0.5}
+FOUND |= {"meshes": [MESH]}
 FOUND |= {f"stages_{preset}": STEP for preset in TOOL.STEPS}
 
 

@@ -1,12 +1,16 @@
+from unittest.mock import ANY
+
 import numpy as np
+import plyfile
 import pytest
 import trimesh
 from support.gltf import glb
 
 from pp_cl.errors import UserError
 from pp_studio.export import mesh as module
+from pp_studio.export.fusion import Fused
 from pp_studio.export.gltf import gltf_colours
-from pp_studio.export.mesh import coloured_mesh, surface, write_mesh
+from pp_studio.export.mesh import coloured_mesh, fair, surface, write_mesh
 
 RADIUS = 0.8  # of the ball
 
@@ -59,8 +63,42 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
     assert np.array_equal(read.faces, mesh.faces)
 
 
+def test_fairing_smooths_noise_and_keeps_what_is_held(rng):
+    ball = trimesh.creation.icosphere(4, 10.0)
+    noisy = ball.vertices + 0.15 * rng.normal(size=ball.vertices.shape)
+
+    def roughness(vertices):
+        return trimesh.Trimesh(vertices, ball.faces).face_adjacency_angles.mean()
+
+    held = np.where(ball.vertices[:, 2] > 0, 1e3, 0.01)
+    found = fair(noisy, ball.faces, held)
+    firm = ball.vertices[:, 2] > 1
+    assert np.abs(found - noisy)[firm].max() < 0.02
+    away = [np.abs(np.linalg.norm(v, axis=1) - 10)[~firm].mean() for v in (noisy, found)]
+    assert away[1] < 0.7 * away[0]  # it does not shrink
+    assert roughness(found) < 0.75 * roughness(noisy)
+
+
+def test_what_no_view_shows_comes_last_and_is_said(run, mesh, tmp_path):
+    """The cameras look down at the ball."""
+    height = mesh.vertices[mesh.faces].mean(1)[:, 2]
+    assert len(height) / 2 < mesh.seen < len(height)
+    assert height[mesh.seen :].max() < 0 < height[: mesh.seen].max()
+    said = f"seen_faces {mesh.seen}: "
+    for suffix in ("ply", "obj", "glb"):
+        write_mesh(tmp_path / f"a.{suffix}", mesh)
+    assert plyfile.PlyData.read(tmp_path / "a.ply").comments[0].startswith(said)
+    assert (tmp_path / "a.obj").read_text().startswith(f"# {said}")
+    assert glb(tmp_path / "a.glb")[0]["meshes"] == [
+        {"primitives": ANY, "extras": {"seen_faces": mesh.seen}}
+    ]
+
+
 def test_no_surface_is_one_line(run, monkeypatch):
-    monkeypatch.setattr(module, "fuse", lambda grid, _: np.ones(grid.dims[::-1]))
+    def nothing(grid, _):
+        return Fused(*np.ones((3, *grid.dims[::-1]), np.float32))
+
+    monkeypatch.setattr(module, "fuse", nothing)
     with pytest.raises(UserError, match="show no surface"):
         surface(run)
 
@@ -69,13 +107,14 @@ def test_crumbs_are_left_out_and_said(run, monkeypatch):
     fuse = module.fuse
 
     def with_a_crumb(grid, views):
-        distances = fuse(grid, views)
-        distances[:6, :6, :6] = 1
-        distances[1:5, 1:5, 1:5] = -1
-        return distances
+        fused = fuse(grid, views)
+        for field, value in zip(fused, (1, 9, 0), strict=True):
+            field[:6, :6, :6] = value
+        fused.distances[1:5, 1:5, 1:5] = -1
+        return fused
 
     monkeypatch.setattr(module, "fuse", with_a_crumb)
     monkeypatch.setattr(module, "LOOSE", 0.2)  # of a small ball
     with pytest.warns(UserWarning, match="1 loose parts are left out"):
-        vertices, faces = surface(run)
-    assert trimesh.Trimesh(vertices, faces).body_count == 1
+        found = surface(run)
+    assert trimesh.Trimesh(found.vertices, found.faces).body_count == 1

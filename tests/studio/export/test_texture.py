@@ -4,10 +4,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support.gltf import glb
 
+from pp_cl.errors import UserError
 from pp_cl.scene.gaze import up_of
 from pp_studio.export import texture
-from pp_studio.export.formats import export_run
-from pp_studio.export.texture import texels, write_textured
+from pp_studio.export.formats import check_target, export_run
+from pp_studio.export.texture import agreed, companions, texels, write_textured
 
 
 def test_texels_are_each_in_one_face(rng):
@@ -41,7 +42,9 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
     said = export_run(run, "textured", tmp_path / "a.glb")
     solid = trimesh.load(tmp_path / "a.glb", force="mesh")
-    assert said == f"{len(solid.vertices)} vertices, {len(solid.faces)} faces, unlit"
+    seen = glb(tmp_path / "a.glb")[0]["meshes"][0]["extras"]["seen_faces"]
+    told = f"{len(solid.faces)} faces ({len(solid.faces) - seen} of them guessed)"
+    assert said == f"{len(solid.vertices)} vertices, {told}, unlit"
     assert 300 < len(solid.faces) <= 600 and solid.visual.uv.shape == (len(solid.vertices), 2)
     gltf, stored = glb(tmp_path / "a.glb")
     # the light of the photographs is in the texture: lamps would be a second one
@@ -53,6 +56,8 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     up = up_of(run.cameras("train"))
     turn = Rotation.align_vectors([(0, 1, 0)], [up])[0].as_matrix()
     assert np.abs(turn @ up - (0, 1, 0)).max() < 1e-6
+    # the cameras look down at the ball
+    assert seen > len(solid.faces) / 2 and solid.triangles_center[seen:, 1].max() < 0
     solid.vertices = solid.vertices @ turn
     for camera in run.cameras("test"):
         rendered, rays = run.render(camera), camera.rays().reshape(-1, 3)
@@ -64,3 +69,39 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
         shown = rendered.rgba().reshape(-1, 4)[ray]
         sure = shown[:, 3] > 0.95
         assert sure.sum() > 150 and np.abs(found - shown[:, :3])[sure].mean() < 0.06
+
+
+def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(texture, "FACES", 600)
+    path = tmp_path / "a.obj"
+    said = export_run(run, "textured", path)
+    export_run(run, "textured", tmp_path / "a.glb")
+    assert said.endswith("with its .mtl and .png")
+    assert {one.name for one in tmp_path.iterdir()} == {"a.obj", "a.mtl", "a.png", "a.glb"}
+    obj, glb_mesh = (trimesh.load(tmp_path / name, force="mesh") for name in ("a.obj", "a.glb"))
+    assert obj.triangles == pytest.approx(glb_mesh.triangles, abs=1e-5)
+    uv = [one.visual.uv[one.faces] for one in (obj, glb_mesh)]
+    assert uv[0] == pytest.approx(uv[1], abs=1e-5)
+    images = obj.visual.material.image, glb_mesh.visual.material.baseColorTexture
+    assert np.array_equal(*(np.asarray(image.convert("RGB")) for image in images))
+    first = path.read_text().splitlines()[0]
+    assert first.startswith("# seen_faces ") and "shown by no photograph" in first
+    path.unlink()  # what lies beside it may be another's
+    with pytest.raises(UserError, match=r"a\.(mtl|png): pp-cl did not write this"):
+        check_target("textured", run.folder.path, path)
+    for one in companions(path):
+        one.unlink()
+    assert check_target("textured", run.folder.path, path) == path
+
+
+def test_highlights_are_left_out(rng):
+    """Of ten views, four of which show a highlight in place of the colour."""
+    colours = np.array([0.4, 0.3, 0.2]) + 0.02 * rng.normal(size=(50, 10, 3))
+    colours[:, ::3] = 0.95
+    weights = rng.uniform(0.8, 1, (50, 10))
+    weights[40:] = 0
+    found = agreed(weights, colours)
+    assert np.abs(found[:40] - (0.4, 0.3, 0.2)).max() < 0.04 and not found[40:].any()
+    one = np.zeros((50, 10))
+    one[:, 0] = 1e-3
+    assert agreed(one, colours) == pytest.approx(0.95)
