@@ -177,6 +177,7 @@ SPLATS = [
     {"head": "Gaussians", "cell": "{gaussians:,}"},
     {"head": "PSNR", "cell": "{psnr_same:.1f}"},
     {"head": "three times as large", "cell": "{psnr_larger:.1f}"},
+    {"head": "beside the hull", "cell": "{beside:.1%}"},
 ]
 # of what a splat is fitted: the trainings' parts, and how rows name them
 SPLATTED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_6000": "lego 400x400"}
@@ -211,7 +212,8 @@ MESHES = [
     {"head": "from the surface: mean, median", "cell": "{mean:.2f}, {median:.2f}"},
     {"head": "surface from it", "cell": "{back:.2f}"},
 ]
-MESHED = {"demo_1500": "demo", "ethiopian_head": "ethiopian_head"}  # the trainings' parts
+# of the trainings' parts, and how rows name them
+MESHED = {"demo_1500": "demo, 1,500 steps", "ethiopian_head": "ethiopian_head, 8,000 steps"}
 DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
 
 
@@ -554,9 +556,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     beside = "ours, PyTorch's, theirs over ours; medians of interleaved runs"
     if "pytorch" in found:
         beside += f", {found['pytorch'][0]['torch']}"
-    meshed = (
-        "exported meshes; roughness is the mean angle of neighbouring faces; distances in spacings"
-    )
+    meshed = "meshes as exported; roughness is the mean angle of neighbouring faces, distances are in spacings"
     fitted = "processor seconds a core; means over five test views, drawn as viewers draw splats"
     parts = {
         "trainings": (quality, QUALITY),

@@ -2,7 +2,8 @@
 
 Each row: processor seconds over the number of processors, Gaussians, and PSNR of five test views,
 drawn as viewers draw splats in windows as large as the images and three times as large each way,
-reduced to the images.
+reduced to the images; how far beside the hull of the masks it shows something where no photograph
+was taken, from below and above, as a share of the object's size.
 """
 
 import argparse
@@ -12,17 +13,26 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
+from pp_cl import Camera
 from pp_cl.engine import FirstFeatures, Model, Renderer, Target, evenly
 from pp_cl.errors import UserError
 from pp_cl.files import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import Run, load
+from pp_cl.scene import up_of
+from pp_cl.scene.hull import hull_on, silhouette
+from pp_studio.camera_path import level
 from pp_studio.export import QUALITIES, QUICK
 from pp_studio.export.gaussians import LEAST_OPAQUE, config_of, fit_gaussians
 
 SIZES = 1, 3  # of the windows, in those of the run's images
 VIEWS = 5
+# Degrees of azimuth and elevation from which the splat is looked at beside the hull, pixels of the
+# images, what share of them the object fills, each way, and alpha that is seen.
+DIRECTIONS = (0, -45), (120, -45), (240, -45), (60, -75), (0, 80)
+SIDE, FILLED, VISIBLE = 400, 0.8, 0.1
 
 
 def row(run: Run, steps: int, cell: float) -> dict:
@@ -45,7 +55,32 @@ def row(run: Run, steps: int, cell: float) -> dict:
         "seconds": round(seconds, 1),
         "gaussians": int((cloud.opacity.get()[:, 0] > LEAST_OPAQUE).sum()),
         "psnr": {size: round(float(np.mean(found)), 2) for size, found in measured.items()},
+        "beside": round(beside_hull(run, renderer), 4),
     }
+
+
+def beside_hull(run: Run, renderer: Renderer) -> float:
+    """How far from the silhouette of the masks' hull an image of DIRECTIONS has an alpha of VISIBLE
+    at most, as a share of the diameter of the run's points.
+    """
+    (centre, radius), cameras = run.ball, run.cameras("train")
+    hull = hull_on(run.dev, run.scene("train").splits["train"], run.model.grid)
+    up = up_of(cameras)
+    ahead = level(cameras[0].eye - centre, up)
+    away = float(np.median([np.linalg.norm(camera.eye - centre) for camera in cameras]))
+    focal, farthest = FILLED * SIDE / 2 * away / radius, 0.0
+    for azimuth, elevation in np.radians(DIRECTIONS):
+        across = np.cos(azimuth) * ahead + np.sin(azimuth) * np.cross(up, ahead)
+        eye = centre + away * (np.cos(elevation) * across + np.sin(elevation) * up)
+        camera = Camera.look_at(eye, centre, up, fx=focal, width=SIDE, height=SIDE)
+        seen = renderer.forward(
+            camera, run.gamma, until="weights", depth_range=run.depth_range(camera)
+        )
+        through = run.dev.download(seen.transmittance).reshape(seen.size)
+        outside = distance_transform_edt(~silhouette(run.model.grid, hull, camera))
+        beside = outside[seen.cropped(through) < 1 - VISIBLE].max(initial=0)
+        farthest = max(farthest, float(beside) / (FILLED * SIDE))
+    return farthest
 
 
 def main() -> int:

@@ -148,9 +148,9 @@ def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     rows = np.flatnonzero(is_seen)
     rows = np.random.default_rng(0).choice(rows, min(SAMPLES, len(rows)), replace=False)
     unseen = np.flatnonzero(~is_seen)
-    for some in np.array_split(unseen, len(unseen) // AT_ONCE + 1):
-        share = 1 / (cdist(positions[some], positions[rows]) + run.model.grid.voxel_size) ** 4
-        found[some] = share @ found[rows] / share.sum(1, keepdims=True)
+    for part in np.array_split(unseen, len(unseen) // AT_ONCE + 1):
+        share = 1 / (cdist(positions[part], positions[rows]) + run.model.grid.voxel_size) ** 4
+        found[part] = share @ found[rows] / share.sum(1, keepdims=True)
     return found
 
 
