@@ -556,7 +556,8 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     beside = "ours, PyTorch's, theirs over ours; medians of interleaved runs"
     if "pytorch" in found:
         beside += f", {found['pytorch'][0]['torch']}"
-    meshed = "meshes as exported; roughness is the mean angle of neighbouring faces, distances are in spacings"
+    meshed = "meshes as exported; roughness is the mean angle of neighbouring faces, distances are"
+    meshed += " in spacings"
     fitted = "processor seconds a core; means over five test views, drawn as viewers draw splats"
     parts = {
         "trainings": (quality, QUALITY),

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.gltf import glb
 from support.splats import colours, draw_splats, read_splats
 
+from pp_cl.engine import FirstFeatures, Model, Renderer
 from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
@@ -36,6 +37,7 @@ from pp_studio.export.splat import (
     write_splat_ply,
     write_splat_spz,
 )
+from tools.splat_quality import beside_hull
 
 # of the training code of 3D Gaussian splatting, for its degree 3
 LAYOUT = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
@@ -154,6 +156,16 @@ def test_windows_are_as_large_as_people_have_them(run, size, least, most):
     assert least <= min(drawn) < 1.1 * least and 0.9 * most < max(drawn) <= most
 
 
+def test_they_are_fitted_to_alpha(run, monkeypatch):
+    trainer = Mock(side_effect=InterruptedError)
+    monkeypatch.setattr(gaussians, "Trainer", trainer)
+    with pytest.raises(InterruptedError):
+        fit_gaussians(run, 10, 0.0)
+    _, config, _, views = trainer.call_args.args
+    assert config.train.mask_weight > 0
+    assert len(views) == 2 * len(run.cameras("train")) and all(view.has_mask for view in views)
+
+
 def test_they_are_fitted_once_for_a_checkpoint(run, monkeypatch):
     table, origin, *_ = fitted_gaussians(run)
     monkeypatch.setattr(gaussians, "Trainer", Mock(side_effect=InterruptedError))
@@ -268,3 +280,27 @@ def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     ours, theirs = colours(harmonics, towards), colours(found["harmonics"], towards * flip)
     assert ours == pytest.approx(theirs, abs=1e-4)
+
+
+def test_a_needle_beside_the_hull_is_measured(run):
+    """By tools/splat_quality.py, whose images from below and above show all of it."""
+    cloud = begun(run, fit_harmonics(run, steps=0), 0)
+    settings = gaussians.config_of(run, 1).raster
+
+    def beside():
+        model = Model(
+            run.dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(run.dev)
+        )
+        return beside_hull(run, Renderer(run.dev, model, settings))
+
+    before = beside()
+    assert before < 0.05
+    offset, opacity = cloud.offset.get(), cloud.opacity.get()
+    highest = run.model.positions()[:, 2].argmax()
+    unit = DEVIATION * run.config.raster.radius * run.model.grid.voxel_size
+    offset[highest, 3:9] = [0, 0, np.log(0.5 / unit), 0, 0, 0]  # upwards, half a unit wide
+    opacity[highest] = 0
+    opacity[highest, 0] = 0.9
+    cloud.offset.set(offset)
+    cloud.opacity.set(opacity)
+    assert beside() > 0.1
