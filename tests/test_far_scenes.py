@@ -103,7 +103,7 @@ def test_exported_meshes_keep_their_places_in_the_world(suffix, tmp_path):
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
     colours = np.arange(12, dtype=np.uint8).reshape(4, 3) * 20
     path = tmp_path / f"a.{suffix}"
-    write_mesh(path, Mesh(in_world(corners, 0.001), faces, colours))
+    write_mesh(path, Mesh(in_world(corners, 0.001), faces, colours, len(faces)))
     read = read_mesh(path)
     np.testing.assert_allclose(read.vertices, corners, rtol=0, atol=1e-9)
     assert np.array_equal(read.faces, faces)

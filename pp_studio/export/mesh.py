@@ -46,14 +46,14 @@ STEPS = 300  # of conjugate gradients, at most
 @dataclass(frozen=True)
 class Mesh:
     """vertices: (V, 3) as in_world() gives them. faces: (F, 3) int32, counter-clockwise from
-    outside. seen: how many of them, the first ones, training views show; others are guessed.
-    colours: (V, 3) uint8 sRGB.
+    outside. colours: (V, 3) uint8 sRGB. seen: how many of the faces, the first ones, training views
+    show; others are guessed.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    seen: int
     colours: np.ndarray
+    seen: int
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
     distance, near = cKDTree(points.positions).query(vertices, list(range(1, count + 1)))
     weight = points.weight[near] / (distance**2 + run.model.grid.voxel_size**2)
     mean = (weight[..., None] * points.colours[near]).sum(1) / weight.sum(1, keepdims=True)
-    return Mesh(vertices, faces, seen, np.rint(mean).astype(np.uint8))
+    return Mesh(vertices, faces, np.rint(mean).astype(np.uint8), seen)
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:

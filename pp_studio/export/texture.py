@@ -170,10 +170,13 @@ def _looked_at(run, camera, positions, normals):
     x, y, z = camera.project(positions[rows])
     rows_seen = shown & solid[row, column] & (z < depth[row, column] + HIDDEN * voxel_size)
     rows, row, column = rows[rows_seen], row[rows_seen], column[rows_seen]
-    rgba, place = rendered.rgba(), np.stack([y, x])[:, rows_seen] - 0.5
-    colours = [map_coordinates(rgba[..., c], place, order=1, mode="nearest") for c in range(3)]
+    # over black, for straight colours beside the object are noise
+    layers = *np.moveaxis(rendered.over((0.0, 0.0, 0.0)), 2, 0), rendered.alpha
+    place = np.stack([y, x])[:, rows_seen] - 0.5
+    *channels, alpha = (map_coordinates(one, place, order=1, mode="nearest") for one in layers)
+    colours = to_8bit(np.stack(channels, 1) / np.maximum(alpha, 1 / 255)[:, None])
     weight = cosine[rows] ** SHARPNESS * np.where(jump[row, column], AT_EDGES, 1)
-    return rows, weight.astype(np.float32), to_8bit(np.stack(colours, 1))
+    return rows, weight.astype(np.float32), colours
 
 
 def agreed(weights: np.ndarray, colours: np.ndarray) -> np.ndarray:
