@@ -14,6 +14,7 @@ may be KIND/TABLE), which holds
     measured   what the numbers are
     columns    [{"head": text, "cell": format}]: format is a str.format of the row's keys
     rows       [{key: value}]; a cell of which a row lacks a key is empty
+    is_plain   the table is shown as on a terminal, if true
 """
 
 import argparse
@@ -68,13 +69,21 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
 
 
+def plain(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table as a terminal shows it."""
+    widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+    line = "  ".join(f"{{:{width}}}" for width in widths)
+    return [f"    {line.format(*cells)}".rstrip() for cells in (heads, *rows)]
+
+
 def table(results: dict) -> str:
     """Markdown of a file of results: what was measured, of which code, and the table."""
     what = results["measured"]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
     caption = f"{what[0].upper()}{what[1:]}. *{sentence(results)}*"
-    return "\n".join([caption, "", *markdown(heads, rows)])
+    lines = plain(heads, rows) if results.get("is_plain") else markdown(heads, rows)
+    return "\n".join([caption, "", *lines])
 
 
 def readme(results: dict) -> dict[str, str]:
@@ -134,24 +143,28 @@ def commands() -> str:
 
 
 def api() -> str:
-    """The public names of each module: of those in TOLD with their signatures and the first
-    sentence of their docstrings, unless another module has named them before.
+    """The public names of the modules in TOLD, with their signatures and the first sentence of
+    their docstrings, unless another module has named them before; then the other modules.
     """
     lines: list[str] = []
     seen: set[int] = set()
-    for name in PUBLIC:
+    for name in TOLD:
         module = importlib.import_module(name)
-        names = public_names(module)
         lines += [f"## {name}", "", _first_sentence(module.__doc__), ""]
-        if name in TOLD:
-            for one in names:
-                thing = getattr(module, one)
-                lines += _described(one, thing) if id(thing) not in seen else [f"- `{one}`: above"]
-                seen.add(id(thing))
-        else:
-            lines += [", ".join(f"`{one}`" for one in names)]
+        for one in public_names(module):
+            thing = getattr(module, one)
+            lines += _described(one, thing) if id(thing) not in seen else [f"- `{one}`: above"]
+            seen.add(id(thing))
         lines += [""]
-    return "\n".join(lines).rstrip()
+    others = [importlib.import_module(name) for name in PUBLIC if name not in TOLD]
+    lines += [
+        "## Other modules",
+        "",
+        "In these, the names in `__all__` are public, or, without it, all that",
+    ]
+    lines += ["are defined there and do not begin with an underscore.", ""]
+    lines += [f"- `{module.__name__}`: {_first_sentence(module.__doc__)}" for module in others]
+    return "\n".join(lines)
 
 
 def public_names(module: ModuleType) -> list[str]:

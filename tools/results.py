@@ -574,6 +574,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
     }
     return {
         name: {"measured": measured, "columns": columns, "rows": rows[name]}
+        | ({"is_plain": True} if name == "stability" else {})
         for name, (measured, columns) in parts.items()
         if rows.get(name)
     }
