@@ -26,7 +26,7 @@ SIZE = 100, 20
 
 Item = TypeVar("Item")
 _told = time.monotonic()  # when the last line was due
-_shown: "Progress | None" = None  # the stage that is shown: those within it are not
+_shown: "Progress | None" = None  # the stage that is shown; stages within it are not
 
 
 class Progress:

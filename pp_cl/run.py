@@ -32,10 +32,10 @@ from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.load import DEMO, Scene, list_split, open_scene, scene_format, scene_frames
 from pp_cl.settings import Config
 
-COMPARED_VIEWS = 2  # training images that tell whether a scene is the run's
-NEAREST = 0.05  # of a point to the eye, in radii of the object
-# Pixels rendered around an image. Without them the corner of a white background has 227 of 255;
-# four more change no pixel by 0.2 of 255, and images of 200 pixels take 8 % more.
+COMPARED_VIEWS = 2  # training images whose pixels show whether a scene is the run's
+NEAREST = 0.05  # distance of drawn points from the eye, in radii of the object
+# Pixels rendered around an image. Without them, the corner of a white background has 227 of 255;
+# four more change no pixel by 0.2 of 255, and an image of 200 pixels takes 8 % longer.
 MARGIN = 4
 
 
@@ -54,7 +54,7 @@ class Run:
 
     @cached_property
     def renderer(self) -> Renderer:
-        """Renders the model, whose parameters must not change any more."""
+        """A renderer of the model, whose parameters must no longer change."""
         self.model.net.freeze()
         supersampling = supersampling_at(self._last_step, self.config.train)
         return Renderer(self.dev, self.model, self.config.raster, supersampling, MARGIN)

@@ -192,8 +192,8 @@ def check_target(path: Path) -> None:
 
 
 def check_room(path: Path, needed: int) -> None:
-    """Raise UserError where the disk of a file, whose folder is there, has no room for so many
-    bytes beside what it holds.
+    """Raise UserError if the disk of a file, whose folder must exist, has less than `needed` bytes
+    free.
     """
     if (free := shutil.disk_usage(path.parent).free) < needed:
         raise UserError(

@@ -45,7 +45,7 @@ class RunFolder:
 
     @property
     def name(self) -> str:
-        """Of the run: that of its folder, or of the one around it that `pp-cl make` fills."""
+        """The run's name: its folder's, or that of the folder around it that `pp-cl make` fills."""
         is_part = self.path.name == MADE and is_owned(self.path.parent)
         return name_of(self.path.parent if is_part else self.path)
 
