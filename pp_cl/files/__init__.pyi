@@ -21,6 +21,7 @@ from .image import read_mask as read_mask
 from .image import read_rgba as read_rgba
 from .image import to_8bit as to_8bit
 from .image import write_png as write_png
+from .rendered_view import mean_rendered_view as mean_rendered_view
 from .sheets import contact_sheet as contact_sheet
 from .srgb import linear_to_srgb as linear_to_srgb
 from .srgb import srgb_to_linear as srgb_to_linear
