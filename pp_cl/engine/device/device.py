@@ -116,6 +116,7 @@ class Device:
         self._recording: list[Any] | None = None
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
+        self.scratch_version = 0  # changes when scratch() allocates
         self._programs: dict[Any, Program] = {}
         self._constants: dict[Any, Any] = {}
         self._seconds: dict[str, list[float]] = defaultdict(list)
@@ -184,6 +185,7 @@ class Device:
         """
         held = self._scratch.get(name)
         if held is None or len(held) < n or held.dtype != dtype:
+            self.scratch_version += 1
             held = self._scratch[name] = None  # frees the old one first
             held = self._scratch[name] = self.empty((n,), dtype)
             if zeros:

@@ -82,8 +82,11 @@ def launch_groups(
 
 
 class Call(NamedTuple):
-    """A call of a function: its arguments, what it launched and filled, and what it returned."""
+    """A call of a function: its arguments, what it launched and filled, and what it returned.
+    scratch: Device.scratch_version after it, as launches hold the scratch memory of their time.
+    """
 
+    scratch: int
     given: tuple[Any, ...]
     launches: list[Any]
     result: Any
@@ -104,12 +107,13 @@ def replayed(function: Callable[P, R]) -> Callable[P, R]:
         place: Any = args[1]
         dev, given = place.dev, (args[0], *args[2:], *named, *named.values())
         call = place.calls.get(function)
-        if call is None or not _are_same(given, call.given):
+        version = dev.scratch_version
+        if call is None or call.scratch != version or not _are_same(given, call.given):
             call = None
             place.calls.pop(function, None)  # frees its arrays
             with dev.recording() as launches:
                 result = function(*args, **named)
-            place.calls[function] = Call(given, launches, result)
+            place.calls[function] = Call(dev.scratch_version, given, launches, result)
             return result
         if dev.doubts:
             dev.compare(call.launches, lambda: function(*args, **named))
