@@ -172,7 +172,7 @@ def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, mo
     assert file.exists()
     shown = []
     monkeypatch.setattr(
-        "pp_studio.view.run_view.RunView", lambda _, __, run, ___: shown.append(run)
+        "pp_studio.view.run_view.RunView", lambda _, __, run, *___, **____: shown.append(run)
     )
     with pytest.raises(AttributeError):  # of what is not there to serve
         main(["view", str(folder), "--port", "0"])
