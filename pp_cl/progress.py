@@ -123,7 +123,7 @@ class Progress:
         return f"{self._what}: {', '.join(parts + [self.note] * bool(self.note))}"
 
     def _left(self):
-        left = self._given - self._done / 60
+        left = max(self._given - self._done / 60, 0.0)
         return f"{left:.1f} of {self._given:.1f} minutes left"
 
 

@@ -219,7 +219,8 @@ def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
     mask bounds the rest.
     """
     hull, *_, voxel_size = forgiving_hull(windows, box)
-    seen = np.bincount(np.concatenate([one.inside(hull)[0] for one in windows]), None, len(hull))
+    inside = [one.inside(hull)[0] for one in track(windows, "where the object ends", "image")]
+    seen = np.bincount(np.concatenate(inside), None, len(hull))
     hull = hull[seen >= MOSTLY_SEEN * len(windows)]
     if not len(hull):
         return None

@@ -85,10 +85,12 @@ def median_colours(
         pixels = image[row[chosen], column[chosen]]
         sure = pixels[:, 3] >= OPAQUE
         colours[chosen[sure]] = pixels[sure, :3] / np.float32(255)
-    found = ~np.isnan(seen[..., 0]).all(axis=0)
-    result = np.full((len(positions), 3), UNSEEN, np.float32)
-    result[found] = np.nanmedian(seen[:, found], axis=0)
-    return result
+    with Progress("medians of colours"):
+        seen.sort(axis=0)  # NaN comes last; nanmedian() takes ten times as long
+        count = (~np.isnan(seen[:, :, :1])).sum(axis=0, keepdims=True)
+        middle = np.maximum([(count - 1) // 2, count // 2], 0)
+        median = np.mean([np.take_along_axis(seen, at, axis=0)[0] for at in middle], axis=0)
+        return np.where(count[0] > 0, median, np.float32(UNSEEN))
 
 
 def _turns(normals):

@@ -135,7 +135,7 @@ def test_what_was_written_is_ours_until_somebody_changes_it(tmp_path):
     written.pop(2).unlink()
     written[0].write_text("changed")
     assert ours(written) == written[1:]
-    with pytest.raises(UserError, match=r"x.txt: was not written by pp-cl, .*; put it elsewhere"):
+    with pytest.raises(UserError, match=r"x.txt: pp-cl did not write this, .*; put it elsewhere"):
         check_ours(written, "put it elsewhere")
     write_text(written[0], "new")
     check_ours([*written, filled / "none"])
@@ -167,7 +167,7 @@ def test_a_folder_becomes_ours_only_where_nothing_would_be_lost(tmp_path):
     (foreign / f".a.{DEAD}.pp-cl.tmp").touch()
     with pytest.raises(UserError, match="foreign: holds other files"):
         own(foreign, alone=True)
-    with pytest.raises(UserError, match=r"a\.txt: was not written by pp-cl"):
+    with pytest.raises(UserError, match=r"a\.txt: pp-cl did not write this"):
         own(foreign, [foreign / "a.txt"])
     assert not is_owned(foreign) and len(list(foreign.iterdir())) == 2
     own(foreign, [foreign / "b.txt"])

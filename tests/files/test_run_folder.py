@@ -130,7 +130,7 @@ def test_images_without_a_checkpoint_go_and_others_stay(tmp_path):
     write_png(ours[1], np.zeros((8, 8, 3)))
     ours[1].write_bytes(b"with an arrow")
     folder.check_sheets(30)  # it would not be made again
-    with pytest.raises(UserError, match=f"{ours[1]}: was not written by pp-cl"):
+    with pytest.raises(UserError, match=f"{ours[1]}: pp-cl did not write this"):
         folder.check_sheets(29)
 
 

@@ -172,7 +172,7 @@ def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, mo
     assert file.exists()
     shown = []
     monkeypatch.setattr(
-        "pp_studio.view.run_view.RunView", lambda _, __, run, ___: shown.append(run)
+        "pp_studio.view.run_view.RunView", lambda _, __, run, *___, **____: shown.append(run)
     )
     with pytest.raises(AttributeError):  # of what is not there to serve
         main(["view", str(folder), "--port", "0"])
@@ -205,7 +205,7 @@ def test_what_is_not_its_own_stays(made, tmp_path):
     page = folder / "index.html"
     page.write_text(page.read_text("utf-8") + "mine", "utf-8")
     status, lines = spoken(["make", scene, "--out", folder])
-    assert status == 2 and "index.html: was not written by pp-cl" in lines[-1]
+    assert status == 2 and "index.html: pp-cl did not write this" in lines[-1]
     assert page.read_text("utf-8").endswith("mine")
 
 
