@@ -129,6 +129,7 @@ def no_stray_writes(session_device):
     yield
     session_device.check()
     session_device._scratch.clear()
+    session_device.scratch_version += 1
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ SETTINGS = {
     "train.prune_every": 20,
     "train.prune_weight": 0.2,
     "train.log_every": 10,
+    "train.specular": "off",
 }
 
 # A network's rate changed by 1e-7 of itself and the form for GPUs move the loss by up to 2e-3 in
@@ -40,7 +41,7 @@ def measure(folder):
     scene = write_ball_scene(folder / "ball", views=12, size=96)
     out = folder / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pp_cl.engine.step.SMOOTHING_EVERY", 1)
+        patch.setattr("pp_cl.engine.training.between.SMOOTHING_EVERY", 1)
         patch.setattr("pp_cl.engine.training.schedule.PRUNE_LOOKS", 5)
         assert main(["train", scene, "--out", str(out), *set_words(SETTINGS)]) == 0
     assert main(["eval", str(out)]) == 0

@@ -16,7 +16,7 @@ from pp_cl.engine.network.layers import multiplications
 from pp_cl.engine.raster.weights import listed_fragments
 from pp_cl.engine.views import evenly
 from pp_cl.files.image import read_rgba
-from pp_cl.run import load
+from pp_cl.run import MARGIN, load
 from pp_cl.scene.outline import OUTLINE
 
 BALL = 0.8  # its radius, support.scenes
@@ -90,7 +90,8 @@ def test_work_is_what_a_view_and_a_step_compute(finished, facts, capsys, dev):
     assert found["step"] == step and 0 < dropped < fragments
     network = found["network"]
     assert 0 < network["tiles"] < 1 and network["whole"] == network["multiplications"]
-    assert network["whole"] == multiplications(run.model.net.layers, 24, 24)
+    side = 24 + 2 * MARGIN
+    assert network["whole"] == multiplications(run.model.net.layers, side, side)
     assert main(["info", str(finished), "--work"]) == 0
     text = capsys.readouterr().out
     assert f"{fragments:.0f} fragments, {1 - dropped / fragments:.1%} of them blended" in text

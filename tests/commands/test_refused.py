@@ -15,7 +15,6 @@ TRAIN = "train BALL --out new"
 OF_RUNS = ("eval", "render", "view", "export --format ply", "info --picture a.png")
 SHAPE = "compare --mesh ball.ply"
 WRITTEN = [  # what the command line alone tells, of whatever runs there are
-    ("", "command"),
     ("trian", "did you mean train?"),
     (f"{TRAIN} --iters 6", "did you mean --iterations?"),
     (f"{TRAIN} --preset smal", "did you mean small?"),

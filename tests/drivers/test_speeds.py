@@ -102,7 +102,7 @@ def test_commands_say_which_one_and_why(measured, monkeypatch, capsys):
     found = [fake("A", "a"), fake("B", "b", index="1:0")]
     measured(found, 1.0, 2.0)
     monkeypatch.setattr(drivers, "list_devices", lambda **_: found)
-    monkeypatch.setattr("pp_cl.engine.device.device.describe", lambda d: dict.fromkeys(NAMES, 1))
+    monkeypatch.setattr("pp_cl.engine.device.quirks.describe", lambda d: dict.fromkeys(NAMES, 1))
     assert main(["devices", "--json"]) == 0
     assert [row["default"] for row in json.loads(capsys.readouterr().out)] == [False, True]
     device = SimpleNamespace(name="b", info={"platform": "B"})

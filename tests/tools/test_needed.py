@@ -13,12 +13,13 @@ def test_the_picture_shows_hull_points_and_tiles(finished, dev, tmp_path, monkey
     assert hull.sum() == run.header["initial_points"] and points.sum() == run.model.cloud.count
     assert (hull | ~points).all()
     image, is_computed = needed.tiles(run)
-    assert image.shape == (24, 24, 3) and is_computed.all()  # so small an image is not planned
+    assert image.shape == (32, 32, 3) and is_computed.all()  # so small an image is not planned
     monkeypatch.setattr("pp_cl.engine.network.unet.LEAST_FROZEN", 0)
     large = run.cameras("train")[0].resized(160, 160)
     monkeypatch.setattr(type(run), "cameras", lambda self, split: [large])
     image, is_computed = needed.tiles(run)
-    tiles = image.reshape(40, 4, 40, 4, 3).swapaxes(1, 2).reshape(1600, -1)
+    side = len(image) // 4
+    tiles = image.reshape(side, 4, side, 4, 3).swapaxes(1, 2).reshape(side * side, -1)
     chosen = is_computed[::4, ::4].ravel()
     computed = {tile.tobytes() for tile in tiles[chosen]}
     assert len(tiles[~chosen]) > 100 and all(t.tobytes() in computed for t in tiles[~chosen])

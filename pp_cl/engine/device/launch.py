@@ -105,7 +105,8 @@ def replayed(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def replaying(*args: P.args, **named: P.kwargs) -> R:
         place: Any = args[1]
-        dev, given = place.dev, (args[0], *args[2:], *named, *named.values())
+        # args[0], the device or the network, is that of the place, and would keep itself alive
+        dev, given = place.dev, (*args[2:], *named, *named.values())
         call = place.calls.get(function)
         version = dev.scratch_version
         if call is None or call.scratch != version or not _are_same(given, call.given):

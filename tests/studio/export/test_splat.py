@@ -123,9 +123,7 @@ def test_the_engine_draws_them_as_viewers_do(run, ply):
     small = run.cameras("test")[0]  # in which viewers would draw them too wide
     as_is = drawn.render(small).colour
     mended = drawn.render(window_camera(small, 1.0, kept)).colour
-    run.renderer.release()  # what it recorded before has other scratch memory
     wanted = to_8bit(run.render(small).colour)
-    run.renderer.release()  # and so will the next test
     assert psnr(to_8bit(mended), wanted) > psnr(to_8bit(as_is), wanted) + 1
 
 
