@@ -5,37 +5,53 @@
 #ifndef HIDDEN
 #define HIDDEN 32  // outputs of the first and of the second layer
 #endif
+#ifndef GROUP
+#define GROUP 1
+#endif
 #define LEAST_ALPHA 0.02f  // pixels below this alpha get no colour
 #define BLOCK 4            // outputs that are summed at a time
+
+// A GPU keeps the values of a pixel in local memory: indexed arrays would spill from registers. Value
+// i of a pixel is PLACE(i) values behind its first one; TOGETHER times LANES pixels are a group's.
+#if LANES == 1
+#define KEPT local
+#define TOGETHER 64
+#define PLACE(i) ((i) * TOGETHER)
+#else
+#define KEPT private
+#define TOGETHER 1
+#define PLACE(i) (i)
+#endif
 
 // outputs[j] = bias[j] + sum over i of weight[i, j] * inputs[i], j < count; with relu at least 0.
 // weight: ((count+15)/16, n, 16).
 ALWAYS_INLINE void dense(
-    const floats *inputs,
+    const KEPT floats *inputs,
     const int n,
     global const float *weight,
     global const float *bias,
-    floats *outputs,
+    KEPT floats *outputs,
     const int count,
     const bool relu) {
-    GPU_UNROLLED_FOR (int j = 0; j < count; j += BLOCK) {
+    for (int j = 0; j < count; j += BLOCK) {
         global const float *column = weight + j / 16 * n * 16 + j % 16;
         floats a = bias[j], b = bias[j + 1], c = bias[j + 2], d = bias[j + 3];
-        GPU_UNROLLED_FOR (int i = 0; i < n; i++) {
+        for (int i = 0; i < n; i++) {
             const float4 w = vload4(0, column + i * 16);
-            a += w.x * inputs[i];
-            b += w.y * inputs[i];
-            c += w.z * inputs[i];
-            d += w.w * inputs[i];
+            a += w.x * inputs[PLACE(i)];
+            b += w.y * inputs[PLACE(i)];
+            c += w.z * inputs[PLACE(i)];
+            d += w.w * inputs[PLACE(i)];
         }
-        outputs[j] = relu ? fmax(a, 0.0f) : a;
-        outputs[j + 1] = relu ? fmax(b, 0.0f) : b;
-        outputs[j + 2] = relu ? fmax(c, 0.0f) : c;
-        outputs[j + 3] = relu ? fmax(d, 0.0f) : d;
+        outputs[PLACE(j)] = relu ? fmax(a, 0.0f) : a;
+        outputs[PLACE(j + 1)] = relu ? fmax(b, 0.0f) : b;
+        outputs[PLACE(j + 2)] = relu ? fmax(c, 0.0f) : c;
+        outputs[PLACE(j + 3)] = relu ? fmax(d, 0.0f) : d;
     }
 }
 
-// One work-item per LANES pixels: adds the layer's colours to the pixels that show points.
+// GROUP work-items per TOGETHER * LANES pixels: add the layer's colours to the pixels that show
+// points.
 kernel void specular_forward(
     const uint n,  // pixels
     const uint width,
@@ -51,37 +67,41 @@ kernel void specular_forward(
     global const float *bias_c,         // (16)
     global float *image)                // (H, W, 3)
 {
-    const size_t first = LANES * get_global_id(0);
-    if (first >= n) return;
-    const int count = min(n - (uint)first, (uint)LANES);
-    float alpha[LANES], most = 0.0f;
-    for (int lane = 0; lane < LANES; lane++) {
-        alpha[lane] = lane < count ? 1.0f - transmittance[first + lane] : 0.0f;
-        most = fmax(most, alpha[lane]);
-    }
-    if (most < LEAST_ALPHA) return;
-
+    KEPT floats kept[TOGETHER * INPUTS], other[TOGETHER * HIDDEN];
     const Camera cam = camera_load(camera);
-    floats inputs[INPUTS], direction[3];
-    for (int lane = 0; lane < LANES; lane++) {
-        const uint pixel = first + min(lane, count - 1);
-        for (int c = 0; c < CHANNELS; c++)
-            ((float *)(inputs + c))[lane] = features[(size_t)CHANNELS * pixel + c];
-        const float3 d = direction_of(&cam, pixel % width, pixel / width, side);
-        ((float *)direction)[lane] = d.x;
-        ((float *)(direction + 1))[lane] = d.y;
-        ((float *)(direction + 2))[lane] = d.z;
-    }
-    floats *encoded = inputs + CHANNELS;
-    ENCODE(floats, direction, encoded)
+    for (int own = get_local_id(0); own < TOGETHER; own += GROUP) {
+        const size_t first = LANES * (TOGETHER * get_group_id(0) + own);
+        if (first >= n) return;
+        const int count = min(n - (uint)first, (uint)LANES);
+        float alpha[LANES], most = 0.0f;
+        for (int lane = 0; lane < LANES; lane++) {
+            alpha[lane] = lane < count ? 1.0f - transmittance[first + lane] : 0.0f;
+            most = fmax(most, alpha[lane]);
+        }
+        if (most < LEAST_ALPHA) continue;
 
-    floats seen[HIDDEN], hidden[HIDDEN], colours[BLOCK];
-    dense(inputs, INPUTS, weight_a, bias_a, seen, HIDDEN, true);
-    dense(seen, HIDDEN, weight_b, bias_b, hidden, HIDDEN, true);
-    dense(hidden, HIDDEN, weight_c, bias_c, colours, BLOCK, false);
-    for (int lane = 0; lane < count; lane++)
-        if (alpha[lane] >= LEAST_ALPHA)
-            for (int c = 0; c < 3; c++)
-                image[3 * (first + lane) + c] +=
-                    0.5f * alpha[lane] * ((float *)(colours + c))[lane];
+        KEPT floats *inputs = kept + own, *hidden = other + own;
+        floats direction[3], encoded[INPUTS - CHANNELS];
+        for (int lane = 0; lane < LANES; lane++) {
+            const uint pixel = first + min(lane, count - 1);
+            for (int c = 0; c < CHANNELS; c++)
+                ((KEPT float *)(inputs + PLACE(c)))[lane] = features[(size_t)CHANNELS * pixel + c];
+            const float3 d = direction_of(&cam, pixel % width, pixel / width, side);
+            ((float *)direction)[lane] = d.x;
+            ((float *)(direction + 1))[lane] = d.y;
+            ((float *)(direction + 2))[lane] = d.z;
+        }
+        ENCODE(floats, direction, encoded)
+        UNROLLED_FOR (int i = CHANNELS; i < INPUTS; i++)
+            inputs[PLACE(i)] = encoded[i - CHANNELS];
+
+        dense(inputs, INPUTS, weight_a, bias_a, hidden, HIDDEN, true);
+        dense(hidden, HIDDEN, weight_b, bias_b, inputs, HIDDEN, true);
+        dense(inputs, HIDDEN, weight_c, bias_c, hidden, BLOCK, false);
+        for (int lane = 0; lane < count; lane++)
+            if (alpha[lane] >= LEAST_ALPHA)
+                for (int c = 0; c < 3; c++)
+                    image[3 * (first + lane) + c] +=
+                        0.5f * alpha[lane] * ((KEPT float *)(hidden + PLACE(c)))[lane];
+    }
 }

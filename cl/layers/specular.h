@@ -13,10 +13,10 @@
 // encoded[0..26] of the unit vector d[3] (of floats, or of vectors with a lane per pixel), as NeRF
 // encodes positions: d, then sines and cosines of 2^k pi/2 d, by the double-angle formulas.
 #define ENCODE(type, d, encoded)                                                                   \
-    for (int c = 0; c < 3; c++) {                                                                  \
+    UNROLLED_FOR (int c = 0; c < 3; c++) {                                                         \
         type cosine, sine = sincos(HALF_PI * d[c], &cosine);                                       \
         encoded[c] = d[c];                                                                         \
-        for (int k = 0; k < OCTAVES; k++) {                                                        \
+        UNROLLED_FOR (int k = 0; k < OCTAVES; k++) {                                               \
             encoded[3 + 6 * k + c] = sine;                                                         \
             encoded[6 + 6 * k + c] = cosine;                                                       \
             const type twice = 2.0f * sine * cosine;                                               \

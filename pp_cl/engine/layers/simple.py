@@ -9,10 +9,11 @@ from typing import Any
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
-from pp_cl.engine.device.launch import channel_ranges, lanes
+from pp_cl.engine.device.launch import channel_ranges, lanes, launch_groups
 from pp_cl.engine.layers.tiles import Tiles, all_tiles
 
 GATE, RESAMPLE = "layers/gate", "layers/resample"
+PIXELS_TOGETHER = 64  # of a group of the specular layer on GPUs: TOGETHER of its kernel
 SHARE = 0.25  # of a feature in its colour; features differ by about four times as much
 
 
@@ -129,9 +130,13 @@ def specular_forward(
     for name, array in parameters.items():
         layer, kind = name.split(".")
         named[f"{kind}_{layer}"] = array
-    dev.program("layers/specular", LANES=lanes(dev), HIDDEN=parameters["a.bias"].size).launch(
+    launch_groups(
+        dev,
+        "layers/specular",
         "specular_forward",
-        -(-n // lanes(dev)),
+        -(-n // (PIXELS_TOGETHER if lanes(dev) == 1 else lanes(dev))),
+        most=PIXELS_TOGETHER,
+        defines={"LANES": lanes(dev), "HIDDEN": parameters["a.bias"].size},
         n=n,
         width=image.shape[1],
         side=float(side),
