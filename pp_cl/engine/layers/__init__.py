@@ -1,1 +1,1 @@
-"""The operations of the network: convolutions in variants, pooling, upsampling, gates, tiles."""
+"""The network's operations: convolutions in variants, pooling, upsampling, gates, tiles."""

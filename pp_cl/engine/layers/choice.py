@@ -1,7 +1,7 @@
 """How a device computes convolutions: which variant (direct, Winograd or local) runs for a shape,
-and the sizes that the kernels are built with. Both are shipped, by the kind of device and, for
-CPUs, by the width of their vectors; `python -m tools.tune` measures a row of that table. And the
-memory that the choice takes.
+which sizes the kernels are built with, and how much memory this takes. Variants and sizes are
+shipped by the kind of device and, for CPUs, by the width of their vectors; `python -m tools.tune`
+measures a row of that table.
 """
 
 import math
@@ -32,18 +32,18 @@ VARIANTS: dict[str, Any] = {
     "direct": conv_direct,
     "winograd": conv_winograd,
 }
-# {class of device: the variants that it is offered}. On GPUs "local" is 3 times as fast as "direct"
-# (an NVIDIA H100); Winograd's groups would be one lane, and spill 15 KB of registers.
+# {class of device: the variants that suit it}. On GPUs "local" is 3 times as fast as "direct" (an
+# NVIDIA H100); Winograd would run in groups of one lane, and spill 15 KB of registers.
 OFFERED = {"CPU": ("direct", "winograd"), "GPU": ("local", "direct")}
-# {direction: pixels}: on CPUs Winograd runs in images of at least so many. It is 2.7 times as fast
-# as direct in the paper's network at 256x256, on 2 cores with AVX-512. In smaller images too few
-# tiles share the cost of transforming the weights; channels matter less, from 16 on all gain. Half
-# of a backward pass, the gradients of the weights, gains from 64 pixels on.
+# {direction: pixels}: CPUs use Winograd for images of at least this many pixels. It is 2.7 times as
+# fast as direct in the paper's network at 256x256, on 2 cores with AVX-512. In smaller images too
+# few tiles share the cost of transforming the weights; channels matter less: 16 or more all gain.
+# The gradients of the weights, half of a backward pass, gain from 64 pixels on.
 WINOGRAD_FROM = {"forward": 900, "backward": 400}
 
 # AVX2 has 16 registers of 8 floats, which hold 8 vectors of 16: 4 sums, the weights of a row, and
-# what they are multiplied with. Measured on Zen 3: 1.6 times (forward) and 1.75 times (training)
-# the speed of the numbers for AVX-512.
+# their factors. On Zen 3 this is 1.6 times (forward) and 1.75 times (training) as fast as the sizes
+# for AVX-512.
 _EIGHT_VECTORS = Blocking(
     direct=(4, 1),
     direct_odd=(4, 1),
@@ -55,8 +55,8 @@ _EIGHT_VECTORS = Blocking(
 )
 # {floats of a CPU's vectors: Blocking}
 CPUS = {
-    # AVX-512 has 32 registers of 16 floats. Where groups of 16 channels pair up, two share each
-    # input value and take 8 pixels: 16 accumulators and 6 weights; else one takes 12.
+    # AVX-512 has 32 registers of 16 floats. If groups of 16 channels pair up, two share each input
+    # value and compute 8 pixels: 16 accumulators and 6 weights; otherwise one computes 12.
     16: Blocking(
         direct=(8, 2),
         direct_odd=(12, 1),
@@ -67,10 +67,11 @@ CPUS = {
         winograd_narrow=(12, 12),
     ),
     8: _EIGHT_VECTORS,
-    # Not measured: Arm's and Apple's 32 registers of 4 floats hold 8 vectors of 16, as AVX2's do.
+    # Not measured: Arm's and Apple's 32 registers of 4 floats hold 8 vectors of 16, like AVX2's.
     4: _EIGHT_VECTORS,
 }
-# A work-item has about 255 scalar registers, and a vector of 16 takes 16 of them: 4 pixels.
+# A work-item has about 255 scalar registers, and a vector of 16 takes 16 of them, so it
+# computes 4 pixels.
 GPU = Blocking(
     direct=(4, 1),
     direct_odd=(4, 1),
@@ -85,7 +86,7 @@ def device_class(dev: Device) -> str:
 
 
 def blocking_of(dev: Device) -> Blocking:
-    """The shipped sizes of a device's kernels."""
+    """The shipped kernel sizes for a device."""
     if not dev.is_cpu:
         return GPU
     width = dev.device.native_vector_width_float
@@ -93,15 +94,16 @@ def blocking_of(dev: Device) -> Blocking:
 
 
 def can_run(variant: str, k: int, *channels: int) -> bool:
-    """Whether a variant takes a K x K kernel and these numbers of channels, of each source and of
-    the output.
+    """Whether a variant supports a K x K kernel and these numbers of channels, of each source and
+    of the output.
     """
     return variant != "winograd" or (k == 3 and conv_winograd.fits(*channels))
 
 
 def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> str:
-    """What computes a convolution, of VARIANTS. variant: a name there is taken wherever it can run,
-    "direct" elsewhere; AUTO takes the shipped choice. Raises ValueError for another variant.
+    """Choose the variant, a key of VARIANTS, that computes a convolution. variant: this one
+    wherever it can run, otherwise "direct"; AUTO: the shipped choice. Raises ValueError for an
+    unknown variant.
     """
     if variant not in (AUTO, *VARIANTS):
         raise ValueError(f"variant {variant!r}: must be one of {', '.join((AUTO, *VARIANTS))}")
@@ -114,8 +116,8 @@ def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> str:
 
 
 def work_table(variant: str, shape: ConvShape) -> Table:
-    """The arrays that a convolution takes beside the layer's own: "work" and "partial" of Conv, of
-    which it may need none.
+    """The arrays that a convolution needs besides the layer's own: "work" and "partial" of Conv, or
+    neither.
     """
     shapes: dict[str, tuple[int, ...]] = {}
     if shape.direction == "backward":
@@ -127,9 +129,9 @@ def work_table(variant: str, shape: ConvShape) -> Table:
 
 
 def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> None:
-    """Write the weights that convolutions read to Conv.work, in one launch.
+    """Write the weights in the layout that convolutions read to Conv.work, in one launch.
 
-    weights, work: (?,) float32, in which Conv.weight and Conv.work lie.
+    weights, work: (?,) float32, the arrays that contain Conv.weight and Conv.work.
     """
     rows, n = [], 0
     for conv in convs:
@@ -161,13 +163,13 @@ def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> 
 
 
 def _blocks(channels):
-    """Groups of 16 of these numbers of channels."""
+    """Groups of 16 in each of these numbers of channels."""
     return [-(-c // VECTOR) for c in channels]
 
 
 def prepared(dev: Device, shape: ConvShape, weight: Array, bias: Array) -> Conv:
-    """What computes a convolution's output by the shipped choice; its weights, which do not change,
-    are laid out in an array of its own.
+    """A Conv that computes a convolution's output by the shipped choice; its weights, which do not
+    change, are laid out in an array of its own.
     """
     conv = Conv(dev, blocking_of(dev), choose(dev, shape), shape, weight, bias)
     for row in work_table(conv.variant, shape).values():

@@ -1,8 +1,8 @@
 """What all convolutions share: the layout of weights, and the sums of the parts of their gradients.
 
-All are convolutions K x K (K = 1 or 3) of stride 1 with zero padding K // 2. conv_direct.py,
+All convolutions are K x K (K = 1 or 3), with stride 1 and zero padding K // 2. conv_direct.py,
 conv_local.py and conv_winograd.py compute them, each with the functions forward() and backward();
-choice.py says which one is taken.
+choice.py selects one.
 """
 
 import math
@@ -18,9 +18,9 @@ from pp_cl.engine.device.device import Device, Program
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.layers.tiles import VECTOR
 
-# What of a convolution is computed: its output, or the gradients of its inputs, weights and bias.
+# A convolution computes its output, or the gradients of its inputs, weights and bias.
 DIRECTIONS = ("forward", "backward")
-# The parts of gradients take at most this many floats (64 MiB), or one part if that is larger.
+# The parts of gradients take at most this many floats (64 MiB), or those of one part if larger.
 PARTIAL_FLOATS = 1 << 24
 
 
@@ -28,8 +28,8 @@ PARTIAL_FLOATS = 1 << 24
 class ConvShape:
     """One direction of a convolution.
 
-    direction: one of DIRECTIONS. k: side of the kernel. sources: channels of each input, one or
-    two, which are read as one. co: output channels. size: (height, width) of the image.
+    direction: one of DIRECTIONS. k: side of the kernel. sources: channels of each input; two inputs
+    are concatenated. co: output channels. size: (height, width) of the image.
     """
 
     direction: str
@@ -51,15 +51,15 @@ class ConvShape:
 
 @dataclass(frozen=True)
 class Blocking:
-    """Sizes that kernels are built and launched with. They change speed, and the rounding of
+    """Sizes that kernels are built and launched with. They change the speed, and the rounding of
     winograd_backward.cl, which sums `winograd_weights` tiles at a time.
 
-    direct: (pixels of a row, groups of 16 output channels) of a work-item of direct.h, where the
-    groups come in multiples of that number; direct_odd: the same for other channels. accumulators:
-    float16 sums of weights' gradients that a work-item keeps in registers. work_group: of direct
-    convolutions, None = the launcher's default. winograd_groups: groups of 16 output channels that
-    Winograd's kernels multiply together, where the groups come in multiples of that number.
-    winograd: (tiles transformed at a time, tiles multiplied together) there; winograd_narrow: the
+    direct: (pixels of a row, groups of 16 output channels) that a work-item of direct.h computes,
+    if their number is a multiple of that; direct_odd: the same otherwise. accumulators: float16
+    sums of weights' gradients that a work-item keeps in registers. work_group: work-group size of
+    direct convolutions, None = the launcher's default. winograd_groups: groups of 16 output
+    channels that Winograd's kernels multiply together, if their number is a multiple of that.
+    winograd: (tiles transformed at a time, tiles multiplied together) in them; winograd_narrow: the
     same for few channels (conv_winograd.NARROW). winograd_weights: tiles transformed at a time for
     the gradients of weights.
     """
@@ -69,9 +69,9 @@ class Blocking:
     accumulators: int
     work_group: tuple[int, int, int] | None
     winograd_groups: int = 2
-    # More tiles at a time use the transformed weights better, fewer leave more room in the caches.
-    # The second number divides the first: with 2 groups of channels, 8 take 16 of AVX-512's 32
-    # vectors, 12 take 24.
+    # More tiles at a time reuse transformed weights better, fewer leave more room in the caches.
+    # The second number divides the first: with 2 groups of channels, 8 tiles take 16 of AVX-512's
+    # 32 vectors, 12 take 24.
     winograd: tuple[int, int] = (64, 8)
     winograd_narrow: tuple[int, int] = (12, 12)
     winograd_weights: int = 32
@@ -81,11 +81,11 @@ class Blocking:
 class Conv:
     """One direction of a layer's convolution on a device.
 
-    variant: what computes it, a key of choice.VARIANTS. weight, bias: the layer's, (ceil(CO/16), K,
-    K, CI, 16) and (ceil(CO/16) * 16,) float32. work: the weights as the kernels read them, by
-    default as they are. partial: of the direction "backward", the parts of the gradients of the
-    weights and biases. Both are of choice.work_table(). is_halved: whether what follows halves the
-    output: backward() takes the gradient of that.
+    variant: a key of choice.VARIANTS, which computes it. weight, bias: the layer's, (ceil(CO/16),
+    K, K, CI, 16) and (ceil(CO/16) * 16,) float32. work: the weights as the kernels read them, by
+    default `weight`. partial: for the direction "backward", the parts of the gradients of the
+    weights and biases. choice.work_table() gives the shapes of both. is_halved: True for the last
+    layer, whose output is halved afterwards; backward() gets the gradient of the halved output.
     """
 
     dev: Device
@@ -103,7 +103,7 @@ class Conv:
 
 
 def pack_weights(weight: np.ndarray, dtype: type = np.float32) -> np.ndarray:
-    """(CO, CI, K, K) -> (ceil(CO / 16), K, K, CI, 16), output channels beyond CO zero."""
+    """(CO, CI, K, K) -> (ceil(CO / 16), K, K, CI, 16); output channels beyond CO are zero."""
     co, ci, k, _ = weight.shape
     packed = np.zeros((-(-co // VECTOR) * VECTOR, ci, k, k), dtype)
     packed[:co] = weight
@@ -127,36 +127,38 @@ def packed_shape(k: int, ci: int, co: int) -> tuple[int, int, int, int, int]:
 
 
 def parts_shape(parts: int, shape: ConvShape) -> tuple[int, int, int, int]:
-    """The shape of an array for so many parts of the gradients of weights and biases."""
+    """The shape of an array for a number of parts of the gradients of weights and biases."""
     return parts, -(-shape.co // VECTOR), shape.k**2 * shape.ci + 1, VECTOR
 
 
 def most_parts(shape: ConvShape) -> int:
-    """The parts for which there is memory."""
+    """How many parts fit in memory, at least 1."""
     return max(1, PARTIAL_FLOATS // math.prod(parts_shape(1, shape)))
 
 
 def first_float(array: Array) -> int:
-    """Where an array of packed_arrays() begins in the whole; 0 for one with a buffer of its own."""
+    """The index of an array's first float in the whole of packed_arrays(); 0 if it has its own
+    buffer.
+    """
     data: Any = array.base_data
     return data.offset // array.dtype.itemsize
 
 
 def mask_bits(masks: Sequence[bool]) -> int:
-    """The argument `masked` of kernels: a bit for each source."""
+    """The argument `masked` of kernels: one bit for each source."""
     return sum(1 << i for i, is_masked in enumerate(masks) if is_masked)
 
 
 def weights_program(dev: Device, transforms: bool = False) -> Program:
-    """The kernels of layers/weights.cl. transforms: whether Winograd's weights are laid out, which
-    on GPUs spills registers.
+    """The kernels of layers/weights.cl. transforms: whether they lay out Winograd's weights, which
+    spills registers on GPUs.
     """
     return dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=int(dev.is_cpu or transforms))
 
 
 class GradientParts(NamedTuple):
-    """Of the gradients of the weights and biases of several convolutions, as kernels take them
-    (cl/layers/parts.h). n: vectors of 16 of all gradients. table: (convolutions, 8) int32. partial:
+    """The parts of the gradients of several convolutions' weights and biases, as kernels read them
+    (cl/layers/parts.h). n: vectors of 16 in all gradients. table: (convolutions, 8) int32. partial:
     (?,) float32, the parts.
     """
 
@@ -168,11 +170,11 @@ class GradientParts(NamedTuple):
 def gradient_parts(
     parts: Sequence[tuple[Conv, int]], table: PackedArrays, partial: Array
 ) -> GradientParts:
-    """What backward() of convolutions has left in `partial`, (?,) float32, in which Conv.partial
-    lie.
+    """The parts that backward() of convolutions left in `partial`, (?,) float32, which contains
+    each Conv.partial.
 
-    parts: [(convolution, number of parts)]. table: for what kernels read of them, until the next
-    call with it.
+    parts: [(convolution, number of parts)]. table: holds the table that kernels read, until the
+    next call with it.
     """
     rows, n = [], 0
     for conv, count in parts:
@@ -185,9 +187,9 @@ def gradient_parts(
 
 
 def sum_parts(dev: Device, parts: GradientParts, grad_weights: Array, grad_biases: Array) -> None:
-    """Overwrite the gradients of weights and biases by the sums, in order, of their parts.
+    """Overwrite the gradients of weights and biases with the sums of their parts, in order.
 
-    grad_weights, grad_biases: (?,) float32, in which the gradients lie as Conv.weight and Conv.bias
+    grad_weights, grad_biases: (?,) float32; the gradients lie in them as Conv.weight and Conv.bias
     do in their arrays.
     """
     weights_program(dev).launch(

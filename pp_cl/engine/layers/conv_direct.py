@@ -1,4 +1,4 @@
-"""Direct convolutions, of any channels, 1x1 and 3x3: the launches of conv.cl and of
+"""Direct convolutions, 1x1 and 3x3, with any number of channels: launches conv.cl and
 conv_backward.cl.
 """
 
@@ -11,16 +11,16 @@ from pp_cl.engine.device.device import Program
 from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits, most_parts
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles
 
-# Rows of the image that one work-item sums for the gradient of the weights: few enough to stay in a
-# core's cache, and enough parts for all cores.
+# Image rows that one work-item sums for the gradient of the weights: few enough to stay in a core's
+# cache, and to give all cores a part.
 ROWS_PER_PART = 8
 
 
 def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
     """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
 
-    sources: one or two of (H, W, C1), (H, W, C2) float32; out: (H, W, CO) float32; tiles: those of
-    out to compute. Raises ValueError for arrays and tiles of other shapes.
+    sources: one or two of (H, W, C1), (H, W, C2) float32; out: (H, W, CO) float32; tiles: the tiles
+    of out to compute. Raises ValueError for arrays and tiles of other shapes.
     """
     shape = conv.shape
     program, size = _program(conv, "layers/conv", (shape.co,), (tiles,))
@@ -55,17 +55,18 @@ def backward(
     tiles: Tiles,
     grad_tiles: Tiles,
 ) -> int:
-    """Write the gradients of the sources, and those of the weights and biases of forward() as sums
-    of the image's parts to conv.partial; returns the number of parts, which conv.sum_parts() sums.
+    """Write the gradients of the sources, and write to conv.partial the gradients of the weights
+    and biases of forward(), one sum for each part of the image; returns the number of parts, which
+    conv.sum_parts() adds up.
 
-    grad_out: (H, W, CO) float32, dL/dout before the ReLU. grads: like the sources. masks: of each
-    source, whether it is a ReLU's output: then its gradient is that of the ReLU's input. tiles:
-    those of grad_out to sum, each as often as it counts; grad_tiles: those of grads to compute. The
-    order of the sums depends on the shapes alone, with other variants on the number of tiles too.
-    Raises ValueError as forward().
+    grad_out: (H, W, CO) float32, dL/dout before the ReLU. grads: like the sources. masks: for each
+    source, whether it is a ReLU's output: then its gradient is that of the ReLU's input. tiles: the
+    tiles of grad_out to sum, each multiplied by its count; grad_tiles: the tiles of grads to
+    compute. The order of the sums depends on the shapes alone; in other variants also on the number
+    of tiles. Raises ValueError like forward().
     """
     shape, (height, width), parts = conv.shape, conv.shape.size, parts_of(conv.shape)
-    # input channels of a work-item, whose sums, k for each, fit the registers
+    # input channels of a work-item: the sums, k for each channel, must fit the registers
     most = conv.blocking.accumulators // shape.k
     group = next(n for n in (16, 8, 4, 2, 1) if n <= most and math.gcd(*shape.sources) % n == 0)
     file, maps = "layers/conv_backward", (tiles, grad_tiles)
@@ -75,7 +76,7 @@ def backward(
         "conv_backward",
         sums + others,
         conv.blocking.work_group and 1,
-        # as if all work-items did as much as those that do the most
+        # as if all work-items did as much work as the busiest
         multiply_adds=height * width * shape.products * (sums + others) / min(sums, others),
         height=height,
         width=width,
@@ -98,20 +99,20 @@ def backward(
 
 
 def parts_of(shape: ConvShape) -> int:
-    """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
+    """The most parts into which the sum over an image for the gradient of weights is cut."""
     return -(-shape.size[0] // _rows(shape))
 
 
 def _rows(shape):
-    """Of one part."""
+    """Image rows in one part."""
     return max(ROWS_PER_PART, -(-shape.size[0] // most_parts(shape)))
 
 
 def _program(
     conv: Conv, file: str, channels: Sequence[int], tiles: Sequence[Tiles], **defines: int
 ) -> tuple[Program, tuple[int, int, int]]:
-    """(program, work-items) for results of so many channels each; no work-item computes groups of
-    channels or a row in vain.
+    """(program, work-items) for results with these numbers of channels; no work-item computes
+    unneeded groups of channels or rows.
     """
     for of_map in tiles:
         of_map.check(conv.shape.size)

@@ -1,5 +1,5 @@
-"""Direct convolutions for GPUs: a work-group shares inputs and weights in local memory, and
-computes tiles of a list. Any channels, 1x1 and 3x3; the launches of conv_local.cl and of
+"""Direct convolutions for GPUs, 1x1 and 3x3, with any number of channels: a work-group shares
+inputs and weights in local memory, and computes tiles of a list. Launches conv_local.cl and
 conv_local_backward_weights.cl.
 """
 
@@ -13,19 +13,19 @@ from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits, most_parts
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles, grid_shape
 
 QUAD = 4  # channels of a work-item
-# Pixels of a work-item: two lines of a tile, ROWS in cl/layers/conv_local.cl.
+# Work-items of a tile: each computes two lines of it, ROWS in cl/layers/conv_local.cl.
 TILE_PARTS = 2
-# Work-items of a group that are tried, until a device runs so many. More share the weights, and fit
-# 32 KiB of local memory up to the first number.
+# Group sizes, tried in turn until the device runs one. Larger groups share the weights among more
+# work-items; the largest still fits 32 KiB of local memory.
 GROUPS = (256, 128, 64, 32)
-# {side of the kernel: groups of four input channels of a work-group} in the gradient of the weights
+# {side of the kernel: groups of four input channels of a work-group} for the weights' gradient
 CI_QUADS = {3: 4, 1: 8}
-# Tiles that a work-item sums in registers there, at most: one sum over an image of background would
-# lose digits. Fewer of narrow images, so that it sums half as many pixels as the direct kernel,
-# which sums a row: errors stay below that one's.
+# The most tiles that a work-item sums in registers there: a single sum over an image of background
+# would lose digits. In narrow images it sums fewer, half as many pixels as the direct kernel, which
+# sums a row, so that its errors stay below that kernel's.
 SUMMED = 4
-# Parts of that sum: each of at least so many tiles, and no more than fill a large GPU: so many
-# work-groups in all.
+# Each part of that sum has at least PART_TILES tiles, and all parts together have at most about
+# MOST_GROUPS work-groups, which fill a large GPU.
 PART_TILES = 8
 MOST_GROUPS = 512
 
@@ -33,7 +33,7 @@ MOST_GROUPS = 512
 def forward(conv: Conv, sources: Sequence[Array], out: Array, *, relu: bool, tiles: Tiles) -> None:
     """See conv_direct."""
     shape = conv.shape
-    if conv.bias.size != -(-shape.co // VECTOR) * VECTOR:  # which the kernel takes in any length
+    if conv.bias.size != -(-shape.co // VECTOR) * VECTOR:  # the kernel would not notice
         raise ValueError(f"bias has shape {conv.bias.shape}, expected that of {shape.co} channels")
     _launch(conv, shape.sources, (shape.co,), sources, (out,), (out,), (False,), relu, tiles)
 
@@ -48,7 +48,7 @@ def backward(
     tiles: Tiles,
     grad_tiles: Tiles,
 ) -> int:
-    """See conv_direct. In two launches: groups of both kinds have other sizes."""
+    """See conv_direct. Uses two launches, as the two kernels need different group sizes."""
     shape = conv.shape
     _launch(conv, (shape.co,), shape.sources, (grad_out,), grads, sources, masks, False, grad_tiles)
     k, co, (_, width) = shape.k, shape.co, shape.size
@@ -78,7 +78,7 @@ def backward(
 
 
 def parts_of(shape: ConvShape) -> int:
-    """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
+    """The most parts into which the sum over an image for the gradient of weights is cut."""
     quads = _quads((shape.co,), _is_aligned(*shape.sources, shape.co))
     groups = -(-shape.ci // (QUAD * CI_QUADS[shape.k])) * -(-shape.co // (QUAD * quads))
     tiles = math.prod(grid_shape(*shape.size))
@@ -87,8 +87,8 @@ def parts_of(shape: ConvShape) -> int:
 
 
 def _launch(conv, inputs, channels, xs, results, mask_arrays, masks, relu, tiles):
-    """Convolve arrays of so many channels each to the tiles of results of so many; in the largest
-    groups that the device runs.
+    """Convolve the arrays xs, with `inputs` channels each, and write `tiles` of the results, with
+    `channels` each, in the largest groups that the device runs.
     """
     tiles.check(conv.shape.size)
     aligned = _is_aligned(*channels, *inputs)
@@ -129,7 +129,7 @@ def _launch(conv, inputs, channels, xs, results, mask_arrays, masks, relu, tiles
 
 
 def _weights_program(conv: Conv) -> tuple[Program, int, int]:
-    """(program, groups of four output channels and work-items of a work-group)."""
+    """(program, groups of four output channels in a work-group, its work-items)."""
     k, aligned = conv.shape.k, _is_aligned(*conv.shape.sources, conv.shape.co)
     most = _quads((conv.shape.co,), aligned)
     for in_group in (n for n in (16, 8, 4) if n <= most):
@@ -147,13 +147,13 @@ def _weights_program(conv: Conv) -> tuple[Program, int, int]:
 
 
 def _is_aligned(*channels):
-    """Whether four channels of a pixel are read and written at once."""
+    """Whether a pixel's channels can be read and written four at a time."""
     return all(c % QUAD == 0 for c in channels)
 
 
 def _quads(channels, aligned):
-    """Groups of four of a result's channels that a work-group computes: 16, 8 or 4, so that nothing
-    is computed in vain. Channels that are not aligned are few.
+    """How many groups of four of a result's channels a work-group computes: 16, 8 or 4, so that it
+    computes none in vain; 4 for channels that are not aligned, as they are few.
     """
     blocks = (-(-c // VECTOR) for c in channels)
     return VECTOR // QUAD * (math.gcd(4, *blocks) if aligned else 1)

@@ -1,6 +1,6 @@
-"""3x3 convolutions by Winograd's minimal filtering F(4 x 4, 3 x 3): 4 times fewer multiplications
-than the direct ones, at two or three times the error. Channels come in multiples of 16. The
-launches of winograd.cl and winograd_backward.cl; results do not depend on the number of compute
+"""3x3 convolutions by Winograd's minimal filtering F(4 x 4, 3 x 3), with 4 times fewer
+multiplications than the direct ones, at two or three times the error. Channels must be multiples of
+16. Launches winograd.cl and winograd_backward.cl; results do not depend on the number of compute
 units.
 """
 
@@ -12,15 +12,15 @@ from pp_cl.engine.layers.conv import Conv, ConvShape, mask_bits
 from pp_cl.engine.layers.tiles import SIDE, VECTOR, Tiles
 
 POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile
-# Weights of at most so many channels in times channels out are narrow: transformed they take 2.25
-# MiB, about what a core's L2 cache holds, and reading them for fewer tiles at a time costs little.
+# Weights are narrow if input channels times output channels are at most this: transformed they take
+# 2.25 MiB, about a core's L2 cache, and reading them for fewer tiles at a time costs little.
 NARROW = 128 * 128
-# At most this many input and output channels of the gradient of the weights at a time: smaller
-# parts transform the same tiles more often, larger ones outgrow a core's cache.
+# The most input and output channels in a part of the gradient of the weights: smaller parts
+# transform the same tiles more often, larger ones outgrow a core's cache.
 CI_PART, CO_PART = 128, 128
-# In these gradients, weights of at most so many channels in times channels out are narrow: their
-# sums, 36 floats each, fit a core's cache. Cutting them would transform each tile more than once.
-# The tiles are cut in their place, into 2, 4, 8 or 16 parts of LEAST_TILES or more.
+# In these gradients, weights are narrow if input times output channels are at most this: their
+# sums, 36 floats each, fit a core's cache. Cutting them would transform each tile more than once;
+# the tiles are cut instead, into 2, 4, 8 or 16 parts of LEAST_TILES or more.
 NARROW_SUMS = 64 * 128
 LEAST_TILES, MOST_PARTS = 80, 16
 COUNTERS = VECTOR  # floats at the front of the scratch, 0 between kernels (cl/layers/winograd.h)
@@ -102,24 +102,24 @@ def backward(
 
 
 def parts_of(shape: ConvShape) -> int:
-    """Into how many parts the sum over an image for the gradient of weights is cut, at most."""
+    """The most parts into which the sum over an image for the gradient of weights is cut."""
     return MOST_PARTS if _is_narrow(shape.ci, shape.co) else 1
 
 
 def transformed_shape(shape: ConvShape) -> tuple[int]:
-    """Of the transformed weights, as cl/layers/winograd.h lays them out."""
+    """The shape of the transformed weights, laid out as in cl/layers/winograd.h."""
     return (POSITIONS * (shape.ci * shape.co + VECTOR),)
 
 
 def reserve_scratch(convs: Iterable[Conv]) -> None:
-    """Allocate the scratch for all of the convolutions at once, before launches hold it."""
+    """Allocate the scratch of all these convolutions at once, before launches hold it."""
     transformed = [conv for conv in convs if conv.variant == "winograd"]
     if transformed:
         _scratch(max(transformed, key=scratch_floats))
 
 
 def scratch_floats(conv: Conv) -> int:
-    """Floats of the scratch that all convolutions share: each compute unit's slice of it."""
+    """Floats in the scratch that all convolutions share: a slice for each compute unit."""
     ci, co = conv.shape.ci, conv.shape.co
     vectors = POSITIONS * ((ci + co) // VECTOR * _at_once(conv)[0] + 3)
     if conv.shape.direction == "backward":
@@ -137,7 +137,7 @@ def _scratch(conv: Conv) -> Array:
 
 
 def _defines(conv, channels):
-    """Of a program for a result of so many channels."""
+    """The defines of a program whose result has this many channels."""
     at_once, together = _at_once(conv)
     return {"TILES": at_once, "TOGETHER": together, "BLOCKS": _groups(conv, channels)}
 
@@ -159,7 +159,9 @@ def _is_narrow(ci, co):
 
 
 def _tile_parts(number, ci, co):
-    """Parts of `number` tiles: a power of two, which most numbers of compute units share evenly."""
+    """The parts to cut `number` tiles into: a power of two, which most numbers of compute units
+    share evenly.
+    """
     parts = 1
     while _is_narrow(ci, co) and parts < MOST_PARTS and number >= 2 * parts * LEAST_TILES:
         parts *= 2
@@ -167,8 +169,8 @@ def _tile_parts(number, ci, co):
 
 
 def _ci_part(units, ci, co):
-    """Input channels of one part, where the tiles are not cut: few enough that every compute unit
-    gets a part.
+    """Input channels of one part if the tiles are not cut: few enough that every compute unit gets
+    a part.
     """
     wanted = -(-units // -(-co // CO_PART))
     return min(CI_PART, max(1, ci // (VECTOR * wanted)) * VECTOR)

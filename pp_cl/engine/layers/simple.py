@@ -1,7 +1,8 @@
-"""The network's layers that are no convolutions, on (H, W, C) float32 feature maps: gates, pooling,
-bilinear upsampling, and the image at the end.
+"""The network's layers other than convolutions, on (H, W, C) float32 feature maps: gates, pooling,
+bilinear upsampling, and the final image.
 
-tiles: those of the result to compute, None = all. All raise ValueError for shapes that do not fit.
+tiles: the tiles of the result to compute, None = all. All functions raise ValueError for shapes
+that do not fit.
 """
 
 from typing import Any
@@ -13,8 +14,9 @@ from pp_cl.engine.device.launch import channel_ranges, lanes, launch_groups
 from pp_cl.engine.layers.tiles import Tiles, all_tiles
 
 GATE, RESAMPLE = "layers/gate", "layers/resample"
-PIXELS_TOGETHER = 64  # of a group of the specular layer on GPUs: TOGETHER of its kernel
-SHARE = 0.25  # of a feature in its colour; features differ by about four times as much
+# pixels of a work-group of the specular layer on GPUs: TOGETHER of its kernel
+PIXELS_TOGETHER = 64
+SHARE = 0.25  # of a feature in its colour: features vary about four times as much as colours
 
 
 def gate_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
@@ -48,8 +50,8 @@ def avgpool2_backward(
     """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where mask
     <= 0.
 
-    mask: what was pooled, where it is a ReLU's output, else None; grad_x: gradient of its other
-    use; grad_out: (H, W, C).
+    mask: the pooled array if it is a ReLU's output, otherwise None; grad_x: gradient through its
+    other use; grad_out: (H, W, C).
     """
     masking = {"masked": mask is not None, "x": mask}
     arrays, of_items = {"grad_out": grad_out, "grad_x": grad_x}, grad_x.shape
@@ -58,7 +60,7 @@ def avgpool2_backward(
 
 
 def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
-    """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C)."""
+    """out (H // 2, W // 2, C) = maximum of 2x2 pixels of x (H, W, C)."""
     h, w, c = out.shape
     if (x.shape[0] // 2, x.shape[1] // 2, x.shape[2]) != out.shape:
         raise ValueError(f"max pooling of {x.shape} to {out.shape}")
@@ -83,8 +85,8 @@ def upsample2_backward(
 
 
 def _launch(dev, file, kernel, shape, result, tiles, of_items=None, **arguments):
-    """Launch a kernel that computes `tiles` of the array `result`. shape: its h, w, c, those of the
-    smaller map. of_items: shape of the map that has the work-items, if it is another.
+    """Launch a kernel that computes `tiles` of the array `result`. shape: h, w, c of the smaller
+    map. of_items: shape of the map that the work-items cover, if it is the other one.
     """
     h, w, c = shape
     size, work_group = channel_ranges(dev, *(of_items or shape))
@@ -95,9 +97,9 @@ def _launch(dev, file, kernel, shape, result, tiles, of_items=None, **arguments)
 
 
 def output_forward(dev: Device, image: Array, features: Array | None) -> None:
-    """image (H, W, 3) = 0.5 + 0.5 * image, and SHARE * (the first three of the features (H, W, C)
-    - the background's 1), if they are given: a residual connection past the network. For the
-    gradient see Conv.is_halved and residual_backward().
+    """image (H, W, 3) = 0.5 + 0.5 * image. If features (H, W, C) are given, adds SHARE * (the first
+    three of them - the background's 1): a residual connection past the network. For the gradient
+    see Conv.is_halved and residual_backward().
     """
     named = {"residual": features is not None, "share": SHARE, "features": features}
     shape = image.shape if features is None else features.shape
@@ -105,8 +107,8 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
 
 
 def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
-    """Add the gradient through the residual connection, of grad_image (H, W, 3), to grad_features
-    (H, W, C).
+    """Add the gradient through the residual connection to grad_features (H, W, C), given grad_image
+    (H, W, 3).
     """
     grads = {"grad_image": grad_image, "grad_features": grad_features}
     _per_pixel(dev, "residual_backward", grad_features.shape, share=SHARE, **grads)
@@ -121,9 +123,9 @@ def specular_forward(
     camera: Array,
     side: int,
 ) -> None:
-    """Add the colours of a specular layer to the image (H, W, 3), by the features (H, W, 16) and
-    the transmittance (H * W,) of a view. parameters: of network/specular.py. camera: (21,), with
-    side x side pixels for each of the image.
+    """Add the colours of a specular layer to the image (H, W, 3), given the features (H, W, 16) and
+    the transmittance (H * W,) of a view. parameters: see network/specular.py. camera: (21,), with
+    side x side pixels for each pixel of the image.
     """
     n = image.shape[0] * image.shape[1]
     named: dict[str, Any] = {}
@@ -160,6 +162,6 @@ def first_features_backward(dev: Device, grad_image: Array, grad_features: Array
 
 
 def _per_pixel(dev, kernel, shape, **arguments):
-    """Launch a kernel of output.cl. shape: of the features."""
+    """Launch a kernel of output.cl. shape: the features' shape."""
     n = shape[0] * shape[1]
     dev.program("layers/output").launch(kernel, n, n=n, channels=shape[2], **arguments)

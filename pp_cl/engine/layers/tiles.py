@@ -1,8 +1,8 @@
-"""Tiles of 4 x 4 pixels of a feature map: lists of those that a kernel computes, tests for tiles
-that are not background, and copies from tile to tile.
+"""Tiles of 4 x 4 pixels of a feature map: lists of the tiles that a kernel computes, tests for
+tiles that are not background, and copies from tile to tile.
 
 A feature map of (height, width) pixels has ceil(height / 4) x ceil(width / 4) tiles, numbered row
-by row; the last ones may be cut off by the border.
+by row; the border may cut off the last ones.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import channel_ranges, lanes
 
 VECTOR = 16  # channels in one float16
-# pixels: the outputs of F(4x4, 3x3), and one pixel after the network has halved its input twice
+# pixels: F(4x4, 3x3) outputs this many, and the network's two halvings make one pixel of them
 SIDE = 4
 
 
@@ -24,9 +24,9 @@ class Tiles:
     """The tiles of a feature map that a kernel computes.
 
     size: (height, width) of the feature map. number: how many tiles are computed. list: (?,) int32:
-    height, width, number, the computed tiles ascending. count: (rows, columns) float32: in sums
-    over the whole feature map a computed tile counts that often, for itself and its copies; 0 for
-    tiles that are not computed.
+    height, width, number, then the computed tiles, ascending. count: (rows, columns) float32: how
+    often a computed tile counts in sums over the whole feature map, for itself and its copies; 0
+    for tiles that are not computed.
     """
 
     size: tuple[int, int]
@@ -35,8 +35,8 @@ class Tiles:
     count: Array
 
     def check(self, size: tuple[int, int]) -> None:
-        """Raise ValueError for another size of the feature map; kernels that take the list alone
-        would write beside it.
+        """Raise ValueError if the feature map has another size; kernels that only read the list
+        would write outside the map.
         """
         if self.size != size:
             raise ValueError(f"tiles of {self.size} for a feature map of {size}")
@@ -50,13 +50,13 @@ def grid_shape(height: int, width: int) -> tuple[int, int]:
 def some_tiles(dev: Device, size: tuple[int, int], count: np.ndarray) -> Tiles:
     """Tiles of a feature map of `size` = (height, width) from their count (rows, columns).
 
-    Raises ValueError when no count is above 0.
+    Raises ValueError if no count is above 0.
     """
     return Tiles(size, int(np.count_nonzero(count)), *map(dev.upload, tile_arrays(size, count)))
 
 
 def tile_arrays(size: tuple[int, int], count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tiles.list and Tiles.count as numpy arrays. Raises ValueError as some_tiles()."""
+    """Tiles.list and Tiles.count as numpy arrays. Raises ValueError like some_tiles()."""
     chosen = np.flatnonzero(count)
     if not len(chosen):
         raise ValueError(f"no tile of {size} chosen")
@@ -69,15 +69,13 @@ def all_tiles(dev: Device, height: int, width: int) -> Tiles:
 
 
 def tiles_find(dev: Device, x: Array, background: float) -> Pending[np.ndarray]:
-    """(rows, columns) bool: the tiles of x (H, W, C) float32 in which some value is not
-    `background`.
-    """
+    """(rows, columns) bool: the tiles of x (H, W, C) float32 that are not all `background`."""
     h, w, c = x.shape
     return _flags(dev, "tiles_find", (h, w), c=c, background=background, x=x)
 
 
 def tiles_covered(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Pending[np.ndarray]:
-    """(rows, columns) bool: the tiles of an image of size (height, width) in which some pixel has
+    """(rows, columns) bool: the tiles of an image of size (height, width) with a pixel that has
     fragments, by its Pairs.pixel_offset (HW+1,) uint32.
     """
     return _flags(dev, "tiles_covered", size, pixel_offset=pixel_offset)
@@ -91,8 +89,8 @@ def tiles_with(pixels: np.ndarray) -> np.ndarray:
 
 
 def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """(n, 2) int32: for tiles_copy(), the tiles whose numbers `source` gives for the n chosen ones,
-    and these.
+    """(n, 2) int32 for tiles_copy(): for each of the n chosen tiles, the number of its source and
+    its own.
 
     source: (rows, columns) integers; chosen: (rows, columns) bool.
     """
@@ -101,8 +99,8 @@ def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
 
 
 def tiles_copy(dev: Device, x: Array, from_to: Array, n: int) -> None:
-    """Copy tiles of x (H, W, C) float32 to others: the first n of from_to, (?, 2) int32 as
-    copy_list() has them; none is both. A tile and its source have the same shape.
+    """Copy tiles of x (H, W, C) float32 to others, by the first n rows of from_to, (?, 2) int32,
+    see copy_list(); no tile is both read and written. A tile and its source have the same shape.
     """
     h, w, c = x.shape
     size, work_group = channel_ranges(dev, n, SIDE * SIDE, c)

@@ -1,1 +1,1 @@
-"""The U-Net: its layers, its memory, its forward and backward pass, and how it skips background."""
+"""The U-Net: its layers, memory, forward and backward pass, and how it skips background."""

@@ -1,5 +1,5 @@
-"""What stands in place of the U-Net where features are colours already, as in 3D Gaussian
-splatting: the image is the first three of them.
+"""Replaces the U-Net where features are already colours, as in 3D Gaussian splatting: the image is
+the first three of them.
 """
 
 from collections.abc import Callable
@@ -11,15 +11,15 @@ from pp_cl.engine.layers.simple import first_features_backward, first_features_f
 
 
 class FirstFeatures:
-    """Has what a model's network has, see UNet, but no parameters."""
+    """Has the methods of UNet, but no parameters."""
 
-    multiple = 1  # of which the sides of images are
+    multiple = 1  # image sides must be multiples of this
 
     def __init__(self, dev: Device):
         self.dev = dev
         self.parameters: dict[str, Array] = {}
         self.all_parameters = dev.zeros((1,))
-        self._shape: tuple[int, ...] = ()  # of the features of the last forward()
+        self._shape: tuple[int, ...] = ()  # shape of the features in the last forward()
 
     def split(self, whole: Array) -> dict[str, Array]:
         """Nothing: there are no parameters."""
@@ -42,7 +42,7 @@ class FirstFeatures:
 
     @staticmethod
     def gradient_tiles(*_: object) -> Callable[[], None]:
-        """What gives None: there is no background to leave out."""
+        """A function that returns None: there is no background to leave out."""
         return lambda: None
 
     def forward(self, x: Array, training: bool = True, plan: None = None) -> Array:

@@ -1,11 +1,12 @@
-"""The architecture of the U-Net as a list of layers: three levels, as the decoder of the
-PlenopticPoints supplemental; and which of its feature maps share memory.
+"""The architecture of the U-Net as a list of layers: three levels, like the decoder in the
+PlenopticPoints supplemental. Also decides which of its feature maps share memory.
 
-Each level is a block: two 3x3 convolutions with ReLU, or one of the others that the supplemental
-compares with them. Levels are joined by 2x2 average pooling on the way down, by bilinear upsampling
-with a 1x1 convolution and a concatenation [upsampled, skip] on the way up; the image is 0.5 + 0.5 *
-(1x1 convolution). The 1x1 convolution runs before the upsampling: both are linear and the
-upsampling weights of a pixel add up to 1, so they commute, bias included, and it costs a quarter.
+Each level is a block: two 3x3 convolutions with ReLU, or one of the alternatives that the
+supplemental compares with them. On the way down, 2x2 average pooling joins the levels; on the way
+up, bilinear upsampling with a 1x1 convolution and a concatenation [upsampled, skip]; the image is
+0.5 + 0.5 * (1x1 convolution). The 1x1 convolution runs before the upsampling: both are linear and
+the upsampling weights of a pixel add up to 1, so they commute, bias included, and it costs a
+quarter.
 """
 
 import math
@@ -23,12 +24,12 @@ from pp_cl.engine.layers.tiles import VECTOR
 class Layer:
     """A layer, named like its output.
 
-    kind: a convolution; ELU of one half of the input's channels times the sigmoid of the other
-    half; means of 2 x 2 pixels; twice the height and width, bilinear. inputs: names of one layer,
-    or of the two that a convolution reads as one; "x" is the network's input. level: the output has
-    the image's height and width divided by 2**level. channels: of the output. sources, kernel_size,
-    relu: of a convolution: the channels of each input, the side of the kernel, and whether a ReLU
-    follows.
+    kind: "conv": a convolution; "gate": ELU of one half of the input's channels times the sigmoid
+    of the other half; "pool": means of 2 x 2 pixels; "upsample": doubles height and width,
+    bilinear. inputs: the name of one layer, or of two that a convolution concatenates; "x" is the
+    network's input. level: the output has the image's height and width divided by 2**level.
+    channels: those of the output. Only for convolutions: sources, the channels of each input;
+    kernel_size, the side of the kernel; relu, whether a ReLU follows.
     """
 
     kind: Literal["conv", "gate", "pool", "upsample"]
@@ -46,7 +47,7 @@ class Layer:
         return self.kind != "upsample"
 
     def weight_shape(self) -> tuple[int, int, int, int]:
-        """(CO, CI, K, K) of a convolution's weights."""
+        """(CO, CI, K, K), the shape of a convolution's weights."""
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
 
     def multiplications(self, height: int, width: int) -> int:
@@ -79,7 +80,7 @@ def unet_layers(
     blocks: str = "double",
 ) -> list[Layer]:
     """The layers in the order of the forward pass. widths: channels of the three levels; blocks:
-    what a level computes, one of settings.BLOCKS.
+    what each level computes, one of settings.BLOCKS.
     """
     w0, w1, w2 = widths
     enc0 = _block(blocks, "enc0", ("x",), 0, w0, (channels_in,))
@@ -134,8 +135,8 @@ def levels_of(layers: list[Layer]) -> dict[str, int]:
 
 
 def array_shapes(layers: list[Layer], size: tuple[int, int]) -> dict[str, tuple[int, int, int]]:
-    """{name: (H, W, C)} of the outputs and of their gradients, x among them, in an image of `size`
-    = (height, width).
+    """{name: (H, W, C)} of the input x, all outputs and their gradients, for an image of `size` =
+    (height, width).
     """
     channels = {"x": sum(layers[0].sources)} | {layer.name: layer.channels for layer in layers}
     channels |= {gradient_of(name): n for name, n in channels.items()}
@@ -154,11 +155,10 @@ def multiplications(layers: list[Layer], height: int, width: int) -> int:
 
 
 def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]:
-    """[(name, first, last)]: the first and last layer, counted through the forward and the backward
-    pass, at which each array is in use; by first use.
+    """[(name, first, last)] by first use: the first and last layer that uses each array, counted
+    through the forward and the backward pass.
 
-    The network's input "x" and the gradient of its output are not among them: they belong to the
-    caller.
+    Leaves out the network's input "x" and the gradient of its output, which belong to the caller.
     """
     schedule = [(*layer.inputs, layer.name) for layer in layers]
     if training:
@@ -179,7 +179,7 @@ def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]
 
 @dataclass
 class SharedBuffer:
-    """A buffer of so many floats that holds several arrays, one after the other; free from a step
+    """A buffer of `floats` floats that holds several arrays in turn; free from the step `free_from`
     on.
     """
 

@@ -1,7 +1,7 @@
 """The specular layer: a small network that turns the 16 blended features and the viewing direction
-of one pixel into a colour, which is multiplied by alpha and added to the image (as in SNeRG, Hedman
-et al. 2021, section 4). It is fitted after the training (training/specular.py) to the residuals of
-the images, which are mostly reflections.
+of a pixel into a colour, which is multiplied by alpha and added to the image (as in SNeRG, Hedman
+et al. 2021, section 4). After the training, training/specular.py fits it to the residuals of the
+images, which are mostly reflections.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Specular(Network):
         super().__init__(dev, specular_layers())
 
     def scale(self, factor: float) -> None:
-        """Multiply its colours."""
+        """Multiply its colours by a factor."""
         for name in ("c.weight", "c.bias"):
             parameter = self.parameters[name]
             self.dev.write(parameter, np.float32(factor) * self.dev.download(parameter))

@@ -3,16 +3,17 @@ are copies of a computed one.
 
 Where the network sees nothing but background, its output depends only on the distance from the
 borders of the image, which it sees as zeros. So the tiles that see only background fall into
-classes of equal ones: one class inside, one for each place near a border. One tile of each class is
-computed, its representative; the others are copies of it, made where a layer needs them. In the
-sums over the image, the gradients of weights, a representative counts as often as its class has
-tiles. The results are the same but for rounding: Winograd's transforms mix the last bits of a tile.
+classes of equal tiles: one class inside, and one for each place near a border. One tile of each
+class is computed, its representative; the others are copied from it where a layer needs them. In
+sums over the image, for the gradients of weights, a representative counts once for each tile of its
+class. The results are the same except for rounding: Winograd's transforms mix the last bits of a
+tile.
 
-The backward pass has classes of its own: of the tiles where the network saw only background, those
-whose gradient of the image is their representative's.
+The backward pass has its own classes: it groups the tiles where the network saw only background and
+the image's gradient equals that of the representative.
 
-Feature maps have the names of UNet's arrays: those of the layers, and gradient_of() them. Sets of
-tiles are (rows, columns) bool.
+Feature maps have the names of UNet's arrays: those of layers, and gradient_of(name). Sets of tiles
+are (rows, columns) bool.
 """
 
 from dataclasses import dataclass, field
@@ -35,13 +36,13 @@ from pp_cl.engine.layers.tiles import (
 )
 from pp_cl.engine.network.layers import Layer, convolutions, gradient_of, levels_of
 
-# How far the loss sees, in pixels: from a target's pixel to the gradients that depend on it, by
-# two of SSIM's windows; and from the image's border, together with the network.
+# How far the loss reaches, in pixels: from a target's pixel to the gradients that depend on it,
+# through two SSIM windows; and, together with the network, from the image's border.
 LOSS_RADIUS, LOSS_BORDER = 10, 48
 
 
 def distance(tiles: np.ndarray) -> np.ndarray:
-    """(rows, columns) int: the distance to the nearest tile that is set, in tiles, diagonals
+    """(rows, columns) int: the distance in tiles to the nearest tile that is set, with diagonals
     counting as 1 (chessboard distance); the largest int32 if none is set.
     """
     if not tiles.any():
@@ -50,8 +51,8 @@ def distance(tiles: np.ndarray) -> np.ndarray:
 
 
 def grow(tiles: np.ndarray, n: int = 1) -> np.ndarray:
-    """The tiles within n tiles, diagonals included, of those that are set."""
-    if n > 2:  # fewer are faster step by step
+    """The tiles within n tiles of a set tile, diagonals included."""
+    if n > 2:  # for smaller n, single steps are faster
         return distance(tiles) <= n
     for _ in range(n):
         rows = tiles.copy()
@@ -64,7 +65,7 @@ def grow(tiles: np.ndarray, n: int = 1) -> np.ndarray:
 
 
 def halve(tiles: np.ndarray, levels: int = 1) -> np.ndarray:
-    """The tiles 2**levels as wide that hold any of those that are set."""
+    """The tiles 2**levels as wide that contain a set tile."""
     for _ in range(levels):
         rows = np.logical_or.reduceat(tiles, np.arange(0, tiles.shape[0], 2), axis=0)
         tiles = np.logical_or.reduceat(rows, np.arange(0, tiles.shape[1], 2), axis=1)
@@ -72,14 +73,14 @@ def halve(tiles: np.ndarray, levels: int = 1) -> np.ndarray:
 
 
 def double(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(rows, columns) = shape bool: the tiles half as wide inside those that are set."""
+    """(rows, columns) = shape bool: the tiles half as wide inside the set tiles."""
     return tiles.repeat(2, 0).repeat(2, 1)[: shape[0], : shape[1]]
 
 
 def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
     """The tiles of an image of `size` = (height, width) where the gradient of the loss may differ
     from that of background over a white target: those within the loss's reach of a tile of the
-    target that is not white. Borders are left to plan_backward().
+    target that is not white. plan_backward() adds the borders.
 
     found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
     in the image, less than a tile.
@@ -90,12 +91,12 @@ def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, 
 
 
 def _tiles_of(pixels):
-    """How many tiles so many pixels reach."""
+    """How many tiles a number of pixels reaches."""
     return -(-pixels // SIDE)
 
 
 def receptive_radius(layers: list[Layer]) -> dict[str, int]:
-    """{name: pixels}: radius of the receptive field of each layer's output in the input x."""
+    """{name: pixels}: the radius of the receptive field of each layer's output in the input x."""
     radius = {"x": 0}
     for layer in layers:
         radius[layer.name] = max(radius[name] for name in layer.inputs) + _forward_radius(layer)
@@ -103,8 +104,9 @@ def receptive_radius(layers: list[Layer]) -> dict[str, int]:
 
 
 def gradient_radius(layers: list[Layer]) -> dict[str, int]:
-    """{name: pixels}: radius of the receptive field, in the image's gradient, of the gradient of
-    each layer's output and of x; at least that, of those which are computed in one launch.
+    """{name: pixels}: for the gradients of x and of each layer's output, the radius of the
+    receptive field in the image's gradient. Gradients computed in one launch get the largest of
+    their radii.
     """
     radius = dict.fromkeys([gradient_of(layer.name) for layer in layers], 0)
     for layer in reversed(layers):
@@ -125,15 +127,15 @@ def _forward_radius(layer):
 
 
 def _backward_radius(layer):
-    """The same from the gradient of the output to the gradient of the input."""
+    """The same radius for the input's gradient in the output's gradient."""
     if layer.kind == "conv":
         return _forward_radius(layer)
     return {"gate": 0, "pool": 0, "upsample": 2}[layer.kind] << layer.level
 
 
 def _read_forward(layer, computed, shape):
-    """(rows, columns) = shape bool: tiles of an input that the computed tiles of the output
-    read.
+    """(rows, columns) = shape bool: the tiles of an input that a layer reads to compute the given
+    tiles of its output.
     """
     if layer.kind == "pool":
         return double(computed, shape)
@@ -143,8 +145,8 @@ def _read_forward(layer, computed, shape):
 
 
 def _read_backward(layer, computed, shape):
-    """(rows, columns) = shape bool: tiles of the gradient of the output that the computed tiles of
-    an input's gradient read.
+    """(rows, columns) = shape bool: the tiles of the output's gradient that a layer reads to
+    compute the given tiles of an input's gradient.
     """
     if layer.kind == "pool":
         return halve(computed)
@@ -155,17 +157,17 @@ def _read_backward(layer, computed, shape):
 
 @dataclass(frozen=True)
 class TileMap:
-    """The tiles of a feature map that have equal ones.
+    """For each tile of a feature map, the computed tile with the same values.
 
-    source: (rows, columns) int, the number of the computed tile that has the same values: the
-    tile's own, or its class's representative. computed: (rows, columns) bool.
+    source: (rows, columns) int, the number of that computed tile: the tile's own, or its class's
+    representative. computed: (rows, columns) bool.
     """
 
     source: np.ndarray
     computed: np.ndarray
 
     def count(self) -> np.ndarray:
-        """(rows, columns) int: how many tiles each one stands for, itself among them; 0 for
+        """(rows, columns) int: for how many tiles each computed tile stands, itself included; 0 for
         copies.
         """
         count = np.bincount(self.source.ravel(), minlength=self.source.size)
@@ -173,24 +175,24 @@ class TileMap:
 
 
 def map_tiles(size: tuple[int, int], level: int, active: np.ndarray, border: int) -> TileMap:
-    """TileMap of a feature map in an image of `size` = (height, width), whose height and width are
+    """The TileMap of a feature map at a level, which has the height and width of the image's `size`
     divided by 2**level: `active` tiles are always computed, all others are grouped into classes of
-    equal tiles. border: tiles of level 0 from the border of the image within which a tile may
-    depend on its distance from it.
+    equal tiles. border: a tile may depend on its distance from the border of the image if it is
+    within this many tiles of level 0.
     """
     rows, columns = (_classes(length, level, border * SIDE) for length in size)
     classes = (rows[:, None] * (columns.max() + 1) + columns).ravel()
     numbers = np.arange(active.size)
     idle, source = np.flatnonzero(~active), numbers.copy()
     representative = np.zeros(classes.max() + 1, int)
-    # assigned backwards, so that the first tile of a class remains
+    # assigned backwards, so that the first tile of a class represents it
     representative[classes[idle[::-1]]] = idle[::-1]
     source[idle] = representative[classes[idle]]
     return TileMap(source.reshape(active.shape), (source == numbers).reshape(active.shape))
 
 
 def _classes(length, level, border):
-    """Classes of the tiles along one axis of the image: each tile near a border is its own."""
+    """Classes of the tiles along one axis of the image: each tile near a border has its own."""
     side = SIDE << level
     start = np.arange(0, length, side)
     near = (start < border) | (start + side > length - border)
@@ -199,12 +201,12 @@ def _classes(length, level, border):
 
 @dataclass
 class TilePlan:
-    """Which tiles of each feature map a pass computes, and which are then copied from them.
+    """Which tiles of each feature map a pass computes, and which it then copies from them.
 
-    tiles: {name: Tiles} to compute. copies: {name: (from_to, number) of tiles_copy()}; none where
-    all tiles are computed. computed_fraction: share of the network's multiplications that is left
-    in a forward pass. For the backward pass after it, maps: {name: TileMap} of the layers' outputs;
-    active: (rows, columns) bool, the tiles of the image where it starts.
+    tiles: {name: Tiles} to compute. copies: {name: (from_to, number) for tiles_copy()}; empty if
+    all tiles are computed. computed_fraction: the share of the network's multiplications that
+    remains in a forward pass. For the backward pass after it, maps: {name: TileMap} of the layers'
+    outputs; active: (rows, columns) bool, the tiles of the image where it starts.
     """
 
     tiles: dict[str, Tiles]
@@ -214,13 +216,13 @@ class TilePlan:
     active: Any = None
 
     def copy_tiles(self, dev: Device, name: str, array: Array) -> None:
-        """Copy the tiles of a feature map that are needed and were not computed."""
+        """Copy the tiles of a feature map that are needed but were not computed."""
         if name in self.copies:
             tiles_copy(dev, array, *self.copies[name])
 
 
 def plan_all(dev: Device, layers: list[Layer], size: tuple[int, int]) -> TilePlan:
-    """The plan of both passes over images of `size` = (height, width) that compute all tiles."""
+    """The plan for images of `size` = (height, width) that computes all tiles in both passes."""
     levels = levels_of(layers)
     tiles = {n: all_tiles(dev, size[0] >> n, size[1] >> n) for n in set(levels.values())}
     return TilePlan({name: tiles[level] for name, level in levels.items()})
@@ -235,15 +237,15 @@ def plan_forward(
     *,
     most: float,
 ) -> TilePlan | None:
-    """The forward pass over an image of `size` = (height, width), where x differs from the
+    """Plan the forward pass over an image of `size` = (height, width), where x differs from the
     background in the tiles `active`; None if more than `most` of the multiplications remain.
 
-    gradient_tiles: as gradient_tiles() returns it; None: all tiles. lists: where the lists of tiles
-    lie on the device, until it holds others.
+    gradient_tiles: from gradient_tiles(); None: all tiles. lists: holds the lists of tiles on the
+    device, until it is given others.
     """
     radius, last = receptive_radius(layers), layers[-1].name
     affected = grow(active, _tiles_of(radius[last]))
-    del radius["x"]  # which is given
+    del radius["x"]  # the caller gives x
     maps = _map_all(layers, size, active, radius)
     count = {c.name: c.multiplications(*size) for c in convolutions(layers)}
     done = sum(n * maps[name].computed.mean() for name, n in count.items()) / sum(count.values())
@@ -263,8 +265,8 @@ def plan_forward(
 def plan_backward(
     layers: list[Layer], size: tuple[int, int], forward: TilePlan, lists: PackedArrays
 ) -> TilePlan:
-    """The backward pass after a forward pass. Among the copies are those of forward outputs that it
-    reads, as inputs of layers and as masks of ReLUs. lists: as of plan_forward().
+    """Plan the backward pass after a forward pass. Also copies tiles of forward outputs that it
+    reads, as inputs of layers and as masks of ReLUs. lists: see plan_forward().
     """
     if not forward.maps:
         return forward
@@ -284,10 +286,11 @@ def plan_backward(
 
 
 def _map_all(layers, size, active, radius, border=0):
-    """{name: TileMap} of feature maps in an image of `size`, some of which are one.
+    """{name: TileMap} of feature maps in an image of `size`; names may share a TileMap.
 
     radius: {name: pixels}: tiles within that distance of the `active` tiles of the image are
-    computed; within `border` tiles more than that from its border they are classes of their own.
+    computed; tiles within that distance plus `border` tiles of the image's border are classes of
+    their own.
     """
     levels, away, made = levels_of(layers), distance(active), {}
     keys = {name: (levels[name], _tiles_of(pixels)) for name, pixels in radius.items()}
@@ -297,10 +300,10 @@ def _map_all(layers, size, active, radius, border=0):
 
 
 def _send(levels, size, maps, needed, copied, lists):
-    """TilePlan whose lists are sent to the device.
+    """Send the lists of a TilePlan to the device, and return the plan.
 
-    maps: {name: TileMap} of what the pass computes. needed: {name: (rows, columns) bool} of what it
-    reads. copied: {name: TileMap} of what is needed.
+    maps: {name: TileMap} of the maps that the pass computes. needed: {name: (rows, columns) bool}
+    of the tiles that it reads. copied: {name: TileMap} of all names in `needed`.
     """
     distinct = {id(of_map): (levels[name], of_map) for name, of_map in maps.items()}
     rows, values, tiles = [], [], {}

@@ -1,4 +1,4 @@
-"""Networks on a device, the U-Net above all: parameters, and the forward and the backward pass."""
+"""Networks on a device, mainly the U-Net: parameters, and the forward and the backward pass."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -53,12 +53,12 @@ from pp_cl.engine.network.tile_plan import (
 )
 from pp_cl.settings import NetworkConfig
 
-# Background tiles are skipped only in images of at least LEAST_PIXELS pixels, of LEAST_FROZEN where
-# the network is not trained, and only if at most MOST_COMPUTED of the multiplications remain:
-# finding them costs time too. A frame of the demo takes a tenth less at 200x200, the same at
+# Background tiles are skipped only in images of at least LEAST_PIXELS pixels (LEAST_FROZEN if the
+# network is frozen), and only if at most MOST_COMPUTED of the multiplications remain, because
+# finding them takes time too. This saves a tenth of the demo's frame time at 200x200, nothing at
 # 128x128.
 LEAST_PIXELS, LEAST_FROZEN, MOST_COMPUTED = 1 << 16, 1 << 15, 0.8
-WHITE = 1.0  # of a target where its image is transparent
+WHITE = 1.0  # colour of a target where its image is transparent
 SIMPLE = {"gate": gate_forward, "pool": avgpool2_forward, "upsample": upsample2_forward}
 
 Size = tuple[int, int]  # (height, width)
@@ -66,13 +66,13 @@ Convs = dict[tuple[str, str], Conv]  # {(layer, direction): Conv}
 
 
 class Workspace:
-    """What the forward pass over images of one size works in, or that and the backward pass.
+    """The arrays of the forward pass over images of one size, or of both passes.
 
-    size: of the images. arrays: {name: feature map} without "x", the caller's, gradients by
-    gradient_of(name); some share a buffer, one after the other. convs: what computes the
-    convolutions, with their arrays, all of which lie in `work`. all_tiles: the plan that skips
-    nothing. is_laid_out: whether the weights in `work` are the network's. calls: of replayed()
-    functions; they keep the caller's arrays alive.
+    size: (height, width) of the images. arrays: {name: feature map}, gradients by
+    gradient_of(name), without "x", which the caller owns; some share a buffer in turn. convs: the
+    convolutions; their arrays lie in `work`. all_tiles: the plan that skips nothing. is_laid_out:
+    whether `work` holds the network's present weights. calls: recorded calls of replayed()
+    functions, which keep the caller's arrays alive.
     """
 
     def __init__(self, dev: Device) -> None:
@@ -88,8 +88,8 @@ class Workspace:
         self.part_table = PackedArrays(dev)
 
     def plan(self, net: "Network", size: Size, training: bool) -> None:
-        """Make room for images of this size, in the same buffers where they are large enough. The
-        arrays are undefined then.
+        """Make room for images of this size, reusing buffers that are large enough. The arrays are
+        undefined afterwards.
         """
         self.size, self.is_laid_out = (0, 0), False
         # frees the old arrays first
@@ -117,7 +117,7 @@ class Workspace:
 
 
 def _work_rows(convs):
-    """{(key, name): (shape, dtype)} of the arrays that convolutions take beside a layer's own."""
+    """{(key, name): (shape, dtype)} of the arrays that convolutions need besides a layer's own."""
     return {
         (key, name): row
         for key, conv in convs.items()
@@ -126,16 +126,16 @@ def _work_rows(convs):
 
 
 class Network:
-    """A network of layers, its parameters and gradients, and the buffers it works in.
+    """A network of layers, its parameters and gradients, and its buffers.
 
-    layers: in the order of the forward pass; the image is 0.5 + 0.5 times what the last one gives.
-    residual: adds output.SHARE of the first three features to the image. variant: of the
-    convolutions, as choose() takes it; blocking: of their kernels, as shipped for the device; both
-    may be replaced before the first pass. parameters:
-    {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
-    on the device; all_parameters: the 1-D array that they lie in, with zeros between them. Weights
-    and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output channels
-    beyond CO at 0, with gradient 0. multiple: of which the sides of images are, in pixels.
+    layers: in the order of the forward pass; the image is 0.5 + 0.5 times the output of the last
+    one. residual: adds simple.SHARE of the first three features to the image. variant: how choose()
+    selects the convolutions; blocking: the sizes of their kernels, shipped for the device; both may
+    be replaced before the first pass. parameters: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16),
+    "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device; all_parameters: the 1-D array
+    that contains them, with zeros between them. Weights and biases start uniform in +-1/sqrt(CI K
+    K) (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient 0. multiple:
+    image width and height must be multiples of this, in pixels.
     """
 
     multiple = 4  # two poolings of the U-Net halve the height and the width
@@ -154,7 +154,7 @@ class Network:
         self.layers = layers
         self.variant, self.blocking = variant, blocking_of(dev)
         self.all_parameters, self.parameters = self._packed()
-        self._gradients: Any = None  # of sum_gradients(): (the whole, its parts by name)
+        self._gradients: Any = None  # for sum_gradients(): (whole array, {name: its part})
         self.reset(seed)
         self.relu_outputs = {layer.name for layer in self.layers if layer.relu}
         self._workspaces: dict[bool, Workspace] = {}  # {training: Workspace}
@@ -164,7 +164,7 @@ class Network:
         self._is_frozen = False
 
     def reset(self, seed: int) -> None:
-        """Write the parameters that a training starts with."""
+        """Write the initial parameters of a training."""
         rng = np.random.default_rng(seed)
         for layer in convolutions(self.layers):
             shape = layer.weight_shape()
@@ -174,13 +174,13 @@ class Network:
             self.dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
 
     def _packed(self):
-        """(zeros like all_parameters, {name: array in them}) of the parameters."""
+        """(zeros like all_parameters, {name: the part of them that holds a parameter})."""
         table = parameter_table(self.layers)
         whole, arrays = packed_arrays(self.dev, [*table.values()])
         return whole.view(np.float32), dict(zip(table, arrays, strict=True))
 
     def split(self, whole: Array) -> dict[str, Array]:
-        """{name of a parameter: its part of an array that is laid out as all_parameters}."""
+        """{name of a parameter: its part of `whole`, an array laid out like all_parameters}."""
         parts = {}
         for name, parameter in self.parameters.items():
             start = first_float(parameter)
@@ -188,26 +188,27 @@ class Network:
         return parts
 
     def release(self) -> None:
-        """Hold the arrays of past passes no longer."""
+        """Stop holding the arrays of past passes."""
         for space in self._workspaces.values():
             space.calls.clear()
 
     def freeze(self) -> None:
-        """From now on the parameters do not change: their weights are laid out for the kernels
+        """Declare that the parameters no longer change: their weights are laid out for the kernels
         once, not for each image, and training is refused.
         """
         self._is_frozen = True
         self._workspaces.clear()
 
     def is_planned(self, size: tuple[int, int]) -> bool:
-        """Whether plan_tiles() is worth a try for an image of size (height, width)."""
+        """Whether plan_tiles() is worth trying for an image of size (height, width)."""
         return math.prod(size) >= (LEAST_FROZEN if self._is_frozen else LEAST_PIXELS)
 
     def plan_tiles(
         self, size: tuple[int, int], active: np.ndarray, gradient_tiles: np.ndarray | None = None
     ) -> TilePlan | None:
-        """Which tiles to compute for features of `size` = (height, width) that are the same in all
-        tiles but the `active` ones, (rows, columns) bool; None = all, as few would be saved.
+        """Plan which tiles to compute for features of `size` = (height, width) that are equal in
+        all tiles except `active`, (rows, columns) bool; None: compute all, as too few would be
+        saved.
 
         Where the network sees only this background, one tile is computed in place of many equal
         ones (tile_plan.py). The result is the same. gradient_tiles: (rows, columns) bool, the tiles
@@ -226,12 +227,12 @@ class Network:
         size: tuple[int, int],
         corner: Sequence[int],
     ) -> Callable[[], np.ndarray | None]:
-        """A function that returns gradient_tiles of plan_tiles() for a step with this target,
-        (h, w, 3) float32, whose corner lies at (left, top) of the image of `size`. It is called
-        once the device has been waited for anyway: looking at the target costs no wait.
+        """A function that returns gradient_tiles of plan_tiles() for a step with this target, (h,
+        w, 3) float32, whose corner lies at (left, top) of the image of `size`. Call it after
+        waiting for the device anyway, so that looking at the target costs no extra wait.
 
-        ignored: (h, w) bool, the pixels that say nothing, if there are any. They are white in the
-        target, but their gradient is another than the background's.
+        ignored: (h, w) bool, the pixels that the loss ignores, if any. They are white in the
+        target, but their gradient differs from the background's.
         """
         if not self.is_planned(size):
             return lambda: None
@@ -243,8 +244,8 @@ class Network:
         """(H, W, 3) image of the features x (H, W, 16); H and W are multiples of 4.
 
         The result is in a buffer of the network: the next call overwrites it. training: keep what
-        backward needs. plan: of plan_tiles(), None = compute all tiles. Raises ValueError for other
-        sizes, RuntimeError for training once frozen.
+        backward() needs. plan: from plan_tiles(), None = compute all tiles. Raises ValueError for
+        other sizes, RuntimeError for training once frozen.
         """
         if training and self._is_frozen:
             raise RuntimeError("Network.freeze() was called: the network can no longer be trained")
@@ -288,11 +289,12 @@ class Network:
         output_forward(self.dev, out, x if self._residual else None)
 
     def backward(self, grad_y: Array) -> tuple[Array, GradientParts]:
-        """(gradient (H, W, 16) of x in the last forward(x, training=True), what the gradients of
-        all parameters are sums of, for sum_gradients() or an optimiser), given dL/dy (H, W, 3).
+        """Given dL/dy (H, W, 3), returns the gradient (H, W, 16) of x in the last forward(x,
+        training=True), and the parts whose sums are the gradients of all parameters, for
+        sum_gradients() or an optimiser.
 
-        Parameters and x must be as they were in forward. The results are in buffers of the network.
-        Raises RuntimeError without such a forward.
+        Parameters and x must be unchanged since forward(). The results are in buffers of the
+        network. Raises RuntimeError without such a forward().
         """
         if self._trained is None:
             raise RuntimeError("Network.backward needs a forward(training=True) before it")
@@ -302,7 +304,9 @@ class Network:
         return space.arrays[gradient_of("x")], parts
 
     def sum_gradients(self, parts: GradientParts) -> dict[str, Array]:
-        """{name of a parameter: its gradient} by the parts of backward(), until the next call."""
+        """{name of a parameter: its gradient} from the parts of backward(), valid until the next
+        call.
+        """
         if self._gradients is None:
             self._gradients = self._packed()
         whole, gradients = self._gradients
@@ -314,7 +318,7 @@ class Network:
         dev, arrays, convs = self.dev, space.arrays | {"x": x}, space.convs
         last = self.layers[-1]
         arrays[gradient_of(last.name)] = grad_y
-        for name in sorted(plan.copies.keys() - plan.tiles.keys()):  # outputs that it reads
+        for name in sorted(plan.copies.keys() - plan.tiles.keys()):  # forward outputs that are read
             plan.copy_tiles(dev, name, arrays[name])
         parts = []
         for layer in reversed(self.layers):
@@ -351,14 +355,14 @@ class Network:
         return gradient_parts(parts, space.part_table, space.work)
 
     def output(self, name: str) -> Array:
-        """(H, W, C) output of the layer `name` in the last forward(training=True), until its
+        """(H, W, C) output of the layer `name` in the last forward(training=True), valid until its
         backward pass.
         """
         return self._workspaces[True].arrays[name]
 
     def convolutions(self, size: Size, training: bool) -> Convs:
-        """What computes the convolutions of images of a size, and their gradients in training; they
-        have no arrays of their own yet.
+        """The Conv of each convolution for images of a size, and in training also those of the
+        backward pass; their own arrays are not yet allocated.
         """
         found: Convs = {}
         for layer in convolutions(self.layers):
@@ -368,7 +372,7 @@ class Network:
                 shape = ConvShape(direction, *of_layer, here)
                 variant = choose(self.dev, shape, self.variant)
                 weight, bias = (self.parameters[f"{layer.name}.{n}"] for n in ("weight", "bias"))
-                is_last = layer is self.layers[-1]  # output_forward() halves what it gives
+                is_last = layer is self.layers[-1]  # output_forward() halves its output
                 conv = Conv(self.dev, self.blocking, variant, shape, weight, bias, is_last)
                 found[layer.name, direction] = conv
         return found
@@ -394,8 +398,8 @@ class Network:
 class UNet(Network):
     """The U-Net that turns blended features into colours.
 
-    widths: channels of the three levels. blocks: what a level computes, of settings.BLOCKS.
-    options: of Network.
+    widths: channels of the three levels. blocks: what each level computes, one of settings.BLOCKS.
+    options: those of Network.
     """
 
     def __init__(

@@ -1,5 +1,5 @@
-"""Features of the visible points from their spherical harmonics, blended into the pixels by the
-weights of the fragments; and the gradients of the blend, gathered by visible point.
+"""Computes features of the visible points from their spherical harmonics, and blends them into the
+pixels by the fragments' weights; gathers the gradients of the blend by visible point.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
 from pp_cl.engine.raster.softmax import softmax_gradient
 from pp_cl.engine.raster.weights import BlendWeights, clear_pairs, sample_macros
 
-ON_GPU = 4  # lanes there: each work-item reads vectors
-SPAN = 64  # pixels whose distortion loss is one sum
+ON_GPU = 4  # lanes on GPUs: each work-item reads vectors
+SPAN = 64  # pixels that share a sum of the distortion loss
 
 
 def shade_forward(
@@ -32,10 +32,10 @@ def shade_forward(
     *,
     visible_features: Array,
 ) -> None:
-    """Write visible_features, (S, 16) float32 or longer, of Gaussians at least 0.
+    """Write visible_features, (S, 16) float32 or longer; those of Gaussians are at least 0.
 
     The direction of a point is normalize(point - eye) in world axes. visible: uint32, the visible
-    points, S = count of them. sh: of PointCloud.
+    points, S = count of them. sh: PointCloud.sh.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
     macros = footprint_macros(points.footprint)
@@ -64,7 +64,7 @@ def blend_forward(
     features: Array,
 ) -> None:
     """Write features (H, W, 16) from visible_features, (S, 16) or longer, both float32. b: keeps
-    the call, see replayed().
+    the recorded call, see replayed().
     """
     dev.program("raster/blend", **_defines(dev)).launch(
         "blend_forward",
@@ -81,8 +81,8 @@ def blend_forward(
 def blend_backward_table(
     visible: int, pixels: int, pairs: int, blend: str, footprint: str = "soft", side: int = 1
 ) -> Table:
-    """The buffers of the backward pass for a number of pixels of side x side samples, and
-    capacities for numbers of visible points and of pairs. blend: one of BLENDS.
+    """The buffers of the backward pass for a number of pixels with side x side samples each, and
+    for capacities of visible points and of pairs. blend: one of BLENDS.
     """
     table: Table = {
         "pair_gradient": ((pairs, 1 + side**2), np.float32),
@@ -99,15 +99,14 @@ def blend_backward_table(
 
 @dataclass(frozen=True)
 class BlendGradients:
-    """Of the visible points, a row for each or more, float32, valid until the next backward pass;
-    those of all other points are 0.
+    """The gradients of the visible points, float32, with at least one row for each; all other
+    points have gradient 0. Valid until the next backward pass.
 
-    visible_features: (S, 16). opacity: (S,). offset: (S, 4) of soft points composited by alpha, (S,
-    16) of Gaussians, through the falloff of their fragments; None if not asked for.
-    distortion: (ceil(HW/SPAN),) of so many pixels each; None without its
-    weight.
-    pair_gradient: (P, 1 + samples), by pair of a visible point the blend weight b and what each
-    sample of the fragment adds to dL/dopacity, 0 where it is dropped or not tracked.
+    visible_features: (S, 16). opacity: (S,). offset: (S, 4) for soft points composited by alpha,
+    (S, 16) for Gaussians, through the falloff of their fragments; None if not asked for.
+    distortion: (ceil(HW/SPAN),), the distortion loss by SPAN pixels; None if its weight is 0.
+    pair_gradient: (P, 1 + samples), for each pair of a visible point the blend weight b and what
+    each sample of the fragment adds to dL/dopacity; 0 where it is dropped or not tracked.
     """
 
     visible_features: Array
@@ -135,15 +134,14 @@ def blend_backward(
 ) -> BlendGradients:
     """The gradients of the points weights.visible, after blend_weights() with derivatives.
 
-    opacity: (N,). visible_features, features: of blend_forward(). grad_features: dL/dfeatures (H,
+    opacity: (N,). visible_features, features: from blend_forward(). grad_features: dL/dfeatures (H,
     W, 16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times
-    sum_ij b_i b_j |z_i - z_j| of every sample to the loss, with b and z the weights and depths
-    (world units) of its fragments; no gradient of the depths is formed. voxel_size: of the grid
-    that offsets are counted in, world units; 0: no gradients of offsets. max_weight: (N,)
-    float32, becomes for each point the highest sum over an image's pixels of its blend weights so
-    far. Raises ValueError for
-    grad_alpha or a distortion loss of a softmax, which has no transmittance, and for offsets unless
-    soft points are composited by alpha.
+    sum_ij b_i b_j |z_i - z_j| of every sample to the loss, where b and z are the weights and depths
+    (world units) of its fragments; depths get no gradient. voxel_size: the unit of offsets, in
+    world units; 0: offsets get no gradients. max_weight: (N,) float32, becomes for each point the
+    highest sum of its blend weights over an image's pixels so far. Raises ValueError if grad_alpha
+    or a distortion loss is given with a softmax, which has no transmittance, and if offsets need
+    gradients without soft points or Gaussians composited by alpha.
     """
     is_alpha, moves = weights.blend == "alpha", voxel_size > 0
     if not is_alpha and (grad_alpha is not None or distortion_weight > 0):

@@ -20,10 +20,11 @@ def depth_forward(
 ) -> tuple[Array, Array, Array]:
     """(alpha, depth, median) of the view that points, pairs and weights belong to, float32 (H, W).
 
-    alpha: share of the pixel that is not background, in [0, 1]; 1 after an early stop. depth: of
-    the surface, along the camera's axis, world units, mean by blend weight; median: where half of
-    the weight is reached, interpolated between fragments; both infinite where alpha is 0. size: (H,
-    W). voxel_size: world units within which samples of a pixel show the same surface.
+    alpha: share of the pixel that is not background, in [0, 1]; 1 after an early stop. depth: mean
+    depth of the surface along the camera's axis, by blend weight, in world units; median: where the
+    weights reach half of their sum, interpolated between fragments; both are infinite where alpha
+    is 0. size: (H, W). voxel_size: depth and median average only the samples of a pixel within this
+    distance of the nearest one, in world units.
     """
     alpha, depth, median = (dev.empty(size) for _ in range(3))
     if pairs.side > 1:

@@ -1,5 +1,5 @@
-"""Fragments, pairs of a point and a pixel that it covers, in a view: listed by point for the
-backward pass, and by pixel sorted by depth for blending.
+"""Finds the fragments of a view, the pairs of a point and a pixel that it covers. Lists them by
+point for the backward pass, and by pixel, sorted by depth, for blending.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.errors import UserError
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
-BUCKETS = 256  # of pairs, at most, which CPUs sort side by side
-MOST_CHUNKS = 64  # of pairs, which CPUs put into buckets side by side
-RUN = 64  # keys that GPUs rank at once by comparing all with all; longer lists are merged
-LONG_LIST = RUN * RUN  # keys of lists that they merge in more than one pass
+BUCKETS = 256  # most buckets of pairs; CPUs sort them in parallel
+MOST_CHUNKS = 64  # most chunks of pairs; CPUs put them into buckets in parallel
+RUN = 64  # keys that GPUs rank by comparing all with all; runs of this length are merged
+LONG_LIST = RUN * RUN  # GPUs merge lists of more keys than this in several passes
 
 
 @dataclass
@@ -31,13 +31,13 @@ class Pairs:
     The arrays have a capacity of P pairs. If the view has more, pixel_offset is all zeros and the
     other arrays must not be read: find the pairs again with more capacity (capacity_needed()).
 
-    footprint: of the points, one of FOOTPRINTS. side: samples of a pixel, each way. count: how many
-    pairs there are, of read_count(). point_offset: (N+1,) uint32, point i owns pairs
+    footprint: the points' footprint, one of FOOTPRINTS. side: samples of a pixel, each way. count:
+    the number of pairs, downloaded by read_count(). point_offset: (N+1,) uint32, point i owns pairs
     point_offset[i] to point_offset[i+1]. pixel_offset: (HW+1,) uint32, pixel q owns keys
     pixel_offset[q] to pixel_offset[q+1]. pair_pixel: (P,) uint32, y*W + x. pair_point_falloff: (P,
-    2) uint32, the point, and the bits of the falloff d of Eq. (1); with several samples of a pixel
-    (P, 1), the point. pair_key: (P,) uint64, depth bits << 32 | pair, sorted within each pixel by
-    depth, then by point.
+    2) uint32, the point, and the bits of the falloff d of Eq. (1); if a pixel has several samples,
+    (P, 1), only the point. pair_key: (P,) uint64, depth bits << 32 | pair, sorted within each pixel
+    by depth, then by point.
     """
 
     footprint: str
@@ -75,14 +75,14 @@ class Pairs:
 
 
 def pairs_table(n: int, pixels: int, pairs: int, side: int = 1) -> Table:
-    """The buffers for n points, a number of pixels and a capacity in pairs. side: as Pairs."""
+    """The buffers for n points, a number of pixels and a capacity of pairs. side: see Pairs."""
     return {
         "point_offset": ((n + 1,), np.uint32),
         "pixel_offset": ((pixels + 1,), np.uint32),
         "pair_pixel": ((pairs,), np.uint32),
         "pair_point_falloff": ((pairs, 2 if side == 1 else 1), np.uint32),
         "pair_key": ((pairs,), np.uint64),
-        # for sorting the keys, then the entries of weights.py
+        # used to sort the keys, then for pixel_weight_point of weights.py
         "pair_scratch": ((pairs,), np.uint64),
     }
 
@@ -96,8 +96,8 @@ def find_pairs(
     capacity: int = 1,
     times_seen: Array | None = None,
 ) -> Pairs:
-    """The fragments in an image of size (height, width), if there are no more than `capacity`; does
-    not wait for the device. Their number is known after read_count().
+    """Find the fragments in an image of size (height, width), if there are at most `capacity`. Does
+    not wait for the device; read_count() downloads their number.
 
     times_seen: (N,) float32, counts for each point the images in which it has a fragment.
     """
@@ -144,10 +144,10 @@ def find_pairs(
 
 
 def _list_by_bucket(dev, b, n, pixels, capacity):
-    """Sort pair_key, which is by point, and write pixel_offset."""
+    """Sort pair_key, which is listed by point, and write pixel_offset."""
     program = dev.program("raster/lists_by_bucket", BUCKETS=BUCKETS)
     chunks = min(MOST_CHUNKS, dev.info["compute_units"])
-    stretch = (-(-pixels // BUCKETS) - 1).bit_length()  # 2^stretch pixels each
+    stretch = (-(-pixels // BUCKETS) - 1).bit_length()  # a bucket covers 2^stretch pixels
     shared = {
         "chunks": chunks,
         "stretch": stretch,
@@ -171,7 +171,7 @@ def _list_by_bucket(dev, b, n, pixels, capacity):
 
 
 def _list_by_key(dev, b, pixels, capacity):
-    """Sort the keys in pair_scratch, which are by point, into pair_key, and write pixel_offset."""
+    """Sort the keys of pair_scratch, listed by point, into pair_key, and write pixel_offset."""
     program = dev.program("raster/lists_by_key", RUN=RUN)
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     shared = {
@@ -191,13 +191,13 @@ def _list_by_key(dev, b, pixels, capacity):
         )
 
     merge(other, keys, RUN, LONG_LIST, 0)
-    if capacity > LONG_LIST:  # there and back, for the lists that are longer
+    if capacity > LONG_LIST:  # the long lists, to the other buffer and back
         merge(keys, other, LONG_LIST, LONG_LIST * RUN, LONG_LIST)
         merge(other, keys, LONG_LIST * RUN, MOST_PAIRS, LONG_LIST)
 
 
 def capacity_needed(pairs: Pairs) -> int:
-    """The capacity of these pairs if all fitted, else a larger one with which they fit. Waits until
+    """The capacity of these pairs if all fitted, otherwise a larger one that they fit. Waits until
     their number is known. Raises UserError for more pairs than uint32 can number.
     """
     total = pairs.total

@@ -1,4 +1,4 @@
-"""The point cloud on the device: vertices of a grid, offsets from them, radii, opacities, and SH
+"""The point cloud on the device: grid vertices, offsets from them, radii, opacities, and SH
 coefficients in arrays by degree.
 """
 
@@ -17,10 +17,10 @@ from pp_cl.engine.device.device import Device
 
 @dataclass(frozen=True)
 class ShBlock:
-    """The SH coefficients of one array (N, count, 16): `count` of one degree, those of the basis
-    functions `first`, `first` + 1, ...
+    """The SH coefficients in one array (N, count, 16): `count` coefficients of one degree, for the
+    basis functions `first`, `first` + 1, ...
 
-    name: sh_ and the degree, then a or b where a degree fills two arrays.
+    name: sh_ and the degree, then a or b if the degree fills two arrays.
     """
 
     name: str
@@ -33,9 +33,9 @@ class ShBlock:
         return math.isqrt(self.first)
 
 
-# Degree 2 fills two arrays: no array takes more than 192 bytes a point, so that 4.04 million
-# points fit devices that allocate at most 1 GiB at once. The layout is the same everywhere, and so
-# are the bits.
+# Degree 2 fills two arrays, so that no array takes more than 192 bytes a point, and 4.04 million
+# points fit devices that allocate at most 1 GiB at once. All devices use this layout and get the
+# same bits.
 SH_BLOCKS = (
     ShBlock("sh_0", 0, 1),
     ShBlock("sh_1", 1, 3),
@@ -44,29 +44,29 @@ SH_BLOCKS = (
 )
 SH_DEGREES = (0, 1, 2)
 OPACITIES = 9  # numbers in a row of PointCloud.opacity
-MOST_OFFSET = 0.5  # voxel sizes each way: a point stays in its cell; radii times 0.61 to 1.65
-MOST_OF_GAUSSIANS = 2.0  # voxel sizes, logarithms and deviations
-MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: what a .spz can hold
+MOST_OFFSET = 0.5  # voxel sizes each way: keeps points in their cells, scales radii by 0.61 to 1.65
+MOST_OF_GAUSSIANS = 2.0  # in voxel sizes, logarithms or deviations
+MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: the largest that a .spz can hold
 
 
 def offset_width(footprint: str) -> int:
-    """Numbers in a row of PointCloud.offset: of Gaussians those of cl/cloud.h."""
+    """How many numbers a row of PointCloud.offset has, see cl/cloud.h."""
     return 16 if footprint == "gaussian" else 4
 
 
 def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
-    """Those of SH_BLOCKS up to a degree."""
+    """The SH_BLOCKS up to a degree."""
     return tuple(block for block in SH_BLOCKS if block.degree <= degree)
 
 
 def stored_degree(sh: Sequence[Array]) -> int:
-    """The highest degree of coefficients in arrays of the first SH_BLOCKS."""
+    """The highest degree in `sh`, arrays of the first SH_BLOCKS."""
     return SH_BLOCKS[len(sh) - 1].degree
 
 
 def four_blocks(sh: Sequence[Array]) -> list[Array]:
-    """Four arrays for a kernel's arguments. Where the degree is lower, the first one takes the
-    place of the missing ones, which a kernel built for that degree does not read.
+    """Four arrays for a kernel's arguments. If the degree is lower, the first array is repeated for
+    the missing ones, which a kernel built for that degree does not read.
     """
     return [*sh, *[sh[0]] * (len(SH_BLOCKS) - len(sh))]
 
@@ -75,14 +75,14 @@ def four_blocks(sh: Sequence[Array]) -> list[Array]:
 class PointCloud:
     """The points, one row each; device arrays.
 
-    ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
-    point in its cell, in voxel sizes, and the logarithm of its radius over point_radius() of the
-    settings; up to MOST_OFFSET. Of Gaussians (N, 16), of which 9 are used, up to MOST_OF_GAUSSIANS:
-    see cl/cloud.h. opacity: (N, 9) float32, o in [0, 1] and coefficients w_k in [-1, 1] of the
-    harmonics Y_k of degrees 1 and 2, as cl/sh.h has them: seen in a direction d, a unit vector from
-    the eye, the point has the opacity o + sum_k w_k Y_k(d), at least 0 and at most 1. sh: the SH
-    coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained any
-    more.
+    ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, the vector from the
+    vertex to the point in its cell, in voxel sizes, and the logarithm of its radius over
+    point_radius() of the settings; all within +-MOST_OFFSET. For Gaussians (N, 16), of which 9 are
+    used, within +-MOST_OF_GAUSSIANS: see cl/cloud.h. opacity: (N, 9) float32, o in [0, 1] and
+    coefficients w_k in [-1, 1] of the harmonics Y_k of degrees 1 and 2 in cl/sh.h: seen in a
+    direction d, a unit vector from the eye, the point has the opacity o + sum_k w_k Y_k(d), clamped
+    to [0, 1]. sh: the SH coefficients, (N, count, 16) for each block: float32, or float16 once they
+    are no longer trained.
     """
 
     ids: Array
@@ -102,7 +102,7 @@ class PointCloud:
 
     @property
     def most_sh(self) -> float:
-        """The bound of SH coefficients above degree 0, infinity if they have none."""
+        """The bound of SH coefficients above degree 0; infinity if there is none."""
         return math.inf if self.offset.shape[1] == 4 else MOST_SH_OF_GAUSSIANS
 
     @property
@@ -125,8 +125,8 @@ class PointCloud:
         degree: int = SH_DEGREES[-1],
         opacity: float | np.ndarray = 1.0,
     ) -> PointCloud:
-        """Points on their vertices, with opacities that are the same from all sides and SH
-        coefficients of 0 of a degree, 0 to 2. ids: (N), ascending. opacity: one for all or (N,).
+        """Points on their vertices, with SH coefficients of 0 up to a degree, 0 to 2, and the same
+        opacity from all sides. ids: (N), ascending. opacity: a number for all points or (N,).
         """
         n = len(ids)
         opacities = _from_all_sides(np.broadcast_to(opacity, n))
@@ -137,10 +137,10 @@ class PointCloud:
     def of_gaussians(
         cls, dev: Device, ids: np.ndarray, offset: np.ndarray, opacity: np.ndarray, sh: np.ndarray
     ) -> PointCloud:
-        """Gaussians for the footprint "gaussian". ids: (N,), ascending. offset: (N, 9) float32, of
-        cl/cloud.h: place in the cell, logarithms of the deviations, what is below the diagonal.
-        opacity: (N,). sh: (N, 9, 16), of degrees 0 to 2, whose coefficients above degree 0 are
-        clipped to what Gaussians may have.
+        """Gaussians for the footprint "gaussian". ids: (N,), ascending. offset: (N, 9) float32, as
+        in cl/cloud.h: place in the cell, logarithms of the deviations, entries below the diagonal.
+        opacity: (N,). sh: (N, 9, 16), degrees 0 to 2; coefficients above degree 0 are clipped to
+        +-MOST_SH_OF_GAUSSIANS.
         """
         padded = np.zeros((len(ids), offset_width("gaussian")), np.float32)
         padded[:, : offset.shape[1]] = offset
@@ -153,13 +153,13 @@ class PointCloud:
         return cls(dev.upload(ids, np.uint32), dev.upload(padded), opacities, sh_arrays)
 
     def learned(self) -> dict[str, Array]:
-        """{name: array} of all that training changes: "offset", "opacity", and the SH by block."""
+        """{name: array that training changes}: "offset", "opacity", and the SH by block."""
         names = (block.name for block in self.blocks)
         places = {"offset": self.offset, "opacity": self.opacity}
         return places | dict(zip(names, self.sh, strict=True))
 
     def compact(self, dev: Device, keep: Array) -> None:
-        """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
+        """Drop all rows except `keep`, (M) uint32, ascending; one array at a time."""
         self.ids = compact_rows(dev, self.ids, keep)
         self.offset = compact_rows(dev, self.offset, keep)
         self.opacity = compact_rows(dev, self.opacity, keep)
@@ -173,8 +173,8 @@ class PointCloud:
         return PointCloud(ids, offset, opacity, sh)
 
     def replace_by(self, dev: Device, ids: np.ndarray, rows: Array) -> None:
-        """Become the points `ids`, (M) ascending, each with what point rows[i] of the present ones
-        has learned; one array after the other. rows: (M,) uint32.
+        """Become the points `ids`, (M) ascending; each takes what point rows[i] of the present ones
+        has learned. Replaces one array at a time. rows: (M,) uint32.
         """
         self.ids = dev.upload(ids, np.uint32)
         self.offset = gather_rows(dev, self.offset, rows)
@@ -183,8 +183,8 @@ class PointCloud:
             self.sh[i] = gather_rows(dev, self.sh[i], rows)
 
     def arrays(self, dev: Device) -> dict[str, DeviceRows]:
-        """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16), (N, 5,
-        16).
+        """The arrays by their names in a checkpoint; the SH by degree, (N, 1, 16), (N, 3, 16), (N,
+        5, 16).
         """
         learned = {"ids": self.ids, "offset": self.offset, "opacity": self.opacity}
         stored = {name: DeviceRows(dev, array) for name, array in learned.items()}
@@ -196,7 +196,7 @@ class PointCloud:
 
     @classmethod
     def load(cls, dev: Device, arrays: dict[str, np.ndarray], degree: int) -> PointCloud:
-        """The points of a checkpoint's arrays, which are taken out of `arrays`."""
+        """The points of a checkpoint's arrays, which are removed from `arrays`."""
         names = "ids", "offset", "opacity"
         ids, offset, opacity = (dev.upload(arrays.pop(f"points.{name}")) for name in names)
         by_degree = [arrays.pop(f"points.sh{d}") for d in SH_DEGREES[: degree + 1]]
@@ -208,5 +208,5 @@ class PointCloud:
 
 
 def _from_all_sides(opacity):
-    """(N, 9) float32, PointCloud.opacity of opacities (N,) that are the same from all sides."""
+    """(N, 9) float32, PointCloud.opacity for opacities (N,) that are the same from all sides."""
     return np.pad(np.asarray(opacity, np.float32)[:, None], ((0, 0), (0, OPACITIES - 1)))

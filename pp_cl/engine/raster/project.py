@@ -1,5 +1,5 @@
-"""Projection and culling: points to camera axes, the box of pixels that each may cover, and how
-many pixels it covers.
+"""Projection and culling: puts points in camera axes, and finds the box of pixels that each may
+cover and how many it covers.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pp_cl.engine.device.launch import lanes, launch_groups, replayed
 from pp_cl.engine.device.scan import BLOCK, blocks_of
 from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
 
-# numbered as in cl/raster/footprint.h; each has its header beside that
+# numbered as in cl/raster/footprint.h; each has a header in cl/raster/footprint/
 FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
-MOVED = ("soft", "gaussian")  # whose points learn offsets, and have radii in voxel sizes
-LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
+MOVED = ("soft", "gaussian")  # their points learn offsets and have radii in voxel sizes
+LEAST_RADIUS = 0.75  # pixels, as in cl/raster/footprint.h
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,15 @@ class ProjectedPoints:
     """N points in one view, valid until the next projection.
 
     footprint: one of FOOTPRINTS. camera_buffer: (21,) float32, cl/camera.h. point_count: (N,)
-    uint32, pixels that are covered; block_sum: (ceil(N/BLOCK),) uint32, the sums of so many. The
-    others are undefined in a run of LANES points without fragments. point_camera: (N, 4) float32,
-    x, y, z in camera axes and the distance from the eye; (0, 0, 0, -1) for a culled point.
-    point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels that may be covered;
-    last < first means none. point_shape: (N, 1) float32, the radius in world units; of Gaussians
-    (N, 4), from pixels to deviations (cl/raster/footprint/gaussian.h). point_opacity: (N,) float32
-    in [0, 1], from the eye; of spheres undefined. cloud_offset, radius: of project_grid(). side:
-    samples of a pixel, each way; boxes and counts are of pixels, the camera is of the samples.
+    uint32, the number of pixels that the point covers; block_sum: (ceil(N/BLOCK),) uint32, the sums
+    of point_count over blocks of BLOCK points. Where LANES consecutive points have no fragments,
+    the other arrays are undefined. point_camera: (N, 4) float32, x, y, z in camera axes and the
+    distance from the eye; (0, 0, 0, -1) for a culled point. point_box: (N, 4) uint16, first x,
+    first y, last x, last y of the pixels that the point may cover; last < first means none.
+    point_shape: (N, 1) float32, the radius in world units; for Gaussians (N, 4), maps pixels to
+    deviations (cl/raster/footprint/gaussian.h). point_opacity: (N,) float32 in [0, 1], as seen from
+    the eye; undefined for spheres. cloud_offset, radius: the arguments of project_grid(). side:
+    samples of a pixel, each way; boxes and counts are in pixels, the camera is in samples.
     """
 
     footprint: str
@@ -52,8 +53,9 @@ class ProjectedPoints:
 
 
 def footprint_pixels(radius: float, side: int = 1) -> float:
-    """How many pixels a point covers, about, of side x side samples each: the area of a disc and of
-    what is as near to it as samples are to their pixel's centre. radius: of its footprint, pixels.
+    """The approximate number of pixels that a point covers, with side x side samples in each: the
+    area of a disc, grown by the square that a pixel's sample centres span. radius: of the
+    footprint, in pixels.
     """
     radius, apart = max(LEAST_RADIUS / side, radius), 1 - 1 / side
     return math.pi * radius**2 + 4 * radius * apart + apart**2
@@ -73,7 +75,7 @@ def projection_table(n: int, footprint: str = "soft") -> Table:
 
 def footprint_macros(footprint: str, side: int = 1) -> dict[str, int]:
     """The defines of a program that includes cl/raster/footprint.h, for one of FOOTPRINTS and side
-    x side samples of a pixel.
+    x side samples in a pixel.
     """
     return {
         "SIDE": side,
@@ -94,8 +96,8 @@ def launch_projection(
     side: int = 1,
     **arguments: Any,
 ) -> None:
-    """Launch a kernel of cl/<file>.cl that projects n points of one of FOOTPRINTS into the buffers
-    b of projection_table().
+    """Launch a kernel of cl/<file>.cl that projects n points with a footprint of FOOTPRINTS into
+    the buffers b of projection_table().
     """
     launch_groups(
         dev,
@@ -132,12 +134,12 @@ def project_grid(
     radius: float,
     side: int = 1,
 ) -> ProjectedPoints:
-    """Project the points, each in the cell of a grid's vertex, into a camera, whose pixels are the
-    samples if there are side x side of them in a pixel.
+    """Project the points, each in the cell of a grid vertex, into a camera. If a pixel has side x
+    side samples, the camera's pixels are the samples.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
-    PointCloud.offset; of Gaussians (N, 16). opacity: (N, 9) float32, PointCloud.opacity. radius: of
-    points without offsets, world units.
+    PointCloud.offset; (N, 16) for Gaussians. opacity: (N, 9) float32, PointCloud.opacity. radius:
+    the radius of points without offsets, in world units.
     """
     n = point_id.size
     b.require(projection_table(n, footprint))

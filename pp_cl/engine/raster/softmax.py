@@ -1,4 +1,4 @@
-"""The launches of the paper's softmax, in place of alpha compositing."""
+"""Launches the paper's softmax, the alternative to alpha compositing."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ from pp_cl.engine.device.device import Device
 def softmax_weights(
     dev: Device, pixels: int, gamma: float, defines: dict[str, Any], **arguments: Any
 ) -> None:
-    """The blend weights of Eq. (1). gamma: depth sharpness. defines, arguments: as of alpha_weights
-    in weights.py, and the camera.
+    """Compute the blend weights of Eq. (1). gamma: depth sharpness. defines, arguments: those of
+    alpha_weights in weights.py, and the camera.
     """
     drops = int(arguments["early_stop"] > 0)
     dev.program("raster/softmax", DROPS=drops, **defines).launch(
@@ -18,7 +18,7 @@ def softmax_weights(
 
 
 def softmax_gradient(dev: Device, pixels: int, **arguments: Any) -> None:
-    """What the backward pass of blend.py needs of each fragment and pixel. arguments: of the
-    kernel.
+    """Write pair_gradient and pixel_blend for blend_backward() of blend.py. arguments: the
+    kernel's.
     """
     dev.program("raster/softmax_gradient").launch("softmax_gradient", pixels, **arguments)

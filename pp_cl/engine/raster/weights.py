@@ -1,5 +1,5 @@
-"""The blend weight of each fragment in its pixel, by alpha compositing or by the paper's softmax;
-the list of visible points, and each point's highest weight for pruning.
+"""Computes the blend weight of each fragment in its pixel, by alpha compositing or by the paper's
+softmax; lists the visible points, and records each point's highest weight for pruning.
 """
 
 from __future__ import annotations
@@ -19,25 +19,26 @@ from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
 from pp_cl.engine.raster.softmax import softmax_weights
 
 BLENDS = ("softmax", "alpha")
-NO_POINT = 0xFFFFFFFF  # in pixel_weight_point, behind which fragments were dropped
-ALL = 2**32 - 1  # fragments of a pixel that get gradients
+NO_POINT = 0xFFFFFFFF  # ends a pixel's list in pixel_weight_point if fragments were dropped
+ALL = 2**32 - 1  # BlendWeights.tracked if all fragments get gradients
 
 
 @dataclass
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
-    blend: one of BLENDS. opacity, early_stop: of blend_weights(). tracked: how many nearest
-    fragments of a pixel get gradients. pixel_weight_point: (P,) uint64, weight bits << 32 | point,
-    each pixel's fragments by depth; where fragments are dropped, a number without a point ends the
-    pixel's list. pixel_derivative: (P,) float32 alike, the factor s of the backward pass,
-    dL/dopacity = s * dL/db (cl/raster/blend.cl), with several samples of a pixel (P, samples); None
+    blend: one of BLENDS. opacity, early_stop: the arguments of blend_weights(). tracked: how many
+    nearest fragments of a pixel get gradients. pixel_weight_point: (P,) uint64, weight bits << 32 |
+    point, each pixel's fragments by depth; where fragments are dropped, NO_POINT ends the pixel's
+    list. pixel_derivative: (P,) float32 in the same order, the factor s of the backward pass,
+    dL/dopacity = s * dL/db (cl/raster/blend.cl); (P, samples) if a pixel has several samples; None
     without derivatives.
-    point_is_visible: (N,) uint8, 1 for visible points. point_slot: (N,) uint32, where a visible
-    point stands in `visible`, undefined for others. transmittance: (HW,) float32 behind all
-    fragments, None with the softmax; sample_transmittance: (HW, samples) of each sample, where
-    there are several. visible_rows: (N,) uint32, `visible` at its front; found: (1,) uint32, how
-    many; count: the same, of read_visible().
+
+    point_is_visible: (N,) uint8, 1 for visible points. point_slot: (N,) uint32, the index of a
+    visible point in `visible`, undefined for others. transmittance: (HW,) float32 behind all
+    fragments, None with the softmax; sample_transmittance: (HW, samples), the same by sample, if a
+    pixel has several. visible_rows: (N,) uint32, begins with `visible`; found: (1,) uint32, the
+    number of visible points; count: that number, downloaded by read_visible().
     """
 
     blend: str
@@ -65,15 +66,15 @@ class BlendWeights:
 
     @property
     def visible(self) -> Array:
-        """(S,) uint32, ascending: the visible points, those with a fragment that is not dropped.
+        """(S,) uint32, ascending: the visible points, which have a fragment that is not dropped.
         Only they are shaded and get gradients. Waits until their number is known.
         """
         return self.visible_rows[: self.total]
 
 
 def weights_table(n: int, pixels: int, derivatives: int, side: int = 1) -> Table:
-    """The buffers for n points and a number of pixels of side x side samples, with a capacity for
-    a number of derivatives, 0: none; pixel_weight_point lies in pairs_table()'s pair_scratch.
+    """The buffers for n points, a number of pixels with side x side samples each, and a number of
+    derivatives, 0 for none; pixel_weight_point uses pair_scratch of pairs_table().
     """
     table: Table = {
         "transmittance": ((pixels,), np.float32),
@@ -111,8 +112,8 @@ def blend_weights(
     max_tracked: only this many nearest fragments of a pixel get gradients (64 in the paper); 0:
     all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
     have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
-    pass reads. points: needed for several samples of a pixel, which alpha compositing of discs
-    has. Which points are visible is known after read_visible().
+    pass reads. points: needed if a pixel has several samples (alpha compositing of discs).
+    read_visible() downloads the number of visible points.
     """
     side, capacity = pairs.side, pairs.capacity if derivatives else 0
     b.require(weights_table(pairs.points, pairs.pixels, capacity, side))
@@ -169,7 +170,7 @@ def blend_weights(
 
 
 def sample_macros(dev: Device, pairs: Pairs, derivatives: bool = True) -> dict[str, Any]:
-    """The defines of cl/raster/samples.cl, whose lanes are the samples of a pixel."""
+    """The defines of cl/raster/samples.cl, which computes the samples of a pixel in its lanes."""
     macros: dict[str, Any] = footprint_macros(pairs.footprint, pairs.side)
     on_cpu = {"ON_CPU": 1} if dev.is_cpu else {}
     return macros | on_cpu | {"LANES": pairs.side**2, "DERIVATIVES": int(derivatives)}
@@ -178,13 +179,13 @@ def sample_macros(dev: Device, pairs: Pairs, derivatives: bool = True) -> dict[s
 def listed_fragments(
     pairs: Pairs, weights: BlendWeights
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """On the host, of each fragment in the order of pairs.pair_key: (P,) bool, whether it is not
-    dropped, and of those that are not uint32 point and float32 weight.
+    """Download the fragments in the order of pairs.pair_key: (P,) bool, False if the fragment is
+    dropped, and the uint32 points and float32 weights of all others.
     """
     offset = pairs.pixel_offset.get().astype(np.int64)
     weight_point = weights.pixel_weight_point.get()[: pairs.total]
     point = (weight_point & np.uint64(NO_POINT)).astype(np.uint32)
-    # what follows NO_POINT within its pixel was never written
+    # entries behind NO_POINT in a pixel were never written
     ends = np.concatenate([[0], np.cumsum(point == NO_POINT)])
     is_listed = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
     return (
@@ -195,7 +196,7 @@ def listed_fragments(
 
 
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
-    """Set (P, 1 + samples) float32 to 0 at the pairs of visible points."""
+    """Set pair_gradient, (P, 1 + samples) float32, to 0 at the pairs of visible points."""
     count = weights.total
     dev.program("raster/weights", SAMPLES=pairs.side**2).launch(
         "clear_pairs",
@@ -208,8 +209,8 @@ def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient:
 
 
 def list_weights(dev: Device, b: Buffers, pairs: Pairs, weights: BlendWeights) -> Array:
-    """(P, 2) float32, valid until the next call: the blend weight of each pair of a visible point,
-    and 0; both 0 where the pair is dropped or not tracked.
+    """(P, 2) float32, valid until the next call: for each pair of a visible point, its blend weight
+    and 0; both are 0 if the pair is dropped or not tracked.
     """
     b.require({"pair_gradient": ((pairs.capacity, 2), np.float32)})
     clear_pairs(dev, pairs, weights, b.pair_gradient)
@@ -235,9 +236,10 @@ def record_weights(
     times_seen: Array,
     least: float = 0.0,
 ) -> None:
-    """Update what pruning looks at, both (N,) float32: max_weight, the highest sum over an image's
-    pixels of a point's blend weights so far, and times_seen, how many images had a fragment of the
-    point, dropped or not, and such a sum of at least `least`. pair_gradient: of list_weights().
+    """Update the inputs of pruning, both (N,) float32. For each point, max_weight is the highest
+    sum of its blend weights over an image's pixels so far, and times_seen counts the images in
+    which it had a fragment, dropped or not, and this sum was at least `least`. pair_gradient: from
+    list_weights().
     """
     dev.program("raster/weights").launch(
         "record_weights",
