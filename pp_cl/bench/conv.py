@@ -26,15 +26,16 @@ from pp_cl.engine.layers.tiles import Tiles, all_tiles
 from pp_cl.engine.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
 
-CHECK_SIDE = 33  # several tiles of any variant, and parts of some; float64 takes a second
-# what of Layer.expected errors are stated of
+CHECK_SIDE = 33  # whole and partial tiles for any variant; float64 takes a second
+# the parts of Layer.expected for which errors are reported
 RESULTS = {"forward": slice(0, 1), "weights": slice(1, 2), "input": slice(3, None)}
 
 
 @dataclass
 class Layer:
     """A convolution with its input: parts (H, W, C) float32, weight (CO, CI, K, K), bias (CO,),
-    grad_out (H, W, CO). relu: of the output, and of the input, which masks its gradient.
+    grad_out (H, W, CO). relu: whether the output has a ReLU, and the input had one, which masks its
+    gradient.
     """
 
     parts: Sequence[np.ndarray]
@@ -52,7 +53,9 @@ class Layer:
         co: int,
         k: int = 3,
     ) -> "Layer":
-        """Of a ReLU's outputs, with weights of PyTorch's initial size and normal gradients."""
+        """A layer with a ReLU's outputs as input, weights of PyTorch's initial size, normal
+        gradients.
+        """
         bound = 1 / np.sqrt(sum(channels) * k * k)
         weight = rng.uniform(-bound, bound, (co, sum(channels), k, k)).astype(np.float32)
         bias = rng.uniform(-bound, bound, co).astype(np.float32)
@@ -79,7 +82,7 @@ class Layer:
     def computed(
         self, dev: Device, variant: str, blocking: Blocking, tiles: Tiles | None = None
     ) -> list[np.ndarray]:
-        """What `expected` lists, by a variant. tiles: of output and gradients."""
+        """The arrays of `expected`, computed by a variant. tiles: of output and gradients."""
         uploaded = UploadedLayer(dev, self)
         for direction in DIRECTIONS:
             uploaded.compute(variant, blocking, direction, tiles)
@@ -88,7 +91,7 @@ class Layer:
 
 
 class UploadedLayer:
-    """A Layer's arrays on the device. variants: those offered to the device that can run it."""
+    """A Layer's arrays on the device. variants: those offered to the device that can run them."""
 
     def __init__(self, dev: Device, layer: Layer):
         self.dev, self.relu = dev, layer.relu
@@ -108,7 +111,7 @@ class UploadedLayer:
         ]
 
     def runner(self, variant: str, direction: str, blocking: Blocking) -> Callable:
-        """A function that computes a direction by a variant and waits for it."""
+        """A function that computes a direction with a variant and waits for the result."""
         tiles = all_tiles(self.dev, *self.grad_out.shape[:2])
 
         def run():
@@ -120,7 +123,7 @@ class UploadedLayer:
     def compute(
         self, variant: str, blocking: Blocking, direction: str, tiles: Tiles | None
     ) -> None:
-        """Compute a direction by a variant, as each step of a training does."""
+        """Compute a direction with a variant, as each step of a training does."""
         dev, kernels = self.dev, choice.VARIANTS[variant]
         parts, grad_out = self.parts, self.grad_out
         channels = tuple(part.shape[2] for part in parts)
@@ -144,7 +147,7 @@ class UploadedLayer:
 
 
 def layer_errors(layer: Layer, computed: list[np.ndarray], result: str) -> tuple[float, float]:
-    """errors() of what Layer.computed() returned, of one of RESULTS."""
+    """errors() of one of RESULTS, which Layer.computed() returned."""
     own = RESULTS[result]
     actual, expected = (
         np.concatenate([array.ravel() for array in arrays[own]])
@@ -154,7 +157,7 @@ def layer_errors(layer: Layer, computed: list[np.ndarray], result: str) -> tuple
 
 
 def _direction_errors(layer, computed, direction):
-    """The larger ones of layer_errors() of what a direction computes."""
+    """Each of layer_errors() at its largest over the results of a direction."""
     results = ["forward"] if direction == "forward" else ["weights", "input"]
     pairs = [layer_errors(layer, computed, result) for result in results]
     return tuple(max(each) for each in zip(*pairs, strict=True))
@@ -163,7 +166,7 @@ def _direction_errors(layer, computed, direction):
 def bench_conv(
     dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
-    """Rows of every distinct convolution of the network at size x size, by direction, variant."""
+    """Yield rows for the network's distinct convolutions at size x size, by direction, variant."""
     rng, blocking = np.random.default_rng(0), choice.blocking_of(dev)
     distinct: dict[tuple, Any] = {}
     for layer in convolutions(unet_layers(widths, blocks=blocks)):

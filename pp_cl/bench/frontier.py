@@ -1,5 +1,5 @@
-"""`pp-cl bench RUN`: a finished run rendered at the settings that trade time for error, and the
-fastest of them that is hardly worse than the default, which is kept in the run's folder.
+"""`pp-cl bench RUN`: renders a finished run at settings that trade time for error, and keeps the
+fastest of those that are hardly worse than the default in the run's folder.
 """
 
 import hashlib
@@ -29,24 +29,24 @@ from pp_cl.progress import Progress, track
 from pp_cl.run import Run
 
 EARLY_STOPS = 0.0, 0.001, 0.003, 0.01, 0.03, 0.1
-SHARES = 1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1  # of the points
-# Test views at most; where frames are slow, as many as make a round of ROUND seconds, at least
-# LEAST_VIEWS, of which as many are timed again and again, for SECONDS in all.
+SHARES = 1.0, 0.95, 0.9, 0.8, 0.7, 0.5, 0.3, 0.1  # shares of the points to keep
+# At most MOST_VIEWS test views are rendered; if frames are slow, as many as a round of ROUND
+# seconds allows, but at least LEAST_VIEWS. This many are timed repeatedly, for SECONDS in all.
 MOST_VIEWS, LEAST_VIEWS, ROUND, SECONDS = 16, 4, 40.0, 40.0
 MOST_LOSS = 0.1  # dB that the fastest setting may lose against the default
-LEAST_GAIN = 1.1  # times as fast as the default: less is within what times of two runs differ by
-# dB that single changes may lose in all to be tried together
+LEAST_GAIN = 1.1  # times as fast as the default: two runs may differ by less
+# dB that single changes may lose in sum if they are to be tried together
 TOGETHER = 0.08, 0.3, 1.0
-MOST_KEPT = 2**20  # bytes of the file; a row takes some 600
+MOST_KEPT = 2**20  # largest size of the file in bytes; a row takes some 600
 
 
 @dataclass(frozen=True)
 class Setting:
     """How a run is rendered.
 
-    early_stop: of raster. samples: of a pixel, 1 or 4. points: share that is kept, those of the
-    highest visibility(). specular: whether that layer is applied. members: of how many
-    the mean is shown. convolutions: what computes them, of choice.VARIANTS or AUTO.
+    early_stop: as raster.early_stop. samples: per pixel, 1 or 4. points: share that is kept, by the
+    highest visibility(). specular: whether the specular layer is applied. members: the image is the
+    mean of this many. convolutions: their variant, a key of choice.VARIANTS or AUTO.
     """
 
     early_stop: float
@@ -58,8 +58,8 @@ class Setting:
 
 
 class Renderings:
-    """A finished run, and the same run by other settings. default: its own setting. choices: {field
-    of Setting: its values, the default's among them} that differ in time and error. Raises
+    """A finished run, and the same run with other settings. default: its own setting. choices:
+    {field of Setting: values that differ in time and error, the default's included}. Raises
     UserError for an unfinished run.
     """
 
@@ -86,8 +86,8 @@ class Renderings:
         }
 
     def settings(self) -> list[Setting]:
-        """The exact one, which is the default without an early stop; the default; those that differ
-        from it in one field.
+        """The exact setting, which is the default without an early stop; the default; the settings
+        that differ from it in one field.
         """
         default = self.default
         found = [replace(default, early_stop=0.0), default]
@@ -96,7 +96,7 @@ class Renderings:
         return list(dict.fromkeys(found))
 
     def varied(self, setting: Setting, index: int = 0) -> Run:
-        """The run, or a further member, by a setting; points and buffers are its own."""
+        """The run, or a further member, with a setting; it has its own points and buffers."""
         run, rows, net, others = self._members[index], None, None, []
         if index == 0:
             others = [self.varied(setting, i) for i in range(1, setting.members)]
@@ -119,11 +119,11 @@ class Renderings:
 
     @cached_property
     def _ranked(self):
-        """Of each member, its points by visibility(), the highest first."""
+        """For each member, its points by visibility(), the highest first."""
         return [np.argsort(-visibility(one), kind="stable") for one in self._members]
 
     def words(self, setting: Setting) -> str:
-        """How a setting differs from the default; of the default, what it is."""
+        """How a setting differs from the default; for the default, its values."""
         told = {
             "early_stop": f"early stop {setting.early_stop:g}",
             "samples": f"{setting.samples} sample{'s' * (setting.samples > 1)} a pixel",
@@ -143,9 +143,9 @@ class Renderings:
 
 
 def visibility(run: Run) -> np.ndarray:
-    """(N,) float64: the sum of each point's blend weights over the pixels of all training views.
-    Leaving out a fifth of the points by it costs the demo 1.1 dB, by the highest sum of one view
-    1.6 dB.
+    """(N,) float64: the sum of each point's blend weights over the pixels of all training views. If
+    a fifth of the points is left out by this sum, the demo loses 1.1 dB; by the highest sum in a
+    single view, 1.6 dB.
     """
     dev, renderer, n = run.dev, run.renderer, run.model.cloud.count
     weight, seen, total = dev.zeros((n,)), dev.zeros((n,)), np.zeros(n)
@@ -154,7 +154,7 @@ def visibility(run: Run) -> np.ndarray:
         dev.fill(weight, 0)
         renderer.record_weights(drawn, weight, seen)
         total += dev.download(weight)
-        del drawn  # else its arrays would stay beside the larger ones of the next view
+        del drawn  # frees its arrays before the next view needs larger ones
     renderer.release()
     return total
 
@@ -163,13 +163,14 @@ def visibility(run: Run) -> np.ndarray:
 
 
 def measured(run: Run, metrics: tuple[str, ...] = ("psnr",)) -> dict[str, Any]:
-    """What `pp-cl bench RUN` finds: {"run", "device", "platform", "views": how many, "rows"}, kept
-    in the run's folder for fastest(). A row: {"bench": "run", "knob": the field of Setting that
-    differs from the default, "together" for several, "default" for none; "setting": all fields;
-    "words"; "ms": a frame, median; "ms_range"; "max_err", "mean_err": of colours in [0, 1], against
-    the exact rendering; the metrics against the photographs, means over the views; "is_default";
-    "is_frontier": no other is faster with as high a PSNR, to 0.01 dB; "is_fast": what fastest()
-    takes}. metrics: psnr among them. Raises UserError as Renderings and Run.scene() do.
+    """Measure what `pp-cl bench RUN` shows: {"run", "device", "platform", "views": how many,
+    "rows"}, kept in the run's folder for fastest(). A row: {"bench": "run", "knob": the field of
+    Setting that differs from the default, "together" for several, "default" for none; "setting":
+    all fields; "words"; "ms": median of a frame; "ms_range"; "max_err", "mean_err": errors of
+    colours in [0, 1] against the exact rendering; the metrics against the photographs, means over
+    the views; "is_default"; "is_frontier": no row with as high a PSNR, to 0.01 dB, is faster;
+    "is_fast": fastest() takes this row}. metrics: must include psnr. Raises UserError as Renderings
+    and Run.scene() do.
     """
     renderings, dev = Renderings(run), run.dev
     check_ours([run.folder.frontier])
@@ -184,7 +185,7 @@ def measured(run: Run, metrics: tuple[str, ...] = ("psnr",)) -> dict[str, Any]:
 
 
 class Measurement:
-    """Measures settings of a run on test views, in turns. metrics: as of measured()."""
+    """Measures settings of a run on test views, in turns. metrics: as for measured()."""
 
     def __init__(
         self, renderings: Renderings, views: Sequence[View], metrics: tuple[str, ...]
@@ -196,10 +197,10 @@ class Measurement:
         self._exact: list[np.ndarray] = []
 
     def rows(self) -> dict[str, Any]:
-        """{"views", "rows"} of measured()."""
+        """The entries "views" and "rows" of measured()."""
         settings = self._renderings.settings()
         self._choose_views(len(settings))
-        # the times of single changes say which are worth being tried together
+        # the times of single changes show which are worth trying together
         for choose in (lambda: settings, self._together):
             for setting in track(choose(), "measuring", "setting"):
                 self._judge(setting, self._render(setting, self._views))
@@ -217,7 +218,7 @@ class Measurement:
                     return
 
     def _choose_views(self, count):
-        """Leave so many views that a round of `count` settings is not too long."""
+        """Keep only so many views that a round of `count` settings does not take too long."""
         run, camera = self._renderings.run, self._views[0].camera
         with Progress("building kernels"):
             frame(run, camera)
@@ -230,9 +231,9 @@ class Measurement:
         self._truths = [target.whole(view) for view in self._views]
 
     def _render(self, setting, views, ms=None):
-        """The images of the views. ms: takes their milliseconds."""
+        """The images of the views. ms: a list to which each view's milliseconds are added."""
         run, images = self._renderings.varied(setting), []
-        frame(run, views[0].camera)  # makes the buffers
+        frame(run, views[0].camera)  # allocates the buffers
         for view in views:
             start = time.perf_counter()
             images.append(frame(run, view.camera))
@@ -242,7 +243,7 @@ class Measurement:
         return images
 
     def _judge(self, setting, images):
-        """Take down the errors of the images; the first ones are the exact ones."""
+        """Store the errors of the images; the images of the first call are the exact ones."""
         self._exact = self._exact or images
         errors = [np.abs(a - b) for a, b in zip(images, self._exact, strict=True)]
         found = {
@@ -258,15 +259,15 @@ class Measurement:
         return float(np.median(self._ms[setting]))
 
     def _together(self):
-        """The settings that differ in several fields and are fastest, by the sums of what each
-        field gains and loses, for each of TOGETHER.
+        """For each loss in TOGETHER, the fastest setting that differs in several fields, as
+        predicted by adding up what each field alone gains and loses.
         """
         default = self._renderings.default
         ms, psnr = self._median(default), self._found[default]["psnr"]
         single: dict[str, list] = {}
         for setting in self._found:
             if setting.early_stop < default.early_stop or setting.samples > default.samples:
-                continue  # takes more work
+                continue  # it does more work
             for name in self._renderings.changed(setting):
                 gains = ms - self._median(setting), psnr - self._found[setting]["psnr"]
                 single.setdefault(name, [(getattr(default, name), 0.0, 0.0)]).append(
@@ -310,21 +311,21 @@ class Measurement:
 
 
 def frame(run: Run, camera: Camera) -> np.ndarray:
-    """(H, W, 3) float32 in [0, 1]: what the run shows to a camera."""
+    """(H, W, 3) float32 in [0, 1]: the image that the run shows to a camera."""
     return run.checked(run.shown(run.renderer.forward(camera, run.gamma)))
 
 
 def release(run: Run) -> None:
-    """Free what a run's renderers keep from view to view."""
+    """Free the buffers that a run's renderers keep from view to view."""
     for one in (run, *run.others):
         one.renderer.release()
 
 
 def fastest_row(rows: list[dict]) -> dict:
-    """The row that gains most of those with at most MOST_LOSS dB less than the default; the
-    default's where none is LEAST_GAIN times as fast, by medians and by shortest times, which other
-    work on the machine hardly changes. More samples and a smaller early_stop take more work: what
-    they gain is chance.
+    """The row that is fastest among those that lose at most MOST_LOSS dB against the default; the
+    default's row if none is LEAST_GAIN times as fast, by medians and by shortest times, which other
+    work on the machine hardly changes. More samples and a smaller early_stop do more work: if they
+    are faster, it is chance.
     """
     default = next(row for row in rows if row["is_default"])
     own = default["setting"]
@@ -343,12 +344,12 @@ def fastest_row(rows: list[dict]) -> dict:
     return fast if gain(fast) >= LEAST_GAIN else default
 
 
-# ---- what is kept
+# ---- the file in the run's folder
 
 
 def fastest(run: Run) -> tuple[Run, str]:
-    """(a finished run as it is rendered fastest with a PSNR at most 0.1 dB below the default's, a
-    line that says how). What is fastest is measured once for a checkpoint and a device, as `pp-cl
+    """(a finished run with the fastest setting whose PSNR is at most 0.1 dB below the default's, a
+    line that describes it). The setting is measured once for a checkpoint and a device, as `pp-cl
     bench RUN` does, and kept in the run's folder. Raises UserError as measured() does.
     """
     renderings = Renderings(run)
@@ -357,8 +358,8 @@ def fastest(run: Run) -> tuple[Run, str]:
 
 
 def _kept(renderings):
-    """_chosen() of what is kept for the run's checkpoint and device; None where nothing is, or what
-    no measurement has written.
+    """_chosen() of the result kept for the run's checkpoint and device; None if there is none, or
+    if the file is not one that a measurement wrote.
     """
     try:
         found = strict_json(read_json_text(renderings.run.folder.frontier, MOST_KEPT))
@@ -368,8 +369,8 @@ def _kept(renderings):
 
 
 def _chosen(renderings, result):
-    """(Setting, the line of fastest()) of what was measured. Raises ValueError for values that the
-    run does not have.
+    """(Setting, the line of fastest()) from the result of measured(). Raises ValueError for values
+    that the run does not have.
     """
     (fast,), (default,) = (
         [row for row in result["rows"] if row[key] is True] for key in ("is_fast", "is_default")
@@ -389,8 +390,8 @@ def _chosen(renderings, result):
 
 
 def _key(renderings):
-    """What a measurement depends on, as text: the arrays of the checkpoints by their checksums, the
-    settings that `pp-cl` renders them by, and the device.
+    """A hash of all that a measurement depends on: checksums of the arrays of the checkpoints, the
+    settings with which `pp-cl` renders them, and the device.
     """
     sums = []
     for member in [renderings.run, *renderings.run.others]:
@@ -408,7 +409,7 @@ HEAD = COLUMNS("setting", "ms", "largest", "mean", "PSNR", "")
 
 
 def line(row: dict) -> str:
-    """A line of the printed table, of a row of measured()."""
+    """A row of measured() as a line of the printed table."""
     marks = {"is_default": "the default", "is_frontier": "frontier", "is_fast": "--fast"}
     more = [f"LPIPS {row['lpips']:.4f}"] if "lpips" in row else []
     more += [words for name, words in marks.items() if row[name]]

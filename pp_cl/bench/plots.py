@@ -1,15 +1,15 @@
-"""The plots of the benches; matplotlib is an extra."""
+"""Draws the plots of the benches; matplotlib is an extra."""
 
 from pathlib import Path
 from typing import Any
 
 from pp_cl.files.atomic import atomic_file
 
-LEAST_ERROR = 1e-9  # an error of 0 has no logarithm: drawn there, far below float32's
+LEAST_ERROR = 1e-9  # an error of 0 has no logarithm: it is drawn here, far below float32's
 
 
-# Of a run's renderings: mean errors below a thousandth of a step of 8 bits are drawn there, and
-# PSNR this many dB below the default's and above it.
+# For a run's renderings: mean errors below LEAST_SEEN, a thousandth of a step of 8 bits, are drawn
+# there; PSNR is drawn from BELOW dB below the default's to ABOVE dB above it.
 LEAST_SEEN, BELOW, ABOVE = 4e-6, 4.0, 0.3
 # {knob of a row: its name, and how its values are written}
 KNOBS = {
@@ -21,12 +21,12 @@ KNOBS = {
     "convolutions": ("convolutions", "{}"),
     "together": ("several of these", ""),
 }
-CURVES = ("early_stop", "samples", "points", "members")  # those whose values have an order
+CURVES = ("early_stop", "samples", "points", "members")  # knobs whose values have an order
 
 
 def plot_time_and_error(rows: list[dict], path: str, title: str = "") -> Any:
-    """Draw time against error, both logarithmic, of the rows that have one, with a colour for each
-    variant of a bench, direction and blend; write the matplotlib figure, and return it.
+    """Draw time against error, both logarithmic, for the rows that have an error, with a colour for
+    each variant of a bench, direction and blend; write the matplotlib figure, and return it.
     """
     from matplotlib.figure import Figure
 
@@ -51,7 +51,7 @@ def plot_time_and_error(rows: list[dict], path: str, title: str = "") -> Any:
 
 
 def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
-    """Draw the milliseconds of a frame against the mean error and against PSNR, of the rows of
+    """Draw the milliseconds of a frame against the mean error and against PSNR, for the rows of
     frontier.measured(): a curve for each knob through the default, and the frontier; write the
     matplotlib figure, and return it.
     """
@@ -87,7 +87,7 @@ def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
                 some = sorted([*some, default], key=lambda row: row["setting"][knob])
             draw(some, "o-" if knob in CURVES else "D", label=name if some else None)
         draw([default], "*", color=ink, markersize=14, label="default", zorder=3)
-    draw(front, "--", color=ink, alpha=0.5, label="frontier")  # on the right
+    draw(front, "--", color=ink, alpha=0.5, label="frontier")  # in the plot on the right
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())

@@ -25,10 +25,11 @@ from pp_cl.reference import dense
 from pp_cl.settings import RasterConfig
 
 BLENDS = ("alpha", "softmax")
-GAMMA = 0.01  # depth sharpness: the last one of a training, the sharpest
-RADIUS = 0.0015  # the paper's and Pulsar's, world units
+GAMMA = 0.01  # depth sharpness: a training's last and sharpest
+RADIUS = 0.0015  # world units, as in the paper and in Pulsar
 CHECKED_POINTS, CHECKED_SIDE = 4000, 16
-ROUNDING = 4 * np.finfo(np.float32).eps  # of the distance from a ray, in shares of the range
+# float32's error in the distance from a ray, as a share of the range
+ROUNDING = 4 * np.finfo(np.float32).eps
 CHANNELS = 16
 # every coefficient of degrees 1 and 2; random ones would take minutes for 4 million points
 HIGHER_SH = 0.1
@@ -82,7 +83,7 @@ class GridScene:
 
 
 class PulsarScene:
-    """The same of Pulsar's own benchmark: n opaque spheres in a cube at a depth of 1 to 2."""
+    """The scene of Pulsar's own benchmark: n opaque spheres in a cube at a depth of 1 to 2."""
 
     footprint, depth_range = "sphere", (0.6, 2.5)
 
@@ -150,7 +151,8 @@ SCENES: dict[str, type[Scene]] = {"grid": GridScene, "pulsar": PulsarScene}
 
 def features_error(scene: Scene, blend: str, features: np.ndarray) -> float:
     """Largest difference of an image's (H, W, 16) features from float64, over the range of the
-    points' features and the background, but where rounding may decide over a fragment.
+    points' features and the background. Pixels where rounding may decide on a fragment do not
+    count.
     """
     geometry = dense.geometry(
         scene.camera, scene.positions, RADIUS, scene.footprint, depth_range=scene.depth_range
@@ -173,7 +175,8 @@ def bench_raster(
     for n, size in product(points, sizes):
         before = dev.reset_peak()
         scene = SCENES[name](dev, n, size)
-        seconds: dict[str, list[dict]] = {blend: [] for blend in blends}  # of the stages of passes
+        # of the stages in each pass
+        seconds: dict[str, list[dict]] = {blend: [] for blend in blends}
 
         def run(blend, scene=scene, seconds=seconds):
             with dev.timed_stages() as stages:

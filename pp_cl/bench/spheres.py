@@ -1,4 +1,4 @@
-"""Spheres anywhere, as Pulsar has them, beside the engine's points on a grid."""
+"""Renders spheres at any position, as Pulsar does; the engine's points lie on a grid."""
 
 import math
 
@@ -21,8 +21,8 @@ def project_spheres(
     point_radius: Array,
     side: int = 1,
 ) -> ProjectedPoints:
-    """Project points anywhere. positions: (N, 3) float32, world. point_radius: (N,). side: of
-    project_grid().
+    """Project points at any position. positions: (N, 3) float32, world. point_radius: (N,). side:
+    as in project_grid().
     """
     n = len(positions)
     b.require(projection_table(n, footprint))
@@ -59,14 +59,14 @@ def find_all_pairs(
     capacity: int = 1,
     times_seen: Array | None = None,
 ) -> Pairs:
-    """What find_pairs() returns with room for all; `capacity` is tried first."""
+    """find_pairs() with room for all pairs; it tries `capacity` first."""
     while True:
         pairs = find_pairs(dev, b, points, size, capacity, times_seen)
         pairs.read_count(dev)
         capacity = capacity_needed(pairs)
         if capacity == pairs.capacity:
             return pairs
-        del pairs  # else its arrays would stay beside the larger ones
+        del pairs  # frees its arrays before the larger ones are made
 
 
 def spheres_backward(
@@ -79,14 +79,14 @@ def spheres_backward(
     opacity: Array,
     gamma: float,
 ) -> tuple[Array, Array]:
-    """(grad_positions (N, 3) in world axes, grad_radius (N,)), after blend_backward()."""
+    """(grad_positions (N, 3) in world axes, grad_radius (N,)); call it after blend_backward()."""
     n = pairs.points
     grad_positions, grad_radius = dev.empty((n, 3)), dev.empty((n,))
     dev.program("bench/spheres").launch(
         "spheres_backward",
         n,
         n=n,
-        # alpha depends on the order of the fragments alone
+        # alpha depends on depths only by the order of the fragments
         gamma=math.inf if weights.blend == "alpha" else gamma,
         camera=points.camera_buffer,
         point_camera=points.point_camera,

@@ -1,4 +1,4 @@
-"""Wall-clock times of runs in turn, errors against float64, and rows of a table."""
+"""Measures wall-clock times of runs in turn and errors against float64; makes rows of a table."""
 
 import time
 from collections.abc import Callable
@@ -47,8 +47,8 @@ def errors(actual: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 def variant_rows(
     about: dict, runs: dict[str, Callable], found: dict[str, tuple], *, flops: int
 ) -> list[dict]:
-    """A row for each variant, timed in turn. about: what rows share. found: {variant: errors()}.
-    flops: floating-point operations of one run, counted as direct convolutions.
+    """A row for each variant, timed in turn. about: fields that all rows share. found: {variant:
+    errors()}. flops: floating-point operations of one run, counted as direct convolutions.
     """
     return [
         {
@@ -69,7 +69,7 @@ HEAD = COLUMNS("bench", "of", "variant", "ms", "rel. L2", "max", "")
 
 
 def line(row: dict) -> str:
-    """A line of the printed table, of a row of any bench."""
+    """A row of any bench as a line of the printed table."""
     if "layer" in row:
         what = f"{row['layer']} {'x'.join(map(str, row['shape']))} {row['direction']}"
         more = f"{row['gflops']:.1f} GFLOP/s"

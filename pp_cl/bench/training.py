@@ -1,4 +1,4 @@
-"""`pp-cl bench train`: the stages of a training's last steps, and what the host takes for one."""
+"""`pp-cl bench train`: times a training's last steps by stages, and the host's work for one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import open_scene, scene_box
 from pp_cl.settings import Config
 
-STEPS = 5  # that are timed each way, after one that builds the kernels
+STEPS = 5  # timed each way, after one that builds the kernels
 
 
 def host_cost(trainer: Trainer, steps: int) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     trainer = Trainer(dev, config, model, views)
     trainer.step = max(0, config.train.iterations - 1 - 2 * STEPS)
     if trainer.exposure and not trainer.exposure.is_applied:
-        trainer.exposure = None  # it has been decided by then
+        trainer.exposure = None  # whether to apply it is decided by then
     trainer.follow(config)
     trainer.train_step()
     host = host_cost(trainer, STEPS)
@@ -54,7 +54,7 @@ def bench_step(dev: Device, config: Config) -> Iterator[dict[str, Any]]:
     stages = {
         name: float(np.median(values)) * 1e3
         for name, values in seconds.items()
-        if len(values) >= STEPS  # what every step does
+        if len(values) >= STEPS  # stages that every step has
     }
     yield {
         "scene": config.scene.path,

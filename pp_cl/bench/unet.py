@@ -1,4 +1,4 @@
-"""`pp-cl bench unet`: time against error of the variants of the convolutions, as a network."""
+"""`pp-cl bench unet`: time against error of whole networks, by variant of the convolutions."""
 
 from collections.abc import Callable, Iterator
 
@@ -20,8 +20,9 @@ CHECK_SIZE = 128  # float64 takes seconds for each variant of the paper's networ
 def bench_unet(
     dev: Device, size: int, widths: tuple[int, int, int], *, blocks: str = "double"
 ) -> Iterator[dict]:
-    """Rows of the whole network at size x size, as shipped and by every variant: forward, and train
-    = forward and backward to the input and the weights, with the errors of the worst gradient.
+    """Yield rows for the whole network at size x size, as shipped and with every variant:
+    "forward"; and "train", which is forward and backward to input and weights, with the errors of
+    the worst gradient.
     """
     rng = np.random.default_rng(0)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
@@ -53,8 +54,8 @@ def bench_unet(
 def make_network(
     dev: Device, widths: tuple[int, int, int], variant: str = AUTO, blocks: str = "double"
 ) -> UNet:
-    """A network by a variant, with He's initial weights: by UNet's own, values fade through the
-    layers, and the error of an image that is 0.5 and little else says nothing.
+    """A network with a variant and He's initial weights. With UNet's own, values fade through the
+    layers, and as the image is little else than 0.5, its error says nothing.
     """
     net = UNet(dev, widths, blocks=blocks, variant=variant)
     for name, parameter in net.parameters.items():
@@ -64,7 +65,7 @@ def make_network(
 
 
 def network_runner(net: UNet, x: Array, grad_image: Array | None = None) -> Callable:
-    """A function that makes an image, and of an image's gradient all gradients, and waits."""
+    """A function that makes an image, and with grad_image also all gradients, and waits."""
 
     def run():
         net.forward(x, training=grad_image is not None)
@@ -87,7 +88,7 @@ def plain_parameters(net: Network, arrays: dict[str, Array]) -> dict[str, np.nda
 def network_errors(
     net: UNet, *, outputs: dict, grad_image: np.ndarray
 ) -> dict[str, tuple[float, float]]:
-    """{"forward", "train": errors}. outputs: of reference.network; grad_image: (H, W, 3)."""
+    """{"forward", "train": errors}. outputs: from reference.network(); grad_image: (H, W, 3)."""
     dev = net.dev
     parameters = plain_parameters(net, net.parameters)
     image = net.forward(dev.upload(outputs["x"], np.float32)).get()

@@ -1,4 +1,4 @@
-"""The commands: modules with HELP, add_arguments(parser), run(options). Only here is printed."""
+"""The commands: modules with HELP, add_arguments(parser), run(options). Only commands print."""
 
 __all__ = ["COMMANDS"]
 

@@ -1,5 +1,5 @@
-"""`pp-cl bench`: time and error of a run's renderings, and of convolutions, network, rasteriser and
-training steps.
+"""`pp-cl bench`: measures time and error of a run's renderings, and of convolutions, network,
+rasteriser and training steps.
 """
 
 import argparse
@@ -20,8 +20,8 @@ OPTIONS = {
     "train": ("scene", "points", "widths"),
     "all": ("plot",),
 }
-OF_RUN = ("scene", "metrics", "plot")  # those of a run
-# what `all` measures: about two minutes on two cores
+OF_RUN = ("scene", "metrics", "plot")  # the options for a run
+# options for `all`, which takes about two minutes on two cores
 SMALL: dict[str, dict[str, Any]] = {
     "conv": {"size": [128], "widths": (32, 64, 128)},
     "unet": {"size": [128], "widths": (32, 64, 128)},
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="raster: of alpha,softmax (both)",
     )
     shared.add_metrics(parser)
-    parser.set_defaults(metrics=None)  # which only a run has
+    parser.set_defaults(metrics=None)  # only a run has metrics
     shared.add_json(parser, OPTIONS)
     add(
         "--plot",
@@ -122,7 +122,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _bench_run(options):
-    """run() of a run."""
+    """run() for a run's folder."""
     from pp_cl.bench.frontier import HEAD, line, measured
     from pp_cl.bench.plots import plot_frontier
     from pp_cl.run import load
@@ -138,7 +138,7 @@ def _bench_run(options):
 
 
 def _what(text):
-    """The type of what is timed: a key of OPTIONS, or the folder of a run."""
+    """The type of the subject: a key of OPTIONS, or the folder of a run."""
     if text in OPTIONS or os.path.isdir(text):
         return text
     near = suggestion(text, OPTIONS)

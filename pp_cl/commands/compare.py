@@ -1,4 +1,4 @@
-"""`pp-cl compare`: images against the ground truth, or a run's points against a mesh."""
+"""`pp-cl compare`: compares images with the ground truth, or a run's points with a mesh."""
 
 import argparse
 from pathlib import Path
@@ -13,7 +13,7 @@ Without TRUTH: how well a run's points fill the surface of a mesh, before and af
 nearest vertex; these vertices are compared with the points. Of a mesh alone: their number, on a
 grid with --edge."""
 METRICS = ("psnr", "ssim")
-SAMPLES = 1024**3  # as pp_cl.metrics.shape has it
+SAMPLES = 1024**3  # as in pp_cl.metrics.shape
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

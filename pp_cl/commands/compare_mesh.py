@@ -22,7 +22,7 @@ DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 
 def mesh_shape(dev: Device, mesh: Mesh, voxel_size: float | None, samples: int) -> dict[str, Any]:
     """{"grid": {"dims", "voxel_size"}, "samples", "surface": vertices nearest to the mesh} for a
-    grid of this voxel size around the mesh; None: the finest that points may have.
+    grid of this voxel size around the mesh; None: the smallest that points may have.
     """
     box = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
     chosen = voxel_size or smallest_voxel_size(box, CELL_CAP)
@@ -31,7 +31,7 @@ def mesh_shape(dev: Device, mesh: Mesh, voxel_size: float | None, samples: int) 
 
 
 def _sampled(dev, mesh, grid, samples):
-    """(sample_surface() under a progress bar, the facts of it)."""
+    """(sample_surface() under a progress bar, facts about it)."""
     with Progress("sampling", samples, "sample") as bar:
         surface = sample_surface(dev, mesh, grid, samples, advance=bar.update)
     return surface, {"grid": _grid_facts(grid), "samples": samples, "surface": surface.count}
@@ -44,9 +44,9 @@ def _grid_facts(grid):
 def run_shape(
     dev: Device, folder: RunFolder, mesh: Mesh | None, samples: int, *, scene: str | None = None
 ) -> dict[str, Any]:
-    """The facts of mesh_shape() of a run's last grid, and overlap() "before" training, of the
-    hull's points, and "after" it. mesh: in the scene's world; None: the demo's own. scene: where
-    it is now. Raises UserError for a checkpoint, a scene or a mesh that is missing.
+    """The facts of mesh_shape() for a run's last grid, and overlap() with the points "before"
+    training, which fill the hull, and "after" it. mesh: in the scene's world; None: the demo's own.
+    scene: where it is now. Raises UserError for a checkpoint, a scene or a mesh that is missing.
     """
     config = stored_config(folder, scene)
     check_scene(config.scene.path)
@@ -66,14 +66,14 @@ def run_shape(
 
 
 def _points_before(dev, config: Config, grid, count):
-    """Ids on a run's last grid of the `count` points that it began with, refined as it was."""
+    """Ids on a run's last grid of the `count` points that it began with, after refinements."""
     views = open_scene(dev, config, ("train",)).splits["train"]
     agreement = agreeing(dev, views, scene_box(config))
     grids = [grid]
     for _ in config.train.refine_at:
-        if not any(n % 2 for n in grids[-1].dims):  # else it is not refined
+        if not any(n % 2 for n in grids[-1].dims):  # a refined grid has even sides
             grids.append(grids[-1].coarsened())
-    while grids:  # the coarsest first, which is the quickest; one has the hull that it began with
+    while grids:  # coarsest first, as it is the quickest; the run began on one of these
         first = grids.pop()
         ids = hull_on(dev, agreement.views, first, agreement.forgiven)
         if len(ids) == count:

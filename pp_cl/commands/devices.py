@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the devices, and which one is taken. Raises UserError if none works."""
+    """Print the devices and which one is used. Raises UserError if none works."""
     from pp_cl.drivers import list_devices, list_left_out, mend
     from pp_cl.engine.device.quirks import describe
     from pp_cl.speeds import by_speed

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the facts, write the image. Raises UserError for options that do not fit, and of a
+    """Print the facts, write the image. Raises UserError for options that do not fit, and for a
     scene whose cameras are wrong.
     """
     from pp_cl.commands.info_facts import describe_scene, run_facts, run_sheet, run_work
@@ -71,11 +71,11 @@ def run(options: argparse.Namespace) -> None:
         facts["picture"] = options.picture
         lines.append(f"wrote {options.picture}")
     shared.tell(options.json, facts, lines)
-    if facts.get("cameras_are_wrong"):  # as train says
+    if facts.get("cameras_are_wrong"):  # train raises the same
         raise UserError(facts["problem"])
 
 
-# ---- facts as rows: (what a line is of, "" for a further one of the same, its text)
+# ---- facts as rows: (subject of a line, "" if it is that of the line before, text)
 
 
 def _run_rows(facts):
@@ -149,7 +149,7 @@ def _scene_rows(facts):
     splits = ", ".join(f"{name} {count}" for name, count in facts["splits"].items())
     angle_x, angle_y = (_range(facts["field_of_view"][axis], ".1f") for axis in "xy")
     masks, stated, dropped = facts["masks"], facts["depth_range"], facts["dropped"]
-    # of world units: those that show four digits of how far the cameras are
+    # decimals of world units that show four digits of the cameras' distances
     distances = facts["distances"]
     places = max(0, 3 - math.floor(math.log10(max(distances) or 1)))
     form = f".{places}f"

@@ -32,15 +32,15 @@ from pp_cl.scene.outline import SHOWN_VIEWS, outline_sheet
 from pp_cl.scene.verdict import WrongCameras, judged
 from pp_cl.session.start import first_hull
 
-WORK_VIEWS = 8  # in which run_work() counts
+WORK_VIEWS = 8  # number of views in which run_work() counts
 
 Facts = dict[str, Any]
 Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
 
 
 def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
-    """What a run is, from its files alone; what they do not tell is None. scene: where its scene
-    is now. Raises UserError naming the file that is missing or broken.
+    """Facts about a run, from its files alone; those that they do not tell are None. scene: where
+    the scene is now. Raises UserError naming the file that is missing or broken.
     """
     config, rows, measured = stored_config(folder, scene), folder.rows(), folder.measured()
     last, network = rows[-1] if rows else {}, config.network
@@ -87,7 +87,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "views": {"count": len(image_files), "images": _image_sizes(image_files)},
         "points": {"initial": initial, "left": left, "pruned": _prunings(rows)},
         "grid": grid | {"voxel_size_pixels": spacing_pixels(Grid.of_header(grid), cameras)},
-        # all of the size that cells have now
+        # all counts are of cells of the present size
         "cells": {
             "box": whole,
             "hull": initial * 8**refined,
@@ -99,17 +99,17 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
 
 
 def _prunings(rows):
-    """How many points each pruning has left, by the rows of a log; refinements are none."""
+    """The number of points after each pruning, from the rows of a log; refinements do not count."""
     counts = [row["points"] for row in rows if "points" in row]
     return [after for before, after in itertools.pairwise(counts) if after < before]
 
 
 def run_work(dev: Device, folder: RunFolder) -> Facts:
-    """What is computed for a view of a run and for a step, means over some training views:
-    {"views", "fragments": {"found", "blended"}, "drawn": points; "step": {"side", "touched": points
-    that get gradients, "with_gradients": fragments}, of the crop in the middle of the view, the
-    whole where it is smaller; "network": {"tiles": share with fragments, "multiplications",
-    "whole": those of the whole image}}. Raises UserError as load() does.
+    """The work for a view of a run and for a training step, as means over some training views:
+    {"views", "fragments": {"found", "blended"}, "drawn": points; "step", for the crop in the middle
+    of the view, or all of a smaller view: {"side", "touched": points that get gradients,
+    "with_gradients": fragments}; "network": {"tiles": share with fragments, "multiplications",
+    "whole": multiplications for the whole image}}. Raises UserError as load() does.
     """
     run = load(folder.path, dev)
     renderer, network = run.renderer, run.config.network
@@ -118,7 +118,7 @@ def run_work(dev: Device, folder: RunFolder) -> Facts:
     for camera in evenly(run.cameras("train"), WORK_VIEWS):
         image = renderer.forward(camera, run.gamma)
         size, computed = image.size, image.computed_fraction
-        del image  # else its arrays would stay beside those of the next forward()
+        del image  # frees its arrays before the next forward()
         found, blended, drawn, tiles = _counted(
             renderer.forward(camera, run.gamma, until="weights")
         )
@@ -140,8 +140,8 @@ def run_work(dev: Device, folder: RunFolder) -> Facts:
 
 
 def _counted(result):
-    """[fragments found, blended before the early stop or tracked, points of these, share of the
-    tiles of pixels with fragments] of a view up to its weights.
+    """[fragments found, fragments blended (before the early stop and tracked), their points, share
+    of the tiles that have fragments] of a view rendered up to its weights.
     """
     pairs, weights = result.pairs, result.weights
     offset = pairs.pixel_offset.get().astype(np.int64)
@@ -169,7 +169,7 @@ def run_sheet(dev: Device, folder: RunFolder, scene: str | None = None) -> np.nd
 
 
 def _files(folder):
-    """{name: bytes} of what lies in a folder, of a folder in it the sum."""
+    """{name: bytes} of the files in a folder; a subfolder counts as the sum of its files."""
     files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
     sizes = Counter()
     for file in files:
@@ -185,9 +185,9 @@ def _image_sizes(image_files):
 def describe_scene(
     dev: Device, scene: str, preset_name: str, given: Iterable[Given] = ()
 ) -> tuple[Facts, list[View], Hull | None, list[Disagreement]]:
-    """(what a scene is with the settings of a preset and those given, its training views, their
-    hull, None where the masks give none, the masks that the others contradict). Raises UserError
-    for a scene that is missing or broken; what prevents a hull is a fact.
+    """(facts about a scene with a preset's and the given settings, its training views, their hull,
+    None if the masks give none, the masks that the others contradict). Raises UserError for a scene
+    that is missing or broken; what else prevents a hull is reported as a fact.
     """
     config = scene_config(scene, preset_name, given)
     path = config.scene.path
@@ -260,7 +260,7 @@ def _angles(sides):
 
 
 def _masks(views):
-    """{"with_alpha": share of the views with a mask, "object": mean share that these hold}."""
+    """{"with_alpha": share of the views with a mask, "object": mean share of pixels in a mask}."""
     masks = [view.image[..., 3] for view in views if view.has_mask]
     shares = [float((mask > MASK_THRESHOLD).mean()) for mask in masks]
     return {

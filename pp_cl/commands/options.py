@@ -16,13 +16,14 @@ from pp_cl.presets import SHORT
 
 METRICS = ("psnr", "ssim", "lpips")
 MOST_SIDE = 8192  # pixels of an image that is rendered
-METAVARS = {"masks": "FOLDER", "ignore": "FOLDER", "mask_from": "HOW", "network": "RUN"}  # else N
+# N for all others
+METAVARS = {"masks": "FOLDER", "ignore": "FOLDER", "mask_from": "HOW", "network": "RUN"}
 
 # ---- types
 
 
 def integer(least: int, most: int, multiple: int = 1) -> Callable[[str], int]:
-    """The type of a whole number in [least, most], a multiple of another."""
+    """The type of a whole number in [least, most] that is a multiple of `multiple`."""
     which = f"a multiple of {multiple}" if multiple > 1 else "a whole number"
     accepted = range(-(-least // multiple) * multiple, most + 1, multiple)
     return _read(config.whole, lambda n: n in accepted, f"{which} from {least} to {most}")
@@ -35,7 +36,7 @@ def number(least: float, most: float) -> Callable[[str], float]:
 
 
 def _read(convert, accepts, what):
-    """The type of what is written as `what`."""
+    """The type of values that `accepts` allows. what: how to write them."""
 
     def read(text):
         try:
@@ -50,12 +51,12 @@ def _read(convert, accepts, what):
 
 
 def several(one: Callable[[str], Any]) -> Callable[[str], list]:
-    """The type of values of another type, separated by commas: ascending, each once."""
+    """The type of values of another type, separated by commas: sorted, without duplicates."""
     return lambda text: sorted({one(word) for word in text.split(",")})
 
 
 def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
-    """The type of known words, separated by commas: in their order, each once."""
+    """The type of known words, separated by commas: in the given order, without duplicates."""
 
     def read(text):
         given = tuple(dict.fromkeys(word.strip() for word in text.split(",")))
@@ -68,7 +69,7 @@ def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
 
 
 def _parts(text, separator, one, count, what):
-    """So many values of another type, written as `what`."""
+    """`count` values of another type. what: how to write them."""
     parts = text.split(separator)
     if len(parts) != count:
         raise UserError(f"{quoted(text)}: write {what}")
@@ -98,7 +99,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def output_file(*suffixes: str) -> Callable[[str], str]:
-    """The type of a file to be written, with one of these suffixes where there are some."""
+    """The type of a file to be written, which ends in one of these suffixes if there are any."""
 
     def read(text):
         path, folder = Path(text), os.path.dirname(os.path.abspath(text))
@@ -118,7 +119,7 @@ def output_file(*suffixes: str) -> Callable[[str], str]:
 
 
 def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Raise UserError for an option out of `names` that was given. why: it makes no sense here."""
+    """Raise UserError if an option out of `names` was given. why: the reason, for the message."""
     for name in names:
         value = getattr(options, name)
         if not (value is None or value is False or value == []):
@@ -126,8 +127,8 @@ def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
 
 
 def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> None:
-    """Add --json: a file, or sys.stdout, which then has nothing but the JSON: cli.main() sends what
-    is printed meanwhile to stderr. known: words of the command, which are no files.
+    """Add --json: a file, or sys.stdout, which then gets only the JSON: cli.main() sends all other
+    output to stderr. known: words of the command, which cannot be names of files.
     """
 
     def target(text):
@@ -135,9 +136,10 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
             return sys.stdout
         is_taken = text in known or os.path.isdir(text)
         if not is_taken:
-            output_file()(text)  # it refuses pipes, that reading would wait for
+            output_file()(text)  # it refuses pipes, on which reading would wait
             with suppress(OSError), open(text, "rb") as file:
-                is_taken = file.read(1) not in (b"", b"{", b"[")  # it would be lost
+                # content that is no JSON would be lost
+                is_taken = file.read(1) not in (b"", b"{", b"[")
         if is_taken:
             raise UserError(
                 f"{quoted(text)}: no JSON may be written there; name another FILE, or write what"
@@ -156,7 +158,7 @@ def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> Non
 
 
 def write_json_option(target: str | TextIO | None, value: Any) -> None:
-    """Write the result to where --json says, if it was given."""
+    """Write the result to the target of --json, if it was given."""
     if isinstance(target, str):
         write_json(target, value)
     elif target is not None:
@@ -164,21 +166,21 @@ def write_json_option(target: str | TextIO | None, value: Any) -> None:
 
 
 def tell(target: str | TextIO | None, value: Any, lines: Iterable[str]) -> None:
-    """Write the result as write_json_option does, and print its lines, unless JSON is printed."""
+    """Write the result as write_json_option() does, and print the lines unless JSON is printed."""
     write_json_option(target, value)
     if target is None or isinstance(target, str):
         print("\n".join(lines))
 
 
 def add_run_scene(parser: argparse.ArgumentParser) -> None:
-    """Add --scene of a command that works on a run."""
+    """Add --scene for a command that works on a run."""
     parser.add_argument(
         "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
     )
 
 
 def add_fast(parser: argparse.ArgumentParser) -> None:
-    """Add --fast of a command that renders a run."""
+    """Add --fast for a command that renders a run."""
     parser.add_argument(
         "--fast",
         action="store_true",
@@ -214,7 +216,7 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
 
 
 def add_short(parser: argparse.ArgumentParser, names: Iterable[str]) -> None:
-    """Add the options of settings with short names, for read_short."""
+    """Add the options for settings with short names, which read_short() reads."""
     for name in names:
         item = config.field_of(SHORT[name])
         parser.add_argument(

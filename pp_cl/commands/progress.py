@@ -1,4 +1,4 @@
-"""How a training shows that it goes on."""
+"""Shows the progress of a training."""
 
 from contextlib import ExitStack
 from typing import Any, TextIO
@@ -10,21 +10,21 @@ from pp_cl.presets import FEW
 from pp_cl.progress import Progress
 from pp_cl.session.training import Training
 
-BUILDING = 2  # steps in which nearly all kernels are built, if the driver has not kept them
+BUILDING = 2  # steps that build nearly all kernels, if the driver has not kept them
 GIB = 2**30
 
 
 class TrainingProgress:
-    """Rate, time left, PSNR, points and device memory of a training: to be entered while it runs,
-    and called after each step with its row of the log. The rate begins once kernels are built. Of
-    train.minutes those that are left are shown, as their steps are planned ever anew.
+    """Shows rate, time left, PSNR, points and device memory of a training. Enter it for the time of
+    the training, and call it after each step with its row of the log. The rate begins once kernels
+    are built. With train.minutes it shows the minutes left, as the number of steps changes.
     """
 
     def __init__(self, training: Training, stream: TextIO | None = None) -> None:
         self._dev, self._stream = training.trainer.dev, stream
         self._built = training.trainer.step + BUILDING
         self._training, self._steps = training, training.config.train.iterations
-        self._is_told = False  # how many steps train.minutes allow
+        self._is_told = False  # whether the steps that train.minutes allow were printed
         self._test, self._stages = "", ExitStack()
 
     def __enter__(self) -> "TrainingProgress":
@@ -37,7 +37,7 @@ class TrainingProgress:
         self._stages.close()
 
     def __call__(self, step: int, row: dict[str, Any] | None) -> None:
-        """Move on to a step."""
+        """Show a step."""
         if self._training.config.train.iterations != self._steps:
             self._replan()
         train = self._training.config.train
@@ -61,7 +61,7 @@ class TrainingProgress:
             )
 
     def _replan(self):
-        """Take up the steps that train.minutes allow; the first time, tell of them."""
+        """Take over the number of steps that train.minutes allow; print it the first time."""
         name, train = self._training.config.preset, self._training.config.train
         if not self._is_told:
             own, steps, few = preset(name).train.iterations, train.iterations, FEW[name]

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the cases, print the table. Raises Stopped, which names them, where cases fail."""
+    """Run the cases, print the table. Raises Stopped, which names the failed cases, if any fail."""
     from pp_cl.drivers import open_device
     from pp_cl.selftest import run as selftest
 

@@ -1,4 +1,4 @@
-"""How Ctrl-C and SIGTERM end a command: with one line, within seconds, a training in good order."""
+"""Ctrl-C and SIGTERM end a command with one line, within seconds, and a training in good order."""
 
 import os
 import signal
@@ -14,16 +14,16 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 3.0  # seconds after a signal until a process ends, whatever it is doing
 INTERRUPTED = "interrupted"
 
-# the line about the end of this process was printed
+# set once the line about the end of this process has been printed
 told = threading.Event()
-# set but while a training may end its step after a signal, however long that takes
+# cleared only while a training may end its step after a signal, however long that takes
 _in_haste = threading.Event()
 _in_haste.set()
 
 
 @contextmanager
 def interrupting() -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM raise KeyboardInterrupt(number) in the block; a list of what came."""
+    """Ctrl-C and SIGTERM raise KeyboardInterrupt(number) in the block; yields a list of numbers."""
     caught: list[int] = []
 
     def interrupt(number: int, _frame: FrameType | None) -> None:
@@ -36,8 +36,9 @@ def interrupting() -> Iterator[list[int]]:
 
 @contextmanager
 def first_signal(*, in_haste: bool = False) -> Iterator[list[int]]:
-    """A list that is empty until Ctrl-C or SIGTERM comes, and then holds its number. A second one
-    does what it did before. in_haste: the process ends PATIENCE seconds later, not so long after.
+    """Yields a list that is empty until Ctrl-C or SIGTERM comes and then holds its number. A second
+    signal does what it did before the block. in_haste: the process ends PATIENCE seconds after the
+    signal, not after the block.
     """
     caught: list[int] = []
 
@@ -56,7 +57,7 @@ def first_signal(*, in_haste: bool = False) -> Iterator[list[int]]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Ctrl-C and SIGTERM are answered after the block; processes that start in it get none."""
+    """Delay Ctrl-C and SIGTERM until the block ends; processes that start in it get neither."""
     if sys.platform == "win32" or not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -69,11 +70,11 @@ def deferred() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
-    """Gives what makes signals do again what they did before; in other threads nothing changes."""
+    """Yields a function that restores the signals' handlers; in other threads nothing changes."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.getsignal(number) for number in STOPPING}
-    # nohup, and & in a script, leave signals ignored; None is a handler that is not Python's
+    # signals that nohup, or & in a script, ignores stay ignored; None: not a handler of Python's
     before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
 
     def restore() -> None:
@@ -89,12 +90,12 @@ def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Cal
 
 
 def watch() -> None:
-    """From now on a signal that is handled ends this process PATIENCE seconds later: handlers do
-    not run while a driver's compiler or a thread that is waited for takes its time.
+    """From now on, a signal with a handler ends this process PATIENCE seconds later, as handlers do
+    not run while a driver's compiler works or while Python waits for a thread.
     """
     try:
         reader, writer = socket.socketpair()
-    except OSError:  # no file may be opened any more: handlers alone
+    except OSError:  # no more files can be opened: only handlers act
         return
     writer.setblocking(False)
     signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)

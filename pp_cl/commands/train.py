@@ -51,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, follow: Callable[["Training"], None] = lambda _: None) -> None:
-    """Train, or say that there is nothing left to train. follow: is called with each training
-    before its first step.
+    """Train, or say that there is nothing left to train. follow: called with each training before
+    its first step.
     """
     from pp_cl.config import run_config
     from pp_cl.files.run_folder import RunFolder
@@ -156,7 +156,7 @@ def _first_line(training):
 
 
 def _specular_line(fitted):
-    """A line of text: what the specular layer has brought."""
+    """A line of text: how much the specular layer improves the image."""
     if fitted.layer is None:
         return "specular: left out, it explains too little of views that it is not fitted to"
     before, after = (-10 * math.log10(max(mse, 1e-10)) for mse in (fitted.before, fitted.after))
@@ -178,14 +178,14 @@ def _images_line(training, chosen):
 
 
 def _sizes(cameras):
-    """WxH of the cameras' images, or that of the smallest and of the largest."""
+    """WxH of the cameras' images; if they differ, of the smallest and of the largest."""
     found = sorted({(c.width, c.height) for c in cameras}, key=math.prod)
     return " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((found[0], found[-1])))
 
 
 def _run(training, options):
-    """Seconds of the training. Raises Stopped after Ctrl-C or SIGTERM: at once in the first step,
-    which builds kernels, else at the end of the step.
+    """Run the training; returns its seconds. Raises Stopped after Ctrl-C or SIGTERM: at once in the
+    first step, which builds kernels, later at the end of the step.
     """
     from pp_cl.commands.progress import TrainingProgress
     from pp_cl.commands.signals import first_signal

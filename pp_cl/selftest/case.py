@@ -38,8 +38,8 @@ class Check(NamedTuple):
 @dataclass(frozen=True)
 class Case:
     """name: "wing: subject", unique. run(dev, rng) yields the checks. variant: the convolution that
-    the case tests; devices to which it is not offered skip the case. hard: for a hard case, how the
-    naive formula fails, which is computed in float32 and with which a check compares.
+    the case tests; devices to which it is not offered skip the case. hard: how the naive formula
+    fails in a hard case; the formula is computed in float32, and a check compares with it.
     """
 
     name: str

@@ -38,13 +38,13 @@ DIRECT_SHAPES = (
 BOUNDS = {"local": 3e-6, "direct": 3e-6, "winograd": 8e-6}
 WEIGHTS_BOUND = 5e-6
 # Share of the largest value: the transforms of F(4x4) add 36 numbers of a few times its size, and
-# the error of a sum of 4608 products is the root of so many roundings.
+# the error of a sum of 4608 products grows as the root of their number.
 HARD_SHARE = 1e-5
 ONE_COLOUR = "one colour"
 
 PLANES = ((1, 1, 16), (1, 5, 3), (31, 33, 17), (3, 257, 32))  # (H, W, C)
 FOUR = 4 * EPS  # means and interpolations of four values
-GATED = 4 * EPS  # exp, expm1 and a division: some units in the last place each
+GATED = 4 * EPS  # exp, expm1 and a division have errors of some units in the last place each
 # for extreme gates: OpenCL allows exp and expm1 an error of three units each, and subnormals of
 # float32 may become 0
 EXTREME, SUBNORMAL = 3e-6, 1e-32

@@ -25,7 +25,7 @@ def _distance(dev, rng):
         program, ranges = lpips_program(dev), group_ranges(dev, n, row_parts(dev))
         arrays = {"a": dev.upload(a), "b": dev.upload(b), "head": dev.upload(head)}
         program.launch("lpips_distance", *ranges, n=n, c=channels, distance=distance, **arrays)
-        # sums over 512 channels in 16 lanes: 32 roundings in sequence, and a root's
+        # sums over 512 channels in 16 lanes have 32 roundings in sequence, the root one more
         expected = lpips.pixel_distance(*(array.astype(np.float64) for array in (a, b, head)))
         units = [x / np.sqrt((x * x).sum(1, keepdims=True)) for x in (a, b)]
         naive = (units[0] - units[1]) ** 2 @ head

@@ -21,7 +21,7 @@ from pp_cl.selftest.case import EPS, SIZES, Case, absolute, each, exact, finite,
 from pp_cl.selftest.points import some_ids, some_opacities
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
-EPSILONS = {"sh": 4e-7, "offset": POINT_EPS, "opacity": POINT_EPS}  # of the tiny preset
+EPSILONS = {"sh": 4e-7, "offset": POINT_EPS, "opacity": POINT_EPS}  # as in the tiny preset
 RATES = Rates(sh=(0.1, 0.05, 0.025), offset=0.01, opacity=0.1, lobe=0.05, network=0.0)
 Gradients = dict[str, np.ndarray]
 EYE = np.array([1.5, -2.5, 1.2])

@@ -30,7 +30,7 @@ from pp_cl.selftest.points import (
 )
 
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
-PLACED = 1e-6  # a rotation of a difference: 8 roundings of half EPS, and the camera's own two
+PLACED = 1e-6  # a rotated difference has 8 roundings of half EPS, and the camera two of its own
 BAND = 1e-4  # pixels around the edge of a footprint in which rounding may decide
 FALLOFF = 1e-4  # a falloff in that band, with a radius of at least 0.75 pixels
 RIM = 1e-3  # the depth of a sphere is steep at its rim
@@ -58,7 +58,7 @@ def _project(dev, rng):
         x, y, z = place.T.astype(np.float32)
         column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         off = np.hypot(*(u - np.floor(u) - np.float32(0.5) for u in (column, row)))
-        naive = off * z < 0.01 * camera.fx  # its centre is that near
+        naive = off * z < 0.01 * camera.fx  # a pixel's centre is within the disc
         yield exact(covers | beside, np.ones(n, bool), naive=naive | beside)
         radius = 0.01 * np.exp(offset[covers, 3])
         yield relative(points.point_shape.get()[covers, 0], radius, PLACED)
@@ -404,7 +404,7 @@ def _record(rule, dev, rng):
     yield exact(seen.get() - np.arange(500), blended.geometry["fragment"].any(axis=1))
     tracked = dense.tracked(blended.geometry, blended.blend, 2)
     weight = np.where(tracked, blended.blend["weight"], 0).sum(axis=1)
-    least = float(np.sort(weight)[-30:-28].mean())  # 29 points have more
+    least = float(np.sort(weight)[-30:-28].mean())  # 29 points have a higher sum
     dev.fill(seen, 0)
     record_weights(dev, scene.pairs, scene.weights, listed, highest, seen, least)
     yield exact(seen.get(), weight > least)

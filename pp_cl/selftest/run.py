@@ -36,8 +36,9 @@ CASES: tuple[Case, ...] = (
 
 @dataclass(frozen=True)
 class Hard:
-    """The naive formula of a hard case. what: how it fails. naive, error, bound: from the check in
-    which it is worst, its error (NaN if its result is), our error, and the bound.
+    """The naive formula of a hard case. what: how it fails. naive, error, bound: the formula's
+    error (NaN if its result is NaN), our error and the bound, from the check in which the formula
+    is worst.
     """
 
     what: str

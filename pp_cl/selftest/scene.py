@@ -15,16 +15,16 @@ from pp_cl.scene.hull import Carver
 from pp_cl.scene.lens import LensDistortion, undistort
 from pp_cl.selftest.case import SIZES, Case, absolute, exact
 
-BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
+BORDER = 1e-4  # pixels from a pixel border within which float32 may choose the other pixel
 TARGET = 5e-7  # a few roundings of a float32 in [0, 1]
-ROUNDED = 0.5 + 0.1  # levels: 8 bits round by half, and 2e-4 pixels of float32's in steep noise
+ROUNDED = 0.5 + 0.1  # levels: 8 bits round by half; float32's 2e-4 pixels add 0.1 in steep noise
 LENSES = (
     LensDistortion(-0.15, 0.04, 0.004, -0.003, 0.01),
     LensDistortion(k1=0.3),
     LensDistortion(k1=0.5, k2=0.1, k4=0.4, k5=0.05, k6=-0.01),
     LensDistortion(0.04, -0.02, 0.0, 0.0, 0.01, -0.004, fisheye=True),
 )
-DEMO = 2e-6  # distances of up to 2, with some ten roundings
+DEMO = 2e-6  # distances of up to 2 have some ten roundings
 
 
 def _views(rng, share):

@@ -1,1 +1,1 @@
-"""A training in the folder of a run: begun or resumed, measured, planned and stored."""
+"""Begins, resumes, measures, plans and stores a training in the folder of a run."""

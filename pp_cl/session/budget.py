@@ -1,4 +1,4 @@
-"""How many steps a training has that is given minutes, by the time that its steps take."""
+"""Plans how many steps a training has in given minutes, from the time that its steps take."""
 
 import statistics
 from collections import deque
@@ -8,24 +8,25 @@ from pp_cl.engine.training.schedule import refine_steps, supersampling_at
 from pp_cl.session.plan import NEVER, Plan
 from pp_cl.settings import Config
 
-PLANS = 50  # in the minutes given
-FOG = 0.35  # of the first step's time, which later ones save: a third of the steps clears it
-# Steps of a training, for each of its refinements, below which it is better without any: in the
-# time of 250 steps of `small`, lego has 27.4 dB with its refinement and 29.8 without, in that of
-# 800 steps 31.5 and 32.3.
+PLANS = 50  # made in the given minutes
+# share of the first step's time that later ones save: a third of the steps clears the fog
+FOG = 0.35
+# With fewer steps than this for each refinement, a training is better without any: in the time of
+# 250 steps of `small`, lego reaches 27.4 dB with its refinement and 29.8 without; in the time of
+# 800 steps, 31.5 and 32.3.
 LEAST_REFINED = 1000
-# Times as long as a step of halved images that one without a refinement takes: a guess, which the
-# next plan corrects.
+# A step without a refinement takes this many times as long as one on halved images: a guess, which
+# the next plan corrects.
 WHOLE = 1.5
-# Of a step's time, for as many pixels of a training view, which the end looks at, and again for the
-# specular layer; and seconds of that one's fit.
+# The end looks at all training views. For as many pixels as a step has, this takes ENDING of a
+# step's time, and the specular layer adds LOOKING. FITTING: seconds of that layer's fit.
 ENDING, LOOKING, FITTING = 0.15, 0.3, 4.0
-FEWEST, MOST = 10, 100  # last steps whose median time counts: first ones may build kernels
+FEWEST, MOST = 10, 100  # last steps whose median time counts: the first may build kernels
 
 
 class Budget:
-    """Plans a training that takes train.minutes. pixels: of all its views. may_stay_coarse: the
-    grid is left as it is where the steps are too few to refine it.
+    """Plans the steps of a training that has train.minutes. pixels: of all its views.
+    may_stay_coarse: whether the grid stays as it is if the steps are too few to refine it.
     """
 
     def __init__(self, config: Config, pixels: int, may_stay_coarse: bool = False):
@@ -35,11 +36,11 @@ class Budget:
         self._ending = share * pixels / train.crop**2 if train.crop else 0.0  # steps
         self._fitting = FITTING * is_fitted
         self._times: deque[float] = deque(maxlen=MOST)
-        self._last = self._next = 0.0  # seconds: of the last step, and at which to plan
+        self._last = self._next = 0.0  # seconds: end of the last step, time of the next plan
 
     def plan(self, config: Config, step: int, seconds: float) -> Plan | None:
-        """Another plan than the settings', if that is due after a step, up to whose end so many
-        seconds have passed; else None.
+        """A new plan, if one is due after this step; else None. seconds: how many have passed up to
+        the step's end.
         """
         train = config.train
         self._times.append(seconds - self._last)
@@ -58,7 +59,7 @@ class Budget:
         to_come = refine_steps(plan.train(train))
         is_coarse = self._may_stay_coarse and all(at > step for at in to_come)
         if is_coarse and plan.iterations < LEAST_REFINED * len(to_come):
-            self._times.clear()  # of images of another size
+            self._times.clear()  # these were of images of another size
             coarse = replace(plan, refine_at=NEVER)
             plan = coarse.for_minutes(train, step, left / WHOLE, self._ending)
         self._may_stay_coarse = False

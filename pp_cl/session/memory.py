@@ -1,5 +1,5 @@
-"""The memory that a training takes, within 15 %: the engine's tables, for the numbers of points,
-fragments and pixels that are expected. What does not fit is refused before it is allocated.
+"""Predicts a training's memory, within 15 %, from the engine's tables for the expected numbers of
+points, fragments and pixels. A training that does not fit is refused before it allocates.
 """
 
 import math
@@ -41,22 +41,24 @@ from pp_cl.scene.load import DEMO, reading_cost
 from pp_cl.settings import Config
 
 MIB, GIB = 2**20, 2**30
-# How many times its share of an image's pixels a crop sees of the points: up to 4 times on lego,
-# where an image shows the object on a third of its pixels.
+# A crop's share of the points is this many times its share of an image's pixels: up to 4 times on
+# lego, where an image shows the object on a third of its pixels.
 CROP_SHARE = 4
-# The share of the points that an image shows at first, when they are fog; all where no fragments
-# are dropped.
+# The share of the points that an image shows at first, when they are fog; it shows all if no
+# fragments are dropped.
 SHOWN = 0.8
-# The least share of its points with which a training goes on where memory is too small for all of
-# them: about as many as pruning leaves at most beyond LEFT_BY_PRUNING, in two refinements.
+# If memory is too small for all points, a training goes on only with at least this share of them:
+# about enough if pruning leaves the most beyond LEFT_BY_PRUNING, in two refinements.
 LEAST_KEPT = 0.5
-# The share of all memory that is filled where that decides the points: plans err by a few percent.
+# The share of the memory to fill if memory decides the number of points: plans err by a few
+# percent.
 FILLED = 0.9
 
 
 class Need(NamedTuple):
-    """Bytes that a training takes: of the device at its peak, with how many points; of the largest
-    buffer; of the host beside the program itself, a CPU's buffers included.
+    """Bytes that a training needs. device: the device's peak, which it reaches with `points`
+    points. largest: the largest buffer. host: host memory besides the program's own, including a
+    CPU's buffers.
     """
 
     device: int
@@ -66,8 +68,8 @@ class Need(NamedTuple):
 
 
 class MemoryPlan:
-    """Checks that a training fits the available memory; made before it allocates anything. need:
-    what it takes, by the last check; budget: --memory, GiB. image_files: of the training views.
+    """Checks, before a training allocates anything, that it fits the available memory. need: result
+    of the last check. budget: --memory, GiB. image_files: of the training views.
     """
 
     def __init__(self, config: Config, net: UNet, image_files: Sequence[ImageFile]):
@@ -89,16 +91,16 @@ class MemoryPlan:
         self._images = image_bytes(sizes, factor)
         self._image = image_bytes([(self._largest.width, self._largest.height)], factor)
         self._reading_bytes = 0 if is_demo else reading_cost(image_files, config.scene, factor)[1]
-        held = self.dev.bytes if self.dev.is_cpu else 0  # which `need` counts
+        held = self.dev.bytes if self.dev.is_cpu else 0  # `need` counts these
         self._program = resident_bytes() - held + compiler_bytes(self.dev.info)
 
     def follow(self, config: Config) -> None:
-        """Check from now on what a training with these settings takes, of the same scene."""
+        """Check a training of the same scene with these settings from now on."""
         self._raster, self._train, self._points = config.raster, config.train, config.points
 
     @property
     def host_bytes(self) -> int:
-        """What this process takes of the host at its peak, by the last check."""
+        """Host memory in bytes that this process takes at its peak, by the last check."""
         return self._program + self.need.host
 
     def check_unseen(self) -> None:
@@ -113,8 +115,8 @@ class MemoryPlan:
     def check_points(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
     ) -> None:
-        """Raise UserError where a training with these points of a grid does not fit from a step
-        on, or would refine the grid beyond what ids can number.
+        """Raise UserError if a training with these points of a grid does not fit from this step on,
+        or if refining gives the grid more vertices than ids can number.
         """
         self.need = self.need_of(grid, points, depth_range, step)
         if fault := self.fault_of(grid, points, depth_range, step):
@@ -123,9 +125,9 @@ class MemoryPlan:
     def points_that_fit(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int
     ) -> int:
-        """The most of these points of a grid with which a training fits from a step on, if it
-        drops the others before it takes more memory. Raises UserError as check_points() does where
-        that is less than LEAST_KEPT of them, or not even the next steps fit.
+        """The largest number of these points with which a training fits from this step on; the
+        others must be dropped before it takes more memory. Raises UserError as check_points() does
+        if that is less than LEAST_KEPT of them, or if not even the next steps fit.
         """
         most, start = points, self.need_of(grid, points, depth_range, step, stretches=1)
         if not self._fault(start) and self.fault_of(grid, points, depth_range, step):
@@ -135,8 +137,8 @@ class MemoryPlan:
         return most
 
     def coarser_points(self, grid: Grid, points: int, depth_range: tuple[float, float]) -> int:
-        """The most points, up to these of a grid, with which a training fits that begins with a
-        coarser grid; 0 where none do.
+        """The largest number of points, at most `points`, with which a training fits that begins
+        with a coarser grid; 0 if none fits.
         """
 
         def fault(count):
@@ -155,8 +157,8 @@ class MemoryPlan:
         step: int = 0,
         share: float = 1.0,
     ) -> tuple[str, str] | None:
-        """Why a training with these points of a grid does not fit into a share of the memory from
-        a step on, and what to do; None where it fits.
+        """(why a training with these points of a grid does not fit into a share of the memory from
+        this step on, what to do), or None if it fits.
         """
         to_come = sum(step < at for at in refine_steps(self._train))
         last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
@@ -168,7 +170,7 @@ class MemoryPlan:
         return self._fault(self.need_of(grid, points, depth_range, step), share)
 
     def grows_after(self, step: int) -> bool:
-        """Whether the next step takes more memory: it refines, begins the EMA or to supersample."""
+        """Whether the next step takes more memory: it refines, begins the EMA or supersampling."""
         begins = averages_from(self._train), supersampled_from(self._train)
         return step + 1 in (*refine_steps(self._train), *begins)
 
@@ -180,12 +182,12 @@ class MemoryPlan:
         step: int = 0,
         stretches: int | None = None,
     ) -> Need:
-        """What a training with these points of a grid takes from a step on. stretches: between
-        the steps after which they take more memory, to which to look ahead; None: all.
+        """The Need of a training with these points of a grid from this step on. stretches: how many
+        stretches to look ahead, each of which ends where more memory is taken; None: all.
         """
         middle = sum(depth_range) / 2
-        # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
-        # second order
+        # footprints grow by 1 / (z^2 cos) nearer by and off the axis: this is the mean over a cube,
+        # to second order
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
         radius = point_radius(self._raster, grid.voxel_size, depth_range)
         radius *= self._largest.fx / middle * math.sqrt(growth)
@@ -194,12 +196,12 @@ class MemoryPlan:
         )
 
     def _need(self, ahead, radius):
-        """The Need of some stretches. radius: of the footprints in the first, pixels of the stored
-        image.
+        """The Need of these stretches. radius: radius of footprints in the first, in pixels of the
+        stored image.
         """
         found = []
         for stretch in ahead:
-            # soft points are as wide as points are apart, which refining halves
+            # soft points are as wide as the spacing of points, and refining halves it
             halved = ahead[0].refinements - stretch.refinements
             width = radius / 2**halved if self._raster.footprint == "soft" else radius
             found.append(self._need_of_stretch(stretch, width / self._downscale))
@@ -209,7 +211,7 @@ class MemoryPlan:
         return peak._replace(largest=largest, host=host)
 
     def _need_of_stretch(self, stretch, radius):
-        """The Need of some steps; of the host what refining after them takes."""
+        """The Need of one stretch; its `host` is what refining after it takes."""
         raster, train, n = self._raster, self._train, stretch.points
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
@@ -244,7 +246,7 @@ class MemoryPlan:
         return Need(device, n, largest, n * REFINING_BYTES if stretch.refinements else 0)
 
     def _padded_size(self, halvings, side):
-        """(height, width) of a crop of the largest image, or of all, in the network's multiples."""
+        """(height, width) of a crop of the largest image, or of it all, padded for the network."""
         camera = self._largest.downscaled(self._downscale << halvings)
         height, width = (min(side or size, size) for size in (camera.height, camera.width))
         return height + -height % UNet.multiple, width + -width % UNet.multiple
@@ -272,7 +274,7 @@ class MemoryPlan:
 
 
 def _most(points, fault):
-    """The largest n up to `points` without a fault(n), as smaller ones are; 0: there is none."""
+    """The largest n up to `points` without a fault(n), as smaller n have none; or 0."""
     return bisect_right(range(1, points + 1), False, key=lambda n: fault(n) is not None)
 
 
@@ -286,7 +288,7 @@ def _size(size):
 
 
 def memory_line(memory_plan: MemoryPlan) -> str:
-    """The memory that the last check found to be needed."""
+    """The memory that a training needs by the last check, as text."""
     need, dev, budget = memory_plan.need, memory_plan.dev, memory_plan.budget
     has, on_host = _size(dev.info["memory_bytes"]), f"{_size(need.host)} of the computer's"
     if dev.is_cpu:

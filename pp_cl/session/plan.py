@@ -1,4 +1,4 @@
-"""What a training decides itself: at first by its hull, then by its memory and minutes."""
+"""The settings that a training decides itself: first by its hull, then by memory and minutes."""
 
 import math
 from collections.abc import Sequence
@@ -13,20 +13,20 @@ from pp_cl.scene.verdict import Agreement
 from pp_cl.settings import Config, TrainConfig
 
 UNSET = (0.0, 0.0)  # train.refine_at
-NEVER = (1.0, 1.0)  # train.refine_at of a grid that is not refined
-# raster.radius where it is automatic, in point spacings: one pixel within these bounds; less is no
-# better where points lie farther apart
+NEVER = (1.0, 1.0)  # train.refine_at if the grid is never refined
+# bounds of an automatic raster.radius, in point spacings; within them it is one pixel. A smaller
+# radius is no better if points lie farther apart
 LEAST_RADIUS, MOST_RADIUS = 0.85, 1.15
-FIXED = 0.8  # share of the steps after which their number rises no more: soon the averages begin
-DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
-SUPERSAMPLED = 1.3  # times that a step takes longer once it is supersampled
+FIXED = 0.8  # share of the steps after which their number no longer rises: averages begin soon
+DEARER = 2.3  # factor by which a refinement of the grid lengthens a step: measured 2 to 3
+SUPERSAMPLED = 1.3  # factor by which supersampling lengthens a step
 
 
 @dataclass(frozen=True)
 class Plan:
     """The settings that a training chooses or changes: iterations, refine_at, supersampled and
-    view_opacity of TrainConfig, radius of RasterConfig, automatic of Config. A decision makes
-    another plan; settings() are what the engine follows and config.json says.
+    view_opacity of TrainConfig, radius of RasterConfig, automatic of Config. Each decision makes a
+    new plan; the engine follows its settings(), and config.json stores them.
     """
 
     iterations: int
@@ -38,7 +38,7 @@ class Plan:
 
     @classmethod
     def given(cls, config: Config) -> "Plan":
-        """The plan that settings have."""
+        """The plan that these settings contain."""
         train = config.train
         steps = train.iterations, train.refine_at, train.supersampled, train.view_opacity
         return cls(*steps, config.raster.radius, tuple(config.automatic))
@@ -47,8 +47,8 @@ class Plan:
     def of(
         cls, config: Config, hull: Hull, agreement: Agreement, refine_at: tuple[float, ...]
     ) -> "Plan":
-        """The plan that a training begins with: automatic settings are chosen, refine_at as
-        first_hull() returns it with the hull.
+        """The plan that a training begins with, in which automatic settings have values. refine_at:
+        as first_hull() returns it with the hull.
         """
         given = cls.given(config)
         is_open = given.refine_at == UNSET, given.radius == 0, given.view_opacity == "auto"
@@ -59,12 +59,12 @@ class Plan:
         return plan.for_grid(config.train, hull.grid, agreement.views)
 
     def settings(self, config: Config) -> Config:
-        """A copy of the settings that has the plan's."""
+        """A copy of the settings with this plan's values."""
         raster, train = replace(config.raster, radius=self.radius), self.train(config.train)
         return replace(config, automatic=[*self.automatic], raster=raster, train=train)
 
     def train(self, train: TrainConfig) -> TrainConfig:
-        """The part of settings() that schedules take."""
+        """The TrainConfig of settings(), which schedules take."""
         return replace(
             train,
             iterations=self.iterations,
@@ -76,8 +76,9 @@ class Plan:
     def for_grid(
         self, train: TrainConfig, grid: Grid, views: Sequence[View], step: int = 0
     ) -> "Plan":
-        """An automatic radius becomes one pixel of the images, within bounds, once the grid after
-        a step has been refined as is planned. train: what else the schedules need.
+        """A plan whose radius, if automatic, is one pixel of the images, within bounds, after the
+        refinements planned after `step`. grid: as it is now. train: other settings for the
+        schedules.
         """
         if "raster.radius" not in self.automatic:
             return self
@@ -87,15 +88,15 @@ class Plan:
         return replace(self, radius=radius)
 
     def for_memory(self) -> "Plan":
-        """Nothing is supersampled."""
+        """A plan without supersampling."""
         return replace(self, supersampled=0.0)
 
     def for_minutes(
         self, train: TrainConfig, step: int, left: float, ending: float = 0.0
     ) -> "Plan":
-        """The iterations of a training that has time for `left` more steps without refinements
-        after a step; refine_at and supersampled are such that what is past stays where it was.
-        train: what else the schedules need. ending: steps that its end is worth.
+        """A plan whose iterations take the time of `left` more steps after `step`, if none of these
+        were refined. refine_at and supersampled change so that past events keep their steps. train:
+        other settings for the schedules. ending: the time that the end takes, in steps.
         """
         train = self.train(train)
         steps, shares = self.iterations, [share for share in self.refine_at if 0 < share < 1]
@@ -110,12 +111,12 @@ class Plan:
         for end, times in [*sorted(dearer), (1.0, 1.0)]:
             all_as_one += (end - start) * cost
             start, cost = end, cost * times
-        # is not jumped over
+        # no event is skipped: the first of these must lie after this step
         soonest = [1.0 if is_late else FIXED, *(share for share in shares if share not in past)]
         soonest += [] if begun else [begins]
         left -= ending * DEARER ** len(to_come)
         planned = max(round((step + left) / all_as_one), math.ceil((step + 1) / min(soonest)))
-        if is_late and planned > steps:  # else averages would begin anew
+        if is_late and planned > steps:  # more steps would begin the averages anew
             return self
         return replace(
             self,

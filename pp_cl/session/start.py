@@ -1,4 +1,4 @@
-"""What a new training starts from: its network, its visual hull, its refinements."""
+"""Makes what a new training starts from: its network, visual hull and refinements."""
 
 import math
 import warnings
@@ -30,17 +30,18 @@ from pp_cl.session.memory import MemoryPlan
 from pp_cl.session.plan import NEVER, UNSET, Plan
 from pp_cl.settings import Config, NetworkConfig
 
-# train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
+# train.refine_at for 0, 1 and 2 refinements; after the last, points are FINEST to COARSEST pixels
+# apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
-LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
-# what `make network` keeps: {"net.NAME": as Network.parameters, float16}
+LEAST_SIDE = 48  # least side in pixels of the reduced images on which a refining training begins
+# written by `make network`: {"net.NAME": as Network.parameters, float16}
 DEMO_NETWORK = Path(__file__).with_name("demo.npz")
 
 
 def begin_network(dev: Device, config: Config) -> UNet:
-    """The network that network.start names: the demo's only where the scene is another and it
-    fits, else a random one. Raises UserError for a run whose network has another shape.
+    """Make the network that network.start names; the demo's only for another scene and if it has
+    this shape, else a random one. Raises UserError for a run whose network has another shape.
     """
     net = UNet.of_settings(dev, config.network, seed=config.train.seed)
     settings, folder = config.network, RunFolder(config.network.start)
@@ -63,7 +64,7 @@ def begin_network(dev: Device, config: Config) -> UNet:
 
 
 def _unlike(ours, theirs):
-    """[(key, our value, their value)] of the settings by which two networks differ in shape."""
+    """[(key, our value, their value)] of the settings that make two networks differ in shape."""
     pairs = [(n, getattr(ours, n), getattr(theirs, n)) for n in ("widths", "blocks")]
     return [(f"network.{n}", text_of(a), text_of(b)) for n, a, b in pairs if a != b]
 
@@ -71,8 +72,8 @@ def _unlike(ours, theirs):
 def first_hull(
     dev: Device, config: Config, agreement: Agreement
 ) -> tuple[Hull, tuple[float, float]]:
-    """(the hull that a training starts from, its train.refine_at). Where that is automatic, there
-    are as many refinements as bring points FINEST to COARSEST pixels of the images close.
+    """Return (the hull that a training starts from, its train.refine_at). If refine_at is
+    automatic, the refinements bring points FINEST to COARSEST pixels of the images close.
     """
     points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
@@ -93,11 +94,11 @@ def first_hull(
 def fitting_hull(
     dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
 ) -> tuple[Agreement, Hull, tuple[float, float], str, Plan]:
-    """(which views' masks agree, first_hull() of them, its (near, far), what it gives up, the plan
-    of the training). Where memory is too small, nothing is supersampled; where that does not
-    suffice and the refinements are automatic, there are as many of these, and the points as close
-    as memory allows. Raises UserError as MemoryPlan.check_points() does, and for an automatic
-    radius of footprints that are not soft.
+    """Return (which views' masks agree, their first_hull(), its (near, far), lines on what is given
+    up, the training's plan). If memory is too small, supersampling is given up; if that does not
+    suffice and refine_at is automatic, points are only as close as memory allows, with as many
+    refinements. Raises UserError as MemoryPlan.check_points() does, and if raster.radius is
+    automatic but footprints are not soft.
     """
     given_up: list[str] = []
     if config.raster.radius == 0 and config.raster.footprint != "soft":
@@ -111,7 +112,7 @@ def fitting_hull(
     plan = Plan.of(config, hull, agreement, refine_at)
     to_come = len(refine_steps(plan.train(config.train)))
     cameras = [view.camera for view in views]
-    last = math.inf  # points of the try before
+    last = math.inf  # points of the previous try
     while True:
         memory_plan.follow(plan.settings(config))
         found = hull.grid, len(hull.ids), depth_range(views, hull)
@@ -140,7 +141,7 @@ def fitting_hull(
 def sheet_of_masks(
     dev: Device, views: list[View], hull: Hull, agreement: Agreement
 ) -> np.ndarray | None:
-    """Warn of masks that disagree with the others; return their image, None if all agree."""
+    """Warn of masks that disagree with the others; return an image of them, None if all agree."""
     found, left_out = contradicting(views, hull, agreement), agreement.left_out
     rejecting = {one.view.name: one.share for one in found if one.view.name not in left_out}
     for what, shares in (

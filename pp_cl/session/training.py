@@ -1,4 +1,4 @@
-"""Runs a training in the folder of a run: begun or resumed, with log, previews and checkpoints."""
+"""Begins or resumes a training in the folder of a run, with log, previews and checkpoints."""
 
 import math
 import time
@@ -39,17 +39,17 @@ from pp_cl.session.plan import NEVER, Plan
 from pp_cl.session.start import begin_network, fitting_hull, sheet_of_masks
 from pp_cl.settings import Config
 
-PREVIEWS = 4  # of a training, besides an early one
-FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
+PREVIEWS = 4  # that a training writes, besides an early one
+FIRST_PREVIEW = 10.0  # seconds; even after a slow step and its writing, it shows within 20
 MEASURED_VIEWS = 4
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 OnStep = Callable[[int, dict[str, Any] | None], None]
 
 
 class HullFacts(NamedTuple):
-    """Of the hull of a new training. capped: it has fewer points than asked for. seconds: carving
-    took. forgiven: so many masks may reject a point. given_up: for lack of memory, in lines; "":
-    nothing. sheet: of the masks that disagree with the others, None if all agree.
+    """Facts about a new training's hull. capped: it has fewer points than asked for. seconds: time
+    of carving. forgiven: how many masks may reject a point. given_up: lines on what lack of memory
+    prevents, or "". sheet: an image of the masks that disagree with the others, None if all agree.
     """
 
     capped: bool
@@ -61,10 +61,11 @@ class HullFacts(NamedTuple):
 
 @dataclass
 class Training:
-    """A training that is ready to begin or to go on. config: its settings, which another plan
-    replaces. info: what a checkpoint's header holds beside the model's. hull: None if it resumes.
-    measured: the views on which train.eval_every measures PSNR. began: time.monotonic() when it was
-    opened, from which train.minutes count. on_preview: is called after each preview, if set.
+    """A training that is ready to begin or to go on. config: its settings, which change with its
+    plan. info: what a checkpoint's header holds besides the model's entries. hull: None if it
+    resumes. measured: the views on which train.eval_every measures PSNR. began: time.monotonic()
+    when it was opened; train.minutes count from there. on_preview: called after each preview, if
+    set.
     """
 
     folder: RunFolder
@@ -78,12 +79,12 @@ class Training:
     on_preview: Callable[[], None] | None = field(default=None, init=False)
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
-    _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
+    _saved: int = field(default=0, init=False)  # step of the last checkpoint; 0: there is none
     _earlier: float = field(default=0.0, init=False)  # seconds before it was interrupted
 
     @property
     def passed(self) -> float:
-        """Seconds of train.minutes that have passed, those before an interruption included."""
+        """Seconds of train.minutes that have passed, including those before an interruption."""
         return self._earlier + time.monotonic() - self.began
 
     def run(
@@ -92,8 +93,8 @@ class Training:
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> float:
         """Train to the end with log, previews and checkpoints; returns the seconds of training,
-        those before an interruption included. on_step(step, row) is called after each step, with
-        its row of the log where it has one; if is_stopped() is true then, a checkpoint is written
+        including those before an interruption. on_step(step, row) is called after each step; row is
+        the step's row of the log, or None. If is_stopped() is true then, a checkpoint is written
         and the training ends. Raises UserError if another process trains into the folder, if the
         next step needs more memory than there is, and if numbers are no longer finite; the last
         checkpoint is kept.
@@ -116,7 +117,7 @@ class Training:
                 ) from None
 
     def _check_unchanged(self):
-        """Raise UserError where another process trained into the folder since it was looked at."""
+        """Raise UserError if another process has trained into the folder since it was opened."""
         step = 0
         if self.folder.checkpoint.exists():
             with opened_run(self.folder, self.config) as stored:
@@ -167,15 +168,15 @@ class Training:
         return seconds
 
     def _follow(self, plan):
-        """Go on by another plan, and keep it in config.json."""
+        """Go on with another plan, and store it in config.json."""
         self.config = plan.settings(self.config)
         for follower in (self.memory_plan, self.trainer):
             follower.follow(_followed(self.config, self.trainer.begun))
         self.folder.configure(self.config.to_json())
 
     def _fit_memory(self):
-        """Give up supersampling that has not begun, then points, where memory is too small for them
-        from the next step on.
+        """If memory is too small from the next step on, give up supersampling that has not begun;
+        if that is not enough, drop points.
         """
         trainer, model, train = self.trainer, self.trainer.model, self.config.train
         count, step = model.cloud.count, trainer.step
@@ -200,7 +201,9 @@ class Training:
             keep_most_visible(trainer, most)
 
     def _after_step(self, log, terms, seconds):
-        """Write the log's row, which it returns, the preview and then the checkpoint, as due."""
+        """Write the row of the log, the preview and the checkpoint if due, in this order; return
+        the row.
+        """
         trainer, train = self.trainer, self.config.train
         step, last, row = trainer.step, trainer.step == train.iterations, None
         is_measured = train.eval_every and step % train.eval_every == 0
@@ -222,7 +225,7 @@ class Training:
         return {"step": self.trainer.step, "seconds": round(seconds, 3), "device": device}
 
     def _measure(self):
-        """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
+        """{"test_psnr": mean PSNR of the present model's 8-bit images of the measured views}."""
         found = []
         for view in self.measured:
             image = self._rendered(view)
@@ -245,7 +248,7 @@ class Training:
         self._saved = trainer.step
 
     def _preview(self):
-        """Prediction, truth and error of the first training view."""
+        """Write prediction, truth and error of the first training view."""
         trainer, view = self.trainer, self.trainer.views[0]
         self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
@@ -254,8 +257,8 @@ class Training:
             self.on_preview()
 
     def present_run(self) -> Run:
-        """What is trained by now as a run, to be drawn between two steps. Its renderer is the
-        trainer's, as one of its own would freeze the network.
+        """The model trained so far as a Run, to be rendered between two steps. It uses the
+        trainer's renderer, as one of its own would freeze the network.
         """
         header = self.info | {"step": self.trainer.step, "finished": False}
         run = Run(self.trainer.dev, self.folder, self.config, header, self.trainer.model)
@@ -263,28 +266,28 @@ class Training:
         return run
 
     def _rendered(self, view):
-        """The present model's image of a view. Raises Diverged where there is none."""
+        """The present model's image of a view. Raises Diverged if it is not finite."""
         image = self.trainer.render(view)
         if not np.isfinite(image).all():
             raise Diverged(f"the image of {view.name} holds NaN after step {self.trainer.step}")
         return image
 
 
-# ---- to begin and to resume: nothing is written
+# ---- beginning and resuming: nothing is written
 
 
 def _followed(config, begun):
-    """What the engine follows: an extended training is not refined."""
+    """The settings that the engine follows; an extended training is not refined."""
     return replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
 
 
 def open_training(
     dev: Device, folder: RunFolder, config: Config, stored: Stored | None
 ) -> Training:
-    """The training in `folder` from its checkpoint `stored` on, a finished one extended with new
-    moments and without refinements; without one from its beginning, by the plan that its hull and
-    memory make of config. Raises UserError for a broken scene or another one than the checkpoint's,
-    too little memory, and a folder that may not be written.
+    """Open the training in `folder`. With a checkpoint `stored` it resumes there; a finished one is
+    extended with new moments and without refinements. Without one it begins, and its hull and
+    memory complete the plan in config. Raises UserError for a scene that is broken or not the
+    checkpoint's, for too little memory, and for a folder that cannot be written.
     """
     began, (header, arrays) = time.monotonic(), stored or ({"step": 0}, {})
     check_target(folder.config)
@@ -335,7 +338,7 @@ def open_training(
 
 
 def _check_scene(folder, config, header, views):
-    """Raise UserError where a checkpoint's training views are not those of the scene."""
+    """Raise UserError if a checkpoint's training views are not those of the scene."""
     mismatch = difference(header, list_split(config.scene.path, edited=False).image_files, views)
     if not mismatch and {view.name for view in views} != {name for name, _ in header["views"]}:
         mismatch = "views were dropped or taken back since, as `pp-cl view` shows"
@@ -357,11 +360,11 @@ def train_scene(
     is_stopped: Callable[[], bool] | None = None,
     **options: Any,
 ) -> Run:
-    """Train a scene into the folder `out`, or go on with the run there; a finished one is left
-    alone, unless more iterations are asked for than it has. scene: a folder, or the word demo.
-    device: as `pp-cl train --device`. settings: {"section.key": value}; options: the same by the
-    names of the command's options, such as iterations. on_step, is_stopped: as Training.run()
-    takes them. Raises UserError.
+    """Train a scene into the folder `out`, or go on with the run there; a finished run is left
+    alone unless it has fewer iterations than asked for. scene: a folder, or the word demo. device:
+    as `pp-cl train --device`. settings: {"section.key": value}; options: settings by the names of
+    the command's options, such as iterations. on_step, is_stopped: passed to Training.run(). Raises
+    UserError.
     """
     unknown = set(options) - set(SHORT)
     if unknown:
@@ -380,12 +383,12 @@ def train_scene(
     return load(out, dev)
 
 
-# ---- what is asked for, and what there is
+# ---- the settings asked for, and the runs that exist
 
 
 def stored_state(folder: RunFolder, config: Config) -> Stored | None:
-    """(header, arrays) of the folder's checkpoint, or None. A finished run takes note of where its
-    scene is now. Raises UserError for a folder or checkpoint that does not fit.
+    """(header, arrays) of the folder's checkpoint, or None. If the scene of a finished run has
+    moved, config.json is updated. Raises UserError for a folder or checkpoint that does not fit.
     """
     folder.check_usable()
     there = load_config(folder.config) if folder.config.exists() else config
@@ -400,8 +403,8 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
 
 
 def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Config]]:
-    """The run in a folder, then its further members, each as the first one is by then: by its plan,
-    with the next seed.
+    """Yield the run in a folder, then its further members. Each of these has the plan that the
+    first has by then, and the next seed.
     """
     yield folder, config
     if config.train.members > 1:
@@ -413,5 +416,5 @@ def members(folder: RunFolder, config: Config) -> Iterator[tuple[RunFolder, Conf
 
 
 def is_finished(stored: Stored | None, config: Config) -> bool:
-    """Whether there is a checkpoint, and no step is left to train after it."""
+    """Whether there is a checkpoint after which no step is left to train."""
     return stored is not None and stored[0]["step"] >= config.train.iterations
