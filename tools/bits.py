@@ -1,11 +1,13 @@
-"""Whether a change keeps every bit: compare short trainings by this tree with those by another one,
-on each OpenCL driver that is here, with drivers and kernels working as on CPUs and as on GPUs.
+"""Compare short trainings by this tree, bit for bit, with those by another tree.
+
+They run on each OpenCL driver of this machine, with drivers and kernels in the forms for CPUs and
+for GPUs.
 
     python -m tools.bits BASE [--driver WORDS] [--form cpu|gpu] [--settings NAMES]
 
-BASE: a commit, or the folder of a checkout. Of each setting there is a digest of the checkpoint in
-the middle of the training and at its end, of the log without times, of config.json, and of a
-rendering; what differs is printed, and the exit status is 1.
+BASE: a commit, or the folder of a checkout. Each setting yields a digest of the checkpoint in the
+middle of the training and at its end, of the log without times, of config.json, and of a rendering.
+Digests that differ are printed, and the exit status is then 1.
 """
 
 import argparse
@@ -32,14 +34,14 @@ COMMON = {
     "network.widths": (16, 32, 32),
 }
 NEVER = {"train.refine_at": (1.0, 1.0)}
-# {name: settings}; the first one alone has the shipped network, smoothing and a specular layer
+# {name: settings}; only the first has the shipped network, smoothing and a specular layer
 SETTINGS = {
     "tiny": {
         "train.iterations": 70,  # the field is smoothed after 64
         "train.specular": "auto",
         "network.widths": (32, 64, 128),
     },
-    # beyond 2^16 pixels, where background is skipped; the crop is smaller than the image
+    # more than 2^16 pixels, so that background is skipped; the crop is smaller than the image
     "tiles": NEVER | {"train.crop": 260, "points.count": 3000},
     "softmax": NEVER
     | {
@@ -59,12 +61,12 @@ SETTINGS = {
     "refined": {"train.refine_at": (0.5, 1.0)},
     "supersampled": NEVER | {"train.supersampled": 1.0},
     "spheres": NEVER | {"raster.footprint": "sphere", "raster.radius": 0.08},
-    "gaussians": NEVER,  # fitted to the run
+    "gaussians": NEVER,  # which are fitted to the run
 }
 
 
 def write_scenes(folder: Path) -> None:
-    """The scenes of all settings, and masks of what is ignored, by this tree alone."""
+    """Write the scenes of all settings and the masks of ignored pixels, always with this tree."""
     sys.path[:0] = [str(ROOT / "tests")]
     from support.scenes import write_ball_scene
 
@@ -78,7 +80,7 @@ def write_scenes(folder: Path) -> None:
 
 
 def digest(*arrays) -> str:
-    """Of bytes, or of arrays with their shapes and dtypes."""
+    """Hex digest of bytes, or of arrays with their shapes and dtypes."""
     found = hashlib.sha256()
     for one in arrays:
         if isinstance(one, np.ndarray):
@@ -94,7 +96,7 @@ def log_rows(file: Path) -> bytes:
 
 
 def digests(name: str, scenes: Path, out: Path) -> dict[str, str]:
-    """{what: digest} of a training with a setting, by the pp_cl that is imported."""
+    """Train with a setting, by the pp_cl that is imported; returns {what: digest}."""
     from pp_cl.session.training import train_scene
 
     scene = str(scenes / ("large" if name == "tiles" else "ball"))
@@ -126,7 +128,7 @@ def digests(name: str, scenes: Path, out: Path) -> dict[str, str]:
 
 
 def of_tree(tree: Path, scenes: Path, names: list[str], driver: str, form: str) -> dict:
-    """{setting: its digests} by a tree, in a process of its own."""
+    """Run digests() of a tree in a new process; returns {setting: its digests}."""
     changed = {"PYTHONPATH": str(tree), "PP_DEVICE": driver, "PP_FORM": form.replace("cpu", "")}
     with tempfile.TemporaryDirectory() as out:
         words = [sys.executable, __file__, "--tree", str(tree), "--scenes", str(scenes)]
@@ -138,7 +140,7 @@ def of_tree(tree: Path, scenes: Path, names: list[str], driver: str, form: str) 
 
 
 def compare(base: Path, drivers: list[str], forms: list[str], names: list[str]) -> int:
-    """Print what differs between the trees; returns how much does."""
+    """Print which digests differ between the trees; returns how many do."""
     differing = 0
     with tempfile.TemporaryDirectory() as folder:
         write_scenes(Path(folder))
@@ -163,7 +165,7 @@ def main() -> int:
     parser.add_argument("--driver", help="words of one driver's name (all)")
     parser.add_argument("--form", choices=("cpu", "gpu"), help="one of both (both)")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
-    for name in ("tree", "scenes", "out"):  # of the processes that train
+    for name in ("tree", "scenes", "out"):  # options of the processes that train
         parser.add_argument(f"--{name}", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.tree:

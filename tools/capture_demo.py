@@ -1,5 +1,5 @@
-"""The demo's object in a textured room, as `pp-cl capture` takes it, and how well the cameras of a
-scene agree with the true ones.
+"""Photograph the demo's object in a textured room, as input of `pp-cl capture`, and compare the
+cameras of a scene with the true ones.
 
     python -m tools.capture_demo photographs FOLDER     # FOLDER/images and FOLDER/masks
     python -m tools.capture_demo video VIDEO.mp4        # the camera moves around the object
@@ -26,7 +26,7 @@ from pp_cl.scene.demo import ANGLE, DISTANCE, demo_frames, render
 from pp_cl.scene.load import scene_frames
 from pp_studio.video import write_video
 
-WIDER = 1.6  # angle of view, so that the room is seen around the object
+WIDER = 1.6  # factor of the angle of view, so that the room is seen around the object
 ROOM = 6.0  # radius of the room, world units; the cameras are 3.4 from its middle
 TURNED, STEPS = 0.35, 72  # elevation of the turntable's camera, radians; photographs of a turn
 VIDEO_FRAMES, FPS, ROUNDS = 240, 24, 2
@@ -36,7 +36,7 @@ NOISE_CELLS, OCTAVES = 48, (1.5, 4.0, 10.0)  # cells per world unit of each laye
 @dataclass(frozen=True)
 class Alignment:
     """How far found cameras are from the true ones after the best similarity. position: root mean
-    square in world units; degrees: the largest rotation.
+    square distance, world units; degrees: the largest rotation.
     """
 
     position: float
@@ -44,9 +44,8 @@ class Alignment:
 
 
 def cameras(size: int, kind: str = "photographs") -> list[Camera]:
-    """Where the photographs are taken, with a wider angle of view: the demo's training cameras;
-    those of a turntable, around the object that turns and fills the image; or those of a video of
-    16:9.
+    """The cameras of the photographs. `photographs`: the demo's training cameras with a wider
+    angle of view; `turntable`: around the object, which fills the image; `video`: wider, 16:9.
     """
     if kind == "turntable":
         return [_around(turn, TURNED, size, size, ANGLE) for turn in np.arange(STEPS) / STEPS]
@@ -59,7 +58,7 @@ def cameras(size: int, kind: str = "photographs") -> list[Camera]:
 
 
 def _around(turn, elevation, width, height, angle=WIDER * ANGLE):
-    """A camera that looks at the object. turn: share of a round. angle: of view, radians."""
+    """A camera that looks at the object. turn: share of a round. angle of view: radians."""
     azimuth, level = 2 * np.pi * turn, np.cos(elevation)
     eye = [np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)]
     focal = 0.5 * min(width, height) / np.tan(0.5 * angle)
@@ -67,8 +66,8 @@ def _around(turn, elevation, width, height, angle=WIDER * ANGLE):
 
 
 def room(camera: Camera, octaves: Sequence[float] = OCTAVES) -> np.ndarray:
-    """(H, W, 3) colours in [0, 1] of the room's wall: noise on a sphere around the origin, of so
-    many cells per world unit in each of its layers.
+    """(H, W, 3) colours in [0, 1] of the room's wall: noise on a sphere around the origin.
+    octaves: cells per world unit of each layer of noise.
     """
     rays = camera.rays()
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -85,7 +84,7 @@ def room(camera: Camera, octaves: Sequence[float] = OCTAVES) -> np.ndarray:
 
 
 def photographs(dev: Device, size: int, kind: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Each (H, W, 3) colours in [0, 1] and (H, W) uint8 mask."""
+    """Yield each photograph: (H, W, 3) colours in [0, 1] and (H, W) uint8 mask."""
     taken = cameras(size, kind)
     still = room(taken[0]) if kind == "turntable" else None
     for camera in taken:
@@ -96,7 +95,7 @@ def photographs(dev: Device, size: int, kind: str) -> Iterator[tuple[np.ndarray,
 
 
 def write_photographs(dev: Device, folder: Path, size: int, kind: str = "photographs") -> None:
-    """Write photographs and masks. Raises UserError for a folder that holds something."""
+    """Write photographs and masks. Raises UserError if the folder is not empty."""
     with atomic_folder(folder) as unfinished:
         for name in ("images", "masks"):
             (unfinished / name).mkdir()
@@ -106,7 +105,7 @@ def write_photographs(dev: Device, folder: Path, size: int, kind: str = "photogr
 
 
 def align(found: list[Camera], true: list[Camera]) -> Alignment:
-    """The found cameras moved onto the true ones by a similarity (Umeyama 1991)."""
+    """Move the found cameras onto the true ones by a similarity (Umeyama 1991)."""
     eyes, targets = (np.stack([camera.eye for camera in some]) for some in (found, true))
     a, b = eyes - eyes.mean(0), targets - targets.mean(0)
     u, sizes, vt = np.linalg.svd(b.T @ a)
@@ -123,7 +122,7 @@ def align(found: list[Camera], true: list[Camera]) -> Alignment:
 
 
 def compare(folder: Path, kind: str) -> tuple[int, Alignment]:
-    """(images that have a place, Alignment of their cameras). Raises UserError as readers do."""
+    """(number of images with a camera, Alignment of these). Raises UserError as readers do."""
     placed = [one for split in ("train", "test") for one in scene_frames(folder, split)]
     true = cameras(placed[0].camera.width, kind)
     places = [int(Path(one.name).stem) for one in placed]

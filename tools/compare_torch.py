@@ -3,7 +3,7 @@
     python tools/compare_torch.py --widths 128,256,512 --size 256 --json FILE
 
 PyTorch (development extra `torch`) runs the same operations in the same order, in channels_last: on
-the CPU, or beside a GPU of ours by CUDA, in float32 without TF32.
+the CPU or, if pp-cl uses a GPU, by CUDA, in float32 without TF32.
 """
 
 import argparse
@@ -19,13 +19,13 @@ from pp_cl.engine.layers.choice import AUTO, VARIANTS
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 
-# Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after
-# PyTorch is done, on cores that our device's threads need.
+# Seconds before each timed call. After PyTorch is done, OpenMP's threads spin for some milliseconds
+# on cores that our device's threads need.
 PAUSE = 0.03
 
 
 class TorchNetwork:
-    """PyTorch's twin of a UNet, with the same parameters, in channels_last, of a dtype and on a
+    """PyTorch's twin of a UNet: the same parameters, in channels_last, with a dtype and on a
     device of PyTorch.
     """
 
@@ -41,11 +41,11 @@ class TorchNetwork:
         return tensor.requires_grad_()
 
     def input(self, values):
-        """Tensor (1, C, H, W) of an (H, W, C) array."""
+        """An (H, W, C) array as a (1, C, H, W) tensor."""
         return self._tensor(values[None].transpose(0, 3, 1, 2))
 
     def image(self, x):
-        """(1, 3, H, W) of the features x (1, C, H, W)."""
+        """The image (1, 3, H, W) of the features x (1, C, H, W)."""
         functional, outputs = self.torch.nn.functional, {"x": x}
         for layer in self.layers:
             source = outputs[layer.inputs[0]]
@@ -67,14 +67,14 @@ class TorchNetwork:
         return 0.5 + 0.5 * outputs["out"]
 
     def forward(self, x):
-        """The image without what a backward pass needs, once it is made."""
+        """The finished image; nothing is kept for a backward pass."""
         with self.torch.inference_mode():
             image = self.image(x)
         self.finish()
         return image
 
     def train(self, x, grad_image):
-        """Make the image and all gradients, and wait."""
+        """Compute the image and all gradients, and wait."""
         self.torch.autograd.grad(self.image(x), [x, *self.parameters.values()], grad_image)
         self.finish()
 
@@ -85,9 +85,9 @@ class TorchNetwork:
 
 
 def compare(torch, dev, widths, size, *, variant, rounds):
-    """{"rel_l2": ours against float64, "forward": {"ours_ms", "torch_ms", "ratio"}, "train": the
-    same, forward and backward to the input and the weights}: medians, ratio = torch_ms / ours_ms.
-    Raises UserError beside a GPU of ours that PyTorch does not see.
+    """{"rel_l2": our error against float64, "forward": {"ours_ms", "torch_ms", "ratio"}, "train":
+    the same for forward and backward to input and weights}: medians, ratio = torch_ms / ours_ms.
+    Raises UserError if pp-cl uses a GPU and PyTorch sees none.
     """
     place, how = "cpu", f"oneDNN, {torch.get_num_threads()} threads"
     if not dev.is_cpu:
@@ -133,7 +133,7 @@ def compare(torch, dev, widths, size, *, variant, rounds):
 
 
 def _summary(times, direction):
-    """Medians and quartiles of both, and how many times faster than PyTorch we are."""
+    """Medians and quartiles of both, and PyTorch's time over ours."""
     summary = {}
     for name in ("ours", "torch"):
         low, median, high = np.percentile(times[direction, name], (25, 50, 75))
@@ -142,7 +142,7 @@ def _summary(times, direction):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Measure, print, write; returns the exit status."""
+    """Measure, print and write the results; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     add, count = parser.add_argument, integer(1, 10_000)
     add("--widths", default="128,256,512", type=widths, metavar="A,B,C", help="of the levels")

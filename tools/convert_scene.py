@@ -2,10 +2,10 @@
 
     python -m tools.convert_scene SCENE OUT --format colmap
 
-Formats are the modules in tools/scene_formats/. Images become PNG at the stored size, freed of lens
-distortion; masks go where the format keeps them. Formats that know no
-splits hold out every eighth photograph: for them the views of both splits are dealt anew
-(--hold-out), which any format can be asked for, so that all of them train and test on the same.
+Formats are the modules in tools/scene_formats/. Images become PNG at the stored size, without lens
+distortion; masks go where the format keeps them. Formats without splits hold out every eighth
+photograph: for them, the views of both splits are dealt anew. --hold-out does so for any format, so
+that all of them train and test on the same views.
 """
 
 import argparse
@@ -26,21 +26,21 @@ FORMATS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "comm
 
 
 def convert(splits: dict[str, list[View]], folder: Path, name: str) -> None:
-    """Write the views of each split in a format. Raises UserError for a folder that holds
-    something, and for what the format cannot hold.
+    """Write the views of each split in a format. Raises UserError if the folder is not empty or
+    the format cannot hold the views.
     """
     with atomic_folder(folder) as unfinished:
         import_module(f"tools.scene_formats.{name}").write(unfinished, splits)
 
 
 def dealt(splits: dict[str, list[View]]) -> dict[str, list[View]]:
-    """The same views in splits train and test as formats without splits have them."""
+    """Deal the views to the splits train and test as formats without splits do."""
     views = [view for split in sorted(splits) for view in splits[split]]
     return {split: hold_out(views, split) for split in SPLITS}
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The exit status: 2 for bad input."""
+    """Convert; returns the exit status, 2 for bad input."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("scene", help="folder of a scene, or the word demo")
     parser.add_argument("out", type=Path, help="new folder")

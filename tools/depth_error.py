@@ -1,7 +1,7 @@
-"""How far the alpha and depth of a run of the demo are from the object's.
+"""Compare the alpha and depth of a run of the demo with those of the object.
 
-On its test views: the share of the object's pixels whose depth is within 1.5 point spacings of the
-exact one, and the intersection over union of alpha and mask.
+Over the test views: the share of the object's pixels whose depth is within 1.5 point spacings of
+the exact one, and the intersection over union of alpha and mask.
 
     python tools/depth_error.py runs/demo
 """
@@ -22,13 +22,13 @@ from pp_cl.files.atomic import write_json
 from pp_cl.run import Run
 from pp_cl.scene.demo import OBJECT_BOX, distances
 
-CELLS = 2**24  # of the distance field
-STEPS = 200  # along a ray
+CELLS = 2**24  # the most cells of the distance field
+STEPS = 200  # of marching along a ray
 NEAR = 1.5  # point spacings
 
 
 class DemoSurface:
-    """The demo's exact surface, by marching through its distance field on a fine grid."""
+    """The demo's exact surface, found by marching through its distance field on a fine grid."""
 
     def __init__(self, dev: Device):
         box = np.array(OBJECT_BOX)
@@ -37,7 +37,7 @@ class DemoSurface:
 
     def depth(self, camera: Camera) -> np.ndarray:
         """(H, W) float64 depth along the camera's axis at the pixels' centres, infinite where
-        their rays miss.
+        a ray misses the object.
         """
         rays = camera.rays()
         lengths = np.linalg.norm(rays, axis=-1)
@@ -51,7 +51,7 @@ class DemoSurface:
         return np.where(hit, travelled / lengths, np.inf)
 
     def _at(self, points):
-        """(distances, inside of the field) of world positions (..., 3)."""
+        """(distances, whether inside the field) at world positions (..., 3)."""
         places = (points - self.grid.origin) / self.grid.voxel_size
         inside = ((places >= 0) & (places <= np.array(self.grid.dims) - 1)).all(axis=-1)
         return map_coordinates(self.field, places.T[::-1].swapaxes(1, 2), order=1), inside
@@ -59,8 +59,8 @@ class DemoSurface:
 
 @dataclass(frozen=True)
 class DepthError:
-    """Means over views. mean, median: share of pixels near the exact depth. overlap: of alpha and
-    mask.
+    """Means over views. mean, median: share of pixels where the mean or median depth is near the
+    exact one. overlap: intersection over union of alpha and mask.
     """
 
     mean: float
@@ -81,7 +81,7 @@ def overlap(one: np.ndarray, two: np.ndarray) -> float:
 
 
 def depth_error(run: Run) -> DepthError:
-    """Of a run of the demo. Raises UserError for another scene."""
+    """The DepthError of a run of the demo. Raises UserError for another scene."""
     if run.config.scene.path != "demo":
         raise UserError(f"{run.folder}: is no run of the demo, whose depth alone is known exactly")
     surface, rows = DemoSurface(run.dev), []

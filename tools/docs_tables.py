@@ -4,17 +4,17 @@
 
 A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end table -->` of a
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
-parsers of pp_cl/commands/), `api` (of the public names), `trained` and `evaluated` (what the
-commands of README.md print, of docs/results/readme.json), `kinds` (all that lie in a folder of
-docs/results/ and have no marker of their own), or that of another file docs/results/NAME.json (NAME
-may be KIND/TABLE), which holds
+parsers of pp_cl/commands/), `api` (the public names), `trained` and `evaluated` (what the commands
+of README.md print, from docs/results/readme.json), `kinds` (all tables in folders of docs/results/
+that have no marker of their own), or the name of another file docs/results/NAME.json (NAME may be
+KIND/TABLE), which holds
 
-    commit, date, machine, how    of what code it is, where and how it was measured
-    decides    digest of what decides a training in that code (tools/provenance.py)
+    commit, date, machine, how    which code was measured, when, where and how
+    decides    digest of the files that decide a training in that code (tools/provenance.py)
     measured   what the numbers are
     columns    [{"head": text, "cell": format}]: format is a str.format of the row's keys
-    rows       [{key: value}]; a cell of which a row lacks a key is empty
-    is_plain   the table is shown as on a terminal, if true
+    rows       [{key: value}]; a cell is empty if the row lacks one of its keys
+    is_plain   if true, the table is shown as on a terminal
 """
 
 import argparse
@@ -38,7 +38,7 @@ from pp_cl.presets import PRESETS, SHORT
 from pp_cl.settings import Config, every_setting
 from tools.provenance import ROOT, sentence
 
-# the modules whose names other packages may import: pp_studio imports no others
+# the modules whose names other packages may import; pp_studio imports from no others
 PUBLIC = (
     "pp_cl",
     *(f"pp_cl.{name}" for name in ("engine", "scene", "files", "config", "errors")),
@@ -51,7 +51,7 @@ MARKER = re.compile(r"^<!-- (?:end )?table", re.MULTILINE)
 
 
 class TableError(Exception):
-    """What is wrong with a marker or with the files of results."""
+    """A marker or a file of results is wrong; the message says how."""
 
 
 def cell(template: str, row: dict) -> str:
@@ -77,7 +77,7 @@ def plain(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def table(results: dict) -> str:
-    """Markdown of a file of results: what was measured, of which code, and the table."""
+    """Markdown of a file of results: what was measured, with which code, and the table."""
     what = results["measured"]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
@@ -87,8 +87,8 @@ def table(results: dict) -> str:
 
 
 def readme(results: dict) -> dict[str, str]:
-    """The lines that README's commands print: {trained, evaluated}, on the first driver; the others
-    beside it.
+    """{"trained", "evaluated"}: the lines that README's commands print on the first driver, and a
+    sentence on the other drivers.
     """
     first, *others = results["rows"]
     beside = "".join(
@@ -105,7 +105,7 @@ def readme(results: dict) -> dict[str, str]:
 
 
 def kinds(tables: dict[str, str]) -> str:
-    """The tables of each kind under its name, first that of its trainings."""
+    """The tables of each kind under its name; the table of trainings comes first."""
     lines: list[str] = []
     for kind in sorted({name.partition("/")[0] for name in tables if "/" in name}):
         own = sorted(name for name in tables if name.startswith(f"{kind}/"))
@@ -115,8 +115,8 @@ def kinds(tables: dict[str, str]) -> str:
 
 
 def settings() -> str:
-    """Every setting: its value in the preset tiny and in those that differ, and its help, unless
-    an option of its own has the same.
+    """Every setting: its value in the preset tiny and in presets that change it, and its help, or
+    the option that stands for it.
     """
     lines = []
     options = {key: f"`--{name.replace('_', '-')}`" for name, key in SHORT.items()}
@@ -129,7 +129,7 @@ def settings() -> str:
 
 
 def commands() -> str:
-    """Every command with its arguments, as they are written."""
+    """Every command with its arguments, as they are typed."""
     lines: list[str] = []
     for name in COMMANDS:
         module = importlib.import_module(COMMANDS[name])
@@ -144,7 +144,7 @@ def commands() -> str:
 
 def api() -> str:
     """The public names of the modules in TOLD, with their signatures and the first sentence of
-    their docstrings, unless another module has named them before; then the other modules.
+    their docstrings, where they first occur; then the other modules.
     """
     lines: list[str] = []
     seen: set[int] = set()
@@ -168,7 +168,7 @@ def api() -> str:
 
 
 def public_names(module: ModuleType) -> list[str]:
-    """The names that others may import from a module: its __all__, else all that it defines."""
+    """The names that others may import from a module: its __all__, or all that it defines."""
     defined = [
         n for n, v in vars(module).items() if getattr(v, "__module__", "") == module.__name__
     ]
@@ -195,7 +195,7 @@ def _described(name: str, thing: Any) -> list[str]:
 
 
 def _members(thing: type) -> list[str]:
-    """The signatures of a class's public methods and properties, but for an error's."""
+    """The signatures of a class's public methods and properties; none for an error."""
     found = []
     for name, member in vars(thing).items():
         if name[0] == "_" or name in getattr(thing, "_fields", ()) or issubclass(thing, Exception):
@@ -209,7 +209,7 @@ def _members(thing: type) -> list[str]:
 
 
 def _signature(thing: Any) -> str:
-    """As the source has it, with types: of a function, or of what makes an object of a class."""
+    """The typed signature of a function, or of a class's constructor, as in the source."""
     (node,) = ast.parse(textwrap.dedent(inspect.getsource(thing))).body
     if isinstance(node, ast.ClassDef):
         inits = [one for one in node.body if getattr(one, "name", "") == "__init__"]
@@ -225,7 +225,7 @@ def _signature(thing: Any) -> str:
 
 
 def _written(action: argparse.Action) -> str:
-    """An argument as the command line has it, such as `--seed S`."""
+    """An argument as it is typed, such as `--seed S`."""
     if action.nargs == 0:
         return ", ".join(action.option_strings)
     value = action.metavar or "|".join(map(str, action.choices or [action.dest.upper()]))
@@ -250,8 +250,8 @@ def marked(root: Path) -> list[str]:
 
 
 def read_tables(folder: Path, own: Collection[str] = ()) -> dict[str, str]:
-    """{name: Markdown} of all that can be generated; folder: of the results. `kinds` has no table
-    of those in `own`, which stand elsewhere. Raises TableError.
+    """{name: Markdown} of all tables. folder: with the results. own: names of tables that have
+    markers of their own, which `kinds` leaves out. Raises TableError.
     """
     results = read_results(folder)
     measured = readme(results.pop("readme")) if "readme" in results else {}
@@ -261,8 +261,8 @@ def read_tables(folder: Path, own: Collection[str] = ()) -> dict[str, str]:
 
 
 def with_tables(text: str, tables: dict[str, str]) -> str:
-    """The text with every table written anew. Raises TableError for a marker without partner, or
-    that names no table.
+    """The text with every table written anew. Raises TableError if a marker lacks its partner or
+    names no table.
     """
 
     def written(block):
@@ -283,7 +283,7 @@ def documents(root: Path) -> list[Path]:
 
 
 def main(root: Path = ROOT) -> int:
-    """Rewrite the tables of all documents, print the files that changed; returns the exit
+    """Rewrite the tables of all documents and print which files changed; returns the exit
     status.
     """
     path = root / "docs" / "results"

@@ -1,8 +1,9 @@
-"""What the mesh of a run is like: python tools/export_quality.py RUN.
+"""Measure the mesh of a run: python tools/export_quality.py RUN.
 
-Its faces, and which share of them no view shows; its parts; its Euler number, 2 of one part without
-holes; its roughness, the mean angle between neighbouring faces. On demo, whose surface is known,
-also how far the mesh lies from it, and it from the mesh, on average, in voxel sizes.
+Prints the number of faces and the share of them that no view shows; the number of parts; the Euler
+number, 2 for one part without holes; and the roughness, the mean angle between neighbouring faces.
+For demo, whose surface is known, also the mean distances in voxel sizes, from mesh to surface and
+back.
 """
 
 import argparse
@@ -20,12 +21,12 @@ from pp_cl.run import Run, load
 from pp_cl.scene.demo import demo_mesh, distances
 from pp_studio.export.mesh import seen_first, surface
 
-SAMPLES = 60_000  # of a surface
-EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances are asked for
+SAMPLES = 60_000  # points on the mesh
+EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances are computed
 
 
 def mesh_figures(run: Run) -> dict:
-    """The figures of the mesh that is exported, those of distances only of a run on demo."""
+    """The figures of the exported mesh; distances only if the run is on demo."""
     found = surface(run)
     solid = trimesh.Trimesh(found.vertices, found.faces, process=False)
     figures = {

@@ -1,4 +1,4 @@
-"""Compile and link every kernel as it is built on GPUs, without a GPU.
+"""Compile and link every kernel as for GPUs, without a GPU.
 
     python -m tools.gpu_check                      # or make gpu-check
     python -m tools.gpu_check --targets sm_80,pvc  # other GPUs: sm_*, gfx*, or a name ocloc knows
@@ -8,9 +8,9 @@ each program that they build is compiled for NVIDIA (clang and libclc to PTX, th
 (clang and libclc, linked) and Intel (ocloc, the driver's own compiler). Fails on what does not
 compile or link, on spilled registers, and on more local memory than all GPUs have.
 
-Debian's packages of compilers that are absent are unpacked into build/gpu, not installed: that
-needs no root, and Intel's driver would be one more OpenCL platform. NVIDIA's ptxas is not free and
-in none of them. Exit status: 1 for a failure, 2 where a compiler is missing.
+If compilers are absent, Debian's packages of them are unpacked into build/gpu, not installed: that
+needs no root, and Intel's driver would be one more OpenCL platform. NVIDIA's ptxas is not free, so
+no package has it. Exit status: 1 for a failure, 2 if a compiler is missing.
 """
 
 import argparse
@@ -42,13 +42,13 @@ MOST_LOCAL = 32768  # bytes: Adreno, Mali, Apple's and older Intel GPUs have no 
 FOLDER = Path(__file__).parents[1] / "build" / "gpu"
 CLANG, LINKER, PTXAS, OCLOC = "clang-19", "ld.lld-19", "ptxas", "ocloc"
 LIBRARIES = {"sm_": "nvptx64--nvidiacl.bc", "gfx": "amdgcn--amdhsa.bc"}
-# {program or file: Debian's package of it}
+# {program or file: Debian's package that has it}
 PACKAGES = {CLANG: "clang-19", LINKER: "lld-19", OCLOC: "intel-opencl-icd"}
 PACKAGES |= dict.fromkeys(LIBRARIES.values(), "libclc-19")
 CUDA = Path("/usr/local/cuda/bin")
-# of ptxas, of clang for AMD, of ocloc
+# as ptxas, clang for AMD and ocloc print it
 SPILL = r"(\d+) bytes spill stores|ScratchSize.*: (\d+)|spilled around (\d+)"
-# What OpenCL asks of a division and of a square root, as NVIDIA's driver takes it.
+# The precision of divisions and square roots that OpenCL asks for, as in NVIDIA's driver.
 ULP = ("-mllvm", "-nvptx-prec-divf32=1", "-mllvm", "-nvptx-prec-sqrtf32=0")
 
 
@@ -63,12 +63,12 @@ class Build(NamedTuple):
 
 
 class BuildError(Exception):
-    """What a compiler or linker said of a build that failed."""
+    """A build failed; the message is what the compiler or linker printed."""
 
 
 @contextmanager
 def recorded() -> Iterator[dict[Build, set[str]]]:
-    """{program that any device builds meanwhile: its kernels that are launched}."""
+    """Record {program that any device builds: the kernels launched from it} within the block."""
     builds, program, launch = {}, Device.program, Program.launch
 
     def build(device, name, **defines):
@@ -86,8 +86,8 @@ def recorded() -> Iterator[dict[Build, set[str]]]:
 
 
 def record() -> dict[Build, set[str]]:
-    """What is built and launched on a GPU: by the selftest, the two blends and the paper's network.
-    Raises RuntimeError where something fails.
+    """Record what the selftest and two trainings (both blends, the paper's network) build and
+    launch in the form for GPUs. Raises RuntimeError if one of them fails.
     """
     with (
         patch.dict(os.environ, {"PP_FORM": "gpu"}),
@@ -112,7 +112,7 @@ def record() -> dict[Build, set[str]]:
 
 
 def environment() -> dict[str, str]:
-    """In which the unpacked programs find their libraries and each other."""
+    """The environment in which unpacked programs find their libraries and each other."""
     libraries = [str(path) for path in sorted((FOLDER / "usr" / "lib").glob("*-linux-gnu"))]
     given = [os.environ[name] for name in ("LD_LIBRARY_PATH",) if os.environ.get(name)]
     programs = [os.environ["PATH"], str(FOLDER / "usr" / "bin")]
@@ -121,19 +121,19 @@ def environment() -> dict[str, str]:
 
 
 def find(name: str) -> str | None:
-    """The path of a program, or of a file of libclc; None where there is none."""
+    """The path of a program, or of a file of libclc; None if it is not found."""
     places, mode = [environment()["PATH"]], os.X_OK
     if name == PTXAS:
         packages = Path(sysconfig.get_path("purelib"), "nvidia").glob(f"*/bin/{PTXAS}")
         places += [str(CUDA), *(str(path.parent) for path in packages)]
     elif name.endswith(".bc"):
-        # not /usr/lib/clc, where another version of LLVM may have put its own
+        # not /usr/lib/clc, which may hold the files of another version of LLVM
         places, mode = [str(FOLDER / "usr" / "lib" / "clc")], os.R_OK
     return shutil.which(name, mode, os.pathsep.join(places))
 
 
 def unpack_missing() -> str:
-    """Unpack Debian's packages of what is absent. Returns what went wrong, else ""."""
+    """Unpack Debian's packages of absent programs. Returns what went wrong, or ""."""
     wanted = dict.fromkeys(package for name, package in PACKAGES.items() if not find(name))
     if not wanted:
         return ""
@@ -156,7 +156,7 @@ def unpack_missing() -> str:
 
 
 def missing(target: str, problem: str) -> list[str]:
-    """A line for each compiler of a target that is not there. problem: why it was not fetched."""
+    """A line for each missing compiler of a target. problem: why it was not fetched."""
     kind = target[:3]
     names = {"sm_": (CLANG, PTXAS), "gfx": (CLANG, LINKER)}.get(kind, (OCLOC,))
     told = []
@@ -170,7 +170,7 @@ def missing(target: str, problem: str) -> list[str]:
 
 
 def _run(command, folder=None):
-    """What a command prints. Raises BuildError."""
+    """Run a command; returns what it prints. Raises BuildError if it fails."""
     path = shutil.which(command[0], path=environment()["PATH"])
     ran = subprocess.run(
         [path or command[0], *command[1:]],
@@ -186,8 +186,8 @@ def _run(command, folder=None):
 
 
 def compile_build(target: str, build: Build, sources: Path, folder: Path) -> str:
-    """What the compilers of a target say of a build. folder: for what is compiled. Raises
-    BuildError.
+    """Compile a build for a target; returns what the compilers print. folder: for the output.
+    Raises BuildError.
     """
     kind, file = target[:3], str(sources / f"{build.file}.cl")
     platform = target if kind in LIBRARIES else INTEL_PLATFORM
@@ -198,7 +198,7 @@ def compile_build(target: str, build: Build, sources: Path, folder: Path) -> str
         return _run([*command, "-options", " ".join(options), "-out_dir", str(folder)])
     clang = [find(CLANG), "-x", "cl", "-O3", "-w", "-Wno-linker-warnings", *options, file]
     clang += ["-Xclang", "-mlink-builtin-bitcode", "-Xclang", find(LIBRARIES[kind])]
-    if kind == "gfx":  # linked: only then undefined functions fail
+    if kind == "gfx":  # linked, as only the linker fails on undefined functions
         remarks = ["-nogpulib", "-Rpass-analysis=kernel-resource-usage"]
         link = [f"-fuse-ld={find(LINKER)}", "-o", str(folder / "x.co")]
         return _run([*clang, "--target=amdgcn-amd-amdhsa", f"-mcpu={target}", *remarks, *link])
@@ -209,9 +209,9 @@ def compile_build(target: str, build: Build, sources: Path, folder: Path) -> str
 
 
 def complaints(said: str) -> list[str]:
-    """A line for each kernel that spills or takes too much local memory, by what ptxas, clang for
-    AMD or ocloc printed. AMD's scratch memory has arrays, too, whose index is not constant; scalar
-    registers spill into vector registers.
+    """A line for each kernel that spills or takes too much local memory, from what ptxas, clang
+    for AMD or ocloc printed. AMD's scratch memory also holds arrays whose index is not constant;
+    scalar registers spill into vector registers.
     """
     found, kernel = [], ""
     for line in said.splitlines():
@@ -227,8 +227,8 @@ def complaints(said: str) -> list[str]:
 
 
 def check(target: str, build: Build, kernels: set[str]) -> list[str]:
-    """A line for each thing that is wrong with a build for a target. kernels: that are launched;
-    what others of the file take is of no interest.
+    """A line for each problem of a build for a target. kernels: those launched; complaints
+    about the file's other kernels are dropped.
     """
     with TemporaryDirectory() as folder:
         try:
@@ -240,7 +240,7 @@ def check(target: str, build: Build, kernels: set[str]) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Returns the exit status."""
+    """Check all builds; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--targets", default=",".join(TARGETS), help="sm_*, gfx*, ocloc's names")
     targets = parser.parse_args(arguments).targets.split(",")

@@ -1,4 +1,4 @@
-"""Keep the network of a run as the one that `pp-cl train --network demo` begins with.
+"""Store the network of a run as the one from which `pp-cl train --network demo` starts.
 
     python -m tools.keep_network runs/network
 

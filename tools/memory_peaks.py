@@ -1,8 +1,8 @@
-"""Compare the memory that trainings are said to need with the peaks of device and host.
+"""Compare the planned memory of trainings with the measured peaks of device and host.
 
     python tools/memory_peaks.py [--scene FOLDER] [--only NAME ...] [--memory GIB] [--json FILE]
 
-Each training is a process of its own, a few steps long: what is allocated does not change between
+Each training is a process of its own, a few steps long, as allocations do not change between
 prunings. Refinements come early, so that none is left out. The rows `phone` and `photos` train on
 300 and 60 photographs of 12 megapixels, which are made in a temporary folder (most of them links)
 and removed. With --memory on a CPU, the device's memory is in the host's peak, not in its plan.
@@ -29,25 +29,25 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.session.training import open_training
 
 MIB = 2**20
-PHONE, SHRUNK = (4000, 3000), 4  # pixels, times the drawing is enlarged
-PHOTOGRAPHS = {"phone": 300, "photos": 60}  # of trainings
-EARLY = {"train.iterations": 70, "train.eval_every": 0}  # they are smoothed once
-# what is trained: preset, settings
+PHONE, SHRUNK = (4000, 3000), 4  # pixels; factor by which the drawing is enlarged
+PHOTOGRAPHS = {"phone": 300, "photos": 60}  # {training: number of photographs}
+EARLY = {"train.iterations": 70, "train.eval_every": 0}  # the field is smoothed once
+# {name: (preset, settings)}
 TRAININGS = {
     "tiny": ("tiny", {}),
     "small": ("small", {}),
-    # without pruning, or its second refinement would be left out
+    # pruning is off, else the second refinement would be left out
     "full": ("full", {"points.count": 30_000, "train.prune_weight": 0}),
     "paper": ("paper", {"points.count": 1_500_000, "scene.downscale": 4, "train.iterations": 4}),
-    "paper in full": ("paper", {"train.iterations": 3}),  # 12 GiB on lego
+    "paper in full": ("paper", {"train.iterations": 3}),  # takes 12 GiB on lego
     "phone": ("tiny", {"scene.downscale": 8}),
     "photos": ("full", {"train.memory_gib": 4, "train.prune_weight": 0}),
 }
 
 
 def write_phone_scene(folder: Path, count: int) -> str:
-    """A scene of `count` photographs of 12 megapixels of a ball with a mask; all cameras look at
-    its centre from one distance and see the same circle, so that a few files do.
+    """Write a scene of `count` photographs of 12 megapixels of a ball with a mask. All cameras look
+    at its centre from one distance and see the same circle, so a few image files are enough.
     """
     width, height = PHONE
     y, x = np.mgrid[: height // SHRUNK, : width // SHRUNK] + 0.5
@@ -71,7 +71,7 @@ def write_phone_scene(folder: Path, count: int) -> str:
 
 
 def peaks(name: str, scene: str, memory: float = 0.0) -> dict:
-    """The row of one training, in MiB; for a process that does nothing else."""
+    """The row of one training, in MiB; the process must do nothing else."""
     preset, settings = TRAININGS[name]
     settings = EARLY | settings | ({"train.memory_gib": memory} if memory else {})
     given = [(*item, "--only") for item in settings.items()]
@@ -97,7 +97,7 @@ def peaks(name: str, scene: str, memory: float = 0.0) -> dict:
 
 
 def measured(name: str, scene: str, memory: float) -> dict:
-    """peaks() in a process of its own; with `memory` in the form for GPUs."""
+    """peaks() in a new process; if `memory` is set, in the form for GPUs."""
     command = [sys.executable, __file__, "--child", name, "--scene", scene, "--memory", f"{memory}"]
     card = {"PP_FORM": "gpu", "PP_MAX_ALLOCATION": f"{256 * memory}"} if memory else {}
     done = subprocess.run(

@@ -1,5 +1,5 @@
-"""Draw what a finished run computes of its scene: the cells of its hull and those with a point, in
-the middle slice of the box, and the tiles of the network in a view.
+"""Draw which parts of its scene a finished run computes: the cells of the hull and those with a
+point, in the middle slice of the box, and the network's tiles in a view.
 
     python -m tools.needed RUN --out FILE.png
 
@@ -23,21 +23,21 @@ BESIDE = 0.35  # brightness of tiles that are not computed
 
 
 def cells(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """(x, y, z) bool of the cells of the box: those of the hull, those with a point."""
+    """Which cells of the box are in the hull and which have a point, each (x, y, z) bool."""
     views = run.scene("train").splits["train"]
     hull, _ = first_hull(run.dev, run.config, judged(run.dev, run.config, views)[0])
     grid, found = run.model.grid, []
     for of, ids in ((hull.grid, hull.ids), (grid, run.dev.download(run.model.cloud.ids))):
         is_there = np.zeros(of.dims, bool)
         is_there[tuple(of.coordinates(ids).T)] = True
-        times = grid.dims[0] // of.dims[0]  # by refinements since
+        times = grid.dims[0] // of.dims[0]  # the grid was refined since
         found.append(is_there.repeat(times, 0).repeat(times, 1).repeat(times, 2))
     return found[0], found[1]
 
 
 def tiles(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """((H, W, 3) the first training view, padded as the network has it; (H, W) bool, the pixels of
-    tiles that the network computes).
+    """The first training view, padded for the network, (H, W, 3), and which pixels are in tiles
+    that the network computes, (H, W) bool.
     """
     result = run.renderer.forward(run.cameras("train")[0], run.gamma)
     image = np.clip(run.dev.download(result.image), 0, 1)
@@ -72,7 +72,7 @@ def draw(run: Run, path: str) -> None:
 
 
 def main() -> int:
-    """Draw; returns the exit status."""
+    """Draw the picture; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("run", metavar="RUN")
     parser.add_argument("--out", required=True, metavar="FILE")

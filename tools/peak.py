@@ -1,4 +1,4 @@
-"""What a device can do at most: multiply-adds that never leave the registers, and copies far larger
+"""A device's highest speeds: multiply-adds that never leave the registers, and copies far larger
 than any cache.
 """
 
@@ -9,8 +9,8 @@ from pp_cl.engine.device.device import Device, Program
 from pp_cl.engine.layers.choice import device_class
 from pp_cl.engine.layers.tiles import VECTOR
 
-# Of one run of PeakFlops: long against the 30 us of a launch, short enough to run between any two
-# others.
+# Length of one run of PeakFlops: long against the 30 us of a launch, short enough to run between
+# any two other measurements.
 PEAK_SECONDS = 0.02
 # Eight times what the caches of processors and GPUs hold: a copy inside a cache would be too fast.
 COPY_BYTES = 2**28
@@ -22,9 +22,9 @@ def program(dev: Device, chains: int = 1) -> Program:
     return Program(dev, "peak", source, options=[*options, f"-DCHAINS={chains}"], defines={})
 
 
-# Independent sums of 16 lanes, of which the fastest number is taken. A CPU core needs 2 units x 4
-# cycles of registers under way and has 32 of 16 floats (16 chains), 16 of 8 (6), or 16 of 4 (3).
-# More are kept in memory; the width that a driver states is not always that of its code.
+# Numbers of independent sums of 16 lanes to try; the fastest is taken. A CPU core needs registers
+# for 2 units x 4 cycles of sums under way, and has 32 of 16 floats (16 chains), 16 of 8 (6), or 16
+# of 4 (3); more sums go to memory. The width that a driver states is not always that of its code.
 # On a GPU the 16 lanes of one chain are 16 chains already, and many work-items share a unit.
 CHAINS = {"CPU": (3, 6, 16), "GPU": (2,)}
 
@@ -40,11 +40,11 @@ class PeakFlops:
         per_unit, self.local = {"CPU": (64, 1), "GPU": (2048, 64)}[kind]
         self.out = dev.empty((per_unit * dev.info["compute_units"], VECTOR))
         self.chains = max(CHAINS[kind], key=self._rate)
-        self._rate(self.chains)  # its rounds
+        self._rate(self.chains)  # sets its program and rounds
 
     @property
     def flops(self) -> int:
-        """A multiply-add counts as two."""
+        """Operations of one run(); a multiply-add counts as two."""
         return 2 * self.out.size * self.chains * self.rounds
 
     def run(self, first: float = 0.0, factor: float = 0.5, term: float = 1.0) -> None:
@@ -65,7 +65,7 @@ class PeakFlops:
         self.dev.finish()
 
     def _rate(self, chains):
-        """Operations a second of so many chains, the best of five runs of PEAK_SECONDS or more."""
+        """Operations a second with `chains` sums, the best of five runs of PEAK_SECONDS or more."""
         self.program, self.chains, self.rounds = program(self.dev, chains), chains, 64
         self.run()  # builds the kernel
         while self._seconds() < PEAK_SECONDS:
@@ -79,7 +79,7 @@ class PeakFlops:
 
 
 class CopyBandwidth:
-    """A copy of COPY_BYTES. bytes: moved by one run(), read and written."""
+    """A copy of COPY_BYTES. bytes: how many one run() moves, read and written."""
 
     def __init__(self, dev: Device):
         self.dev, self.program = dev, program(dev)

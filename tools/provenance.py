@@ -1,7 +1,7 @@
-"""Of which code a figure in the documents is: a digest of all that decides a training, which is
-stored with each measurement, so that no release states figures of older code.
+"""Find figures in the documents that older code gave. Each measurement is stored with a digest of
+the files that decide a training, so that no release states figures of older code.
 
-    python -m tools.provenance      # or make figures; fails where figures are of older code
+    python -m tools.provenance      # or make figures; fails if figures are of older code
 """
 
 import hashlib
@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# what decides the numbers of a training, its evaluation and a capture
+# files that decide the numbers of a training, its evaluation and a capture
 DECIDES = (
     "cl",
     *(f"pp_cl/{name}.py" for name in ("config", "evaluate", "presets", "run", "settings")),
@@ -21,7 +21,7 @@ KINDS = (".py", ".cl", ".h", ".npz", ".json")
 
 
 def digest(root: Path = ROOT) -> str:
-    """Hex digest of what decides a training in a checkout."""
+    """Hex digest of the files that decide a training in a checkout."""
     files = [file for place in DECIDES for file in _files(root / place)]
     found = hashlib.sha256()
     for file in sorted(files, key=lambda one: one.relative_to(root).as_posix()):
@@ -36,13 +36,13 @@ def _files(place):
 
 
 def sentence(results: dict) -> str:
-    """Of which commit, machine and way a file of results is."""
+    """The sentence that states the commit, date, machine and method of a file of results."""
     said = f"Commit {results['commit']}, {results['date']}, {results['machine']}"
     return said + (f"; {results['how']}." if results.get("how") else ".")
 
 
 def older(folder: Path, now: str) -> list[str]:
-    """A line for each file of results in a folder that is of other code than now, a digest()."""
+    """A line for each file of results in a folder whose code is not `now`, a digest()."""
     files = {path: json.loads(path.read_text("utf-8")) for path in sorted(folder.rglob("*.json"))}
     return [
         f"{path}: of commit {results['commit']}, before the last change to what decides a training;"
@@ -53,7 +53,7 @@ def older(folder: Path, now: str) -> list[str]:
 
 
 def main(root: Path = ROOT) -> int:
-    """Print what is older than the code; returns the exit status."""
+    """Print which figures are older than the code; returns the exit status."""
     found = older(root / "docs" / "results", digest(root))
     print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
     return 1 if found else 0

@@ -1,7 +1,7 @@
-"""Type README.md's commands in an empty folder, on each OpenCL driver that is here, and keep what
-they print in docs/results/readme.json, from which `make docs` writes the lines of README.md.
+"""Run README.md's commands in an empty folder, on each OpenCL driver of this machine, and store the
+output in docs/results/readme.json, from which `make docs` writes the lines of README.md.
 
-    python -m tools.readme_lines        # or make readme; minutes, in which nothing else should run
+    python -m tools.readme_lines        # or make readme; for minutes nothing else should run
 """
 
 import json
@@ -29,24 +29,24 @@ EVALUATED = re.compile(
 
 
 def commands() -> list[str]:
-    """README's commands of the demo, as they stand there: the training and the evaluation."""
+    """README's commands that train and evaluate the demo, word for word."""
     found = COMMANDS.findall((ROOT / "README.md").read_text("utf-8"))
     return [train or evaluate for train, evaluate in found]
 
 
 def drivers() -> dict[str, int]:
-    """{platform: the floats of a vector} of the CPU devices that work."""
+    """{platform: floats in a vector} of the CPU devices that work."""
     found = [device for _, device, problem in list_devices() if not problem]
     return {one.platform.name: one.native_vector_width_float for one in found}
 
 
 def machine() -> str:
-    """The processor whose lines README shows."""
+    """The number of cores and the name of this processor."""
     return f"{os.cpu_count()} cores of {processor()}"
 
 
 def typed(driver: str) -> list[str]:
-    """What README's commands print on a driver, in an empty folder."""
+    """The lines that README's commands print on a driver, in an empty folder."""
     said = []
     environment = os.environ | {"PP_DEVICE": driver, "PYTHONPATH": str(ROOT)}
     with tempfile.TemporaryDirectory() as folder:
@@ -60,7 +60,7 @@ def typed(driver: str) -> list[str]:
 
 
 def row(driver: str, width: int) -> dict:
-    """What README shows of a driver."""
+    """The lines and numbers that README shows for a driver."""
     lines = typed(driver)
     numbers = {}
     for form in (TRAINED, EVALUATED):
@@ -73,9 +73,9 @@ def row(driver: str, width: int) -> dict:
 
 
 def main() -> int:
-    """Measure on every driver, keep what was found; returns the exit status."""
+    """Measure on every driver and store the rows; returns the exit status."""
     rows = [row(driver, width) for driver, width in drivers().items()]
-    # README's own install line brings Intel's
+    # Intel's first: README's own install line installs it
     rows.sort(key=lambda one: "Intel" not in one["driver"])
     about = {
         "commit": git("log", "-1", "--format=%h"),

@@ -1,15 +1,15 @@
 """Measure what README.md and docs/ state as results of this code: `make results`.
 
-Every part is a process: a training with its evaluation, a bench, a tool. What it found is kept in
-runs/results/, so that the same command goes on where it was stopped; for other code everything is
-measured anew. A table is written to docs/results/ once all of it was found, the plots once
-everything was; `make docs` puts them into the pages. Scenes are looked for in PP_DATA
+Every part is a process: a training with its evaluation, a bench, a tool. Its result is stored in
+runs/results/, so that the same command goes on where it was stopped; if the code changes, all parts
+are measured anew. A table is written to docs/results/ once all its parts are measured, the plots
+once all parts are; `make docs` puts them into the pages. Scenes are looked for in PP_DATA
 (../shared/data). It takes hours in which nothing else should run.
 
-`--kind NAME` measures for another processor, driver (PP_DEVICE) or GPU. What it finds is kept in
-runs/results-NAME/, and the tables of those parts that were measured go to docs/results/NAME/, for
-the marker `table: kinds` or markers of their own. `--minutes N`, on a GPU that is lent for a while,
-measures the parts of WORTH for which there is time, and names those that it left out.
+`--kind NAME` measures for another processor, driver (PP_DEVICE) or GPU. Results are stored in
+runs/results-NAME/, and the tables of the parts measured so far go to docs/results/NAME/, for the
+marker `table: kinds` or markers of their own. `--minutes N`, on a GPU that is lent for a while,
+measures the parts of WORTH for which there is time, and names the parts that it left out.
 """
 
 import argparse
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 DATA = Path(os.environ.get("PP_DATA", ROOT.parent / "shared" / "data"))
-CODE = ("pp_cl", "cl")  # what decides the numbers
+CODE = ("pp_cl", "cl")  # the code that decides the numbers
 WIDTHS = {16: "AVX-512", 8: "AVX2", 4: "vectors of 128 bits"}  # floats in a vector of the device
 
 LEGO, ALL_VIEWS = "nerf_synthetic/lego", "nerf_synthetic/lego_all"
@@ -54,7 +54,7 @@ HEAD = "ethiopian_head"
 HIGHLIGHTS = {f"test/r_{i}.png" for i in range(1, 14)}  # lego's views with a highlight
 TOOL = (sys.executable, "-m")
 PP_CL = (*TOOL, "pp_cl")
-OPENSPLAT = [(3.6, 24.2), (14.0, 29.9)]  # minutes on one core, PSNR; its CPU build, 15b7e80
+OPENSPLAT = [(3.6, 24.2), (14.0, 29.9)]  # minutes on one core, PSNR, of its CPU build 15b7e80
 # lego at 800x800 on NVIDIA GPUs: minutes, PSNR (docs/results.md names the sources)
 ON_GPUS = {
     "3DGRT": (7.8, 36.70),
@@ -73,20 +73,20 @@ Found: TypeAlias = dict | list[dict]
 
 @dataclass(frozen=True)
 class Training:
-    """A training and the scene of its test views, if that is another one."""
+    """A training, and the scene of its test views if they are elsewhere."""
 
     name: str
     scene: str
     preset: str
-    steps: int | None = None  # None: the preset's, or as many as its minutes allow
+    steps: int | None = None  # None: the preset's number, or as many as its minutes allow
     downscale: int | None = None
     test: str | None = None
-    is_captured: bool = False  # the scene is a folder of photographs, which `capture` makes one of
-    minutes: float | None = None  # its budget
+    is_captured: bool = False  # `scene` is a folder of photographs, from which `capture` makes one
+    minutes: float | None = None  # its time budget
 
 
 def lego(preset: str, downscale: int, *steps: int) -> list[Training]:
-    """Trainings of several lengths, each with schedules of its own."""
+    """Trainings on lego of several lengths, each with schedules of its own."""
     return [Training("lego", LEGO, preset, n, downscale, ALL_VIEWS) for n in steps]
 
 
@@ -108,7 +108,7 @@ TRAININGS = [
     ),
 ]
 
-# PSNR against minutes: each curve is the trainings of one scene and preset, by rising budgets
+# PSNR against minutes: a curve joins trainings of one scene and preset, by rising budgets
 CURVES = [
     Training(name, scene, preset, None, downscale, test, minutes=minutes)
     for name, scene, preset, downscale, test, budgets in (
@@ -134,9 +134,9 @@ QUALITY = [
     {"head": "points", "cell": "{points:,}"},
     {"head": "ms a frame", "cell": "{frame_ms:.0f}"},
 ]
-# by preset, the training whose last steps are timed
+# {preset: the training that stages() continues to time its steps}
 STEPS = {"tiny": "lego_8000", "full": "lego_15000"}
-# parts that --minutes measures, the most telling first: minutes that each takes at most on an H200
+# {part: the most minutes it takes on an H200} that --minutes measures, the most telling first
 WORTH = {"demo_1500": 1.0, "lego_8000": 1.5, "lego_15000": 3.0}
 WORTH |= {"rasteriser": 1.0, "pytorch": 1.0, "stages_tiny": 0.5, "stages_full": 1.0}
 RASTERISER = [
@@ -179,7 +179,7 @@ SPLATS = [
     {"head": "three times as large", "cell": "{psnr_larger:.1f}"},
     {"head": "beside the hull", "cell": "{beside:.1%}"},
 ]
-# of what a splat is fitted: the trainings' parts, and how rows name them
+# {part whose training a splat is fitted to: its name in the rows}
 SPLATTED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_6000": "lego 400x400"}
 SPLATTED |= {"ethiopian_head": "ethiopian_head"}
 STABILITY = [
@@ -189,7 +189,7 @@ STABILITY = [
     {"head": "ours", "cell": "{error}"},
     {"head": "bound", "cell": "{bound}"},
 ]
-# what of a scene runs compute, and of whose views time is drawn against error: trainings' parts
+# {part whose run work() examines: its name in the rows}; TRADED: the run of frontier()
 WORKED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_15000": "lego 800x800"}
 TRADED = "lego_8000"
 WORK = [
@@ -211,12 +211,12 @@ MESHES = [
     {"head": "from the surface: mean, median", "cell": "{mean:.2f}, {median:.2f}"},
     {"head": "surface from it", "cell": "{back:.2f}"},
 ]
-# of the trainings' parts, and how rows name them
+# {part whose mesh is measured: its name in the rows}
 MESHED = {"demo_1500": "demo, 1,500 steps", "ethiopian_head": "ethiopian_head, 8,000 steps"}
 DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
 
 
-# ---- parts: each returns what it found
+# ---- parts: each returns its measurements
 
 
 def run_program(*words: object) -> None:
@@ -228,7 +228,7 @@ def run_program(*words: object) -> None:
 
 
 def read_found(store: Path, *words: object) -> Any:
-    """What a program writes with --json."""
+    """Run a program; returns the contents of its --json file."""
     file = store / "found"
     run_program(*words, "--json", file)
     return json.loads(file.read_text("utf-8"))
@@ -245,7 +245,7 @@ def key_of(training: Training) -> str:
 
 
 def train(training: Training, store: Path) -> dict:
-    """A row of QUALITY."""
+    """Train and evaluate; returns a row of QUALITY."""
     run, scene = store / key_of(training), scene_of(training.scene)
     if training.is_captured:
         scene, photographs = store / f"{key_of(training)}_scene", scene
@@ -310,7 +310,7 @@ def pytorch(store: Path) -> list[dict]:
 
 
 def stages(preset: str, store: Path) -> dict:
-    """What tools/stages.py says of a preset's run. Raises UserError without one."""
+    """The times by tools/stages.py of a preset's run. Raises UserError if there is none."""
     run = store / STEPS[preset]
     if not run.exists():
         raise UserError(f"the part {run.name} comes first")
@@ -332,7 +332,7 @@ def memory(store: Path) -> list[dict]:
 
 
 def demo(store: Path) -> list[dict]:
-    """Rows of DEMO: depths of the demo's runs."""
+    """Rows of DEMO: errors of depth and alpha of the demo's runs."""
     rows = []
     short, long = (store / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
@@ -422,7 +422,7 @@ PARTS: dict[str, Callable[[Path], Found]] = {
 }
 
 
-# the parts of each table that has not its part's name
+# {table: its parts}, unless the table has the name of its only part
 OF_TABLE = {
     "trainings": {key_of(training) for training in TRAININGS},
     "curves": {key_of(training) for training in CURVES},
@@ -441,7 +441,7 @@ def scene_of(name: str) -> Path | str:
 
 
 def git(*words: str) -> str:
-    """What git prints."""
+    """Run git; returns what it prints."""
     return subprocess.run(
         [shutil.which("git") or "git", *words],
         cwd=ROOT,
@@ -462,11 +462,11 @@ def processor() -> str:
 
 
 def origin() -> dict[str, str]:
-    """Where, when and of which code. Raises UserError for code that is not committed."""
+    """Code, date and machine of the results. Raises UserError if code is not committed."""
     if git("status", "--porcelain", "--", *CODE):
         raise UserError("pp_cl/ or cl/ differ from the last commit: commit first")
     dev = open_device()
-    # PoCL's name is longer than the processor's: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
+    # not PoCL's longer name: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
     name = processor().replace("(R)", "")
     driver = f"{dev.info['platform']} {dev.info['driver']}"
     vectors = WIDTHS.get(dev.queue.device.native_vector_width_float)
@@ -482,7 +482,7 @@ def origin() -> dict[str, str]:
 
 
 def begin(store: Path, commit: str) -> None:
-    """Make the folder of what is kept, empty if what is in it is of another commit."""
+    """Make the folder of results; empty it first if its results are of another commit."""
     mark = store / "commit"
     if not (mark.exists() and mark.read_text("utf-8") == commit):
         shutil.rmtree(store, ignore_errors=True)
@@ -491,7 +491,7 @@ def begin(store: Path, commit: str) -> None:
 
 
 def measure(store: Path, name: str) -> Found:
-    """What a part found, now or before."""
+    """The result of a part, which is measured unless it is stored."""
     file = store / f"{name}.json"
     if not file.exists():
         write_json(file, PARTS[name](store))
@@ -499,8 +499,8 @@ def measure(store: Path, name: str) -> Found:
 
 
 def measure_within(store: Path, minutes: float) -> list[str]:
-    """Measure the parts of WORTH for which there is time, on a device as slow as its parts so far;
-    what was left out, and why.
+    """Measure the parts of WORTH for which there is time, judged by how slow the device was so
+    far. Returns which parts were left out, and why.
     """
     start, expected, left_out = time.monotonic(), 0.0, []
     for name, needed in WORTH.items():
@@ -517,19 +517,19 @@ def measure_within(store: Path, minutes: float) -> list[str]:
 
 
 def trained(found: dict[str, Found], trainings: list[Training]) -> list[dict]:
-    """The rows of these trainings, as far as they were measured."""
+    """The rows of those trainings that were measured."""
     return [found[key_of(t)] for t in trainings if key_of(t) in found]
 
 
 def timed(found: dict[str, Found]) -> list[dict]:
-    """What plot_speed() draws: {"panel", "kind", "label", "ms", "error"}."""
+    """The rows that plot_speed() draws: {"panel", "kind", "label", "ms", "error"}."""
     rows: list[dict] = []
     for r in found["rasteriser"]:
         points = f"{r['points'] / 1e6:.2g} M" if r["points"] >= 1e6 else f"{r['points'] // 1000} k"
         label = f"{r['scene']}, {points} points,\n{r['size']}x{r['size']} pixels"
         own = {"panel": "rasteriser", "kind": r["blend"], "label": label}
         rows.append(own | {"ms": r["ms"], "error": r["max_err"]})
-    for r in found["pytorch"]:  # of the same network
+    for r in found["pytorch"]:  # rows of one network share a panel
         widths, side = r["widths"].replace(",", ", "), r["size"]
         panel = {"panel": f"network of {widths} channels, {side}x{side}"}
         ratio, ours = r["forward_ratio"], {"ms": r["forward_ours_ms"], "error": r["rel_l2"]}
@@ -542,7 +542,7 @@ def timed(found: dict[str, Found]) -> list[dict]:
 
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
-    """{name: contents} of the tables of which all was found, but for origin()."""
+    """{name: contents without origin()} of the tables that have rows."""
     quality = "means over the held-out views; minutes of training alone"
     blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
     rows = found | {"trainings": trained(found, TRAININGS), "curves": trained(found, CURVES)}
@@ -580,7 +580,7 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
 
 
 def draw(found: dict[str, Found], machine: str, folder: Path) -> None:
-    """quality.png, speed.png and frontier.png, and the same for dark pages."""
+    """Draw quality.png, speed.png and frontier.png, and the same for dark pages."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
@@ -598,8 +598,8 @@ def draw(found: dict[str, Found], machine: str, folder: Path) -> None:
 
 
 def plot_quality(figure: "Figure", rows: list[dict]) -> None:
-    """PSNR of test views against minutes of training: a panel for each size of lego's images, and
-    one for captures with a curve each. Others' results stand in the panel of their size alone.
+    """Plot PSNR of test views against minutes of training: a panel for each size of lego's images,
+    and one with a curve for each capture. Results of other programs are in their size's panel.
     """
     lego = [row for row in rows if row["name"] == "lego"]
     panels = {
@@ -634,7 +634,7 @@ def plot_quality(figure: "Figure", rows: list[dict]) -> None:
 
 
 def plot_speed(figure: "Figure", timed: list[dict]) -> None:
-    """Time against error, a panel for the rasteriser and each network, each point with its name."""
+    """Plot error against time: a panel for the rasteriser and each network, labelled points."""
     names = dict.fromkeys(row["panel"] for row in timed)
     panels = figure.subplots(1, len(names))
     for axes, name in zip(panels, names, strict=True):
@@ -667,7 +667,7 @@ def label_logarithmic(axes: "Axes") -> None:
 
 
 def main() -> int:
-    """Measure what is missing, write the documents; returns the exit status."""
+    """Measure missing parts, write tables and plots; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
     parser.add_argument("--kind", default="", metavar="NAME")

@@ -1,9 +1,9 @@
-"""Write docs/road.md: what a default step of a training calls, in the order in which it is read.
+"""Write docs/road.md: what a default training step calls, in reading order.
 
     python -m tools.road            # or make docs
 
-A step is traced on a CPU. Functions and kernel files stand where they come first; a minute is 40
-lines of code, without blank lines, comments and docstrings.
+A step is traced on a CPU. Functions and kernel files are listed where they are first called; a
+minute is 40 lines of code, without blank lines, comments and docstrings.
 """
 
 import ast
@@ -35,7 +35,7 @@ SETTINGS = {
     "train.refine_at": (1.0, 1.0),
 }
 WARM = 4  # steps in which buffers grow and kernels are built
-LEAST_LINES = 5  # of a function: what shorter ones do is in their names
+LEAST_LINES = 5  # of a listed function; shorter ones are explained by their names
 HEAD = """# The road: one step, in the order to read it
 
 What `Trainer.train_step` calls in a default training on a CPU, once its buffers are there:
@@ -49,7 +49,7 @@ Step = tuple[Path, str]  # (a file, a function in it; "" for a file of kernels)
 
 
 def traced(dev: Device) -> list[Step]:
-    """What one step calls and launches, in the order of the first time."""
+    """The functions and kernel files that one step uses, in the order of first use."""
     given = [(*item, "road") for item in SETTINGS.items()]
     with tempfile.TemporaryDirectory() as folder:
         run = RunFolder(Path(folder) / "run")
@@ -61,13 +61,13 @@ def traced(dev: Device) -> list[Step]:
 
 
 def forget_calls(trainer: Trainer) -> None:
-    """Let the next step call what it would replay."""
+    """Make the next step call the functions that it would replay."""
     trainer.renderer._buffers.calls.clear()
     trainer.model.net.release()
 
 
 def called(function: Callable[[], object]) -> list[Step]:
-    """The functions of the engine, and kernel files, of a call."""
+    """Call a function; returns the engine's functions and kernel files that it uses."""
     found: dict[Step, None] = {}
 
     def watch(frame, event, _):
@@ -78,7 +78,7 @@ def called(function: Callable[[], object]) -> list[Step]:
             if code.co_name == "program":
                 found[kernel_folder() / f"{frame.f_locals['name']}.cl", ""] = None
 
-    gc.disable()  # which calls back for arrays of others
+    gc.disable()  # its callbacks for unrelated arrays would be listed
     sys.setprofile(watch)
     try:
         function()
@@ -90,7 +90,7 @@ def called(function: Callable[[], object]) -> list[Step]:
 
 @cache
 def python_lines(path: Path) -> dict[str, int]:
-    """{function or method: its lines of code}, of the first of a name."""
+    """{function or method: its lines of code}; a name counts where it first occurs."""
     text = path.read_text("utf-8")
     skipped = {getattr(tokenize, kind) for kind in ("COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT")}
     code = {
@@ -110,14 +110,14 @@ def python_lines(path: Path) -> dict[str, int]:
 
 
 def kernel_files(path: Path) -> list[Path]:
-    """A kernel's file, after the headers that it includes."""
+    """The headers that a kernel's file includes, then the file."""
     includes = re.findall(r'(?m)^#include "(.+)"', path.read_text("utf-8"))
     headers = [file for name in includes for file in kernel_files(kernel_folder() / name)]
     return [*dict.fromkeys([*headers, path])]
 
 
 def kernel_lines(path: Path) -> int:
-    """Its lines of code."""
+    """The number of lines of code in a kernel's file."""
     lines = path.read_text("utf-8").splitlines()
     return sum(bool(line.partition("//")[0].strip()) for line in lines)
 

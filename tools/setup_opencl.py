@@ -1,8 +1,8 @@
 """Makes sure that this virtual environment has a working OpenCL device; `make setup` runs it.
 
-A device counts when a test build runs on it. Tried in turn until one does: what is there already,
-Debian's PoCL (as root), Intel's CPU runtime (x86-64). With --intel: Intel's runtime, whatever else
-is there.
+A device works if a test build runs on it. Tried in turn until one works: the devices already here,
+Debian's PoCL (as root), Intel's CPU runtime (x86-64). With --intel: Intel's runtime, even if other
+devices work.
 """
 
 import argparse
@@ -17,7 +17,7 @@ def devices():
     """The lines of `pp-cl devices`, which also measures which device is the fastest."""
     command = [sys.executable, "-m", "pp_cl", "devices"]
     listed = subprocess.run(command, capture_output=True, text=True)
-    if listed.returncode not in (0, 2):  # 2: none works
+    if listed.returncode not in (0, 2):  # 2: no device works
         print(
             f"asking for the devices ended with status {listed.returncode}:"
             f" {listed.stderr.strip()}",
@@ -50,7 +50,7 @@ def install_intel():
 
 
 def main():
-    """Exit status 0 when a device works at the end, else 1."""
+    """Returns the exit status: 0 if a device works at the end, else 1."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
         "--intel", action="store_true", help="install Intel's CPU runtime, whatever else is there"

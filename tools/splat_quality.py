@@ -1,9 +1,9 @@
-"""What steps of fitting buy a run's splat: python tools/splat_quality.py RUN --steps 100 250 500.
+"""Measure a run's splat by steps of fitting: python tools/splat_quality.py RUN --steps 100 250 500.
 
 Each row: processor seconds over the number of processors, Gaussians, and PSNR of five test views,
-drawn as viewers draw splats in windows as large as the images and three times as large each way,
-reduced to the images; how far beside the hull of the masks it shows something where no photograph
-was taken, from below and above, as a share of the object's size.
+drawn as viewers draw splats, in windows as large as the images and three times as large each way,
+reduced to the images; how far outside the hull of the masks the splat shows something, seen from
+below and above, where no photograph was taken, as a share of the object's size.
 """
 
 import argparse
@@ -27,16 +27,16 @@ from pp_studio.camera_path import level
 from pp_studio.export import QUALITIES, QUICK
 from pp_studio.export.gaussians import LEAST_OPAQUE, config_of, fit_gaussians
 
-SIZES = 1, 3  # of the windows, in those of the run's images
+SIZES = 1, 3  # of the windows: multiples of the images' size
 VIEWS = 5
-# Degrees of azimuth and elevation from which the splat is looked at beside the hull, pixels of the
-# images, what share of them the object fills, each way, and alpha that is seen.
+# Directions from which beside_hull() looks: azimuth and elevation, degrees. Its images: pixels of a
+# side, share of a side that the object fills, alpha from which on a pixel shows something.
 DIRECTIONS = (0, -45), (120, -45), (240, -45), (60, -75), (0, 80)
 SIDE, FILLED, VISIBLE = 400, 0.8, 0.1
 
 
 def row(run: Run, steps: int, cell: float) -> dict:
-    """The measurements of a splat."""
+    """Fit a splat; returns its measurements."""
     before = sum(os.times()[:2])
     cloud = fit_gaussians(run, steps, cell)
     seconds = (sum(os.times()[:2]) - before) / (os.cpu_count() or 1)
@@ -60,8 +60,8 @@ def row(run: Run, steps: int, cell: float) -> dict:
 
 
 def beside_hull(run: Run, renderer: Renderer) -> float:
-    """How far from the silhouette of the masks' hull an image of DIRECTIONS has an alpha of VISIBLE
-    at most, as a share of the diameter of the run's points.
+    """The largest distance from the silhouette of the masks' hull at which an image from DIRECTIONS
+    has an alpha above VISIBLE, as a share of the diameter of the run's points.
     """
     (centre, radius), cameras = run.ball, run.cameras("train")
     hull = hull_on(run.dev, run.scene("train").splits["train"], run.model.grid)

@@ -1,12 +1,12 @@
-"""Time of a training's steps by stage, beside the time that its bytes and multiplications need; and
-of a step that does not wait for its stages, and of the host in it.
+"""Time a training's steps by stage, next to the time that the stage's bytes and multiplications
+need; also time a step that does not wait for its stages, and the host's part of it.
 
     python -m tools.stages SCENE --out RUN [--preset P] [--json FILE]
 
-A finished run goes on for some steps, with the points that it ended with; without a run in RUN the
-training begins. Nothing is written there. A stage that only moves data is compared with the copy of
-what it must read or write once; the network with its multiplications as direct convolutions. Both
-speeds are measured in the same process.
+A finished run goes on for some steps with its final points; without a run in RUN a training starts.
+Nothing is written there. A stage that only moves data is compared with a copy of the bytes that it
+must read or write once, the network with its multiplications as direct convolutions. Both speeds
+are measured in the same process.
 """
 
 import argparse
@@ -34,7 +34,7 @@ WORD, ROW = 4, 64  # bytes of a number, and of a point's or pixel's 16 features
 
 
 def least_bytes(n: int, visible: int, fragments: int, front: int, pixels: int, sh: int) -> dict:
-    """{stage: bytes that it reads or writes once}.
+    """{stage: bytes that it must read or write once}.
 
     n: points. visible: those with a fragment before the early stop. fragments: pairs of a point and
     a pixel. front: fragments before the early stop. sh: bytes of a point's SH coefficients.
@@ -56,7 +56,7 @@ def least_bytes(n: int, visible: int, fragments: int, front: int, pixels: int, s
 
 
 def counts(result) -> dict:
-    """The arguments of least_bytes() that a rendered view decides."""
+    """The arguments of least_bytes() that depend on a rendered view."""
     pairs, weights = result.pairs, result.weights
     front = int(listed_fragments(pairs, weights)[0].sum())
     shown = {"visible": weights.visible.size, "fragments": pairs.total, "front": front}
@@ -64,8 +64,8 @@ def counts(result) -> dict:
 
 
 def measure(scene: str, out: Path, preset: str | None) -> dict:
-    """{"points", "size", "copy_gbs", "gflops", "launches": of a step, "stages": rows of {"stage",
-    "ms", "least_ms"}}, medians of the timed steps. Raises UserError as `pp-cl train`.
+    """{"points", "size", "copy_gbs", "gflops", "launches": in a step, "stages": [{"stage", "ms",
+    "least_ms"}]}; times are medians of the timed steps. Raises UserError as `pp-cl train` does.
     """
     folder, steps, given = RunFolder(out), UNTIMED + 2 * TIMED, []
     if folder.checkpoint.exists():
@@ -89,13 +89,13 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     host = host_cost(trainer, TIMED)
     dev.finish()
     step = (time.perf_counter() - start) / TIMED
-    trainer.renderer.backward = watched  # it reads counts back
+    trainer.renderer.backward = watched  # set after host_cost(), as it reads counts back
     with dev.timed_stages() as seconds:
         for _ in range(TIMED):
             trainer.train_step()
     copy, peak = CopyBandwidth(dev), PeakFlops(dev)
     times = interleave({"copy": copy.run, "peak": peak.run})
-    copied = copy.bytes / statistics.median(times["copy"])  # a millisecond
+    copied = copy.bytes / statistics.median(times["copy"])  # bytes a millisecond
     computed = peak.flops / statistics.median(times["peak"])
     need = {name: statistics.median(row[name] for row in seen) for name in seen[0]}
     network = 2 * need.pop("products") / computed  # a multiply-add counts as two
@@ -105,7 +105,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
         {"stage": name, "ms": 1e3 * statistics.median(taken)}
         | ({"least_ms": least[name]} if name in least else {})
         for name, taken in seconds.items()
-        if len(taken) >= TIMED  # what every step does; pairs anew where there was too little room
+        if len(taken) >= TIMED  # omits stages of some steps only: pairs found anew for lack of room
     ]
     unsplit = {"step without waits": 1e3 * step, "host's time in it": host["host_ms"]}
     rows += [{"stage": name, "ms": ms} for name, ms in unsplit.items()]
@@ -121,7 +121,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
 
 
 def main() -> int:
-    """Measure, print, write; returns the exit status."""
+    """Measure, print and write the results; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("scene", help="folder of a scene, or demo")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="a run, if any")

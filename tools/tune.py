@@ -1,11 +1,11 @@
-"""Times what a row of the table in pp_cl/engine/layers/choice.py can hold, on this device, and
-prints the best of it as such a row.
+"""Times the values that a row of the table in pp_cl/engine/layers/choice.py may have, on this
+device, and prints the row with the fastest ones.
 
     python -m tools.tune [--device D]
 
 Each field is timed with the best values of those before it, over the 3x3 convolutions of the preset
 tiny's network at SIDE x SIDE pixels. Times are medians of interleaved runs. Run it twice on a quiet
-machine: what differs between the two runs does not matter.
+machine: fields that differ between the two runs do not matter.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from pp_cl.engine.network.layers import convolutions, unet_layers
 
 SIDE = 96
 BOTH, BACKWARD = ("forward", "backward"), ("backward",)
-# {class of device: [(variant, directions, the fields that are tried)]}
+# {class of device: [(variant, directions, values of fields to try)]}
 CANDIDATES: dict[str, Any] = {
     "CPU": [
         (
@@ -78,7 +78,7 @@ def network_convolutions(dev: Device) -> list[UploadedLayer]:
 
 
 def tuned(dev: Device, convs: Sequence[UploadedLayer]) -> Blocking:
-    """The shipped row of a device with the fastest of CANDIDATES, whose times are printed."""
+    """The device's shipped row with the fastest of CANDIDATES; prints their times."""
     blocking = blocking_of(dev)
     for variant, directions, candidates in CANDIDATES[device_class(dev)]:
         tried = [replace(blocking, **fields) for fields in candidates]
@@ -94,7 +94,7 @@ def tuned(dev: Device, convs: Sequence[UploadedLayer]) -> Blocking:
 
 
 def main() -> None:
-    """Measure, print the times and the row."""
+    """Measure; print the times and the row."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--device", help="as `pp-cl train` takes it")
     dev = open_device(parser.parse_args().device)
