@@ -21,7 +21,7 @@ from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 from pp_cl.scene import hull
 from pp_studio.export import QUALITIES, QUICK, texture
 
-# of Hypothesis: the same few examples each time, or as many as `make fuzz` is told
+# Profiles of Hypothesis: the same few examples each time, or as many as `make fuzz` asks for
 settings.register_profile(
     "short",
     max_examples=60,
@@ -40,7 +40,7 @@ settings.register_profile(
 settings.load_profile("short")
 
 
-# A shell starts what runs in its background with SIGINT ignored, and programs inherit that.
+# A shell starts background programs with SIGINT ignored, and their children inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(items):
     for item in items if not hasattr(os, "fork") else ():
         if item.get_closest_marker("unix"):
             item.add_marker(pytest.mark.skip(reason="needs Unix"))
-    if part := os.environ.get("PP_SLOW_PART"):  # of so many, such as 3/16
+    if part := os.environ.get("PP_SLOW_PART"):  # number/parts, such as 3/16
         number, parts = map(int, part.split("/"))
         for item in items:
             if item.get_closest_marker("slow") and crc32(item.nodeid.encode()) % parts == number:
@@ -58,8 +58,8 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
-    """What drivers showed the user stays unread: a cache folder for the session, with nothing in
-    it but the weights of LPIPS. All processes share it, as they take the same device.
+    """Give the session a cache folder that holds only the weights of LPIPS, so that what the user's
+    cache says of drivers is not read. All processes share it, as they take the same device.
     """
     cached = cache_folder() / WEIGHTS_FILE
     folder = tmp_path_factory.getbasetemp()
@@ -73,16 +73,16 @@ def cache_of_its_own(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PP_CACHE", str(lent.parent))
         yield
-    if lent.exists() and not lent.is_symlink() and not cached.exists():  # fetched by a test
-        with suppress(FileNotFoundError):  # another process was first
+    if lent.exists() and not lent.is_symlink() and not cached.exists():  # a test fetched it
+        with suppress(FileNotFoundError):  # another process moved it first
             shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def small_work():
-    """Points of the hull by which masks are compared, and texels: what a ball needs; steps of
-    fitting Gaussians and specular layers: few, as one file each sees to how good these are
-    (export/test_splat.py, training/test_specular.py).
+    """Use as few hull points (to compare masks) and texels as a ball needs, and few steps to fit
+    Gaussians and specular layers, whose quality one file each tests (export/test_splat.py,
+    training/test_specular.py).
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hull, "COMPARED_POINTS", 8000)
@@ -96,8 +96,8 @@ def small_work():
 def session_device(tmp_path_factory):
     """The one device of a process: tests and the commands that they run share its built kernels.
 
-    Its buffers are guarded; traced where Oclgrind watches reads. Where a test asks for another
-    form, debug level or limit, a command has a device of its own.
+    Its buffers are guarded, and traced if Oclgrind watches reads. If a test asks for another form,
+    debug level or limit, a command opens a device of its own.
     """
     if os.environ.get("OCLGRIND_UNINITIALIZED") == "1":
         log = tmp_path_factory.mktemp("oclgrind") / "log"
@@ -116,15 +116,15 @@ def session_device(tmp_path_factory):
 
 
 def _variables():
-    """What a Device asks the environment for."""
+    """The environment variables that a Device reads."""
     return [os.environ.get(name) for name in ("PP_DEBUG", "PP_FORM", "PP_MAX_ALLOCATION")]
 
 
 @pytest.fixture(autouse=True)
 def no_stray_writes(session_device):
-    """The canaries are checked when a test ends, whoever ran the kernels.
+    """Check the canaries when a test ends, no matter what ran the kernels.
 
-    No scratch memory stays: its values could stand for what another test forgets to write.
+    Scratch memory is dropped: its values could hide that the next test forgets to write some.
     """
     yield
     session_device.check()
@@ -139,13 +139,13 @@ def dev(session_device):
 
 @pytest.fixture
 def plain(session_device):
-    """The tests' device without guards, and without the scratch of other tests."""
+    """The tests' device without guards, and without scratch memory of other tests."""
     return Device(session_device.device)
 
 
 @pytest.fixture
 def cpu_form(dev, monkeypatch):
-    """For a test of what is chosen on CPUs: the device takes their form, PP_FORM or not."""
+    """Make the device take the form for CPUs, whatever PP_FORM says."""
     monkeypatch.delenv("PP_FORM", raising=False)
     monkeypatch.setattr(dev, "is_cpu", True)
 
@@ -157,7 +157,7 @@ def rng():
 
 @pytest.fixture
 def data():
-    """The folder of real data (PP_DATA); skips where there is none."""
+    """The folder of real data (PP_DATA); skips the test if there is none."""
     if not DATA.is_dir():
         pytest.skip(f"no real data at {DATA}; set PP_DATA")
     return DATA
@@ -175,11 +175,11 @@ def runs(tmp_path_factory, session_device):
 
 @pytest.fixture(scope="session")
 def scene(runs):
-    """Folder of a small scene, not to be changed."""
+    """Folder of a small scene, which tests must not change."""
     return runs.ball()
 
 
 @pytest.fixture(scope="module")
 def finished(runs, scene, tmp_path_factory):
-    """Folder of an uninterrupted run, the module's own."""
+    """Folder of an uninterrupted run; each module has its own copy."""
     return runs.trained(tmp_path_factory.mktemp("runs") / "whole", scene)

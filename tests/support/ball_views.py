@@ -6,7 +6,7 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.views import View
 
 CENTRE, RADIUS = np.array([-0.5, 1.3, 1.7]), 0.8
-UP = (0.3, 0.2, 1)  # of all cameras: none is parallel to an axis
+UP = (0.3, 0.2, 1)  # of all cameras, so that none is parallel to an axis
 
 
 def ball_camera(eye, target, size=(64, 64), focal=1.5):
@@ -16,7 +16,7 @@ def ball_camera(eye, target, size=(64, 64), focal=1.5):
 
 
 def ball_view(name, camera, centre=CENTRE, radius=RADIUS):
-    """View of a ball: alpha 255 where the ray through the pixel's centre meets it."""
+    """View of a ball: alpha is 255 if the ray through the pixel's centre meets the ball."""
     rays, to_centre = camera.rays(), centre - camera.eye
     along = rays @ to_centre
     hit = (along > 0) & (to_centre @ to_centre - along**2 / (rays**2).sum(-1) <= radius**2)

@@ -28,7 +28,7 @@ OPTIONS = (
     "--disable-sync",
     "--remote-debugging-port=0",
     "--window-size=1000,700",
-    # WebGL on the CPU, so that no graphics card is needed
+    # run WebGL on the CPU, so that no graphics card is needed
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
@@ -37,7 +37,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 
 def find_chromium():
-    """The program; skips the test where there is none."""
+    """The path of Chromium; skips the test if there is none."""
     found = next(filter(None, map(shutil.which, NAMES)), None)
     if not found:
         pytest.skip("no chromium on PATH; apt install chromium")
@@ -45,14 +45,14 @@ def find_chromium():
 
 
 class Page:
-    """A tab. wrong: the errors in its console; asked: the addresses that it requested."""
+    """A tab. wrong: errors in its console; asked: addresses that it requested."""
 
     def __init__(self, socket):
         self.wrong, self.asked = [], []
         self._socket = socket
 
     def call(self, method, **parameters):
-        """The result of a method of the protocol."""
+        """Call a method of the protocol; returns its result."""
         self._socket.send(json.dumps({"id": 1, "method": method, "params": parameters}))
         while "id" not in (found := json.loads(self._socket.recv(timeout=SECONDS))):
             kind, told = found["method"], found["params"]
@@ -63,7 +63,7 @@ class Page:
         return found["result"]
 
     def evaluate(self, expression):
-        """The value of a JavaScript expression, or of what it promises."""
+        """The value of a JavaScript expression; waits for it if it is a promise."""
         found = self.call(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )
@@ -71,8 +71,8 @@ class Page:
         return found["result"].get("value")
 
     def open(self, address):
-        """Go to an address and to the front, with everything noted that happens there."""
-        self.call("Page.bringToFront")  # in the back no image is painted
+        """Bring the tab to the front and go to an address, noting requests and errors."""
+        self.call("Page.bringToFront")  # a tab in the back paints no image
         for domain in ("Page", "Runtime", "Network"):
             self.call(f"{domain}.enable")
         self.call("Page.navigate", url=address)
@@ -80,7 +80,7 @@ class Page:
         wait(lambda: self.evaluate(there))
 
     def drag(self, start, moves):
-        """Press at a place, go along, release."""
+        """Press the left button at `start`, move by each of `moves`, release."""
 
         def mouse(kind, **more):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", **more)
@@ -99,13 +99,13 @@ class Page:
             self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key)
 
     def screenshot(self):
-        """(H, W, 3) uint8 of the window."""
+        """(H, W, 3) uint8 image of the window."""
         return image_of("base64," + self.call("Page.captureScreenshot")["data"])
 
 
 @contextlib.contextmanager
 def new_page(address):
-    """A Page at an address, of a browser with a profile of its own."""
+    """A Page at an address, in a browser with a profile of its own."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         words = [find_chromium(), *OPTIONS, f"--user-data-dir={profile}"]
         with subprocess.Popen(words, stderr=subprocess.DEVNULL) as process:
@@ -125,9 +125,9 @@ def new_page(address):
 
 
 def ask(file, script, fragment=""):
-    """What a script returns that runs in a page after it has loaded.
+    """Run a script in a page after it has loaded; returns what the script returns.
 
-    file: the page. script: the body of a function. fragment: of the page's address, from # on.
+    file: the page. script: body of a function. fragment: the end of the page's address, from # on.
     """
     with new_page(f"{file.as_uri()}{fragment}") as page:
         return page.evaluate(f"(async () => {{ {script} }})()")

@@ -1,4 +1,4 @@
-"""Checkpoints that no training made: whole ones by a run's settings, and broken ones of them."""
+"""Checkpoints that no training made: whole ones for a run's settings, and broken ones."""
 
 import json
 import warnings
@@ -36,7 +36,7 @@ def ids(values):
 
 
 def settings(**changes):
-    """The settings of such a run. changes: of the section train."""
+    """The settings of such a run. changes: settings of the section train."""
     config = preset("tiny")
     config.scene.path = "demo"
     config.network.widths = (16, 16, 16)
@@ -69,7 +69,7 @@ def load_checkpoint(path):
 
 
 def write_run(folder, config, header, arrays):
-    """A run's folder with settings and this checkpoint, whatever its numbers are."""
+    """Write a run's folder with settings and this checkpoint, whatever its numbers are."""
     folder.path.mkdir(parents=True, exist_ok=True)
     folder.config.write_text(config.to_json())
     with patch("pp_cl.checkpoint._is_finite", lambda _: True):
@@ -77,14 +77,14 @@ def write_run(folder, config, header, arrays):
 
 
 def header_text(**changes):
-    """The header as bytes; a change may be a text of JSON that json.dumps would not write."""
+    """The header as bytes; a change may be JSON text that json.dumps would not write."""
     header = {"format": 1, **HEADER}
     fields = [f'"{k}": {changes.get(k) or json.dumps(v)}' for k, v in header.items()]
     return ("{" + ", ".join(fields) + "}").encode()
 
 
 def refusal(folder, config):
-    """The one line by which the checkpoint is refused."""
+    """The single error line with which the checkpoint is refused."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(UserError) as caught:

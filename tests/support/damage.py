@@ -1,6 +1,6 @@
 """Damage to files, drawn by Hypothesis: JSON, lines of text, bytes, archives of arrays, images.
 
-`draw` is that of st.data(): each choice is printed with an example that fails, and shrinks.
+`draw` is that of st.data(): choices are printed with a failing example, and shrink.
 """
 
 import copy
@@ -16,13 +16,13 @@ import zlib
 import numpy as np
 from hypothesis import strategies as st
 
-BOMB = bytes(2**25)  # what a few deflated bytes unfold to
+BOMB = bytes(2**25)  # compresses to a few bytes
 LIMITS = [0.5, 1e-7, 1e-45, 5e-324, 1e9, 1e38, 3.5e38, -1e300]
 LIMITS += [n for bits in (8, 15, 16, 31, 32, 53, 63) for n in (2**bits - 1, 2**bits)] + [10**25]
 TEXTS = ["", " ", "nan", "-inf", "1e400", "0x10", "1_000", "٣", "1,2,3", "../..", "/etc/passwd"]
 TEXTS += ["a\nb", "a\x1b[31mb", "a\0b", "a\u2028b", "😀", "%s", "{0}", "$HOME", "'", '"']
 TEXTS += ["x" * 300, "x" * 100_000, "9" * 5000, "[" * 5000]
-# that files of JSON may have beside the keys of a template
+# keys that JSON files may have, of all formats
 NAMES = (
     "format fl_x cx w near far camera_angle_x k1 k4 p2 camera_model mask_path file_path frames fov"
     " test_filenames applied_transform aabb_scale path size intrinsics_format mass R focal_length"
@@ -38,7 +38,7 @@ CHUNKS = [b"tRNS", b"PLTE", b"acTL", b"fcTL", b"fdAT", b"eXIf", b"gAMA"]
 numbers = st.sampled_from(LIMITS) | st.floats() | st.integers()
 texts = st.sampled_from(TEXTS) | st.text(max_size=12)
 keys = st.sampled_from(NAMES.split()) | texts
-# copies: what is put into a damaged value may be damaged in its turn
+# copied, as a value that is put into another one may be damaged in its turn
 values = st.recursive(
     st.none() | st.booleans() | numbers | texts | st.sampled_from([10**400, "\ud800", DEEP]),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=3),
@@ -48,17 +48,17 @@ words = texts | st.lists(numbers.map(repr), min_size=1, max_size=6).map(",".join
 
 
 def one(draw, *choices):
-    """One of a few; the first is the simplest."""
+    """Draw one of a few choices, of which the first is the simplest."""
     return draw(st.sampled_from(choices))
 
 
 def rarely(draw, times=10):
-    """Whether to do what takes long, one in so many times."""
+    """True once in `times` draws; for slow choices."""
     return draw(st.integers(1, times)) == times
 
 
 def damaged_json(draw, value):
-    """The bytes of a value of JSON with another one at some place, or one more, or one less."""
+    """The bytes of JSON in which one value is changed, added or removed."""
     root = owner = {"": copy.deepcopy(value)}
     key = ""
     while owner[key] and isinstance(owner[key], dict | list) and not rarely(draw, 5):
@@ -79,7 +79,7 @@ def damaged_json(draw, value):
 
 
 def damaged_text(draw, data):
-    """The bytes of a text with another word, or in another coding."""
+    """The bytes of a text with one word replaced, or in another encoding."""
     text = data.decode("utf-8", "replace")
     if rarely(draw, 6):
         code = one(draw, "utf-8-sig", "utf-16", "utf-32", "utf-16-le", "cp037")
@@ -90,7 +90,7 @@ def damaged_text(draw, data):
 
 
 def damaged_bytes(draw, data):
-    """Bytes of which some are gone, other ones, or there twice."""
+    """The bytes with some of them removed, replaced or repeated."""
     at, gone = draw(st.integers(0, len(data))), one(draw, 1, 4, 0, 100, len(data))
     number = one(draw, *(n for n in LIMITS if isinstance(n, int) and n < 2**64))
     field = number.to_bytes(8, one(draw, "little", "big"))[: one(draw, 2, 4, 8)]
@@ -141,7 +141,7 @@ def damaged_npy(draw, data):
 
 
 def damaged_npz(draw, data):
-    """The bytes of an archive of arrays with a changed, missing, doubled or strange member."""
+    """The bytes of an .npz file with a member changed, missing, doubled or unknown."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = [(name, archive.read(name)) for name in archive.namelist()]
     at, form = draw(st.integers(0, len(members) - 1)), zipfile.ZIP_STORED
@@ -164,7 +164,7 @@ def damaged_npz(draw, data):
 
 
 def damaged_png(draw, data):
-    """The bytes of a PNG whose chunks are changed under right checksums."""
+    """The bytes of a PNG with changed chunks and correct checksums."""
     parts, place = [], 8
     while place < len(data):
         end = place + 8 + int.from_bytes(data[place : place + 4], "big")
@@ -187,7 +187,7 @@ def damaged_png(draw, data):
 
 
 def damaged_lines(draw, data):
-    """The bytes of lines of JSON with one changed."""
+    """The bytes of JSON lines of which one is damaged."""
     lines = data.splitlines()
     at = draw(st.integers(0, len(lines) - 1))
     lines[at] = damaged_json(draw, json.loads(lines[at]))
@@ -207,10 +207,10 @@ BY_KIND = {
 
 
 def damage_file(draw, file):
-    """Change a file by its kind; now and then something else stands in its place."""
+    """Damage a file according to its kind; sometimes put something else in its place."""
     data = file.read_bytes()
     kind = one(draw, *["kind"] * 6, "text", "text", "bytes", "displace")
-    file.unlink()  # it may be a link
+    file.unlink()  # may be a link, whose target must not be written
     if kind == "displace":
         displace(draw, file)
     elif kind == "text" and b"\0" not in data:
@@ -221,7 +221,7 @@ def damage_file(draw, file):
 
 
 def displace(draw, file):
-    """Put something else in the place of a file, or nothing."""
+    """Put a link, folder, pipe or empty file in the place of a file, or nothing."""
     kind = one(draw, "gone", "empty", "folder", "pipe", "nothing", file.name, "/etc/passwd")
     if kind == "empty":
         file.touch()

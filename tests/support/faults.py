@@ -1,6 +1,6 @@
-"""Calls that change files, failing one by one; and what a command must leave after a fault.
+"""Make single calls that change files fail, and check what a command leaves after a fault.
 
-python -m support.faults FOLDER CALL WORDS...    # a command that kills itself before a call
+python -m support.faults FOLDER CALL WORDS...    # runs a command that is killed before a call
 """
 
 import contextlib
@@ -25,18 +25,18 @@ from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import read_row
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
-TIMES = ("seconds", "seconds_per_frame")  # what no two runs have in common
-# marks without content of their own, and what knows of a try that failed, too
+TIMES = ("seconds", "seconds_per_frame")  # keys whose values differ in all runs
+# marks without content, and a list of files that also has those of failed tries
 BESIDE = (".pp-cl.lock", ".pp-cl.owner", ".pp-cl-files.jsonl")
 LEFTOVER = re.compile(r"\..*\.tmp")
-PREVIEW = re.compile(r"previews/step_\d+\.png")  # the clock asks for an early one
+PREVIEW = re.compile(r"previews/step_\d+\.png")  # the clock may ask for an early one
 
 
 class Faults(contextlib.ExitStack):
-    """While it is entered, one of the calls that change something below a folder fails.
+    """Within the block, one of the calls that change something below a folder fails.
 
-    call: which, from 1 on, 0 for none. number: its errno, 0: the process is killed in front of it.
-    stays: all that take space fail from then on. calls: "kind path" of each that came.
+    call: which one, from 1 on; 0: none. number: its errno; 0: the process is killed before it.
+    stays: later calls that take space fail, too. calls: "kind path" of each call so far.
     """
 
     def __init__(self, folder, call=0, number=errno.EIO, *, stays=False):
@@ -65,7 +65,7 @@ class Faults(contextlib.ExitStack):
         self.enter_context(patch.object(module, name, call))
 
     def count(self, kind, path):
-        """Count a call; raise OSError, or die, where it is the one."""
+        """Count a call; raise OSError, or die, if this call is to fail."""
         name = os.path.relpath(os.fspath(path), self.folder) if path else ".."
         if name.startswith("..") and not name.startswith("..."):
             return
@@ -89,7 +89,7 @@ class Faults(contextlib.ExitStack):
 
 
 class _File(io.FileIO):
-    """A file that writes a half of what fails, as a full disk does, and is closed in any case."""
+    """A file that writes half when a write fails, as on a full disk, and always closes."""
 
     def __init__(self, faults, path, mode):
         self._faults = faults
@@ -111,15 +111,15 @@ class _File(io.FileIO):
 
 
 def _place(path, folder=None):
-    """The path of a descriptor, or of a name in the folder of one."""
+    """The path of a descriptor, or of a name in the folder of a descriptor."""
     if isinstance(path, int):
         return os.readlink(f"/proc/self/fd/{path}")
     return path if folder is None else os.path.join(_place(folder), path)
 
 
 def run_command(words, run=""):
-    """(exit status, what is wrong with how it ended): it may warn, and tells of its end in one
-    line, which names a file of the run.
+    """(exit status, problems with how the command ended). It may warn, but its last line alone must
+    tell the error and name a file of the run.
     """
     try:
         status, lines = spoken(words)
@@ -133,7 +133,7 @@ def run_command(words, run=""):
 
 
 def content(run):
-    """{path below the run: bytes, times left out} of all files under final names."""
+    """{path below the run: bytes without times} of all files under final names."""
     files = {}
     for path in sorted(p for p in run.rglob("*") if p.is_file()):
         if LEFTOVER.match(path.name) or path.name in BESIDE:
@@ -158,14 +158,14 @@ def leftovers(run):
 
 
 def half_written(run):
-    """A line for each file under a final name that is not whole; the last row of a log may be."""
+    """A line for each incomplete file under a final name; a log's last row may be incomplete."""
     paths = [p for p in run.rglob("*") if p.is_file() and p.name not in BESIDE]
     found = [(path, _problem(path)) for path in paths if not LEFTOVER.match(path.name)]
     return [f"{path.relative_to(run)}: {problem}" for path, problem in found if problem]
 
 
 def _problem(path):
-    """What is wrong with a file, "" where nothing is."""
+    """What is wrong with a file; "" if nothing is."""
     try:
         if path.suffix == ".npz":
             load_checkpoint(path)
@@ -183,7 +183,7 @@ def _problem(path):
 
 
 def differences(run, expected):
-    """A line for each file that differs, is missing or is new."""
+    """A line for each file of a run that differs from `expected`, is missing or is new."""
     found = content(run)
     names = sorted(n for n in found.keys() | expected.keys() if found.get(n) != expected.get(n))
     words = {True: "differs", False: "is missing"}

@@ -1,4 +1,4 @@
-"""Files of glTF 2.0 as they are, without a library that adds what they lack."""
+"""Read glTF 2.0 files without a library, which would add missing parts."""
 
 import json
 import struct
@@ -7,7 +7,7 @@ import numpy as np
 
 
 def glb(path):
-    """(JSON, {attribute: array}) of a file."""
+    """(JSON, {attribute: array}) of a .glb file."""
     data = path.read_bytes()
     magic, version, length = struct.unpack_from("<4sII", data)
     assert (magic, version, length) == (b"glTF", 2, len(data))

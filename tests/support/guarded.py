@@ -17,22 +17,22 @@ DATA = Path(
 
 CANARY_BYTES = 256
 CANARY = 0xA5
-MOST_UNCHECKED = 2**28  # bytes of buffers that are gone and wait for a check
+MOST_UNCHECKED = 2**28  # bytes of released buffers that wait for a check
 
 
 def large(*values):
-    """Arguments of a test that are too many for a simulator (`make oclgrind`)."""
+    """Arguments of a test that takes too long in a simulator (`make oclgrind`)."""
     return pytest.param(*values, marks=pytest.mark.large)
 
 
 def slow(*values):
-    """Arguments of a test that others show in part: `make test-slow` runs them."""
+    """Arguments of a test that `make test-slow` runs; faster ones cover part of it."""
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
 class GuardedDevice(Device):
     """A Device whose fresh buffers hold NaN (0xff bytes) and are followed by canary bytes that
-    check() compares; before it replays what a function launched it looks whether the function would
+    check() compares. Before it replays a function's launches, it checks that the function would
     launch the same again.
     """
 
@@ -44,7 +44,7 @@ class GuardedDevice(Device):
         self._is_dry = False
 
     def compare(self, launches, function):
-        """Fail unless the function would launch and fill what was recorded."""
+        """Fail unless the function would launch and fill exactly what was recorded."""
         self._is_dry = True
         try:
             with self.recording() as again:
@@ -54,7 +54,7 @@ class GuardedDevice(Device):
         assert [*map(facts_of, launches)] == [*map(facts_of, again)]
 
     def enqueue(self, launch):
-        """As Device.enqueue, but in compare()."""
+        """As Device.enqueue; within compare(), only record the launch."""
         if self._is_dry:
             self._recording.append(launch)
         else:
@@ -71,19 +71,19 @@ class GuardedDevice(Device):
         poison[nbytes:] = CANARY
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
         memory = Memory(self.context, flags, hostbuf=poison)
-        # a reference of its own, so that the device counts the memory as released in time
+        # a second handle, as holding `memory` would delay its release in the device's count
         buffer = cl.Buffer.from_int_ptr(memory.int_ptr)
         self._guarded.append((weakref.ref(memory), buffer, nbytes))
         self._unchecked += nbytes
         return memory
 
     def scratch(self, name, n, dtype=np.float32, **options):
-        """As Device.scratch, with no more memory than is asked for."""
+        """As Device.scratch, with exactly the memory that is asked for."""
         return super().scratch((name, n), n, dtype, **options)
 
     def check(self):
-        """Fail if a kernel wrote behind a buffer that is in use or was since the last check,
-        temporary ones included.
+        """Fail if a kernel wrote past the end of a buffer, temporary ones included, that was in use
+        since the last check.
         """
         self.finish()
         guarded, self._guarded, self._unchecked = self._guarded, [], 0
@@ -95,7 +95,7 @@ class GuardedDevice(Device):
 
 
 def facts_of(launch):
-    """What two launches or fills have alike that do the same."""
+    """Facts that are equal for two launches or fills that do the same."""
     if isinstance(launch, Fill):
         return place_of(launch.array), launch.value
     values = {name: place_of(value) for name, value in launch.arguments.items()}
@@ -103,18 +103,18 @@ def facts_of(launch):
 
 
 def place_of(value):
-    """Where an array lies, with its shape and dtype; a number is itself."""
+    """An array's address, shape and dtype; any other value is returned."""
     is_array = isinstance(value, Array)
     return (value.base_data, value.offset, value.shape, value.dtype) if is_array else value
 
 
 class TracedDevice(GuardedDevice):
-    """The guarded device in Oclgrind 21.10's search for reads of what nobody wrote: its reports
-    fail the test.
+    """The guarded device for Oclgrind 21.10's search for reads of uninitialised memory; a report
+    fails the test.
 
-    Oclgrind knows what kernels and whole uploads write, not what fills and copies do, and takes
-    what stood at a freed buffer's address for written: here kernels fill and copy, and no buffer is
-    freed. It sees strays without canaries.
+    Oclgrind tracks writes by kernels and whole uploads, not by fills and copies, and takes memory
+    at a freed buffer's address for initialised: here kernels fill and copy, and no buffer is freed.
+    It finds writes out of bounds without canaries.
     """
 
     canary_bytes = 0
@@ -154,8 +154,8 @@ class TracedDevice(GuardedDevice):
             )
 
     def check(self):
-        """Fail if Oclgrind has reported anything since the last check; all buffers stay in
-        _guarded.
+        """Fail if Oclgrind has reported anything since the last check. Buffers stay in _guarded,
+        so that none is freed.
         """
         reports, self._unchecked = self._log.read_text(), 0
         new, self._reported = reports[self._reported :], len(reports)

@@ -1,4 +1,4 @@
-"""What a kernel computes in several launches, as for a watchdog."""
+"""Check the results of a kernel whose launch is cut into parts for a watchdog."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ from pp_cl.engine.device import device
 
 
 def check_parts(dev, monkeypatch, kernel, run):
-    """run(), an array or a tuple of them, has the same bits with every launch cut as finely as can
-    be. Returns how often the kernel was launched then.
+    """Assert that run(), an array or a tuple of arrays, gives the same bits if every launch is cut
+    as finely as possible. Returns how often the kernel was launched then.
     """
     whole = run()
     launched, attempt = [], dev.attempt

@@ -1,4 +1,4 @@
-"""Models of a few points, and what a renderer has made of them."""
+"""Models of a few points, and checks of their renderings."""
 
 import weakref
 
@@ -32,13 +32,13 @@ def make_model(dev, rng, n=90):
 
 
 def fetched(arrays):
-    """{name: numpy array} of {name: DeviceRows}."""
+    """Download {name: DeviceRows}; returns {name: numpy array}."""
     return {name: rows.get() for name, rows in arrays.items()}
 
 
 def drawn_alone(monkeypatch, renderer):
-    """[weak references to all results of renderer.forward() from now on]. While one is held, no
-    further view may be drawn: its arrays would lie beside the others.
+    """[weak references to all results of renderer.forward() from now on]. Drawing a view while one
+    of them is alive fails: device memory would hold the arrays of two views.
     """
     forward, drawn = renderer.forward, []
 

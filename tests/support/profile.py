@@ -34,7 +34,7 @@ def display_p3():
 
 
 def in_srgb(colour):
-    """What an 8-bit colour with the profile is in sRGB, of which it must be a part."""
+    """Convert an 8-bit colour from the profile to sRGB; it must lie inside sRGB."""
     linear = np.linalg.solve(SRGB, P3 @ (np.array(colour) / 255) ** GAMMA)
     curve = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return 255 * curve

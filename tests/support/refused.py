@@ -1,4 +1,4 @@
-"""Refusals: the error of a call, and the line of a command."""
+"""Refusals: check the error of a call and the last line of a command."""
 
 import contextlib
 
@@ -10,7 +10,7 @@ from pp_cl.errors import UserError
 
 @contextlib.contextmanager
 def refusing(*words):
-    """The block raises a UserError, one line as all are (tests/test_errors.py), with the words."""
+    """Assert that the block raises a UserError that has all the words."""
     with pytest.raises(UserError) as caught:
         yield
     for word in words:
@@ -18,7 +18,7 @@ def refusing(*words):
 
 
 def failure(*words):
-    """The one line of its own, the last on stderr, with which a command ends with status 2."""
+    """Run a command that must end with status 2; returns its error line, the last on stderr."""
     status, lines = spoken(words)
     told = [line for line in lines if line.startswith("pp-cl")]
     assert status == 2 and told == lines[-1:], (status, lines)

@@ -1,4 +1,4 @@
-"""Trainings started, interrupted and resumed as a user does; finished ones that tests share."""
+"""Start, interrupt and resume trainings as a user does; share finished ones among tests."""
 
 import contextlib
 import functools
@@ -14,14 +14,14 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
 
-# Every mechanism of the loop is due several times within 60 steps.
+# With these, every mechanism of the loop is due several times within 60 steps.
 SETTINGS = {
     "train.iterations": 60,
     "points.count": 1500,
-    "raster.radius": 0.85,  # wider, and pruning so hard leaves gaps
+    "raster.radius": 0.85,  # wider points, as such hard pruning leaves gaps
     "network.widths": "16,16,16",
     "train.crop": 24,
-    "train.opacity_rate": "0.1,0.01",  # in 60 steps something is to become opaque
+    "train.opacity_rate": "0.1,0.01",  # high, so that some points become opaque within 60 steps
     "train.refine_at": "1,1",
     "train.prune_every": 10,
     "train.checkpoint_every": 10,
@@ -37,7 +37,7 @@ def arguments(scene, out, downscale=2, **changes):
 
 
 def rows(out):
-    """The rows of a run's log, whole or not."""
+    """The rows of a run's log, which may be incomplete."""
     return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
@@ -47,18 +47,18 @@ def checkpoint(out):
 
 
 def set_words(settings, **changes):
-    """--set words of settings; train__crop=8 sets train.crop."""
+    """The words --set KEY=VALUE for settings; train__crop=8 sets train.crop."""
     settings = settings | {key.replace("__", "."): value for key, value in changes.items()}
     return [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
 
 
 def spoken(words):
-    """(exit status, lines on stderr) of a command."""
+    """Run a command; returns (exit status, lines on stderr)."""
     errors = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
         try:
             status = main([str(word) for word in words])
-        except SystemExit as end:  # --help
+        except SystemExit as end:  # as --help does
             status = end.code or 0
     return status, [line for line in errors.getvalue().splitlines() if line]
 
@@ -70,7 +70,7 @@ class Runs:
         self._folder = folder
 
     def made(self, name, make):
-        """The folder of this name that make(folder) has filled; nobody changes what is in it."""
+        """The folder `name`, filled once by make(folder); tests must not change it."""
         folder = self._folder / name
         with FileLock(f"{folder}.lock"):
             if not folder.exists():
@@ -87,7 +87,7 @@ class Runs:
         return str(self.made(_name("ball", shape), make))
 
     def trained(self, out, scene, downscale=2, **changes):
-        """Make `out` what a small training on a scene of ball() leaves. Returns it."""
+        """Copy the run of a small training on a scene of ball() to `out`. Returns `out`."""
 
         def train(folder):
             assert main(arguments(scene, folder, downscale, **changes)) == 0
@@ -97,13 +97,13 @@ class Runs:
 
 
 def _name(kind, values):
-    """A file's name for values of a kind."""
+    """A file name made of a kind and a digest of values."""
     text = json.dumps(values, sort_keys=True)
     return f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
 def train_and_interrupt(scene, out, steps, monkeypatch, **changes):
-    """A small training that ends with Ctrl-C after `steps` steps."""
+    """Run a small training and end it with Ctrl-C after `steps` steps."""
     train_step, done = Trainer.train_step, []
 
     def stopping(self):

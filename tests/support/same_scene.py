@@ -1,4 +1,4 @@
-"""A small scene with exactly known cameras, and whether a folder holds it."""
+"""A small scene with known cameras, and a check that a folder holds it."""
 
 import numpy as np
 from support.scenes import ring_cameras
@@ -10,8 +10,8 @@ from pp_cl.scene.readers.common import SPLITS, hold_out
 
 
 def views(count=11, size=(30, 22), *, centred=False, alike=False):
-    """Views with random pixels. centred: principal points in the middle, fx = fy; alike: one lens
-    for all.
+    """Views with random pixels. centred: principal points in the middle, fx = fy; alike: all have
+    one lens.
     """
     rng = np.random.default_rng(5)
     made = []
@@ -31,7 +31,7 @@ def held_out(all_views):
 
 
 def same(folder, splits, atol=1e-6):
-    """The folder holds these views: cameras, images, masks."""
+    """Assert that the folder holds these views: cameras, images, masks."""
     read = load_scene(folder, tuple(splits)).splits
     for split, expected in splits.items():
         assert len(read[split]) == len(expected)

@@ -9,7 +9,7 @@ from pp_cl.engine.camera import Camera
 
 
 def ring_cameras(n, size, distance=4.0, field_of_view=0.7):
-    """n cameras on two rings around the origin that look at it."""
+    """n cameras on two rings around the origin, looking at it."""
     focal = 0.5 * size / np.tan(0.5 * field_of_view)
     eyes = [
         distance * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)])
@@ -45,7 +45,7 @@ def write_ball_scene(folder, views=8, size=48, splits=("train", "test")):
         frames = []
         cameras = ring_cameras(views, size)
         if split != "train":
-            cameras = ring_cameras(37, size)[5::16][:2]  # none of which is one of training
+            cameras = ring_cameras(37, size)[5::16][:2]  # neither is a training camera
         for i, camera in enumerate(cameras):
             Image.fromarray(ball_image(camera)).save(folder / split / f"r_{i}.png")
             pose = np.vstack([camera.pose * [1, -1, -1, 1], [0, 0, 0, 1]])  # OpenGL axes

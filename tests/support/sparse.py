@@ -13,7 +13,7 @@ COLOURS = np.array([[1, 2, 3], [250, 128, 0]])
 
 
 def write_model(folder, *, binary):
-    """A model of COLMAP with the points."""
+    """Write a COLMAP model with the points."""
     folder.mkdir(parents=True)
     for name in ("cameras", "images"):
         (folder / f"{name}{'.bin' if binary else '.txt'}").touch()
@@ -30,7 +30,7 @@ def write_model(folder, *, binary):
 
 
 def write_ply(folder):
-    """The points as sparse_pc.ply, and a transforms.json that names it."""
+    """Write the points as sparse_pc.ply, and a transforms.json that names it."""
     names = ("x", "y", "z", "red", "green", "blue")
     kinds = np.dtype([(name, "f4" if name in "xyz" else "u1") for name in names])
     table = np.array([(*p, *c) for p, c in zip(POINTS, COLOURS, strict=True)], kinds)
@@ -39,5 +39,5 @@ def write_ply(folder):
 
 
 def write_some_edits(folder):
-    """A pp_cl.json with a box and a dropped image."""
+    """Write a pp_cl.json with a box and a dropped image."""
     write_edits(folder, Edits(np.array([[-1.0, -1, -1], [1, 2, 3]]), frozenset({"r_1.png"})))

@@ -8,8 +8,8 @@ LOW_PASS, LEAST, MOST, NEAR = 0.3, 1 / 255, 0.99, 0.2
 
 
 def read_splats(path):
-    """{name: array} of a file: positions (N, 3), harmonics (N, 16, 3), opacity (N,), covariance
-    (N, 3, 3).
+    """Read a file as {name: array}: positions (N, 3), harmonics (N, 16, 3), opacity (N,) and
+    covariance (N, 3, 3).
     """
     vertex = plyfile.PlyData.read(str(path))["vertex"]
 
@@ -28,7 +28,7 @@ def read_splats(path):
 
 
 def colours(harmonics, towards):
-    """(N, 3), of degrees 0 to 2, in unit directions (N, 3) from the eye."""
+    """(N, 3) colours from harmonics of degrees 0 to 2 in unit directions (N, 3) from the eye."""
     x, y, z = towards.T
     basis = [0.28209479177387814 + 0 * x]
     basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
@@ -39,7 +39,7 @@ def colours(harmonics, towards):
 
 
 def splats_of(table, origin):
-    """What read_splats() gives, of records of GAUSSIAN."""
+    """Convert records of GAUSSIAN to the arrays of read_splats()."""
     turn = Rotation.from_quat(np.roll(table["turn"], -1, axis=1)).as_matrix()
     axes = turn * table["deviations"].astype(np.float64)[:, None]
     return {
@@ -51,9 +51,9 @@ def splats_of(table, origin):
 
 
 def draw_splats(splats, camera, low_pass=LOW_PASS, widened=LOW_PASS):
-    """(H, W, 3): what a Camera sees of read_splats() before white. low_pass: pixels^2 by which
-    their variances were widened where they were fitted; widened: by which they are now, with peaks
-    as much lower.
+    """(H, W, 3) image that a Camera sees of read_splats() over white. low_pass: pixels^2 by which
+    the fit widened the variances; widened: pixels^2 by which this drawing does, with peaks lowered
+    to match.
     """
     axes = camera.pose[:, :3].T
     at = (splats["positions"] - camera.eye) @ axes.T
@@ -77,7 +77,7 @@ def draw_splats(splats, camera, low_pass=LOW_PASS, widened=LOW_PASS):
     first = np.clip(np.floor(centre - reach), 0, size).astype(int)
     sides = (np.clip(np.floor(centre + reach) + 1, 0, size).astype(int) - first).clip(0)
     count = sides.prod(axis=1)
-    rank = np.repeat(np.arange(n), count)  # of each pixel of the boxes
+    rank = np.repeat(np.arange(n), count)  # for each pixel of the boxes
     place = np.arange(len(rank)) - np.repeat(np.cumsum(count) - count, count)
     column, row = first[rank].T + np.stack([place % sides[rank, 0], place // sides[rank, 0]])
     away = np.stack([column, row], 1) + 0.5 - centre[rank]
@@ -87,7 +87,7 @@ def draw_splats(splats, camera, low_pass=LOW_PASS, widened=LOW_PASS):
     pixel, rank, alpha = (row * camera.width + column)[hit], rank[hit], alpha[hit]
     sort = np.lexsort((rank, pixel))
     pixel, rank, alpha = pixel[sort], rank[sort], alpha[sort]
-    through = np.concatenate([[0], np.cumsum(np.log1p(-alpha))])  # of the light, logarithm
+    through = np.concatenate([[0], np.cumsum(np.log1p(-alpha))])  # log of the light let through
     count = camera.width * camera.height
     begin = np.searchsorted(pixel, np.arange(count + 1))
     weight = alpha * np.exp(through[:-1] - through[begin[pixel]])

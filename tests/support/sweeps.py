@@ -1,4 +1,4 @@
-"""Runs of a sweep: planned ones, and folders of runs that look trained and measured."""
+"""Planned runs of a sweep, and folders that look like trained and measured runs."""
 
 import json
 
@@ -25,13 +25,13 @@ def jobs_of(scenes, out, seeds=(0,), varied=None, **options):
 
 
 def words_of(scenes, out, *more, changes=None):
-    """Command line of the same sweep, with other settings where there are changes."""
+    """Command line of the same sweep; `changes` are made to its settings."""
     sets = set_words(SETS | (changes or {}))
     return ["sweep", *map(str, scenes), "--out", str(out), *sets, *map(str, more)]
 
 
 def pretend(job, psnr, ssim=0.5, *, points=10, seconds=2.0, step=None, finished=True):
-    """Write the folder of a run as its training and its evaluation would leave it."""
+    """Write a run's folder as its training and evaluation would leave it."""
     folder = RunFolder(job.folder)
     config = run_config(folder, job.scene, job.preset, job.given)
     folder.create(config.to_json())

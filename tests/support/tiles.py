@@ -4,12 +4,12 @@ from pp_cl.engine.layers.tiles import SIDE, grid_shape
 
 
 def pixels_of(tile_mask, height, width):
-    """(height, width) of what (rows, columns) says of the tiles."""
+    """Expand an array of tiles, (rows, columns), to pixels, (height, width)."""
     return tile_mask.repeat(SIDE, 0).repeat(SIDE, 1)[:height, :width]
 
 
 def random_counts(rng, height, width):
-    """(rows, columns) of 0 (half of them), 1 and 7; at least one is not 0."""
+    """(rows, columns) of random 0 (half of them), 1 and 7; at least one is not 0."""
     counts = rng.choice([0, 0, 1, 7], grid_shape(height, width))
     counts[-1, -1] = 7
     return counts

@@ -1,4 +1,4 @@
-"""Kernels for tests of the launcher: good ones, one that writes behind its buffer, formulas."""
+"""Kernels for tests of the launcher; one writes past its buffer, some have sizes by formulas."""
 
 SOURCE = """
 # ifndef WIDTH

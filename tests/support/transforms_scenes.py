@@ -1,4 +1,4 @@
-"""Scenes in the format of NeRF-synthetic, with random images, right and wrong ones."""
+"""Valid and invalid scenes in the format of NeRF-synthetic, with random images."""
 
 import json
 import os
@@ -14,13 +14,13 @@ SIZE = (24, 18)  # width, height of the images written here
 
 
 def opengl_pose(eye):
-    """4x4 camera-to-world in OpenGL axes of a camera that looks from `eye` to the origin, z up."""
+    """4x4 camera-to-world, in OpenGL axes, of a camera looking from `eye` to the origin, z up."""
     return np.vstack([look_at(eye, (0, 0, 0)) * [1, -1, -1, 1], [0, 0, 0, 1]])
 
 
 def write_scene(folder, split="train", count=3, edit=None):
-    """A NeRF-synthetic split of `count` random views; edit(data) changes the JSON before it is
-    written. Returns its data.
+    """Write a NeRF-synthetic split of `count` random views; edit(data) changes the JSON data before
+    they are written. Returns the data.
     """
     rng = np.random.default_rng(3)
     frames = []
@@ -39,7 +39,7 @@ def write_scene(folder, split="train", count=3, edit=None):
 
 
 def train_views(folder, **keys):
-    """Views of a new scene of which `keys` are added to every frame."""
+    """Views of a new scene with `keys` added to every frame."""
     write_scene(folder, edit=lambda data: [frame.update(keys) for frame in data["frames"]])
     return load_scene(folder).splits["train"]
 
@@ -53,7 +53,7 @@ def escape(file):
 
 
 def left_out(folder, *words, split="train"):
-    """Some views of a split are left out; the error of the first has all the words."""
+    """Assert that views of a split are left out, the first with an error that has all words."""
     gone: list = []
     assert find_reader(folder).read_split(folder, split, gone)
     with refusing(*words):
@@ -61,6 +61,6 @@ def left_out(folder, *words, split="train"):
 
 
 def refused(folder, *words, splits=("train",)):
-    """Loading fails with one line that has all the words."""
+    """Assert that loading fails with one line that has all the words."""
     with refusing(*words):
         load_scene(folder, splits)

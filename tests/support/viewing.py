@@ -1,4 +1,4 @@
-"""A tab of the viewer without a browser: viser's messages over a websocket."""
+"""A tab of the viewer without a browser: exchanges viser's messages over a websocket."""
 
 import contextlib
 import io
@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from support.scenes import ring_cameras
 from websockets.sync.client import connect
 
-SECONDS = 60  # that an answer may take on a machine that does other things, too
+SECONDS = 60  # for an answer, which may be slow on a busy machine
 
 
 class Tab:
-    """handles: {label of a switch or button: its message}, nodes: {name: its message}, as the
-    server has sent them.
+    """A tab. handles: {label of a switch or button: its message}; nodes: {name: its message}, both
+    as the server sent them.
     """
 
     def __init__(self, socket):
@@ -31,7 +31,7 @@ class Tab:
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     def look(self, camera, space=None):
-        """Move the tab's camera to the place of another, with its pixels. space: of the page."""
+        """Give the tab another camera's place and pixels. space: of the page."""
         position = space.page(camera.eye) if space else camera.eye
         self.send(
             "ViewerCameraMessage",
@@ -51,7 +51,7 @@ class Tab:
         self.send("GuiUpdateMessage", uuid=self.handles[label]["uuid"], updates={"value": value})
 
     def receive(self, kind, accept=lambda _message: True):
-        """The next message of a type that is accepted."""
+        """Wait for the next message of type `kind` that accept() takes; returns it."""
         deadline = time.monotonic() + SECONDS
         while True:
             while self._unread:
@@ -61,7 +61,7 @@ class Tab:
             self._read(deadline - time.monotonic())
 
     def image(self, accept=lambda _image: True):
-        """The next image behind the frustums that is accepted, (H, W, 3) int."""
+        """The next background image that accept() takes, (H, W, 3) int."""
         found = []
 
         def take(message):
@@ -73,7 +73,7 @@ class Tab:
         return found[-1]
 
     def file(self):
-        """(name, content) of the next file that is sent."""
+        """(name, content) of the next file that the server sends."""
         name = self.receive("FileTransferStartDownload")["filename"]
         return name, self.receive("FileTransferPart")["content"]
 
@@ -91,12 +91,12 @@ class Tab:
 
 @contextlib.contextmanager
 def tab(address):
-    """A Tab of the server at an address that has got all that the page has."""
+    """A Tab of the server at an address, once it has received the whole page."""
     place, version = address.replace("http", "ws"), f"viser-v{viser.__version__}"
     with connect(place, subprotocols=[version], max_size=None, compression=None) as socket:
         opened = Tab(socket)
         opened.receive("ReplayDoneMessage")
-        opened.look(ring_cameras(1, 32)[0])  # before it viser takes no notice of the tab
+        opened.look(ring_cameras(1, 32)[0])  # until then viser ignores the tab
         yield opened
 
 
@@ -110,7 +110,7 @@ def wait(condition):
 
 @contextlib.contextmanager
 def drawing(page):
-    """Draw what tabs of a ModelPage want, in another thread, until the block ends."""
+    """Draw the images that a ModelPage's tabs ask for, in a thread, until the block ends."""
     done = threading.Event()
 
     def draw():
