@@ -54,7 +54,7 @@ def test_the_smallest_voxel_size_depends_on_the_size_alone(by):
 
 
 def test_a_header_of_huge_integers_is_one_of_floats():
-    """JSON has them without a point, and numpy would keep them as objects."""
+    """JSON writes them without a decimal point, and numpy would keep them as objects."""
     grid = Grid.of_header({"origin": [10**25, 0, -1], "voxel_size": 1, "dims": [2, 3, 4]})
     assert grid == Grid((1e25, 0.0, -1.0), 1.0, (2, 3, 4))
     assert grid.centre.dtype == np.float64 and grid.packed(grid.centre).dtype == np.float32
@@ -90,7 +90,7 @@ def test_small_parts_are_told_from_large_ones():
 
 
 def test_parts_of_a_wide_box_take_the_memory_of_their_vertices():
-    """A thin wide object: 10^9 vertices in its box, of which a row and some specks are taken."""
+    """A thin wide object takes a row and some specks of the 10^9 vertices in its box."""
     grid = Grid((0, 0, 0), 1.0, (1000, 1000, 1000))
     row, specks = [(i, 0, 0) for i in range(500)], [(999, 999, 0), (0, 0, 500), (999, 999, 999)]
     ids = np.sort(grid.ids(np.array(row + specks)))

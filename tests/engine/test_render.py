@@ -18,8 +18,8 @@ GAMMA = 0.03
 
 
 def chained(model, settings, camera, k=1):
-    """Float64 (image, function from its gradient to those of the points' features, of their
-    opacities and of the network) of the padded camera, of k x k drawn pixels each.
+    """Float64 rendering by the padded camera, k x k drawn pixels for each: (image, function from
+    its gradient to those of the points' features, their opacities and the network).
     """
     padded, _, _ = camera.padded(4)
     shape, padded = (padded.height, padded.width), padded.enlarged(k)

@@ -104,7 +104,7 @@ def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path):
 
 
 def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, monkeypatch):
-    """No buffer larger than 200 bytes a point, and pruning in place by many pieces."""
+    """No buffer is larger than 200 bytes a point, and pruning in place takes many pieces."""
     changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}
     assert main(arguments(scene, tmp_path / "free", **changes)) == 0
     points = load_checkpoint(tmp_path / "free" / "checkpoint.npz")[0]["initial_points"]

@@ -16,9 +16,9 @@ from pp_cl.engine.training import between
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session.training import open_training
 
-MOST_LAUNCHES = 64  # of a step of tiny: each takes the host 30 us
+MOST_LAUNCHES = 64  # in a step of tiny; each takes the host 30 us
 COMPLETE = cl.command_execution_status.COMPLETE
-EVERY_STEP = {  # so that a step of any number does what most do
+EVERY_STEP = {  # so that every step does the work of most steps
     "points.count": 300,
     "train.iterations": 1000,
     "train.prune_every": 900,
@@ -46,7 +46,7 @@ def make_trainer(dev, scene, folder, name):
 
 
 class Recorder:
-    """Counts what waits for the device, what is launched and what is allocated there."""
+    """Counts waits for the device, launches and allocations."""
 
     def __init__(self, monkeypatch):
         self.counts = collections.Counter()
@@ -87,7 +87,7 @@ class Recorder:
     ],
 )
 def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypatch, name, planned):
-    """planned: with background tiles left out, as in large images."""
+    """planned: background tiles are left out, as in large images."""
     if planned:
         monkeypatch.setattr(pp_cl.engine.network.unet, "LEAST_PIXELS", 0)
         monkeypatch.setattr(pp_cl.engine.network.unet, "MOST_COMPUTED", 2)
@@ -107,7 +107,7 @@ def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypat
 
 
 def test_the_end_holds_no_view_beside_another(dev, scene, tmp_path, monkeypatch):
-    """Nor when rows of points are moved: their arrays are the largest of a training."""
+    """Nor does it hold one when it moves rows of points, the largest arrays of a training."""
     trainer = make_trainer(dev, scene, tmp_path / "run", "tiny")
     drawn, keep = drawn_alone(monkeypatch, trainer.renderer), between.keep
 

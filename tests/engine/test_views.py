@@ -35,7 +35,7 @@ def test_reduced_too_far(view, downscale):
 @pytest.mark.parametrize("downscale", (1, 2, 3))
 @pytest.mark.parametrize("margin", (0, 2, 100))
 def test_object_bounds_are_the_tightest(view, rng, downscale, margin):
-    assert view.reduced(3).object_bounds(5) == (0, 0, 23, 16)  # there is none
+    assert view.reduced(3).object_bounds(5) == (0, 0, 23, 16)  # no pixel is opaque
     for _ in range(5):
         view.image[..., 3] = rng.integers(0, MASK_THRESHOLD + 1, view.image.shape[:2])
         view.image[rng.integers(5, 50, 4), rng.integers(9, 70, 4), 3] = MASK_THRESHOLD + 1

@@ -1,4 +1,4 @@
-"""What the selftest leaves open: it has sizes and gathers."""
+"""What the selftest does not test of buffers; it covers sizes and gathers."""
 
 import weakref
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ from pp_cl.engine.device.buffers import (
 )
 from pp_cl.errors import UserError
 
-pytestmark = pytest.mark.kernels  # of rows.cl
+pytestmark = pytest.mark.kernels  # they test rows.cl
 
 TABLE = {"place": ((5, 4), np.float32), "box": ((5, 4), np.uint16)}
 
@@ -64,7 +64,7 @@ def test_a_pending_value_is_what_the_kernels_before_it_left(dev, rng):
 
 
 def test_kernels_that_fail_on_the_device_are_told_of(dev, monkeypatch):
-    """Where the host waits for them, as GPUs find many faults then."""
+    """GPUs report many faults only when the host waits for the kernels."""
 
     def failing():
         raise cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
@@ -121,7 +121,7 @@ def test_parts_are_joined(dev, rng, monkeypatch, n, piece):
 
 
 def test_what_was_fetched_or_written_is_not_kept(dev):
-    """A preview or a video would keep a dozen of its images beside the one that is shown."""
+    """Otherwise a preview or a video would keep a dozen images besides the current one."""
     array, zeros = dev.upload(np.arange(9, dtype=np.float32)), np.zeros(9, np.float32)
     [packed] = PackedArrays(dev).send([((9,), np.float32)], [zeros])
     hosts = [dev.download(array), array.get(), array[:5].get(), packed.get(), zeros]

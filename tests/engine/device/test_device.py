@@ -90,7 +90,7 @@ def test_memory_is_counted_and_given_back(plain):
     assert plain.bytes == plain.peak_bytes == 4000 + 8000
     del b
     assert (plain.bytes, plain.peak_bytes) == (4000, 12000)
-    part = a[:10].reshape(5, 2).view(np.uint32)  # as much as before, whoever holds it
+    part = a[:10].reshape(5, 2).view(np.uint32)  # a view holds all of the memory
     del a
     assert plain.bytes == 4000
     del part
@@ -169,7 +169,7 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
     [
         ("Intel(R) OpenCL Graphics", "GPU", True),
         ("Intel(R) OpenCL", "CPU", False),
-        ("Apple", "GPU", False),  # which drives Intel's GPUs too, and refuses unknown options
+        ("Apple", "GPU", False),  # drives Intel's GPUs too, and refuses unknown options
         ("NVIDIA CUDA", "GPU", False),
     ],
 )
@@ -259,7 +259,7 @@ def test_debug_3_takes_infinity_where_the_kernel_says_so(debugged, tiny):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="only Unix has the signal")
 def test_a_file_that_grows_too_large_is_an_error_alone(dev):
-    """Drivers catch the signal when they are loaded, unknown to Python; the device sets it back."""
+    """Drivers catch the signal once loaded, unknown to Python; the device ignores it again."""
     own = Path("/proc/self/status")
     if not own.exists():
         pytest.skip("no /proc")

@@ -13,7 +13,7 @@ MIB = 2**20
 
 @pytest.fixture
 def group(tmp_path, monkeypatch):
-    """The container of this process, on a machine with 1000 MiB free; it holds 40 MiB."""
+    """A container for this process, which holds 40 MiB, on a machine with 1000 MiB free."""
     monkeypatch.setattr(host, "GROUP", tmp_path)
     free, held = SimpleNamespace(available=1000 * MIB), SimpleNamespace(rss=40 * MIB)
     monkeypatch.setattr("psutil.virtual_memory", lambda: free)
@@ -42,7 +42,7 @@ def test_a_container_has_less(group):
 
 def test_this_machine():
     before = host.resident_bytes()
-    block = np.frombuffer(mmap.mmap(-1, 256 * MIB), np.uint8)  # not what malloc has kept
+    block = np.frombuffer(mmap.mmap(-1, 256 * MIB), np.uint8)  # fresh, not memory that malloc kept
     block[:] = 1
     grown = host.resident_bytes() - before
     assert 0.9 * block.nbytes < grown < 1.2 * block.nbytes

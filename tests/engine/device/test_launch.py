@@ -37,7 +37,7 @@ def rows(dev, rng):
 
 
 def test_a_launch_computes(program, dev, rows):
-    """A letter stands for one size only within a launch; numpy's numbers are taken."""
+    """A letter may stand for another size in the next launch; numpy's numbers are accepted."""
     program.launch("rows", (np.uint32(33),), local=(8,), **rows | {"n": np.int64(33)})
     expected = 2 * rows["x"].get().sum(1) + np.arange(33) % 3
     np.testing.assert_allclose(rows["y"].get()[:, 0], expected, rtol=1e-6)
@@ -102,7 +102,7 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
         patch.setattr(cl, ENQUEUE, enqueue)
         program.launch("rows", n, multiply_adds=multiply_adds, **rows)
     assert seen == launched
-    # each part is handed to the system by itself
+    # each part is flushed on its own
     watched = has_watchdog and multiply_adds > 0
     assert flushed == (list(range(1, len(launched) + 1)) if watched else [])
     np.testing.assert_allclose(
@@ -111,7 +111,7 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
 
 
 INT, UINT = np.zeros(3, np.int32), np.zeros(3, np.uint32)
-# (arguments that are other ones, None: left out; error; message)
+# (changed arguments, None: left out; error; message)
 REFUSED = [
     ({"scale": None}, TypeError, r"missing \['scale'\], unknown \[\]"),
     ({"z": 1}, TypeError, r"missing \[\], unknown \['z'\]"),
@@ -214,8 +214,8 @@ def test_file_builds_alone_and_its_signatures_agree_with_the_driver(dev, stem):
     source = (KERNEL_FOLDER / f"{stem}.cl").read_text("utf-8")
     parsed = parse_signatures(source, f"cl/{stem}.cl")
     assert parsed, "no kernel that the launcher can read"
-    # Intel's runtime has no names for a program out of pyopencl's cache; hence the parser, and this
-    # build without it.
+    # Intel's runtime has no parameter names for a program from pyopencl's cache; hence the parser,
+    # and this build without the cache.
     options = ["-cl-std=CL1.2", "-cl-kernel-arg-info", "-I", str(KERNEL_FOLDER)]
     built = cl.Program(dev.context, source).build(options=options, cache_dir=False)
     assert set(built.kernel_names.split(";")) == set(parsed)
@@ -267,7 +267,7 @@ def test_heads_that_are_refused(parameters, message):
 
 @replayed
 def scaled(program, place, x, scale, wrong=()):
-    """Fill and launch; `wrong` is what a replayed function must not depend on."""
+    """Fill and launch by the length of `wrong`, on which a replayed function must not depend."""
     place.require({"y": ((33, 1), np.float32)})
     place.dev.fill(place.y, 7 if len(wrong) == 1 else -1)
     k = place.dev.constant([(0,), (0,), (0,)]).view(np.uint32).reshape(3)
@@ -291,7 +291,7 @@ def test_a_call_is_replayed_while_its_arguments_are_the_same(program, dev, rows,
         scaled(program, b, *again)
     assert len(called) == 3
     np.testing.assert_allclose(b.y.get(), 1.5 * expected, rtol=1e-6)
-    b.require({"y": ((34, 1), np.float32)})  # forgets what holds the old one
+    b.require({"y": ((34, 1), np.float32)})  # forgets calls that hold the old buffer
     assert not b.calls
 
 

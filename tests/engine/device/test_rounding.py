@@ -1,5 +1,5 @@
-"""What OpenCL asks of divisions and square roots, on which the tests' tolerances count: a GPU may
-round them no better.
+"""Test the accuracy that OpenCL asks of divisions and square roots. The tests' tolerances rely on
+it, as a GPU may have no better.
 """
 
 import os

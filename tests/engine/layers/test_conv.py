@@ -1,4 +1,4 @@
-"""Some tiles, other launches and blockings, NaN: what the selftest compares with no float64."""
+"""What the selftest does not compare with float64: some tiles, other launches, blockings, NaN."""
 
 import numpy as np
 import pytest
@@ -28,8 +28,8 @@ OF_3X3 = [param for param in ALL if param.values[1] == 3]
 @pytest.mark.parametrize("variant, k", ALL)
 @pytest.mark.parametrize("size, co", [((6, 7), 16), large((31, 33), 48)])
 def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
-    """The bits are those with all tiles; the other tiles of a result keep their NaN. The gradient
-    of a tile that does not count may hold NaN, and so may inputs that no counted gradient sees.
+    """Chosen tiles have the bits of a run over all tiles; the others keep their NaN. The gradient
+    of a tile that is not chosen may hold NaN, and so may inputs that no chosen tile reads.
     """
     layer = Layer.random(rng, size, (16, 16), co, k)
     counts = random_counts(rng, *size)
@@ -43,7 +43,7 @@ def test_only_the_chosen_tiles(dev, rng, variant, k, size, co):
     given = layer.weight, layer.bias
     actual = Layer(parts, *given, poisoned).computed(dev, variant, CPU, tiles)
     expected = Layer(layer.parts, *given, layer.grad_out * count).expected
-    for i in (1, 2):  # those of the weights and the bias
+    for i in (1, 2):  # the gradients of the weights and the bias
         assert relative_error(actual[i], expected[i]) < 1e-5
 
 
@@ -81,7 +81,7 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch):
             patch.setattr(kernel, "largest_group", 48)
         return found
 
-    # first, as sizes that were launched are not checked again
+    # launched first, as a size is not checked again
     with monkeypatch.context() as patch:
         patch.setattr(dev, "program", limited)
         results = layer.computed(dev, LOCAL, CPU)
@@ -118,7 +118,7 @@ def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, variant, most):
 )
 @pytest.mark.large
 def test_every_row_of_the_table(dev, rng, variant, blocking, shape):
-    """Images of more tiles than are taken at a time, in no more memory than each row asks for."""
+    """Images have more tiles than are computed at a time; memory is what each row asks for."""
     layer = Layer.random(rng, *shape)
     for result in map(within, layer.computed(dev, variant, blocking), layer.expected):
         assert result.share <= 1
@@ -133,4 +133,4 @@ def test_a_relu_hides_no_nan(dev, rng, variant, k):
     layer.parts[0][4, 5, 6] = np.nan
     bad = np.isnan(layer.computed(dev, variant, CPU)[0]).all(axis=2)
     assert bad[3:6, 4:7].all() and not bad[:, 10].any()
-    assert bad.sum() == 9 or variant == WINOGRAD  # more of the tiles that saw it
+    assert bad.sum() == 9 or variant == WINOGRAD  # Winograd spreads it in its tiles

@@ -1,4 +1,4 @@
-"""Where the selftest does not look: values beyond float32's range, NaN."""
+"""What the selftest does not test: values beyond float32's range, and NaN."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from pp_cl.engine.network.unet import UNet
 from pp_cl.reference import network
 from pp_cl.selftest.layers import gated
 
-pytestmark = pytest.mark.kernels  # of gate.cl, output.cl and resample.cl
+pytestmark = pytest.mark.kernels  # they test gate.cl, output.cl and resample.cl
 
 
 @pytest.mark.exact

@@ -18,11 +18,11 @@ from pp_cl.engine.training.loss import TAPS
 from pp_cl.reference.network import network, network_gradients
 from pp_cl.settings import BLOCKS
 
-BACKGROUND = 1.0  # of a pixel without fragments, cl/common.h
+BACKGROUND = 1.0  # features of a pixel without fragments, as in cl/common.h
 LAYERS = unet_layers((16, 16, 16))
 GRADIENT = np.float32([0.3, -0.2, 0.1])
 SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
-OBJECTS = {  # (rows, columns) that are not background
+OBJECTS = {  # (rows, columns) of pixels that are not background
     "inside": (slice(60, 81), slice(70, 93)),
     "across the border": (slice(100, 148), slice(0, 30)),
     "one corner pixel": (slice(147, 148), slice(179, 180)),
@@ -46,8 +46,8 @@ def always(monkeypatch):
 
 
 def scene(rng, place, size=SIZE):
-    """(features, gradient of the image): background and one colour, but for `place` and, in the
-    gradient, another one.
+    """(features, gradient of the image): background and one colour, but random at `place` and, in
+    the gradient, at another place.
     """
     x = np.full((*size, 16), BACKGROUND, np.float32)
     grad_y = np.full((*size, 3), GRADIENT, np.float32)
@@ -82,12 +82,12 @@ def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     plan = net.plan_tiles(SIZE, active_mask(x))
     assert (plan.computed_fraction < 0.4) == (name != "everywhere")
     np.testing.assert_array_equal(net.forward(device_x, False, plan).get(), actual[0])
-    if variant == "direct":  # Winograd mixes the last bits of a tile
+    if variant == "direct":  # Winograd rounds the pixels of a tile together
         np.testing.assert_array_equal(actual[0], expected[0])
-    # so through seven layers two of its results differ, on Intel's runtime by up to 1.1e-6
+    # so its results differ after seven layers, on Intel's runtime by up to 1.1e-6
     for a, b in zip(actual[:2], expected[:2], strict=True):
         assert np.abs(a - b).max() <= 2e-6 * np.abs(b).max()
-    # sums over 26,640 pixels, added up in another order
+    # sums over 26,640 pixels are added up in another order
     for a, b in zip(actual[2:], expected[2:], strict=True):
         assert relative_error(a, b) < 5e-6
 
@@ -111,7 +111,7 @@ def test_few_tiles_in_large_images_only(dev, rng):
         assert (plan is not None) == chosen
         if chosen:
             assert plan.computed_fraction <= pp_cl.engine.network.unet.MOST_COMPUTED
-    net.freeze()  # the last of them, which is smaller, and half of it
+    net.freeze()  # a frozen network plans the last size, too small before, but not half of it
     assert net.plan_tiles(x.shape[:2], active_mask(x)) and not net.is_planned((124, 256))
 
 
@@ -145,8 +145,8 @@ def test_radius_is_what_a_change_reaches(rng, blocks):
 
 
 def test_the_loss_sees_the_border_no_further():
-    """The margin that is compared tile by tile holds what the forward pass and a window of the
-    SSIM's gradient reach.
+    """The margin that is compared tile by tile covers the reach of the forward pass and of the
+    SSIM's gradient.
     """
     assert LOSS_RADIUS == 2 * (TAPS // 2)
     assert receptive_radius(LAYERS)["out"] + LOSS_RADIUS <= LOSS_BORDER

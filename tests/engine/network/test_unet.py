@@ -60,7 +60,7 @@ def test_frozen_weights_are_laid_out_once(dev, rng, variant):
     for _ in range(2):
         for x, image in zip((small, large), expected, strict=True):
             np.testing.assert_array_equal(net.forward(x, training=False).get(), image)
-    net.parameters["enc1.a.weight"].fill(0)  # forbidden, and unseen where the weights are laid out
+    net.parameters["enc1.a.weight"].fill(0)  # forbidden, and not seen once weights are laid out
     assert np.array_equal(net.forward(large, training=False).get(), expected[1]) == (
         variant != "direct"
     )

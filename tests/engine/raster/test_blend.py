@@ -1,4 +1,4 @@
-"""Gradients against finite differences of the float64 twins that the selftest compares with."""
+"""Check gradients by finite differences of the float64 twins that the selftest uses."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ CASES = [("softmax", 0.1), ("softmax", 0.01), ("alpha", 0.1)]
 
 @pytest.mark.parametrize("rule, gamma", CASES)
 def test_gradients_against_finite_differences(dev, rng, rule, gamma):
-    """Opacities of 0 and 1 included; a softmax has no logarithm of what lies below 0."""
+    """Opacities include 0 and 1; the softmax takes no logarithm of a value below 0."""
     blended = Blended(dev, rng, n=60, gamma=gamma, rule=rule)
     gradients = blended.gradients()
 
@@ -66,7 +66,7 @@ def test_fragments_at_one_depth_and_single_fragments_have_no_distortion_loss(dev
 @pytest.mark.exact
 @pytest.mark.parametrize("kind", ["soft", "gaussian"])
 def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
-    """To the pixels that see the point, and to the weight by which it is pruned."""
+    """NaN reaches the pixels that see the point, and the weight by which it is pruned."""
     scene = Blended(dev, rng, 31, kind=kind, rule="alpha").scene
     point = scene.seen[0]
     opacity = np.where(np.arange(31) == point, np.nan, 0.1)
@@ -101,8 +101,8 @@ def test_the_softmax_by_hand(dev):
 
 
 def test_untracked_fragments_without_weight_are_shaded(dev, rng):
-    """A weight may underflow to 0 beyond max_tracked; its point is in the pixels' lists, so it must
-    be shaded.
+    """A weight may underflow to 0 beyond max_tracked, but its point is in the pixels' lists and
+    must be shaded.
     """
     blended = Blended(dev, rng, n=300, gamma=1e-3, radius=0.4, max_tracked=1, early_stop=1e-30)
     listed_zero = blended.geometry["fragment"] & ~blended.dropped & (blended.weight == 0)

@@ -20,7 +20,7 @@ def test_soft_points_are_balls(dev, rng):
         centre = dense.camera_space(scene.camera, position[None])[0]
         along = ray @ centre
         across = np.linalg.norm(centre - along[:, None] * ray, axis=1)
-        # a pixel's falloff takes its distance at the centre's range, second order in it
+        # the falloff takes a pixel's distance at the centre's range: a second-order error
         inside = (alpha > 0) & (across < 0.9 * radius)
         assert inside.sum() > 10
         front = (along - np.sqrt(radius**2 - np.minimum(across, radius) ** 2)) * ray[:, 2]
@@ -29,8 +29,8 @@ def test_soft_points_are_balls(dev, rng):
 
 
 def test_a_falloff_that_is_rounded_below_0_has_a_depth(dev):
-    """Of the nearest of two fragments, as a GPU's square roots and quotients may round it at the
-    rim.
+    """A GPU's square roots and quotients may round the falloff of the nearest fragment below 0 at
+    the rim.
     """
     scene, _ = blend_on_axis(dev, [0.9, 0.5], [1.0, 1.0], 0.1, rule="alpha")
     fragments = scene.pairs.pair_point_falloff.get()

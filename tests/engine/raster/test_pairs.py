@@ -22,8 +22,8 @@ def by_point(pairs):
 
 @pytest.mark.parametrize("kind", FOOTPRINTS)
 def test_fragments_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind):
-    """As where a compiler rounds in one way where fragments are counted, in another where they are
-    written: all other points' pairs are what they would be, and no slot is left undefined.
+    """A compiler may round one way when fragments are counted, another when they are written: the
+    pairs of other points must not change, and no slot may stay undefined.
     """
     camera, n = make_camera(), 300
     scene = PairedPoints(dev, camera, make_points(rng, n), 0.1, kind=kind)
@@ -52,7 +52,7 @@ def test_fragments_that_were_counted_otherwise_stay_within_their_point(dev, rng,
     ],
 )
 def test_lists_of_all_lengths_side_by_side_are_sorted(dev, rng, lengths):
-    """About the lengths at which GPUs merge in one pass more."""
+    """Lengths are around those from which on GPUs need another merge pass."""
     camera = replace(make_camera(len(lengths), 1), fx=20.0, fy=20.0, cx=len(lengths) / 2, cy=0.5)
     pixel = rng.permutation(np.repeat(np.arange(len(lengths)), lengths))
     along = oracle.rays(camera)[pixel] @ camera.pose[:, :3].T

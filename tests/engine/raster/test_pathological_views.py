@@ -15,11 +15,11 @@ pytestmark = pytest.mark.kernels
 
 
 def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=oracle.DEPTH_RANGE):
-    """A scene's fragments, features and gradients against the oracle; returns the scene. Left out
-    are pixels where rounding decides over a fragment, or makes up most of a falloff.
+    """Compare a scene's fragments, features and gradients with the oracle; returns the scene. Left
+    out are pixels where rounding decides whether there is a fragment, or dominates a falloff.
     """
-    # a Gaussian's centre may lie hundreds of pixels beside the image, where float32 rounds it by
-    # 3e-5 of one, and its deviation is half a pixel
+    # a Gaussian's centre may lie hundreds of pixels outside the image, where float32 rounds it by
+    # 3e-5 pixels, and its deviation is half a pixel
     n, unit = len(positions), 10 if kind == "gaussian" else 1
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
     scene = PairedPoints(dev, camera, positions, radius, kind=kind, depth_range=depth_range)
@@ -60,9 +60,9 @@ def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
     positions = camera.eye + directions * (front + radius)[:, None]
     scene = check(dev, rng, camera, positions, radius, kind, depth_range=(0.5, 3.0))
     placed = scene.projected.point_camera.get()
-    left_out = ~(placed[:, 3] >= 0)  # NaN where nothing is known of a point that covers no pixel
+    left_out = ~(placed[:, 3] >= 0)  # NaN for a point that covers no pixel
     assert (left_out[front < 0.5 - 1e-4]).all() and (~left_out).sum() > 40
-    assert (placed[~left_out, 2] < radius[~left_out]).any()  # reaches the plane of the eye
+    assert (placed[~left_out, 2] < radius[~left_out]).any()  # some reach the plane of the eye
 
 
 @pytest.mark.parametrize("kind", ["soft", "sphere"])

@@ -50,7 +50,7 @@ def test_what_whole_bricks_miss_no_point_of_them_covers(dev, rng, monkeypatch, k
     assert all(
         np.array_equal(count, counts(crop)) for count, crop in zip(found, crops, strict=True)
     )
-    monkeypatch.setattr(project, "MOST_OFFSET", -3.5)  # nowhere beyond their middle
+    monkeypatch.setattr(project, "MOST_OFFSET", -3.5)  # bricks end before their middle
     culls = dev.is_cpu  # GPUs judge each point alone
     assert (
         any((count != counts(crop)).any() for count, crop in zip(found, crops, strict=True))

@@ -1,5 +1,5 @@
-"""Parity with Pulsar (PyTorch3D, compiled with exact exp and log): images, fragment counts and
-gradients of its fixtures.
+"""Compare images, fragment counts and gradients with fixtures of Pulsar (PyTorch3D, compiled with
+exact exp and log).
 """
 
 import numpy as np
@@ -24,8 +24,8 @@ MIRROR = np.array([1.0, -1.0, 1.0])  # Pulsar's left-handed world to our right-h
 
 
 def read_camera(fixture):
-    """Our (Camera, depth range): Pulsar's integer pixel centres become ours at +0.5, its y axis
-    turns over with the world.
+    """Our (Camera, depth range): Pulsar's integer pixel centres become ours at +0.5, and its y
+    axis flips with the world.
     """
     width, height = int(fixture["in_width"]), int(fixture["in_height"])
     step_x, step_y = (
@@ -58,8 +58,8 @@ class Case:
         self.scene = PairedPoints(
             dev, self.camera, self.positions, self.radius, kind="sphere", depth_range=depth_range
         )
-        # The weights sum to one, so features shifted from Pulsar's background to ours shift the
-        # image alike.
+        # The weights sum to one, so shifting features from Pulsar's background to ours shifts the
+        # image equally.
         self.shift = 1 - self["in_bg"].astype(np.float64)
         point_features = self._padded(self["in_features"] + self.shift)
         features = self.scene.blend(
@@ -74,7 +74,7 @@ class Case:
         return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 16 - values.shape[-1])])
 
     def compare(self, keys, which):
-        """The sums of gradients of the spheres `which` are the fixture's."""
+        """Assert that the gradients of the spheres `which` are the fixture's, in sum."""
         gradients = self.scene.sphere_gradients(self._padded(self["in_grad_image"]))
         gradients["features"] = gradients["features"][:, : len(self.shift)]
         gradients["positions"] = gradients["positions"] * MIRROR

@@ -13,7 +13,7 @@ OPAQUE = View("a.png", CAMERA, np.full((64, 64, 4), 255, np.uint8))
 
 
 def jitters(view, **settings):
-    """(100, 2): of the crops of 100 steps, which lie in whole pixels of the view's camera."""
+    """(100, 2) jitters of the crops of 100 steps, whose cameras must be shifted to match."""
     crops = [Crops([view], TrainConfig(crop=32, **settings), 0).draw(step) for step in range(100)]
     for crop in crops:
         shift = np.array(crop.jitter) / view.downscale + crop.box[:2]

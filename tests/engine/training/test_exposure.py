@@ -18,14 +18,14 @@ VIEWS, STEPS = 48, 500
 DECIDED, LAST = (decided_at(0, VIEWS, is_last=is_last) for is_last in (False, True))
 GAINS = np.exp(np.random.default_rng(4).uniform(np.log(0.25), 0, (VIEWS, 3)))
 MATRICES = 0.8 * np.eye(3) + np.random.default_rng(5).uniform(-0.25, 0.25, (VIEWS, 3, 3))
-# a model this small lacks more than gains tell
+# a model this small has errors that gains do not explain
 NO_MATRICES = "pp_cl.engine.training.exposure.LEAST_BEYOND", 1.0
-EVERY = DECIDED // 2  # steps of a checkpoint
+EVERY = DECIDED // 2  # steps between checkpoints
 SETTINGS = {"downscale": 1, "train__iterations": STEPS, "train__checkpoint_every": EVERY}
 
 
 def write_demo(dev, folder, matrices):
-    """The demo's folder, small, with few images, multiplied by matrices (VIEWS, 3, 3)."""
+    """Write a small demo scene, its colours multiplied by matrices (VIEWS, 3, 3)."""
     views = demo_views(dev, "train", VIEWS, size=48)
     images = [view.image.copy() for view in views]
     for image, matrix in zip(images, matrices, strict=True):

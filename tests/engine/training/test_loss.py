@@ -1,4 +1,4 @@
-"""The loss against scikit-image and finite differences: the selftest compares it with float64."""
+"""Compare the loss with scikit-image and finite differences; the selftest does with float64."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_a_nan_is_not_hidden(dev, rng, weight):
     loss, grad = run(dev, prediction, target, weight, 0.05)
     assert np.isnan(grad[5, 6, 1])
     pending = loss.read(7)
-    for _ in range(2):  # as often as asked
+    for _ in range(2):  # each get() raises
         with pytest.raises(Diverged, match=r"at step 7 \(loss, l1(, ssim)?, psnr\)$"):
             pending.get()
 

@@ -1,4 +1,4 @@
-"""What the selftest's cases of Adam, RMSprop and averages leave open."""
+"""What the selftest does not test of Adam, RMSprop and averages."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from pp_cl.engine.training.state import PointState
 from pp_cl.reference import dense, optim
 from pp_cl.selftest.optim import EYE, RATES, Cloud, gradients
 
-pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
+pytestmark = pytest.mark.kernels  # they test adam.cl and rmsprop.cl
 
 
 def test_refuses_different_shapes(dev):
@@ -31,11 +31,11 @@ def test_averages_start_as_copies_and_are_applied_and_released(dev, rng):
     optimiser = Optimiser(dev, model, PointState(dev, model.cloud))
     before = dev.bytes
     learned = model.cloud.learned()
-    for name in ("sh_1", "sh_2a", "sh_2b"):  # these have none
+    for name in ("sh_1", "sh_2a", "sh_2b"):  # these have no averages
         learned.pop(name)
     parameters = learned | model.net.parameters
     start = {name: array.get() for name, array in parameters.items()}
-    optimiser.update_ema(0.25)  # the first one copies, whatever its weight
+    optimiser.update_ema(0.25)  # the first update copies, whatever its weight
     for array in parameters.values():
         dev.fill(array, 0)
     optimiser.update_ema(0.25)
@@ -47,13 +47,13 @@ def test_averages_start_as_copies_and_are_applied_and_released(dev, rng):
     for name, array in parameters.items():
         np.testing.assert_allclose(array.get(), 0.75 * start[name], rtol=1e-6)
         dev.fill(array, 0)
-    optimiser.apply_ema()  # there are none any more
+    optimiser.apply_ema()  # no averages are left
     assert not any(array.get().any() for array in parameters.values())
 
 
 def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(rng):
-    """Of the oracle: for one gradient seen from everywhere, v is the mean of those that Adam keeps
-    of the coefficients, and the moves are Adam's with that mean.
+    """Tests the oracle: for one gradient seen from everywhere, v is the mean of the v that Adam
+    keeps of the coefficients, and the moves are Adam's with that mean.
     """
     directions = dense.directions(rng.standard_normal((20_000, 3)), np.zeros(3))
     basis = dense.sh_basis(directions)
@@ -87,8 +87,8 @@ def test_degrees_at_rate_0_stay(dev, rng, rates):
 
 
 def test_an_opacity_moves_as_it_changes_with_what_is_learned(dev, rng):
-    """Against finite differences of the float64 opacity from the eye, inside its bounds: the first
-    step of RMSprop is the rate times the sign of the gradient.
+    """Compare with finite differences of the float64 opacity from the eye, inside its bounds: the
+    first step of RMSprop is the rate times the sign of the gradient.
     """
     cloud = Cloud(dev, rng, 31)
     start = np.hstack([rng.uniform(0.4, 0.6, (31, 1)), rng.uniform(-0.1, 0.1, (31, 8))])

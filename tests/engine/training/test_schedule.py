@@ -45,13 +45,13 @@ def test_the_distortion_weight_rises_from_nothing():
     "shares, iterations, changes, expected",
     [
         ("0.33,0.67", 11_000, {}, [3630, 7370]),
-        ("0.33,0.67", 60, {}, [20]),  # 64 times as many points, of which none was pruned
-        ("0.33,0.67", 500, {}, [165]),  # the pruning at 250 finds points that were seen 85 times
+        ("0.33,0.67", 60, {}, [20]),  # no second one, as no pruning follows the first
+        ("0.33,0.67", 500, {}, [165]),  # at the pruning at 250, points were seen only 85 times
         ("0.33,0.67", 2, {}, [1]),
         ("0.33,0.67", 60, {"train.prune_weight": 0}, [20, 40]),
         ("0.5,0.5", 100, {"train.prune_weight": 0}, [50]),
         ("1,1", 8000, {}, []),
-        ("0,0", 8000, {}, []),  # not known yet
+        ("0,0", 8000, {}, []),  # the steps are not decided yet
     ],
 )
 def test_a_refinement_needs_a_pruning_since_the_one_before(shares, iterations, changes, expected):
@@ -112,7 +112,7 @@ def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
     "low, high, size, limit", [(10, 400, 64, 800), (0, 617, 256, 800), (17, 183, 128, 200)]
 )
 def test_a_quarter_of_the_crops_shows_an_end_of_the_object(low, high, size, limit):
-    """Drawn uniformly they would hardly ever; what lies between is seen as often, within a half."""
+    """Uniform draws would hardly ever; pixels between are still seen at least half as often."""
     seen, draws = np.zeros(limit), 3000
     for i in range(draws):
         start = draw_start(np.random.default_rng(i), low, high, size, limit=limit)

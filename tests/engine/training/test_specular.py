@@ -28,8 +28,8 @@ def directions(camera):
 
 
 class Shown:
-    """Views of a model of which each shows what lacking(view's index, camera) has beyond its image,
-    where alpha is 1.
+    """Views of a model. Each target adds lacking(view's index, camera), times alpha, to the model's
+    image.
     """
 
     def __init__(self, dev, rng, views, lacking):
@@ -136,7 +136,7 @@ def test_ignored_pixels_are_not_looked_at(dev, rng, enough):
 
 @pytest.fixture
 def always(monkeypatch):
-    """A training keeps its layer, however little that explains."""
+    """Make a training keep its layer, however little that explains."""
     monkeypatch.setattr(specular, "LEAST_SCALE", -1.0)
 
 

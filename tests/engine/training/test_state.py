@@ -13,11 +13,11 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.session.training import open_training
 from pp_cl.settings import TrainConfig
 
-pytestmark = pytest.mark.kernels  # of refine.cl
+pytestmark = pytest.mark.kernels  # they test refine.cl
 
 
 def rows(opacity):
-    """(N, 9) float32 of opacities that are the same from all sides."""
+    """(N, 9) float32 coefficients of opacities that are the same from all sides."""
     return np.pad(np.float32(opacity)[:, None], ((0, 0), (0, 8)))
 
 
