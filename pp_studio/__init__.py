@@ -1,4 +1,4 @@
-"""What is made of photographs and runs: scenes, videos, pages, splats, meshes, a viewer, sweeps."""
+"""Makes scenes of photographs, makes videos, pages, splats and meshes of runs, views and sweeps."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Camera paths: around an object, by the cameras of its images, and through given cameras."""
+"""Camera paths: around an object, following the cameras of its images, or through given cameras."""
 
 import math
 from collections.abc import Sequence
@@ -11,24 +11,24 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from pp_cl import Camera
 from pp_cl.scene import looked_at, up_of
 
-MARGIN = 0.95  # of the image that the object may fill
+MARGIN = 0.95  # share of the image that the object may fill
 HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles an image would spin
-TURNS = 2  # of a spiral
-RING = math.radians(15)  # of elevations; a spiral of less makes one turn, else it is an orbit twice
-NEIGHBOURS = 4  # of a camera, in whose directions another lies between()
+TURNS = 2  # turns of a spiral
+RING = math.radians(15)  # least range of elevations for TURNS; with less, a spiral makes one turn
+NEIGHBOURS = 4  # between() goes towards the nearest cameras, at most this many
 SAMPLED_POINTS = 20_000
 
 
 def around(
     path: str, cameras: Sequence[Camera], points: np.ndarray, camera: Camera, frames: int
 ) -> list[Camera]:
-    """So many cameras with the size and angle of view of `camera` that look at the middle of an
-    object from one distance: that of its images, or farther where it would be cut off.
+    """Return `frames` cameras, with the size and angle of view of `camera`, that look at the middle
+    of an object from one distance: that of its images, or farther if the object would be cut off.
 
-    path: orbit, a circle at the images' median elevation that begins where the first was taken, the
-    last frame one step before the first; spiral, two turns from the lowest tenth of the elevations
-    to the highest, one where these are within RING. cameras: those of the images. points: (N, 3),
-    the object's, in the world.
+    path: orbit, a circle at the images' median elevation that begins where the first was taken and
+    ends one step before it; spiral, two turns from the lowest tenth of the elevations to the
+    highest, or one turn if these are within RING. cameras: those of the images. points: (N, 3)
+    points of the object, in the world.
     """
     up, centre = up_of(cameras), (points.min(axis=0) + points.max(axis=0)) / 2
     points = points[:: max(1, len(points) // SAMPLED_POINTS)] - centre
@@ -50,7 +50,7 @@ def around(
     size = {"width": camera.width, "height": camera.height}
     poses = [Camera.look_at(offset, (0, 0, 0), up, fx=camera.fx, **size).pose for offset in towards]
     distance = float(np.median(distances))
-    for pose in poses:  # from which all points are in the image
+    for pose in poses:  # move back until all points are in the image
         x, y, z = (points @ pose[:, :3]).T
         across = np.abs(x) * 2 * camera.fx / (MARGIN * camera.width) - z
         down = np.abs(y) * 2 * camera.fy / (MARGIN * camera.height) - z
@@ -62,8 +62,8 @@ def around(
 
 
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A smooth path through cameras, as long from each to the next, with the size of the first; of
-    one camera that camera alone.
+    """A smooth path of `frames` cameras through others, equally long from each to the next, in the
+    size of the first; a single camera is returned alone.
     """
     if len(cameras) == 1:
         return list(cameras)
@@ -80,9 +80,9 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def between(cameras: Sequence[Camera]) -> list[Camera]:
-    """For each camera, one half-way to another around what they look at, which it shows in the same
-    pixel: in turn to the nearest, the second, the third and the fourth of all directions. A camera
-    that has none on its side is itself.
+    """For each camera, one half-way around the object towards another camera: in turn the nearest,
+    second, third or fourth in direction. The point that cameras look at keeps its pixel. A camera
+    with no other on its side is returned unchanged.
     """
     centre = looked_at(cameras)
     offsets = np.stack([camera.eye - centre for camera in cameras])
@@ -105,7 +105,7 @@ def between(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(3,) unit vector across `up` towards which a vector leans, some other where it does not."""
+    """(3,) unit vector across `up` towards which a vector leans, or any if it does not."""
     across = vector - vector @ up * up
     if np.linalg.norm(across) <= 1e-6 * np.linalg.norm(vector):
         across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])

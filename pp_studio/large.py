@@ -1,4 +1,4 @@
-"""Renderings that are finer than the images of the training, with the network at its own scale."""
+"""Renderings finer than the images of the training, with the network at its own scale."""
 
 import itertools
 import math
@@ -13,21 +13,21 @@ from pp_cl import Camera, RenderedView, Run
 from pp_cl.engine import MIN_SIDE
 from pp_cl.files import mean_rendered_view
 
-# Of a woven rendering, each way. Of a run of the demo's images of 200 pixels, one rendering of 800
-# has 29.0 dB, 2 x 2 woven ones 30.0 and 4 x 4 30.4; of 600 steps on lego's, 27.1, 27.5 and 27.7.
+# Most parts of a woven rendering, each way. For a run of the demo at 200 pixels, one rendering of
+# 800 has 29.0 dB, 2 x 2 woven ones 30.0, 4 x 4 30.4; after 600 steps of lego 27.1, 27.5 and 27.7.
 MOST_PARTS = 4
-# Pixels of the training: the deviations of the filter along outlines, and of those that find them.
-# A run of the demo's images of 200 pixels has 30.5 dB at 720 with teeth, 30.3 without; one of
-# lego's of 100 pixels 26.4 and 26.3 at 400.
+# Standard deviations, in pixels of the training: of the filter along outlines, and of two that find
+# them. A run of the demo's images of 200 pixels has 30.5 dB at 720 with teeth, 30.3 without; a run
+# of lego's of 100 pixels has 26.4 and 26.3 at 400.
 ALONG, BEFORE, AROUND = 0.4, 0.5, 1.0
-TAPS = np.linspace(-2, 2, 9)  # of that filter, in deviations
-EDGE = 0.25  # change of alpha in a pixel of the training from which an outline is one altogether
+TAPS = np.linspace(-2, 2, 9)  # where the filter along outlines samples, in standard deviations
+EDGE = 0.25  # change of alpha per pixel of the training from which an outline is fully smoothed
 LEAST_EDGE = 0.01
 
 
 def fineness(run: Run, camera: Camera) -> float:
-    """How many pixels of a camera the middle of the object has for one of the run's images, each
-    way.
+    """How many pixels of a camera, each way, show what one pixel of the run's images shows at the
+    middle of the object.
     """
     centre = run.ball[0]
 
@@ -38,8 +38,8 @@ def fineness(run: Run, camera: Camera) -> float:
 
 
 def parts(run: Run, camera: Camera, most: int = MOST_PARTS) -> int:
-    """How many renderings, up to `most`, at the training's scale a camera's image is woven of, each
-    way.
+    """The number of renderings at the training's scale, each way, that make up a camera's woven
+    image; at most `most`.
     """
     most = min(most, min(camera.width, camera.height) // MIN_SIDE)
     return max(1, min(math.ceil(fineness(run, camera) - 0.25), most))
@@ -54,9 +54,9 @@ def render_large(
     on_part: Callable[[], object] = lambda: None,
     **options: Any,
 ) -> RenderedView:
-    """run.render(camera, samples=samples, **options), in which the points are as dense as the
-    network knows them: an image that is much finer than those of the training is woven() with
-    smooth_outlines(). most: of parts(). on_part: called before each part is rendered.
+    """run.render(camera, samples=samples, **options) with the points as dense as the network knows
+    them: an image much finer than those of the training is woven() and gets smooth_outlines().
+    most: as in parts(). on_part: called before each part is rendered.
     """
     n, side = parts(run, camera, most), math.isqrt(samples)
     if n == 1:
@@ -72,9 +72,9 @@ def render_large(
 def woven(
     run: Run, camera: Camera, n: int, on_part: Callable[[], object], **options: Any
 ) -> RenderedView:
-    """An image of n x n renderings at 1/n of its scale, each shifted by another fraction of a
-    pixel. They see the points at one place of a pixel: at four, which are as far apart as some
-    pixels of the image, it would be blurred.
+    """Weave an image from n x n renderings at 1/n of its scale, each shifted by another fraction of
+    a pixel. Each rendering samples its pixels at one place: four places would be some pixels of the
+    image apart and blur it.
     """
     focal = {name: getattr(camera, name) / n for name in ("fx", "fy", "cx", "cy")}
     width, height = -(-camera.width // n), -(-camera.height // n)
@@ -92,9 +92,9 @@ def woven(
 
 
 def smooth_outlines(view: RenderedView, n: int) -> RenderedView:
-    """The view with alpha averaged along the outlines of the object, not across them, over about
-    the n pixels that one of the training is wide: at a finer scale an outline shows the points that
-    it is made of as the teeth of a comb.
+    """The view with alpha averaged along the object's outlines, not across them, over about n
+    pixels, the width of one of the training's. At a finer scale the points of an outline show as
+    the teeth of a comb.
     """
     alpha = view.alpha
     down, across = np.gradient(gaussian_filter(alpha, BEFORE * n))
@@ -104,11 +104,11 @@ def smooth_outlines(view: RenderedView, n: int) -> RenderedView:
     )
     rows, columns = np.nonzero(np.sqrt(xx + yy) * n > LEAST_EDGE)
     xx, xy, yy = (product[rows, columns] for product in (xx, xy, yy))
-    coherence = np.hypot(xx - yy, 2 * xy) / (xx + yy)  # 1 of straight outlines, 0 of corners
+    coherence = np.hypot(xx - yy, 2 * xy) / (xx + yy)  # 1 on straight outlines, 0 at corners
     weight = np.minimum(np.sqrt(xx + yy) * n / EDGE, 1) * coherence**4
     angle = (
         np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2
-    )  # of the line that alpha changes least along
+    )  # the direction in which alpha changes least
     along = np.stack([np.sin(angle), np.cos(angle)])
     shares = np.exp(-(TAPS**2) / 2)
     mean = sum(
@@ -118,7 +118,7 @@ def smooth_outlines(view: RenderedView, n: int) -> RenderedView:
     )
     smooth, colour = alpha.copy(), view.colour.copy()
     smooth[rows, columns] += weight * (mean - alpha[rows, columns])
-    # what shows at alpha a over white is a colour + (1 - a), with the colours around
+    # over white, alpha a shows a colour + (1 - a); the colour is that of the surroundings
     near = gaussian_filter(colour - (1 - alpha[..., None]), (1, 1, 0))[rows, columns]
     near /= np.maximum(gaussian_filter(alpha, 1)[rows, columns, None], 1 / 255)
     change = (smooth - alpha)[rows, columns, None]

@@ -10,18 +10,18 @@ from PIL import Image
 from pp_cl.errors import UserError, require
 from pp_cl.files import atomic_path
 
-LOOPED = ("gif", "webp")  # as pages show without a player
+LOOPED = ("gif", "webp")  # formats that pages show without a player
 FORMATS = ("mp4", "webm", *LOOPED)
-MOST_FRAMES = 100_000  # of a video for pages
-# players take videos without tags for BT.601 or BT.709 by their size; sRGB's primaries are BT.709's
+MOST_FRAMES = 100_000  # most frames of a video for a page
+# players guess BT.601 or BT.709 from the size of untagged videos; sRGB has BT.709's primaries
 CONVERTED = "scale=out_color_matrix=bt709:out_range=tv"
 TAGGED = "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 COLOURS = ["-vf", f"{CONVERTED},{TAGGED}"]
-AT_ONCE = ["-movflags", "+faststart"]  # the index comes first: browsers play it as it arrives
+AT_ONCE = ["-movflags", "+faststart"]  # index first: browsers play the video as it arrives
 
 
 def check_video(suffix: str) -> None:
-    """Raise UserError with what mends it where a video of this format cannot be made."""
+    """Raise UserError, with the remedy, if a video of this format cannot be made."""
     if suffix in LOOPED:
         return
     require("a video, unlike --format webp or frames,", "imageio", "imageio-ffmpeg")
@@ -34,9 +34,9 @@ def check_video(suffix: str) -> None:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write a video of uint8 frames of one size, (H, W, 3), or (H, W, 4) with straight alpha, which
-    WebM keeps, in the format of the path's suffix, one of FORMATS. An odd side is extended by its
-    last row or column. Raises UserError naming the file when it cannot be written.
+    """Write a video in the format of the path's suffix, one of FORMATS. frames: uint8, all of one
+    size, (H, W, 3), or (H, W, 4) with straight alpha, which WebM keeps. An odd side is extended by
+    its last row or column. Raises UserError naming the file if it cannot be written.
     """
     frames = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), "edge") for f in frames)
     looped = path.suffix.lower()[1:] in LOOPED
@@ -46,7 +46,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
 def _write_looped(path, frames, fps):
     images = map(Image.fromarray, frames)
-    # whole units, whose sum is off by less than one wherever the video ends
+    # durations in whole units; their sum is off by less than one unit wherever the video ends
     unit = 10 if path.suffix.lower() == ".gif" else 1
     ends = [round(i * 1000 / fps / unit) for i in range(MOST_FRAMES + 1)]
     durations = [unit * (end - start) for start, end in pairwise(ends)]
@@ -55,7 +55,7 @@ def _write_looped(path, frames, fps):
 
 
 def _write(path, frames, fps):
-    """Raises OSError where the video is not whole: imageio says nothing of a full disk."""
+    """Raises OSError if the video is incomplete: imageio does not report a full disk."""
     import imageio.v2 as imageio
     from imageio_ffmpeg import count_frames_and_secs
 
@@ -68,7 +68,7 @@ def _write(path, frames, fps):
         options = {"codec": "libvpx-vp9", "quality": None, "pixelformat": pixels}
         quality = ["-crf", "24", "-b:v", "0", "-auto-alt-ref", "0"]
         options["output_params"] = [*quality, *COLOURS]
-    # of a full disk ffmpeg says four lines
+    # on a full disk, ffmpeg would print four lines
     options |= {"fps": fps, "macro_block_size": 1, "ffmpeg_log_level": "quiet"}
     options["input_params"] = ["-threads", "2"]
     with imageio.get_writer(str(path), **options) as writer:

@@ -1,4 +1,4 @@
-"""`pp-cl capture`: a scene from photographs or a video, with cameras, box and masks."""
+"""`pp-cl capture`: makes a scene with cameras, box and masks from photographs or a video."""
 
 import argparse
 from typing import Any
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_hints(parser: argparse.ArgumentParser) -> None:
-    """Add what a capture is told of the photographs."""
+    """Add the options that tell a capture about the photographs."""
     add = parser.add_argument
     add(
         "--turntable",
@@ -58,14 +58,14 @@ def add_hints(parser: argparse.ArgumentParser) -> None:
 
 
 def _box(text):
-    """The type of --box: AUTO, or two corners."""
+    """Convert --box to AUTO or two corners."""
     from pp_cl.commands.options import box
 
     return text if text == AUTO else box(text)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Do the stages that are left."""
+    """Run the stages that are not done yet."""
     from pathlib import Path
 
     from pp_cl.errors import UserError
@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> None:
         given["turntable"] = options.turntable
     if options.box:
         given["box"] = None if options.box == AUTO else options.box
-    if options.masks or options.mask_command:  # one takes the place of the other
+    if options.masks or options.mask_command:  # each replaces the other
         own = None if options.masks in (None, AUTO) else str(Path(options.masks).resolve())
         command = None if options.mask_command == AUTO else options.mask_command
         given |= {"masks": own, "mask_command": command}

@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Write the run, say what was written."""
+    """Write the run, and print what was written."""
     from pp_cl import find_run, load, open_device
     from pp_studio.export.formats import check_target, export_run
     from pp_studio.export.length import set_length
@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> None:
     ends = (*options.length[:2], _metres(options.length[2])) if options.length else None
     path = check_target(name, folders[0].path, Path(options.out) if options.out else None)
     for one in folders:
-        load_config(one.config)  # that all are there is seen before any work
+        load_config(one.config)  # check that all runs are there before any work
     device = open_device(options.device)
 
     def loaded(folder):

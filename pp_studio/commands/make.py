@@ -1,4 +1,4 @@
-"""`pp-cl make`: from photographs, a video or a scene to a folder that can be sent."""
+"""`pp-cl make`: turns photographs, a video or a scene into a folder to send to others."""
 
 import argparse
 import importlib
@@ -30,18 +30,18 @@ EPILOG = """FOLDER then holds
   scene, run           what was captured of photographs; the training, which all other commands take
 Its parts are capture, train, eval, export and render. The same command goes on where it stopped."""
 MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
-# the preset of so many minutes: on two cores with AVX-512 the steps of `small` take 7, of `full` 25
+# least minutes of each preset: on two cores with AVX-512 `small` takes 7 for its steps, `full` 25
 PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
-# Of the minutes, those that evaluation, splat and video take after the training: a share of what
-# the capture leaves, within these.
+# Evaluation, splat and video, after the training, take this share of the minutes that the capture
+# leaves, within these bounds in minutes.
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
-LEAST_TRAINING = 0.6  # of what the capture leaves
-# Of the minutes, left after a capture, however long it took: the training has a third of them then.
+LEAST_TRAINING = 0.6  # share of the minutes that the capture leaves
+# At least this share of the minutes is left after a capture: training then gets a third of all.
 LEAST_LEFT = 5 / 9
-LEAST_MORE = 0.1  # minutes for which a finished training goes on
-LATE = 0.8  # of a training: by the steps after it those are counted for which it goes on
-PER_PHOTOGRAPH = 0.05  # minutes that a capture takes, about: on two cores without AVX-512
-OF_SPLAT = 0.6  # of what is left after the evaluation
+LEAST_MORE = 0.1  # minutes that must be left for a finished training to go on
+LATE = 0.8  # the time per step is measured after this share of a training
+PER_PHOTOGRAPH = 0.05  # minutes that a capture takes for each, about, on two cores without AVX-512
+OF_SPLAT = 0.6  # share of the minutes left after the evaluation
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Do the steps that are left, and say what to open."""
+    """Run the steps that are not done yet, and say what to open."""
     from pp_cl import RunFolder, load
     from pp_cl.scene import read_json, scene_splits
     from pp_studio.export.gaussians import fitted_gaussians
@@ -115,7 +115,7 @@ def run(options: argparse.Namespace) -> None:
                 try:
                     write_preview(training, out, clock.title)
                     show(f"In training, at step {training.trainer.step}.")
-                except (UserError, MemoryError) as error:  # which is no reason to end a training
+                except (UserError, MemoryError) as error:  # must not end a training
                     warnings.warn(f"{page} is not renewed in the training: {error}", stacklevel=2)
                     training.on_preview = None
 
@@ -133,7 +133,7 @@ def run(options: argparse.Namespace) -> None:
             if not Path(scene, "transforms.json").exists():
                 clock.tell_of_capture(options.source)
             step("capture", options.source, "--out", scene, *_hints(options))
-            *stages, _ = STAGES  # the last one tells what it has written
+            *stages, _ = STAGES  # the last one prints what it has written
             found = {name: read_json(out / f"scene/capture/{name}.json") for name in stages}
             told = [f"{name}: {one['line']}" for name, one in found.items()]
         preset = ["--preset", options.preset] if options.preset else []
@@ -146,7 +146,7 @@ def run(options: argparse.Namespace) -> None:
             minutes = clock.training()
             preset = ["--preset", options.preset or _preset(minutes, share)]
             train(*preset, "--minutes", f"{minutes:.3g}")
-        else:  # as it began, unless told otherwise, which train refuses
+        else:  # keep the run's preset; train refuses another
             train(*preset, *clock.iterations())
         if clock.goes_on(folder):
             train(*clock.iterations())
@@ -156,7 +156,7 @@ def run(options: argparse.Namespace) -> None:
         step("eval", str(folder), "--split", split, *device)
         if not is_newer(out / SPLAT, folder.checkpoint):
             show("Trained and measured; splat and video follow.", split)
-            # of which export makes the file
+            # export writes these Gaussians to the file
             fitted_gaussians(load(folder.path, options.device), QUICK, OF_SPLAT * clock.left)
             words = ["--format", "splat"]
             step("export", str(folder), "--out", str(out / SPLAT), *words, *device)
@@ -171,10 +171,10 @@ def run(options: argparse.Namespace) -> None:
 
 
 class _Clock:
-    """The minutes of all of it: those asked for, and those that have passed, which a file keeps for
-    the same command to go on, with the page's title. What a step took that failed does not count.
+    """The time budget: the minutes asked for and those used, kept in a file with the page's title
+    so that the same command can go on. The time of a step that failed does not count.
 
-    asked, title: None, as before.
+    asked, title: None keeps the stored value.
     """
 
     def __init__(self, file: Path, asked: float | None, title: str | None) -> None:
@@ -187,7 +187,7 @@ class _Clock:
         self.title = before or name_of(file.parent) if title is None else title
         self.is_renamed = before not in (None, self.title)
         self._file, self._passed = file, known.get("passed", 0.0)
-        # minutes for which the training is planned, and its iterations if it goes on after these
+        # minutes for which the training was planned, and its iterations if it was extended later
         self._planned = known.get("planned", self.minutes)
         self._iterations: int | None = known.get("iterations")
         self._until = max(self.minutes, known.get("until", 0.0))
@@ -202,7 +202,7 @@ class _Clock:
         self.keep()
 
     def keep(self) -> None:
-        """Write down what has passed by now."""
+        """Store the minutes used so far."""
         from pp_cl.files import write_json
 
         self._passed, self._began = self.passed, time.monotonic()
@@ -212,21 +212,21 @@ class _Clock:
 
     @property
     def passed(self) -> float:
-        """Minutes since the beginning, without those between two commands."""
+        """Minutes since the beginning, without breaks between two commands."""
         return self._passed + (time.monotonic() - self._began) / 60
 
     @property
     def left(self) -> float:
-        """Minutes that are left, a tenth of one at least."""
+        """Minutes left, at least a tenth of one."""
         return max(self._until - self.passed, 0.1)
 
     @property
     def told(self) -> str:
-        """The same in words."""
+        """The minutes left, in words."""
         return f"{self.left:.1f} of {round(self._until, 1):g} minutes left"
 
     def tell_of_capture(self, source: str) -> None:
-        """Say how the minutes are divided, before the photographs are looked at."""
+        """Print how the minutes are divided before the photographs are read."""
         capture = min(PER_PHOTOGRAPH * _photographs(source), self.minutes)
         print(
             f"{self.minutes:g} minutes: about {capture:.1f} for cameras and masks, a quarter of the"
@@ -235,16 +235,14 @@ class _Clock:
         )
 
     def training(self) -> float:
-        """Minutes of the training, which it is planned for from now on; says how the rest is
-        divided.
-        """
+        """Plan the training: return its minutes, and print how the rest is divided."""
         passed = self.passed
         left = max(self.minutes - passed, LEAST_LEFT * self.minutes)
         self._planned, self._until = self.minutes, passed + left
         return self._divided(left)
 
     def _divided(self, left):
-        """Minutes of a training out of those that are left, of which it tells."""
+        """Return and print the minutes of a training, out of those that are left."""
         after = min(max(AFTER * left, LEAST_AFTER), MOST_AFTER, (1 - LEAST_TRAINING) * left)
         told = f"{self.minutes:g} minutes: {self.passed:.1f} have passed"
         if self._until > self.minutes + 0.05:
@@ -257,14 +255,14 @@ class _Clock:
         return left - after
 
     def goes_on(self, folder: "RunFolder") -> bool:
-        """Whether a finished training goes on, as more minutes are asked for than it was planned
-        for, and are left; iterations() then has as many as they allow.
+        """Whether a finished training goes on: more minutes are asked for than it was planned for,
+        and some are left. iterations() then gives as many as fit in them.
         """
         left, rows = self.minutes - self.passed, folder.rows()
         if self._planned >= self.minutes or left < LEAST_MORE or len(rows) < 2:
             return False
         self._planned, self._until = self.minutes, self.minutes
-        end = rows.pop()  # its training's last step is in the one before
+        end = rows.pop()  # the training's last step is in the row before
         late = next(row for row in rows if row["step"] >= LATE * end["step"])
         took, last = rows[-1]["seconds"] - late["seconds"], rows[-1]
         seconds = took / max(last["step"] - late["step"], 1) or last["seconds"] / last["step"]
@@ -275,17 +273,17 @@ class _Clock:
         return True
 
     def iterations(self) -> list[str]:
-        """The words of a training that goes on after it was finished."""
+        """The arguments of a training that goes on after it was finished."""
         return ["--iterations", str(self._iterations)] if self._iterations else []
 
 
 def _wrote_hull(out, scene, title, options, masks):
-    """Whether the page of what the masks tell could be written."""
+    """Write the page of the hull that the masks give; return whether it could."""
     from pp_studio.export.hull import hull_gaussians
     from pp_studio.export.result import write_model
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the training tells the same
+        warnings.simplefilter("ignore")  # the training gives the same warnings
         try:
             found = hull_gaussians(scene, options.masks if masks else None, options.device)
         except UserError:
@@ -296,7 +294,7 @@ def _wrote_hull(out, scene, title, options, masks):
 
 
 def _preset(minutes, share):
-    """That of so many minutes of a share of the processor; says so where others take the rest."""
+    """The preset for the minutes at a share of the processor; prints if other programs lower it."""
     quiet, chosen = (
         next(name for name, least in PRESET_FROM.items() if one >= least)
         for one in (minutes, share * minutes)
@@ -311,13 +309,13 @@ def _preset(minutes, share):
 
 
 def _share():
-    """Of the processor, what others leave: what is running already goes on beside the training."""
+    """The share of the processor left by running programs, which are expected to run on."""
     cores = os.cpu_count() or 1
     return cores / (cores + (os.getloadavg()[0] if hasattr(os, "getloadavg") else 0))
 
 
 def _is_scene(source):
-    """Whether it is one that `pp-cl train` reads; else there is no pose yet."""
+    """Whether `pp-cl train` can read the source; photographs have no poses yet."""
     from pp_cl.scene import scene_format
 
     if source != "demo" and not Path(source).exists():
@@ -333,14 +331,14 @@ def _is_scene(source):
 
 
 def _photographs(source):
-    """How many a capture takes."""
+    """How many photographs a capture uses."""
     from pp_studio.capture.frames import FRAMES, listed
 
     return len(listed(Path(source))) if Path(source).is_dir() else FRAMES
 
 
 def _hints(options):
-    """The words of a capture."""
+    """The arguments of a capture."""
     words = []
     if options.turntable is not None:
         words = ["--turntable" if options.turntable else "--no-turntable"]
@@ -355,7 +353,7 @@ def _hints(options):
 
 
 def _step(name, *words, note, **more):
-    """Run another command, as it would be typed. note: is told with it. more: of its run()."""
+    """Run a command as if typed. note: printed beside it. more: keyword arguments of its run()."""
     print(f"== pp-cl {name} {shlex.join(words)}  # {note}", flush=True)
     module = importlib.import_module(COMMANDS[name])
     parser = argparse.ArgumentParser(prog=f"pp-cl {name}")

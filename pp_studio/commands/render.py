@@ -1,4 +1,4 @@
-"""`pp-cl render`: renders a run along a path of cameras, as a video or as frames."""
+"""`pp-cl render`: renders a run along a camera path, as a video or as frames."""
 
 import argparse
 import math
@@ -22,11 +22,11 @@ MADE = ("orbit", "spiral")  # paths that the program makes
 SECONDS, FPS = 4, 30
 FASTEST_GIF = 50  # frames per second; browsers show faster ones slowly
 MOST_FRAMES = 100_000
-LEAST_HEIGHT = 720  # of an orbit or spiral; an even number, as the width beside it, for mp4
+LEAST_HEIGHT = 720  # least height of an orbit or spiral; mp4 needs an even width and height
 
 
 def _colour(text):
-    """The type of --background: a key of COLOURS, or sRGB in [0, 1]."""
+    """Convert --background: a key of COLOURS, or sRGB in [0, 1]."""
     if text in COLOURS:
         return text
     try:
@@ -107,7 +107,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Render the frames that are missing, and make a video of them where one is asked for."""
+    """Render the frames that are missing, and make a video of them if one is asked for."""
     from pp_cl import fastest, load
     from pp_cl.files import own
     from pp_studio.export.render_video import render_frames, render_video
@@ -144,7 +144,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _format(options):
-    """Of VIDEOS or IMAGES, as the name of --out and --format say."""
+    """One of VIDEOS or IMAGES, according to --out and --format."""
     suffix = Path(options.out).suffix[1:].lower() if options.out else ""
     if suffix in VIDEOS and options.format not in (None, suffix):
         raise UserError(
@@ -167,14 +167,14 @@ def _format(options):
 
 
 def _default(run, path, sizes, kind):
-    """Where a path is written that has no --out. sizes: {(width, height)} of its images."""
+    """Where to write without --out. sizes: {(width, height)} of the path's images."""
     name = Path(path).stem if Path(path).suffix else path
     name += "_{}x{}".format(*sizes.pop()) if len(sizes) == 1 else ""
     return run.folder.path / "render" / (f"{name}.{kind}" if kind in VIDEOS else name)
 
 
 def _style(options, kind):
-    """render_video.Style of the options."""
+    """The render_video.Style that the options describe."""
     from pp_studio.export.render_video import Style
 
     if options.background and kind == "exr":
@@ -188,7 +188,7 @@ def _style(options, kind):
 
 
 def _frame_count(options, kind):
-    """Frames of an orbit or spiral, 0 of other paths."""
+    """The number of frames of an orbit or spiral; 0 for other paths."""
     fps, seconds = options.fps, options.seconds
     if kind == "gif" and fps > FASTEST_GIF:
         raise UserError(f"--fps {fps:g}: a gif has at most {FASTEST_GIF} frames per second")
@@ -210,7 +210,7 @@ def _frame_count(options, kind):
 
 
 def _cameras(run, path, count, *, size, fov):
-    """The cameras of a path, `count` of an orbit or spiral, with size and angle of view."""
+    """The cameras of a path in a size and angle of view; `count` for an orbit or spiral."""
     from pp_cl.scene import read_cameras
     from pp_studio.camera_path import around
 

@@ -1,4 +1,4 @@
-"""`pp-cl sweep`: trains and measures many scenes, settings and seeds, with one table."""
+"""`pp-cl sweep`: trains and measures many scenes, settings and seeds, and prints one table."""
 
 import argparse
 import sys
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run what is missing, print the table. Raises Stopped where runs failed."""
+    """Run what is missing and print the table. Raises Stopped if runs failed."""
     from pp_cl import RunFolder
     from pp_cl.files import own
     from pp_studio.sweep import plan, table
@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
         try:
             if row := table.finished_row(job):
                 rows[job.folder], states[job.folder] = row, f"finished: {table.values_text(row)}"
-        except UserError as error:  # which the job meets again, and tells in its row
+        except UserError as error:  # the job raises it again and reports it in its row
             states[job.folder] = f"will fail: {error}"
     told = f"{len(jobs)} runs, {len(rows)} of them finished already"
     if options.dry_run:
@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
     own(out, [out / name for name in table.TABLES])
     if missing:
         rows |= _run(options, missing, len(jobs))
-    # folders as seen from `out`, which may be moved
+    # store folders relative to `out`, which may be moved
     ordered = [
         rows[job.folder] | {"folder": Path(job.folder).relative_to(out.resolve()).as_posix()}
         for job in jobs
@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _run(options, jobs, total):
-    """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after a signal."""
+    """Run the jobs, print a line as each ends; {folder: row}. Raises Stopped after a signal."""
     from pp_cl import separate_devices
     from pp_cl.commands.signals import first_signal
     from pp_cl.errors import require

@@ -20,7 +20,7 @@ EPILOG = """A scene: its cameras, and sparse points or visual hull. Its box can 
 dropped; both are written to pp_cl.json in its folder, which training, info and all other commands
 obey. Whoever reaches the port sees and steers the page."""
 LOOPBACKS = (LOOPBACK, "localhost", "::1")
-BROWSERS = ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")  # without these one for terminals would answer
+BROWSERS = ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")  # with none set, a terminal browser would open
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
 
 @contextmanager
 def following(training: "Training") -> Iterator["OnStep"]:
-    """Show a training in the browser while the block runs; gives what to call after each step."""
+    """Show a training in the browser during the block; yields its OnStep."""
     from pp_studio.view.run_view import shown_training
 
     with shown_training(training) as (address, show):
@@ -98,7 +98,7 @@ def following(training: "Training") -> Iterator["OnStep"]:
 
 
 def open_browser(address: str) -> None:
-    """Open an address in the browser, where there is one with windows."""
+    """Open an address in a graphical browser, if there is one."""
     if sys.platform in ("win32", "darwin") or any(name in os.environ for name in BROWSERS):
-        # some browsers answer only when they are closed, and must not keep the server waiting
+        # some browsers return only when closed; the server must not wait for them
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()

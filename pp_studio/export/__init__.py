@@ -1,15 +1,15 @@
 """Exports a run to other programs: videos, point clouds, meshes, a web page, rendered views."""
 
 QUICK, BEST = "quick", "best"
-# {quality of a splat: (steps that fit it, voxel sizes of the cells whose points begin as one, 0:
-# each alone)}
+# {quality of a splat: (steps of its fit, size in voxels of the cells whose points begin as one
+# Gaussian, 0: each point alone)}
 QUALITIES = {QUICK: (1500, 1.25), BEST: (7000, 0.0)}
 SCENE, VIEWER = AXES = "scene", "viewer"
 SPLATS, POINTS = ("splat", "splat-spz", "splat-glb"), ("ply", "glb")
-# {format of coordinates: whose axes they have, unless others are asked for}
+# {format of coordinates: the axes that it uses by default}
 AXES_OF = dict.fromkeys((*SPLATS, "textured"), VIEWER) | dict.fromkeys((*POINTS, "mesh"), SCENE)
-# {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder;
-# what it is)}
+# {format: (default name below RUN/export; suffixes of the file, none if it is a folder; what it
+# is)}
 FORMATS: dict[str, tuple[str, tuple[str, ...], str]] = {
     "splat": (
         "splat.ply",

@@ -32,8 +32,8 @@ from pp_studio.export import (
 
 
 def check_target(name: str, folder: Path, out: Path | None) -> Path:
-    """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says. Raises
-    UserError unless it can be written there, and no file is lost that `out` does not name.
+    """The path to which the format FORMATS[name] of the run in `folder` is written. out: from
+    --out. Raises UserError unless it can be written without losing a file that `out` does not name.
     """
     default, suffixes, _ = FORMATS[name]
     path = folder / "export" / default if out is None else out
@@ -60,9 +60,9 @@ def export_run(
     axes: str | None = None,
     others: Iterable[Run] = (),
 ) -> str:
-    """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
+    """Write a run in the format `name` of `pp-cl export`; returns in words what was written.
     min_weight, quality, box, axes: as the options. others: further runs of a gallery. Raises
-    UserError for what cannot be written, before which nothing is.
+    UserError, before anything is written, if the run cannot be exported.
     """
     if name not in FORMATS:
         raise UserError(f"no format {name}; choose from {', '.join(FORMATS)}")
@@ -71,7 +71,7 @@ def export_run(
     within, turn = None, np.eye(3)
     if box is not None:
         within = np.sort(np.reshape(box, (2, 3)), axis=0)
-        points.inside(run.model.positions(), within)  # an empty one is refused before any work
+        points.inside(run.model.positions(), within)  # an empty box is refused before any work
     if (axes or AXES_OF.get(name)) == VIEWER:
         turn = splat.upright(run, splat.Y_DOWN if name == "splat" else splat.Y_UP)
 
@@ -131,22 +131,22 @@ def export_run(
         else:
             colours = gltf.gltf_colours(found.colours / 255)
             write = partial(gltf.write_glb, path, {"POSITION": found.positions, "COLOR_0": colours})
-    if path.parts[-2:] == ("export", FORMATS[name][0]):  # of a file that has no --out
+    if path.parts[-2:] == ("export", FORMATS[name][0]):  # the default folder, without --out
         own(path.parent)
     write()
     return told
 
 
 def _faces(count, seen):
-    """How many faces there are, and how many of them are guessed, in words."""
+    """The number of faces, and how many of them are guessed, in words."""
     guessed = f" ({count - seen} of them guessed)" if seen < count else ""
     return f"{count} faces{guessed}"
 
 
 def renderings(run: Run) -> dict[str, list[View]]:
-    """{split: views}: those of train and test at the run's resolution, each image the run's
-    rendering of it as straight RGBA; where the run's scene has no test views, or none that can be
-    read, those are left out with a warning that says why.
+    """{split: views} of train and test at the run's resolution; each image is the run's rendering,
+    in straight RGBA. If the scene has no readable test views, they are left out with a warning that
+    says why.
     """
     splits = {"train": run.image_files("train")}
     try:

@@ -1,5 +1,5 @@
-"""The depth maps of training views, fused into one signed distance field, a TSDF (Curless and Levoy
-1996), and closed where no view shows anything.
+"""Fuses the depth maps of training views into a signed distance field, a TSDF (Curless and Levoy
+1996), and closes it where no view shows anything.
 """
 
 from collections.abc import Iterable
@@ -11,24 +11,24 @@ from scipy.spatial import ConvexHull, QhullError
 from pp_cl import Camera, RenderedView
 from pp_cl.engine import Grid
 
-TRUNCATION = 4.0  # of the distances, in voxel sizes: depths scatter by one or two
-# What a view in which a vertex is hidden says for its being inside, in views. Without it, one ray
-# that slips between the points hollows out what all other views hide.
+TRUNCATION = 4.0  # distances are clipped at this many voxel sizes; depths scatter by one or two
+# The weight, in views, with which a view that does not see a vertex says that it is inside. Without
+# it, one ray that slips between the points hollows out what all other views hide.
 HIDDEN = 0.03
 COVERED = 0.5  # alpha from which a pixel shows the object
-SEEN = 2  # views whose surface is near a vertex, which one alone may be wrong about
-MARGIN = 2  # vertices around the points, so that the surface is closed
-SLAB = 1 << 20  # vertices that are projected at once: 50 MB of temporary arrays
-PLANES = 1 << 21  # distances of vertices to planes that are compared at once
+SEEN = 2  # views that must show a surface near a vertex; one alone may be wrong
+MARGIN = 2  # vertices added around the points, so that the surface is closed
+SLAB = 1 << 20  # vertices projected at once: 50 MB of temporary arrays
+PLANES = 1 << 21  # distances from vertices to planes compared at once
 
 
 class Fused(NamedTuple):
-    """What views say of a grid's vertices; (nz, ny, nx) float32 each.
+    """What the views tell about a grid's vertices; each field is (nz, ny, nx) float32.
 
-    distances: in [-1, 1], the mean over the views of each vertex's distance to what they show,
-    along the cameras' axes, in TRUNCATION voxel sizes, negative inside. near: how many views show
-    their surface within TRUNCATION voxel sizes of it. scatter: the standard deviation of what these
-    say its distance is, in voxel sizes.
+    distances: in [-1, 1], the mean over the views of each vertex's distance to the surface they
+    show, along the cameras' axes, in TRUNCATION voxel sizes, negative inside. near: how many views
+    show their surface within TRUNCATION voxel sizes of it. scatter: the standard deviation of the
+    distances in these views, in voxel sizes.
     """
 
     distances: np.ndarray
@@ -37,7 +37,7 @@ class Fused(NamedTuple):
 
 
 def box_around(grid: Grid, ids: np.ndarray) -> Grid:
-    """The part of a grid around its vertices ids (N,), MARGIN wider on every side."""
+    """The part of a grid that holds its vertices ids (N,), MARGIN wider on every side."""
     ijk = grid.coordinates(ids)
     first, last = ijk.min(0) - MARGIN, ijk.max(0) + MARGIN
     origin = np.asarray(grid.origin) + grid.voxel_size * first
@@ -45,10 +45,10 @@ def box_around(grid: Grid, ids: np.ndarray) -> Grid:
 
 
 def fuse(grid: Grid, views: Iterable[tuple[Camera, RenderedView]], hidden: float = HIDDEN) -> Fused:
-    """What views say of a grid's vertices.
+    """Fuse the depth maps of views at a grid's vertices.
 
-    A view says nothing of vertices outside its image, and counts as `hidden` views for those more
-    than TRUNCATION voxel sizes behind its surface. What no view says anything of is inside.
+    A view ignores vertices outside its image, and counts as `hidden` views for those more than
+    TRUNCATION voxel sizes behind its surface. Vertices that all views ignore are inside.
     """
     total, count, near, first_moment, second_moment = (
         np.zeros(grid.dims[::-1], np.float32) for _ in range(5)
@@ -84,13 +84,13 @@ def fuse(grid: Grid, views: Iterable[tuple[Camera, RenderedView]], hidden: float
 
 
 def closed(grid: Grid, fused: Fused, points: np.ndarray) -> np.ndarray:
-    """The distances of what a grid's vertices hold, where fewer than SEEN views show a surface no
-    farther out than the convex hull of points (N, 3) of it: a base that no camera saw is flat.
+    """The distances of a grid's vertices, with the object cut at the convex hull of its points
+    (N, 3) where fewer than SEEN views show a surface: a base that no camera saw is flat.
     """
     distances = fused.distances.copy()
     try:
         planes = np.unique(ConvexHull(points).equations.round(9), axis=0)
-    except QhullError:  # all in one plane
+    except QhullError:  # all points lie in one plane
         return distances
     unseen = np.flatnonzero((fused.near < SEEN) & (distances < 0))
     normals, offsets = (

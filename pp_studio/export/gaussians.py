@@ -1,8 +1,8 @@
-"""Gaussians of three axes fitted to a run's images, and where these are few to its renderings
-of as many views between them, as viewers of 3D Gaussian splatting draw them: without a network,
-each widened by a third of a pixel^2, and colours below 0 taken for black. A step draws them for a
-window of another size. It is the trainer's, with the footprint "gaussian" and means of features in
-place of the network.
+"""Fits Gaussians with three axes to a run's images and, if these are few, to the run's renderings
+of as many views between them. They are drawn as viewers of 3D Gaussian splatting do: without a
+network, each widened by a third of a pixel^2, and colours below 0 shown as black. Each step draws a
+window of another size. The trainer is the usual one, with the footprint "gaussian" and means of
+features as its network.
 """
 
 import hashlib
@@ -46,32 +46,32 @@ GAUSSIAN = np.dtype(
         ("turn", "<f4", 4),
     ]
 )
-LEAST_OPAQUE = 1 / 255  # what viewers leave out
-FIRST_VIEWS = 16  # of which the points have their colours before the fit
-LOW_PASS = 0.3  # pixels^2, by which they widen all on the screen
+LEAST_OPAQUE = 1 / 255  # viewers leave out Gaussians of less opacity
+FIRST_VIEWS = 16  # views that colour the points before the fit
+LOW_PASS = 0.3  # pixels^2 that viewers add to all variances on the screen
 
-# Pixels on the longer side of the smallest window for which splats are made; in smaller ones
-# viewers widen Gaussians by more than points are apart, and to try costs all others some dB.
+# Pixels on the longer side of the smallest window for which splats are made. In smaller ones
+# viewers widen Gaussians by more than the points' spacing; to fit these costs all others some dB.
 WINDOW = 600
-DOUBLINGS = 2.0  # from there to the largest
-# Images that need no renderings beside them, which cost lego's 200 views 0.2 dB and give 0.3
+DOUBLINGS = 2.0  # of the window's size, from the smallest to the largest
+# With this many images, renderings are not added: they cost lego's 200 views 0.2 dB, but give 0.3
 # to the 57 of ethiopian_head.
 ENOUGH = 200
-LARGEST = 800  # pixels to which images are reduced, about: of more, a crop would show too little
+LARGEST = 800  # images are reduced to about this many pixels, or a crop would show too little
 CROP = 192  # pixels on each side of a step's crop
-EARLY_STOP = 1e-4  # of viewers
-# Of alpha in the loss: images are over white, on which pale Gaussians beside the object cost
-# nothing; viewers have dark backgrounds, too. After 150 steps ethiopian_head has 0.3 dB more over
-# black, and as much over white.
+EARLY_STOP = 1e-4  # the viewers' value
+# Weight of alpha in the loss. Images are over white, where pale Gaussians beside the object cost
+# nothing, but viewers have dark backgrounds, too. After 150 steps ethiopian_head has 0.3 dB more
+# over black, and as much as before over white.
 MASK_WEIGHT = 0.5
-# Steps that build the kernels, after which the time of the others is known, and that a fit in some
-# minutes has in any case.
+# The kernels are built in the first steps; after TIMED steps, the time of a step is known. A fit
+# with limited minutes makes at least FEWEST steps.
 BUILDING, TIMED, FEWEST = 3, 10, 40
-# Of a Gaussian before it is fitted, in radii of the soft disc, whose alpha falls linearly to its
-# rim: the root of its second moment. With the disc's opacity it covers 0.91 of the disc.
+# Standard deviation of a Gaussian before the fit, in radii of the soft disc: the root of the disc's
+# second moment (alpha falls linearly to its rim). With its opacity it covers 0.91 of it.
 DEVIATION = 0.39
-MOST_OPAQUE = 0.99  # what viewers clamp to
-# 3D Gaussian splatting's functions of degrees 0 to 2 are basis()'s in this order, times these.
+MOST_OPAQUE = 0.99  # viewers clamp to this
+# 3D Gaussian splatting's functions of degrees 0 to 2: basis() in this order, times these factors.
 ORDER = [0, 2, 3, 1, 4, 5, 7, 6, 8]
 CONSTANT = 0.28209479177387814
 FACTORS = np.array(
@@ -92,11 +92,11 @@ class Gaussians(NamedTuple):
     float64. deviations: (3,) float32, standard deviations along a Gaussian's own axes (what files
     call scales, without a logarithm). turn: (4,) float32, the unit quaternion (w, x, y, z) that
     turns these axes to the world's. opacity: float32 in (1/255, 0.99], after the sigmoid.
-    harmonics: (9, 3) float32, coefficients of degrees 0 to 2 for the three channels of sRGB less
-    0.5, basis and signs of 3D Gaussian splatting, of the unit direction from the eye to the mean.
+    harmonics: (9, 3) float32, coefficients of degrees 0 to 2 for sRGB less 0.5, in 3D Gaussian
+    splatting's basis and signs, of the unit direction from the eye to the mean.
 
-    windows: least and most pixels of a window, for one of the run's images each way, in which they
-    look right with all variances on the screen widened by low_pass, pixels^2.
+    windows: least and most pixels of a window per pixel of the run's images, each way, for which
+    they look right when low_pass, pixels^2, is added to all variances on the screen.
     """
 
     table: np.ndarray
@@ -106,7 +106,7 @@ class Gaussians(NamedTuple):
 
 
 class WindowCrops(Crops):
-    """Crops as windows of any size show them: a pixel is the mean of several of a window's."""
+    """Crops as windows of any size show them: each pixel is the mean of several window pixels."""
 
     def __init__(self, views: list[View], config: Config):
         super().__init__(views, config.train, 0)
@@ -121,20 +121,20 @@ class WindowCrops(Crops):
 
 
 def windows(longest: float) -> tuple[float, float]:
-    """Least and most pixels of a window, for one pixel of images of `longest` ones, each way, of
-    the windows for which Gaussians are made.
+    """The least and most window pixels per image pixel, each way, for which Gaussians are made.
+    longest: the images' longest side, in pixels.
     """
-    least = min(max(WINDOW / longest, 1.0), 2.0)  # from the images' own pixels to a quarter of them
+    least = min(max(WINDOW / longest, 1.0), 2.0)  # 1 to 4 pixels of a window for one of an image
     return least, least * 2**DOUBLINGS
 
 
 def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) -> PointCloud:
-    """Gaussians that are fitted in so many steps, or as many as take these minutes, from the points
-    that training views show, those in a cubic `cell`, in voxel sizes, as one; 0: each point. Of the
-    features of their SH, which are 3D Gaussian splatting's, the first three are sRGB colour.
+    """Fit Gaussians in `steps` steps, or as many as fit in `minutes`. They begin at the points that
+    training views show. cell: voxel sizes; the points in a cube of this side begin as one; 0: each
+    alone. Their SH are 3D Gaussian splatting's, with sRGB colour as the first three features.
     """
     end = time.monotonic() + 60 * minutes
-    dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell)  # the first of many steps
+    dev, cloud = run.dev, begun(run, fit_harmonics(run, steps=1), cell)  # the fit does the rest
     model = Model(dev, run.model.grid, run.model.depth_range, cloud, net=FirstFeatures(dev))
     views = _fitted_views(run)
     if len(views) < ENOUGH:
@@ -165,9 +165,9 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
 
 
 def fitted_gaussians(run: Run, quality: str | None = None, minutes: float = math.inf) -> Gaussians:
-    """The run's Gaussians, fitted once for a checkpoint and kept in the run's folder as FILE, which
-    later calls read. quality: one of QUALITIES; None: what is kept, else QUICK. minutes: at most,
-    which costs steps. Raises UserError as check_drawable does.
+    """The run's Gaussians, fitted once per checkpoint and kept as FILE in the run's folder for
+    later calls. quality: one of QUALITIES; None: any that is kept, else QUICK. minutes: limits the
+    fit to fewer steps. Raises UserError as check_drawable does.
     """
     check_drawable(run)
     if found := kept_gaussians(run, [quality] if quality else QUALITIES):
@@ -182,8 +182,8 @@ def fitted_gaussians(run: Run, quality: str | None = None, minutes: float = math
 
 
 def kept_gaussians(run: Run, qualities: Iterable[str] = QUALITIES) -> Gaussians | None:
-    """What fitted_gaussians() has kept for the run's checkpoint, if that is of one of these
-    qualities and not damaged, else None.
+    """The Gaussians that fitted_gaussians() kept for the run's checkpoint in one of these
+    qualities; None if there are none or the file is damaged.
     """
     try:
         with np.load(run.folder.path / FILE) as stored:
@@ -203,8 +203,8 @@ def _fitted(run, table):
 
 
 def first_gaussians(run: Run) -> Gaussians:
-    """As fitted_gaussians(), but before the fit, in seconds: round, as wide as the points, with the
-    means of the colours that the network gives them. Raises UserError as check_drawable does.
+    """Like fitted_gaussians(), but in seconds, without a fit: round, as wide as the points, each
+    with the mean of the colours that the network gives it. Raises UserError as check_drawable does.
     """
     check_drawable(run)
     cloud = begun(run, fit_harmonics(run, steps=-1, most=FIRST_VIEWS), 0)
@@ -220,7 +220,7 @@ def _key(run, quality):
 
 
 def _table(run, cloud):
-    """The visible ones as records of GAUSSIAN, relative to the centre of the run's grid."""
+    """Records of GAUSSIAN for a cloud's visible Gaussians, relative to the grid's centre."""
     opacity, offset = cloud.opacity.get()[:, 0].clip(0, MOST_OPAQUE), cloud.offset.get()
     rows, grid = np.flatnonzero(opacity > LEAST_OPAQUE), run.model.grid
     vertices = grid.positions(cloud.ids.get()[rows]) - grid.centre
@@ -229,19 +229,19 @@ def _table(run, cloud):
     table["harmonics"] = np.concatenate([block.get()[rows, :, :3] for block in cloud.sh], axis=1)
     table["harmonics"][:, 0] -= 0.5 / CONSTANT
     table["opacity"] = opacity[rows]
-    deviation = run.config.raster.radius * DEVIATION * grid.voxel_size  # of one without offsets
-    lower = np.zeros((len(rows), 3, 3))  # L of the covariances L L^T, by cl/cloud.h
+    deviation = run.config.raster.radius * DEVIATION * grid.voxel_size  # of one whose offset is 0
+    lower = np.zeros((len(rows), 3, 3))  # L of the covariances L L^T, as in cl/cloud.h
     lower[:, range(3), range(3)] = np.exp(offset[rows, 3:6])
     lower[:, [1, 2, 2], [0, 0, 1]] = offset[rows, 6:9]
     axes, table["deviations"], _ = np.linalg.svd(deviation * lower)
-    axes[..., 2] *= np.linalg.det(axes)[:, None]  # no mirror
+    axes[..., 2] *= np.linalg.det(axes)[:, None]  # a rotation without reflection
     table["turn"] = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
     return table
 
 
 def drawn_by(run: Run, gaussians: Gaussians) -> Run:
     """The run with its Gaussians in place of its points and network: its render() draws them as
-    viewers do, for cameras of window_camera().
+    viewers do, with cameras from window_camera().
     """
     dev, grid, table = run.dev, run.model.grid, gaussians.table
     place = table["position"] / grid.voxel_size + (np.asarray(grid.dims) - 1) / 2
@@ -267,16 +267,16 @@ def drawn_by(run: Run, gaussians: Gaussians) -> Run:
 
 
 def window_camera(camera: Camera, finer: float, gaussians: Gaussians) -> Camera:
-    """A camera for a run of drawn_by() that shows Gaussians as the nearest window does for which
-    they are made. finer: how many of its pixels there are for one of the run's images, each way.
+    """A camera for drawn_by() that shows Gaussians as the nearest window for which they are made
+    does. finer: pixels of the camera per pixel of the run's images, each way.
     """
     least, _ = gaussians.windows
     return replace(camera, samples=max(1.0, least / finer))
 
 
 def check_drawable(run: Run) -> None:
-    """Raise UserError unless the run's points are composited by alpha, with soft footprints: no
-    others are drawn without the network.
+    """Raise UserError unless the run composites its points by alpha, with soft footprints: only
+    such points can be drawn without the network.
     """
     raster = run.config.raster
     if (raster.blend, raster.footprint) != ("alpha", "soft"):
@@ -288,7 +288,7 @@ def check_drawable(run: Run) -> None:
 
 
 def _fitted_views(run):
-    """The run's training views; none if exposures differ, or, with a warning, they are gone."""
+    """The run's training views; none if exposures differ or, with a warning, if they are gone."""
     try:
         views = [] if run.header.get("exposed") else run.scene("train").splits["train"]
     except UserError as error:
@@ -299,9 +299,9 @@ def _fitted_views(run):
 
 
 def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
-    """The run's points as Gaussians, without those that have no coefficients (N, 9, 3) of basis().
-    cell: voxel sizes; the points in a cube of them become one of their mean, covariance and colour
-    that absorbs as much light. 0: none do.
+    """The run's points as Gaussians, except those without coefficients (N, 9, 3) of basis(). cell:
+    voxel sizes; the points in a cube of this side become one Gaussian of their mean, covariance and
+    colour that absorbs as much light; 0: each stays alone.
     """
     dev, cloud, grid = run.dev, run.model.cloud, run.model.grid
     rows = np.flatnonzero(coefficients.any((1, 2)))
@@ -311,12 +311,12 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     opacity = cloud.opacity.get()[rows, 0].clip(0, MOST_OPAQUE)
     vertices = (grid.positions(ids) - grid.origin) / grid.voxel_size
     places, unit = vertices + moved[:, :3], DEVIATION * run.config.raster.radius
-    area = (unit * np.exp(moved[:, 3])) ** 2  # of a round one, in voxel sizes, over 2 pi
-    one = np.arange(len(rows))  # the Gaussian of a point
+    area = (unit * np.exp(moved[:, 3])) ** 2  # area of a round one, in voxel sizes, over 2 pi
+    one = np.arange(len(rows))  # the Gaussian of each point
     if cell:
         one = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
     count = one.max() + 1
-    weight = area * opacity + 1e-6  # of those that are invisible, too, if they are alone
+    weight = area * opacity + 1e-6  # above 0, also for a lone invisible point
     total = np.bincount(one, weight, count)[:, None]
 
     def mean(values):
@@ -328,9 +328,9 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     spread = mean(apart[:, :, None] * apart[:, None]).reshape(-1, 3, 3)
     spread += mean(area)[..., None] * np.eye(3)
     lengths = np.linalg.eigvalsh(spread)
-    seen = np.sqrt(lengths[:, 1] * lengths[:, 2])  # as area
+    seen = np.sqrt(lengths[:, 1] * lengths[:, 2])  # area over 2 pi of the merged one
     absorbed = np.bincount(one, -np.log1p(-opacity) * area, count) / seen
-    # Each is kept at the vertex of the first of its points, which no other has.
+    # Each Gaussian is kept at the vertex of its first point, which no other one has.
     first = np.unique(one, return_index=True)[1]
     order = np.argsort(ids[first])
     first, lower = first[order], np.linalg.cholesky(spread)[order] / unit
@@ -346,9 +346,9 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
 
 
 def config_of(run: Run, steps: int) -> Config:
-    """What the trainer follows here, and how the Gaussians are drawn."""
-    # Colours, which begin nearly right, would diverge with their default rates, many times these;
-    # shapes have the longest way. In few steps both must go faster.
+    """The settings with which Gaussians are trained and drawn here."""
+    # Colours begin nearly right and would diverge at their default rates, which are many times
+    # these; shapes have the farthest to go. With few steps both must go faster.
     faster = (QUALITIES[BEST][0] / steps) ** 0.25
     raster = replace(
         run.config.raster,
@@ -369,12 +369,12 @@ def config_of(run: Run, steps: int) -> Config:
         distortion_weight=0.0,
         exposure="off",
         sh_smoothing=0.0,
-        prune_weight=0.0,  # points are judged in images, where larger windows show more
+        prune_weight=0.0,  # images judge points, but larger windows show more
         rate_steps=0,
         sh_rate=(1.2e-2 * faster, 6e-3 * faster, 3e-3 * faster),
         opacity_rate=(2.3e-2, 6.8e-3),
         offset_rate=(4e-2 * faster, 4e-3 * faster),
-        view_opacity="off",  # splats have neither this
-        specular="off",  # nor this
+        view_opacity="off",  # splats have no such term
+        specular="off",  # nor this one
     )
     return replace(run.config, raster=raster, train=train)

@@ -1,4 +1,4 @@
-"""glTF 2.0 in one binary file (GLB): points, Gaussians or triangles with attributes."""
+"""Writes glTF 2.0 as one binary file (GLB): points, Gaussians or triangles with attributes."""
 
 import json
 import struct
@@ -9,8 +9,8 @@ import numpy as np
 
 from pp_cl.files import atomic_file, srgb_to_linear
 
-POINTS, TRIANGLES = 0, 4  # of a primitive
-UNLIT = "KHR_materials_unlit"  # the light of the photographs is in the colours
+POINTS, TRIANGLES = 0, 4  # modes of a primitive
+UNLIT = "KHR_materials_unlit"  # the colours already contain the light of the photographs
 TYPES = {np.dtype("f4"): 5126, np.dtype("u2"): 5123, np.dtype("u4"): 5125}
 
 
@@ -23,12 +23,12 @@ def write_glb(
     extras: dict[str, Any] | None = None,
 ) -> None:
     """Write vertices. attributes: {name: (M,) or (M, K) array of float32, or of uint16 for 0 to 1},
-    POSITION (M, 3) among them, in world coordinates. faces: (F, 3) vertices of triangles; None:
-    points. extension: of the primitive, its name and JSON. extras: JSON of the mesh. Raises
+    which includes POSITION (M, 3), in world coordinates. faces: (F, 3) vertices of triangles; None:
+    points. extension: name and JSON of the primitive's extension. extras: JSON of the mesh. Raises
     UserError as atomic_file does.
 
-    Positions in glTF are float32, so those of float64 are moved to the origin, and the file's node
-    moves them back.
+    glTF stores positions as float32, so float64 positions are moved to the origin, and the file's
+    node moves them back.
     """
     place, arrays = attributes["POSITION"], dict(attributes)
     origin = np.rint(place.mean(0)) if place.dtype == np.float64 else np.zeros(3)
@@ -59,7 +59,7 @@ def write_glb(
         "bufferViews": views,
         "buffers": [{"byteLength": len(content)}],
     }
-    if faces is not None:  # without a material it would be metal
+    if faces is not None:  # without a material, viewers show metal
         gltf["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}}]
         make_unlit(gltf)
     if extras:
@@ -76,15 +76,15 @@ def write_glb(
 
 
 def make_unlit(gltf: dict[str, Any]) -> None:
-    """Have viewers that know how show the materials of a glTF document without lamps."""
+    """Mark a glTF document's materials as unlit, for viewers that support this."""
     for material in gltf.get("materials", ()):
         material["extensions"] = {UNLIT: {}}
     gltf["extensionsUsed"] = [*gltf.get("extensionsUsed", ()), UNLIT]
 
 
 def gltf_colours(colours: np.ndarray) -> np.ndarray:
-    """(M, 4) uint16 linear RGBA of sRGB (M, 3) in [0, 1], clipped to it: glTF 2.0 keeps vertex
-    colours in linear light, of which 8 bits would hold 6 of the 40 darkest levels of sRGB.
+    """(M, 4) uint16 linear RGBA of sRGB (M, 3) clipped to [0, 1]. glTF 2.0 stores vertex colours in
+    linear light, where 8 bits would hold only 6 of the 40 darkest levels of sRGB.
     """
     linear = np.rint(65535 * srgb_to_linear(colours.clip(0, 1))).astype(np.uint16)
     return np.column_stack([linear, np.full(len(colours), 65535, np.uint16)])

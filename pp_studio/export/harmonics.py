@@ -1,9 +1,9 @@
-"""What the points of a run add to its training views, and spherical harmonics of colour that are
-fitted to each point by it, so that viewers can draw a run without the network.
+"""Measures what each point of a run contributes to its training views, and fits spherical harmonics
+of colour to each point, so that viewers can draw the run without the network.
 
-An image is linear in the points' coefficients: the blend weights of its pixels, which are known,
-times the colours of the points in the directions from the eye. The coefficients minimise the
-squared differences from the run's own renderings of the training views, by conjugate gradients.
+An image is linear in the points' coefficients: it is the known blend weights of its pixels times
+the colours of the points in the directions from the eye. The coefficients minimise the squared
+differences from the run's own renderings of the training views, by conjugate gradients.
 """
 
 from collections.abc import Iterator
@@ -17,18 +17,18 @@ from pp_cl import Camera, Run, track
 from pp_cl.engine import RenderResult, evenly
 
 COUNT = 9  # functions of basis()
-COLOURS = slice(3)  # of the 16 features that are blended here; that behind them is 0 in all points
-# Ridge on all but the constant function, per blend weight: a point that few views show has no
-# slopes. On the demo's test views, 0.003 is 0.8 dB better than 0.03.
+COLOURS = slice(3)  # used here of the 16 blended features; the next is 0 in all points
+# Ridge on all functions but the constant one, per blend weight: a point that few views show keeps
+# no slopes. On the demo's test views, 0.003 is 0.8 dB better than 0.03.
 RIDGE = 0.003
-LEAST = 1e-6  # weight of the ridge where a point is never seen: its colour stays 0
+LEAST = 1e-6  # ridge weight of a point that is never seen: its colour stays 0
 
 
 @dataclass
 class Observation:
-    """A run's N points in a view of H x W pixels; gone once the next view is asked for. It is a
-    linear map, the blend weights (HW, S) of the visible points, which blended() applies and
-    gathered() transposes, both where it was observed with blending=True.
+    """A run's N points in a view of H x W pixels, valid until the next view is requested. The blend
+    weights (HW, S) of the visible points are a linear map: blended() applies it and gathered() its
+    transpose, both only if blending=True was passed to observe().
     """
 
     run: Run
@@ -48,24 +48,24 @@ class Observation:
         return self.view.weights.visible.get()
 
     def blended(self, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """((HW, 3), (HW,)) float32: colours (S, 3) blended by the weights, and what the weights of
-        a pixel leave of 1.
+        """((HW, 3), (HW,)) float32: colours (S, 3) blended by the weights, and 1 less the sum of
+        each pixel's weights.
         """
         rows = np.zeros((len(colours), 16), np.float32)
         rows[:, COLOURS] = colours
         pixels = self.run.renderer.blend(self.view, rows).reshape(-1, 16)
-        rest = pixels[:, 3]  # of the background, whose features are 1
+        rest = pixels[:, 3]  # weight of the background, whose features are 1
         return pixels[:, COLOURS] - rest[:, None], rest
 
     def gathered(self, pixels: np.ndarray) -> np.ndarray:
-        """(S, 3) float32: of each point, the sum over the pixels (HW, 3) times its weights."""
+        """(S, 3) float32: for each point, the sum of the pixels (HW, 3) times its weights there."""
         features = np.zeros((self.camera.height, self.camera.width, 16), np.float32)
         features[..., COLOURS] = pixels.reshape(*features.shape[:2], 3)
         return self.run.renderer.gather(self.view, features)[:, COLOURS]
 
     def functions(self, positions: np.ndarray) -> np.ndarray:
-        """(S, 9) float32: basis() of the directions from the eye to the visible ones of the points,
-        which lie at positions (N, 3).
+        """(S, 9) float32: basis() of the directions from the eye to the visible points. positions:
+        (N, 3), of all points.
         """
         towards = positions[self.visible] - self.camera.eye
         return basis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
@@ -74,11 +74,11 @@ class Observation:
 def observe(
     run: Run, cameras: list[Camera], text: str, *, blending: bool = False
 ) -> Iterator[Observation]:
-    """What the points contribute to each camera's view, in turn. text: of the progress bar."""
+    """Yield the Observation of each camera in turn. text: label of the progress bar."""
     seen = None
     for camera in track(cameras, text, "view"):
         if seen:
-            del seen.view  # else its arrays would stay beside the larger ones of this view
+            del seen.view  # frees its arrays before the next view makes larger ones
         seen = _look(run, camera, blending)
         yield seen
 
@@ -97,14 +97,14 @@ def basis(towards: np.ndarray) -> np.ndarray:
 
 
 def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
-    """(N, 9, 3) float32: coefficients of basis(), of the sRGB colour of each of the run's points, 0
-    of those that no view shows. most: of the training views, spread evenly; None: all.
+    """(N, 9, 3) float32: coefficients of basis() for the sRGB colour of each of the run's points; 0
+    for points that no view shows. most: use this many training views, spread evenly; None: all.
 
-    Colours are blended as the features are, over white, and clamped at last: one point's may lie
+    Colours are blended like features, over white, and clamped only then: a point's own may lie
     outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
-    gradients, preconditioned by A's blocks of a point. Views are weighed anew in each, since the
-    weights of all would fill the memory. steps: -1 takes what the preconditioner makes of b alone:
-    means of the colours of a point's pixels, by its weights.
+    gradients, preconditioned by each point's block of A. Each step recomputes the views' weights,
+    since those of all views would fill the memory. steps: -1 applies the preconditioner to b alone:
+    each point gets the weighted mean colour of its pixels.
     """
     cameras, n = evenly(run.cameras("train"), most), run.model.cloud.count
     positions = run.model.positions()

@@ -1,4 +1,4 @@
-"""What can be shown before a training: the visual hull of a scene's masks, coloured from its
+"""Makes what can be shown before a training: the visual hull of a scene's masks, coloured from its
 photographs, as flat Gaussians on its surface.
 """
 
@@ -15,37 +15,37 @@ from pp_cl.engine import View, evenly
 from pp_cl.scene import agreeing, build_grid, open_scene, scene_box, shrink
 from pp_studio.export.gaussians import CONSTANT, GAUSSIAN, Gaussians
 
-PRESET = "tiny"  # whose image size colours are read at: a training begins with it, too
-POINTS = 400_000  # of the hull, inside and on its surface: some 50,000 are shown
+PRESET = "tiny"  # colours are read at its image size; a training begins with it, too
+POINTS = 400_000  # in the hull and on its surface; some 50,000 are shown
 SMOOTHING = 1.0  # standard deviation, in voxel sizes, of the Gaussian that smooths the surface
-MOST_VIEWS = 48  # of which a colour is the median
-FACING = 0.35  # cosine between the normal and the direction to the eye, from which a view counts
-OPAQUE = 250  # alpha of pixels that hold nothing of the background
-BEHIND = 3.0  # voxel sizes: a point further behind the nearest one of its pixel is hidden
-# Standard deviations, in voxel sizes, along the surface and across it, and opacity: neighbours
+MOST_VIEWS = 48  # a colour is the median over at most this many views
+FACING = 0.35  # least cosine between the normal and the direction to the eye for a view to count
+OPAQUE = 250  # least alpha of pixels that contain no background
+BEHIND = 3.0  # a point this many voxel sizes behind its pixel's nearest one is hidden
+# Standard deviations, in voxel sizes, along and across the surface, and opacity: neighbours
 # overlap, so that nothing shines through.
 ALONG, ACROSS, OPACITY = 0.8, 0.2, 0.95
-UNSEEN = 0.6  # the grey of what no view shows well
+UNSEEN = 0.6  # grey of points that no view shows well
 
 
 def hull_gaussians(
     scene: str, masks: str | None = None, device: str | None = None
 ) -> tuple[Gaussians, list[Camera]] | None:
-    """(the coloured hull, the cameras of the photographs at their reduced size); None without any
-    mask. scene, masks, device: as `pp-cl train` takes them. Raises UserError where the masks leave
-    no hull.
+    """(the coloured hull, the cameras of the photographs at their reduced size); None if there are
+    no masks. scene, masks, device: as for `pp-cl train`. Raises UserError if the masks leave no
+    hull.
     """
     dev = open_device(device)
     config = scene_config(scene, PRESET, [("scene.masks", masks, "--masks")] if masks else [])
     views, box = open_scene(dev, config, ("train",)).splits["train"], scene_box(config)
     if not any(view.has_mask for view in views):
-        return None  # there is nothing but a box
+        return None  # without masks, the hull is only a box
     with Progress("carving the visual hull"):
         views, _, forgiven = agreeing(dev, views, box)
         hull = build_grid(dev, views, POINTS, box, forgiven)
     inside = np.zeros(hull.grid.dims, np.float32)
     inside[tuple(hull.grid.coordinates(hull.ids).T)] = 1
-    # room around it, so that the surface is closed
+    # empty cells around the hull, so that the surface is closed
     room = 3
     field = gaussian_filter(np.pad(inside, room), SMOOTHING)
     places, _, normals, _ = marching_cubes(field, 0.5)
@@ -64,8 +64,8 @@ def hull_gaussians(
 def median_colours(
     views: Sequence[View], positions: np.ndarray, normals: np.ndarray, spacing: float
 ) -> np.ndarray:
-    """(N, 3) in [0, 1]: the median sRGB colour of points (N, 3) with outward normals (N, 3), which
-    lie so far apart, in the views that face them, and in which nothing hides them.
+    """(N, 3) in [0, 1]: the median sRGB colour of points (N, 3) over the views that face their
+    outward normals (N, 3) and in which nothing hides them. spacing: the distance between points.
     """
     seen = np.full((len(views), len(positions), 3), np.nan, np.float32)
     for colours, view in zip(seen, track(views, "colours of the hull", "view"), strict=True):
@@ -74,7 +74,7 @@ def median_colours(
         towards = camera.eye - positions
         facing = (normals * towards).sum(1) > FACING * np.linalg.norm(towards, axis=1)
         column, row, is_shown = camera.pixels(positions)
-        # the nearest depth, in cells as wide as points are apart
+        # the nearest depth in each cell; cells are about as wide as the points' spacing
         cell = max(1, int(np.ceil(1.5 * spacing * camera.fx / np.median(depth))))
         shape = -(-camera.height // cell), -(-camera.width // cell)
         at = row[is_shown] // cell, column[is_shown] // cell

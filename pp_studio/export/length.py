@@ -1,4 +1,4 @@
-"""True size: how many metres a unit of a run's scene is, from one length that is known."""
+"""True size: how many metres a unit of a run's scene is, from one known length."""
 
 import json
 import re
@@ -18,7 +18,7 @@ OPAQUE = 0.5  # least alpha of a pixel that shows the object
 
 
 def metres_per_unit(run: Run) -> float:
-    """What set_length() has found, 1 before it was called. Raises UserError for a broken file."""
+    """The scale that set_length() stored, else 1. Raises UserError for a broken file."""
     path = run.folder.path / FILE
     if not path.exists():
         return 1.0
@@ -34,9 +34,9 @@ def metres_per_unit(run: Run) -> float:
 
 
 def set_length(run: Run, first: str, second: str, metres: float) -> float:
-    """Keep in the run's folder that two points of the object are so many metres apart, and return
-    how many a unit of the scene is; all exports of coordinates are in metres from then on. first,
-    second: PHOTO:X,Y, as `surface_point`. Raises UserError for two points at one place.
+    """Store in the run's folder that two points of the object are `metres` apart, and return the
+    metres of a scene unit; from then on all exports of coordinates are in metres. first, second:
+    PHOTO:X,Y, as for `surface_point`. Raises UserError if both points are at one place.
     """
     apart = float(np.linalg.norm(surface_point(run, first) - surface_point(run, second)))
     if apart < run.model.grid.voxel_size:
@@ -50,7 +50,7 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
 
 
 def _straight(run, image_file, x, y):
-    """The pixel without distortion; (x, y) itself where the scene, which knows it, is gone."""
+    """The pixel without distortion; (x, y) unchanged if the scene, which stores it, is gone."""
     try:
         listed = scene_frames(run.config.scene.path, edited=False)
     except UserError:
@@ -61,15 +61,15 @@ def _straight(run, image_file, x, y):
     camera = image_file.camera
     there = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
     found = root(lambda place: np.subtract(lens.apply(*place), there), there)
-    if not found.success:  # NaN is beyond every image
+    if not found.success:  # NaN lies outside every image
         return np.nan, np.nan
     return found.x[0] * camera.fx + camera.cx, found.x[1] * camera.fy + camera.cy
 
 
 def surface_point(run: Run, text: str) -> np.ndarray:
-    """(3,) world: what a pixel of a training image shows of the object. text: PHOTO:X,Y, the
+    """(3,) world position of the object at a pixel of a training image. text: PHOTO:X,Y, the
     image's path in the scene or the end of it, and pixels from its upper left corner. Raises
-    UserError where there is no such image or pixel, or no object in it.
+    UserError if there is no such image or pixel, or it does not show the object.
     """
     found = re.fullmatch(r"(.+):([0-9.]+),([0-9.]+)", text)
     try:

@@ -1,5 +1,5 @@
-"""The surface of a run as a mesh with coloured vertices, by marching cubes in the field that the
-depth maps of its training views are fused to.
+"""Makes the surface of a run as a mesh with coloured vertices, by marching cubes in the field to
+which the depth maps of its training views are fused.
 """
 
 import warnings
@@ -30,24 +30,24 @@ from pp_studio.export.points import (
 )
 
 NEIGHBOURS = 4  # points that colour a vertex
-# Standard deviations, in voxel sizes, of two Gaussians that smooth the field, of which the lesser
-# is taken: the finer keeps what is thin, the coarser closes the pits and tunnels that noise makes.
-# So the demo has each of its spokes (Euler number -30), of which 22 break with 0.7 alone.
+# Two Gaussians with these standard deviations, in voxel sizes, smooth the field; the lesser value
+# is taken. The finer keeps thin parts, the coarser closes the pits and tunnels that noise makes.
+# This keeps all the demo's spokes (Euler number -30); with 0.7 alone, 22 of them break.
 SMOOTHING = 0.5, 1.0
-LOOSE = 0.02  # of the largest part's faces: parts with fewer are left out
-# How strongly a vertex is held to its place where the surface is made fair, against the square of
-# its mean distance from its neighbours: where views agree, where their depths scatter by some voxel
-# sizes, and where no view shows it.
+LOOSE = 0.02  # parts with less than this share of the largest part's faces are left out
+# How strongly fair() holds a vertex to its place, relative to the square of its distance from the
+# mean of its neighbours: where views agree; the scatter of depths, in voxel sizes, at which this
+# halves; and where no view shows the vertex.
 HELD, SCATTER, UNSEEN = 0.3, 0.85, 0.003
-SEEN_FACES = "seen_faces"  # what files call the number of them
-STEPS = 300  # of conjugate gradients, at most
+SEEN_FACES = "seen_faces"  # the name of this count in files
+STEPS = 300  # most steps of conjugate gradients
 
 
 @dataclass(frozen=True)
 class Mesh:
     """vertices: (V, 3) as in_world() gives them. faces: (F, 3) int32, counter-clockwise from
-    outside. colours: (V, 3) uint8 sRGB. seen: how many of the faces, the first ones, training views
-    show; others are guessed.
+    outside. colours: (V, 3) uint8 sRGB. seen: training views show this many of the faces, the first
+    ones; the others are guessed.
     """
 
     vertices: np.ndarray
@@ -59,7 +59,7 @@ class Mesh:
 @dataclass(frozen=True)
 class Surface:
     """vertices: (V, 3) float64, world. faces: (F, 3) int32, counter-clockwise from outside. seen:
-    (V,) bool, whether depths of SEEN training views are near.
+    (V,) bool, whether at least SEEN training views have depths near the vertex.
     """
 
     vertices: np.ndarray
@@ -68,15 +68,15 @@ class Surface:
 
 
 def surface(run: Run, box: np.ndarray | None = None) -> Surface:
-    """The surface that the depths of the training views agree on, closed where they show none; with
-    a box (2, 3) only the faces in it. Raises UserError where there is none.
+    """The surface on which the depths of the training views agree, closed where they show none.
+    box: (2, 3); only the faces in it are kept. Raises UserError if there are none.
     """
     grid = box_around(run.model.grid, run.model.cloud.ids.get())
     cameras = track(run.cameras("train"), "depths", "view")
     fused = fuse(grid, ((camera, run.render(camera)) for camera in cameras))
     opacity = run.model.cloud.opacity.get()[:, 0]
     solid = run.model.positions()[opacity >= np.median(opacity)]
-    # its border closes what no view shows
+    # the padding closes the surface where no view shows it
     outside = np.pad(closed(grid, fused, solid), MARGIN, constant_values=1)
     smooth = [gaussian_filter(outside, sigma, mode="nearest") for sigma in SMOOTHING]
     outside = np.minimum(*smooth)
@@ -104,8 +104,8 @@ def surface(run: Run, box: np.ndarray | None = None) -> Surface:
 
 
 def fair(vertices: np.ndarray, faces: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """(V, 3) float64: vertices moved so that the sum of held (V,) times the squares of their ways,
-    and of the squared distances of each from the mean of its neighbours, is least. faces: (F, 3).
+    """(V, 3) float64: vertices moved to minimise the sum of held (V,) times their squared moves,
+    plus their squared distances from the mean of their neighbours. faces: (F, 3).
     """
     n = len(vertices)
     ends = np.concatenate([faces[:, :2], faces[:, 1:], faces[:, [2, 0]]])
@@ -123,15 +123,15 @@ def fair(vertices: np.ndarray, faces: np.ndarray, held: np.ndarray) -> np.ndarra
 
 
 def seen_first(faces: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, int]:
-    """(faces (F, 3) with those first of which two corners are seen, how many these are). seen: (V,)
-    bool of the vertices.
+    """(faces (F, 3), those with at least two seen corners first, and the number of these). seen:
+    (V,) bool of the vertices.
     """
     is_seen = seen[faces].sum(1) >= 2
     return faces[np.argsort(~is_seen, kind="stable")], int(is_seen.sum())
 
 
 def _large_parts(faces, vertices):
-    """The faces (F, 3) of parts that are no crumbs beside the largest one; says how many are."""
+    """The faces (F, 3) of parts not tiny beside the largest; warns of how many others there are."""
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(vertices, vertices))
     _, part = connected_components(graph, directed=False)
@@ -144,7 +144,7 @@ def _large_parts(faces, vertices):
 
 
 def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
-    """surface(), with the mean colours of the nearest points by weight over squared distance."""
+    """surface(), coloured by the nearest points' mean, by weight over squared distance."""
     found, points = surface(run, box), coloured_points(run)
     faces, seen = seen_first(found.faces, found.seen)
     vertices = in_world(found.vertices, run.model.grid.voxel_size)
@@ -156,7 +156,7 @@ def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
-    """Write a PLY, GLB, OBJ or STL file, by the suffix; all but STL say how many faces are seen.
+    """Write a PLY, GLB, OBJ or STL file, by the suffix; all but STL state how many faces are seen.
     Raises UserError as atomic_file does.
     """
     suffix = Path(path).suffix.lower()
@@ -170,7 +170,7 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
             file.write(data.encode() if isinstance(data, str) else data)
     elif suffix == ".glb":
         near = mesh.vertices - mesh.vertices.mean(0)
-        normals = trimesh.Trimesh(near, mesh.faces, process=False).vertex_normals  # else all flat
+        normals = trimesh.Trimesh(near, mesh.faces, process=False).vertex_normals  # else flat
         attributes = {
             "POSITION": mesh.vertices,
             "NORMAL": normals.astype(np.float32),
@@ -183,5 +183,5 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 
 
 def of_faces(seen: int) -> str:
-    """What a file says of its faces, of which the first ones are seen."""
+    """The note in a file that says which of its faces are seen: the first ones."""
     return f"{SEEN_FACES} {seen}: the faces after these are shown by no photograph, but guessed"

@@ -1,4 +1,4 @@
-"""Runs as HTML files that a browser draws with WebGL2, without the network; a gallery of them."""
+"""Writes runs as HTML files drawn with WebGL2, without the network; and a gallery of them."""
 
 import base64
 import html
@@ -19,9 +19,9 @@ from pp_studio.export.gaussians import Gaussians, fitted_gaussians
 from pp_studio.export.harmonics import COUNT
 from pp_studio.large import render_large
 
-# A Gaussian's bytes: place in the box of all; opacity; logarithms of its deviations; x, y and z of
-# the quaternion that turns its axes, of which the one with the largest w is taken, so that all lie
-# within TURNED; coefficients of its colours, as Gaussians have them.
+# The bytes of a Gaussian: place in the box of all Gaussians; opacity; logarithms of its deviations;
+# x, y and z of the quaternion that turns its axes, swapped to make w largest, so that x, y and z
+# lie within TURNED; coefficients of its colours, in the order of Gaussians.
 PACKED = np.dtype(
     [
         ("place", "<u2", 3),
@@ -31,22 +31,22 @@ PACKED = np.dtype(
         ("colour", "u1", 27),
     ]
 )
-OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
+OUTLIERS = 1e-3  # share of values clipped at each end, as outliers would coarsen all others
 PLACES, TURNED = np.iinfo(np.uint16).max, 240
 FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
 RISE = 20.0  # degrees
-FILLED = 0.8  # of the shorter side, by the object as it is turned round; lines of text are above
+FILLED = 0.8  # share of the shorter side that the turning object fills; lines of text are above it
 SAMPLED_POINTS = 20_000
-NEAREST = 0.05  # of the object's radius: what is nearer to the eye is not drawn, as in a run
-SECTORS, BESIDE = 36, 45.0  # azimuths, and degrees to either side that a photograph speaks for
-STILL = 600, 315  # pixels; the least that is shown large beside a link
+NEAREST = 0.05  # in radii of the object: anything nearer to the eye is not drawn, as in a run
+SECTORS, BESIDE = 36, 45.0  # azimuths, and degrees to each side that a photograph covers
+STILL = 600, 315  # pixels: the least size that programs show large beside a link
 HERE = Path(__file__).parent
 
 
 def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-    """Records of GAUSSIAN as the page keeps them: (N,) rows of PACKED, and what their bytes stand
-    for: a place is corner + unit times the number; byte v of coefficient k, low[k] + span[k] v /
-    255; of a deviation, the exponential of logarithms[0] + logarithms[1] v / 255.
+    """Records of GAUSSIAN as (N,) rows of PACKED, as the page stores them, and how to decode their
+    bytes: a place is corner + unit times the number; byte v of coefficient k is low[k] +
+    span[k] v / 255; of a deviation, the exponential of logarithms[0] + logarithms[1] v / 255.
     """
     rows, place = np.zeros(len(table), PACKED), table["position"].astype(np.float64)
     corner = place.min(axis=0)
@@ -68,7 +68,7 @@ def pack(table: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def _nearest_axes(deviations, turn):
-    """(deviations (N, 3), bytes (N, 3) of their axes), swapped so that they turn least."""
+    """(deviations (N, 3), bytes (N, 3) of their axes), swapped so that the axes turn least."""
     ways = Rotation.create_group("O")
     own = Rotation.from_quat(np.roll(turn, -1, axis=1))
     # w of the product of two quaternions (x, y, z, w)
@@ -81,17 +81,17 @@ def _nearest_axes(deviations, turn):
 
 
 def page_text(gaussians: Gaussians, cameras: Sequence[Camera], title: str, still: str = "") -> str:
-    """The page. cameras: of the training. still: the file of an image that stands for it where it
-    is linked to, if any.
+    """The HTML of the page. cameras: those of the training. still: the file of an image that stands
+    for the page in links, "" for none.
     """
     rows, about = pack(gaussians.table)
     data, corner = base64.b64encode(rows.tobytes()).decode(), about.pop("corner")
     places = gaussians.table["position"].astype(np.float64)
-    # a few may have gone astray
+    # a few Gaussians may have gone astray
     low, high = np.quantile(places, [OUTLIERS, 1 - OUTLIERS], axis=0) + gaussians.origin
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     eye, up = first_look(places + gaussians.origin, centre, cameras)
-    # what a pixel of the training shows in the middle of the object
+    # width of a training pixel at the middle of the object
     pixels = [np.linalg.norm(one.eye - centre) / min(one.fx, one.fy) for one in cameras]
     header = about | {
         "count": len(rows),
@@ -120,8 +120,8 @@ def photographed(
     cameras: Sequence[Camera], centre: np.ndarray, up: np.ndarray, ahead: np.ndarray
 ) -> list[list[int]]:
     """From where an object was photographed: for each of SECTORS azimuths around `up`, counted from
-    `ahead` on by the right hand, [lowest elevation, highest elevation, how far the nearest camera
-    is aside beyond BESIDE], in whole degrees.
+    `ahead` by the right-hand rule, [lowest elevation, highest elevation, degrees beyond BESIDE to
+    the nearest camera's azimuth], in whole degrees.
     """
     offsets = np.stack([one.eye - centre for one in cameras])
     height, across = offsets @ up, offsets @ np.stack([ahead, np.cross(up, ahead)], axis=1)
@@ -138,8 +138,8 @@ def photographed(
 
 
 def filled(template: str, parts: dict[str, str], still: str) -> str:
-    """A template of this folder with its parts, {name: text}. still: the image that programs show
-    beside a link to the page, if any.
+    """Fill a template of this folder with its parts, {name: text}. still: the image that programs
+    show beside a link to the page, "" for none.
     """
     large = '<meta name="twitter:card" content="summary_large_image">'
     card = f'<meta property="og:image" content="{still}">\n{large}' if still else ""
@@ -150,8 +150,8 @@ def filled(template: str, parts: dict[str, str], still: str) -> str:
 
 
 def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
-    """Write a page and a still of each run into a folder, with an index of them; returns their
-    number. Raises UserError as fitted_gaussians and atomic_folder do.
+    """Write a page and a still of each run into a folder, with an index of them; returns the number
+    of runs. Raises UserError as fitted_gaussians and atomic_folder do.
     """
     stems: list[str] = []
     figures = []
@@ -159,7 +159,7 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
         for run in runs:
             name = run.folder.name
             stem = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-") or "run"
-            while stem.lower() in {"index", *map(str.lower, stems)}:  # as some disks take names
+            while stem.lower() in {"index", *map(str.lower, stems)}:  # some disks ignore case
                 stem += "-2"
             stems.append(stem)
             page = page_text(fitted_gaussians(run), run.cameras("train"), name, f"{stem}.png")
@@ -173,7 +173,7 @@ def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
 
 
 def still(run: Run) -> np.ndarray:
-    """(H, W, 3) uint8: the run as a page of it begins, as large as STILL."""
+    """(H, W, 3) uint8: the first view of the run's page, in the size STILL."""
     look = run.model.positions(), run.ball[0], run.cameras("train")
     (eye, up), (width, height) = first_look(*look), STILL
     focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
@@ -184,9 +184,9 @@ def still(run: Run) -> np.ndarray:
 def first_look(
     points: np.ndarray, centre: np.ndarray, cameras: Sequence[Camera]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(eye, up), both (3,), with which a page begins: it looks at the centre of the points (N, 3)
-    from the side of the first camera, RISE above the horizon, or as near to it as cameras were, and
-    shows the whole object, also when it is turned round.
+    """(eye, up), both (3,), of a page's first view: it looks at the centre of the points (N, 3)
+    from the side of the first camera, RISE above the horizon, or as near to that as cameras were,
+    and shows the whole object, also while it turns.
     """
     up, offsets = up_of(cameras), np.stack([one.eye - centre for one in cameras])
     elevations = np.arcsin(offsets @ up / np.linalg.norm(offsets, axis=1))

@@ -1,4 +1,4 @@
-"""The points of a run with the colours that its network gives them, as PLY files."""
+"""Writes the points of a run, in the colours that its network gives them, as PLY files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ COMMENTS = (
     "features are the input of the run's network, no colours",
 )
 COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
-FINEST = 1e-3  # of the voxel size: how far rounding to float32 may move a point in a file
+FINEST = 1e-3  # how far, in voxel sizes, rounding to float32 may move a point in a file
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class ColouredPoints:
 def coloured_points(
     run: Run, min_weight: float = 0.0, box: np.ndarray | None = None
 ) -> ColouredPoints:
-    """The points that weigh more than min_weight in some training view, with their colours in the
-    view where they weigh most: that of the pixel which shows their centre, without the background.
+    """The points that weigh more than min_weight in some training view. A point's colour comes from
+    the view where it weighs most, at the pixel that shows its centre, without the background.
 
-    No colour is invented for points that no training view shows: they are left out. box: (2, 3)
-    that holds the points, or None. Raises UserError where no point is left.
+    Points that no training view shows are left out: no colour is invented for them. box: (2, 3) to
+    which points are limited, or None. Raises UserError if no point is left.
     """
     cloud, voxel_size = run.model.cloud, run.model.grid.voxel_size
     positions = run.model.positions()
@@ -59,7 +59,7 @@ def coloured_points(
         weights = seen.point_weights()
         higher, camera = np.flatnonzero(weights > best), seen.camera
         best[higher] = weights[higher]
-        # one whose centre is just outside the image takes the nearest pixel; its depth is above 0
+        # a centre just outside the image takes the nearest pixel; its depth is above 0
         column, row, _ = camera.project(positions[higher])
         column = column.clip(0, camera.width - 1).astype(np.int64)
         row = row.clip(0, camera.height - 1).astype(np.int64)
@@ -82,8 +82,8 @@ def coloured_points(
 
 
 def inside(positions: np.ndarray, box: np.ndarray | None) -> np.ndarray:
-    """(N,) bool: which positions (N, 3) lie in a box (2, 3) of the world, all where there is none.
-    Raises UserError where none does.
+    """(N,) bool: which positions (N, 3) lie in a box (2, 3) of the world; all if box is None.
+    Raises UserError if none does.
     """
     if box is None:
         return np.ones(len(positions), bool)
@@ -96,8 +96,8 @@ def inside(positions: np.ndarray, box: np.ndarray | None) -> np.ndarray:
 
 
 def in_world(positions: np.ndarray, voxel_size: float) -> np.ndarray:
-    """(N, 3) float64 world positions as files keep them: float32, which every program reads, or
-    float64 where the world's origin is so far that float32 moves them. voxel_size: of the grid.
+    """(N, 3) float64 world positions as files store them: float32, which every program reads, or
+    float64 if the world's origin is so far away that float32 moves them. voxel_size: the grid's.
     """
     resolution = np.spacing(np.float32(np.abs(positions).max(initial=0)))
     return positions if resolution > FINEST * voxel_size else positions.astype(np.float32)
@@ -106,15 +106,15 @@ def in_world(positions: np.ndarray, voxel_size: float) -> np.ndarray:
 def write_ply(
     path: Path | str, points: ColouredPoints, cloud: PointCloud, frame: str = "its scene's"
 ) -> None:
-    """Write points and what `cloud` learned of them, as write_vertices() does. frame: whose axes
-    and units the positions have, in words.
+    """Write points, and what `cloud` learned about them, as write_vertices() does. frame: whose
+    axes and units the positions have, in words.
     """
     columns = place_and_colour(points.positions, points.colours)
     columns |= {"point_opacity": points.opacity, "weight": points.weight, "radius": points.radius}
     for block, array in zip(cloud.blocks, cloud.sh, strict=True):
         values = array.get()[points.rows].astype(np.float32)
         for k in range(block.count):
-            order = block.first + k - block.degree**2  # within its degree
+            order = block.first + k - block.degree**2  # index within its degree
             columns |= {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
     about = (f"pp-cl: points of a run; axes and units: {frame}", *COMMENTS)
     write_vertices(path, columns, comments=about)
@@ -126,8 +126,8 @@ def write_vertices(
     faces: np.ndarray | None = None,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write a binary little-endian PLY file of vertices, {property: (M,) array}, and faces (F, 3)
-    of them, if there are any. Raises UserError as atomic_file does.
+    """Write a binary little-endian PLY file of vertices, {property: (M,) array}, and of faces
+    (F, 3) if there are any. Raises UserError as atomic_file does.
     """
     kinds = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
     vertices = np.rec.fromarrays(list(columns.values()), dtype=kinds)
@@ -141,6 +141,6 @@ def write_vertices(
 
 
 def place_and_colour(positions: np.ndarray, colours: np.ndarray) -> dict[str, np.ndarray]:
-    """{property of a PLY vertex: (M,) array} of positions and colours, both (M, 3)."""
+    """{property of a PLY vertex: (M,) array} from positions and colours, both (M, 3)."""
     columns = dict(zip(COORDINATES, positions.T, strict=True))
     return columns | dict(zip(CHANNELS, colours.T, strict=True))

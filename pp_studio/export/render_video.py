@@ -1,4 +1,4 @@
-"""Renders a run along a camera path: frames, resumed by a later call, and videos of them."""
+"""Renders a run along a camera path: frames, which a later call resumes, and videos of them."""
 
 import hashlib
 import json
@@ -31,14 +31,14 @@ from pp_studio.export.gaussians import drawn_by, kept_gaussians, window_camera
 from pp_studio.large import MOST_PARTS, fineness, parts, render_large
 from pp_studio.video import write_video
 
-MOST_IDENTITY = 1000  # bytes of it
-# bytes of a frame's pixel that Pillow keeps until the video is written, and of all that it may
+MOST_IDENTITY = 1000  # most bytes of the file IDENTITY
+# bytes per pixel that Pillow keeps until the video is written, and the most that it may keep in all
 PIXEL_BYTES, MOST_HELD = {".webp": 4, ".gif": 1}, 2**31
-IDENTITY = "frames.json"  # in the folder of the frames: what they show
+IDENTITY = "frames.json"  # says what the frames in a folder show
 LOCK = ".pp-cl.lock"
-GAUSSIANS = 0  # in place of a number of parts
-WRITING = 0.05  # seconds, about, that a frame takes to be written, and its share of a video
-FEWER_PARTS = 2  # where as many as there may be would take too long (large.py says what it costs)
+GAUSSIANS = 0  # Style.parts if Gaussians are drawn
+WRITING = 0.05  # seconds, about, to write a frame and its share of a video
+FEWER_PARTS = 2  # tried if Style.parts would take too long (large.py says what it costs)
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,8 @@ class Style:
     """How frames are rendered and written.
 
     suffix: png or exr. background: sRGB in [0, 1], None: transparent; OpenEXR always is. samples:
-    per pixel, a square number. features: in OpenEXR, the network's input too. parts: at most so
-    many renderings, each way, that a frame is woven of; GAUSSIANS: those of kept_gaussians() are
-    drawn.
+    per pixel, a square number. features: OpenEXR files also hold the network's input. parts: a
+    frame is woven of at most this many renderings, each way; GAUSSIANS: kept_gaussians() are drawn.
     """
 
     suffix: str = "png"
@@ -60,8 +59,8 @@ class Style:
 
 @dataclass(frozen=True)
 class Rendered:
-    """What render_frames() has done. seconds: of each frame that was not there. paths: of all. why:
-    a line on how frames are drawn that would have taken too long, "" of others.
+    """The result of render_frames(). seconds: of each new frame. paths: of all frames. why: a line
+    that says how frames are drawn because the style would have taken too long, otherwise "".
     """
 
     seconds: list[float]
@@ -78,14 +77,13 @@ def render_frames(
     minutes: float = math.inf,
     anew: bool = False,
 ) -> Rendered:
-    """Render the frames of the cameras that are not there yet into a folder.
+    """Render those frames of the cameras that are not in a folder yet.
 
-    minutes: for all frames; where the style takes longer, they are drawn less finely, or by the
-    Gaussians that the run's folder keeps. anew: frames of something else make room. Raises
-    UserError for a folder that cannot be made, holds other files or frames, or that another process
-    renders into.
+    minutes: for all frames; if the style takes longer, they are drawn less finely, or by the
+    Gaussians in the run's folder. anew: replace frames that show something else. Raises UserError
+    if the folder cannot be made, holds other files or frames, or is in use by another process.
     """
-    # Python stands for bytes that are no UTF-8 by these
+    # Python represents bytes that are not UTF-8 by these
     if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
         raise UserError(
             f"{folder}: OpenEXR writes no file whose name is no UTF-8; choose another --out"
@@ -94,7 +92,7 @@ def render_frames(
     if folder.exists():
         if not folder.is_dir():
             raise UserError(f"{folder}: is not a folder; choose another --out")
-        _identity_of(folder)  # no lock is made in a folder of others
+        _identity_of(folder)  # raises before a lock is made among other files
     check_target(folder / IDENTITY)
     folder.mkdir(parents=True, exist_ok=True)
     seconds, why = [], ""
@@ -131,9 +129,9 @@ def render_video(
     *,
     minutes: float = math.inf,
 ) -> Rendered:
-    """Render a video, whose frames are in a hidden folder beside it until it is written, for a
-    later call to go on with. minutes: of render_frames. Raises UserError as render_frames and
-    write_video do, and for a video whose frames would fill the memory.
+    """Render a video. Its frames stay in a hidden folder beside it until it is written, so that a
+    later call can go on. minutes: as for render_frames. Raises UserError as render_frames and
+    write_video do, and if the frames of the video would fill the memory.
     """
     check_file(video)
     held = PIXEL_BYTES.get(video.suffix.lower(), 0) * sum(c.width * c.height for c in cameras)
@@ -153,7 +151,7 @@ def render_video(
 
 
 def _drawer(run: Run, style: Style) -> Callable[[Camera], RenderedView]:
-    """What draws a frame."""
+    """The function that draws a frame in a style."""
     if style.parts:
         options: Any = {"samples": style.samples, "features": style.features}
         return lambda camera: render_large(run, camera, most=style.parts, **options)
@@ -168,8 +166,8 @@ def _drawer(run: Run, style: Style) -> Callable[[Camera], RenderedView]:
 
 
 def _affordable(run, cameras, style, minutes, there):
-    """(the first of some styles with which all frames take these minutes, else the last, Rendered.
-    why). there: identity of frames that are there, with whose style the others are drawn.
+    """(the first style in which all frames fit in the minutes, else the last; Rendered.why). there:
+    identity of frames already there; their style is kept.
     """
     ways = {style: ""}
     if parts(run, cameras[0], style.parts) > FEWER_PARTS:
@@ -182,7 +180,7 @@ def _affordable(run, cameras, style, minutes, there):
     first = 0.0
     for way in ways:
         draw = _drawer(run, way)
-        draw(cameras[0])  # builds kernels
+        draw(cameras[0])  # builds the kernels
         start = time.perf_counter()
         draw(cameras[0])
         needed = (time.perf_counter() - start + WRITING) * len(cameras) / 60
@@ -194,7 +192,7 @@ def _affordable(run, cameras, style, minutes, there):
 
 
 def _begin(folder, paths, identity, anew):
-    """Have a folder hold frames of this identity alone."""
+    """Prepare a folder to hold only frames of this identity."""
     if _identity_of(folder) not in (None, identity):
         if not anew:
             raise UserError(
@@ -208,7 +206,7 @@ def _begin(folder, paths, identity, anew):
 
 
 def _identity(run, cameras, style):
-    """Of everything that the frames depend on."""
+    """A digest of everything on which the frames depend, and their count."""
     checkpoint, model = run.folder.checkpoint.stat(), run.model
     varied = run.renderer.supersampling, model.cloud.count, bool(model.specular), len(run.others)
     about = style, run.header["step"], run.config.raster, varied
@@ -220,7 +218,7 @@ def _identity(run, cameras, style):
 
 
 def _identity_of(folder):
-    """What the frames in a folder show, None where there are none. Raises UserError for others."""
+    """The identity of a folder's frames, None without frames. Raises UserError for other files."""
     if all(path.name.startswith(".") for path in folder.iterdir()):
         return None
     try:

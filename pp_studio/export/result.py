@@ -1,5 +1,5 @@
-"""The folder that `pp-cl make` fills: a page about a run, beside the files that it shows. It can be
-written at any time, shows what is there by then, and is loaded again by itself until all is.
+"""Writes the folder that `pp-cl make` fills: a page about a run, beside the files that it shows.
+The page can be written at any time, shows what is there, and reloads itself until everything is.
 """
 
 import html
@@ -24,20 +24,20 @@ from pp_studio.export.page import HERE, filled, page_text, still
 INDEX, MODEL, SPLAT = "index.html", "model.html", "splat.ply"
 STILL, VIEWS, CAMERAS, MASKS = "thumbnail.png", "views.png", "cameras.png", "masks.png"
 VIDEOS = ("video.mp4", "video.webp")
-VERSION = "version.js"  # calls what an open page listens to with the version of the newest
-STATE = "make.json"  # what the same command goes on with
+VERSION = "version.js"  # tells an open page the newest version
+STATE = "make.json"  # lets the same command go on
 LABELS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
 WHAT = {
     MODEL: "the model alone, one page that needs no network",
     SPLAT: "3D Gaussians, for SuperSplat, Blender and other viewers",
     STILL: "an image of it",
 } | dict.fromkeys(VIDEOS, "once around the object")
-PLAN_WIDTH = 1000  # pixels of the drawing of the cameras
+PLAN_WIDTH = 1000  # width in pixels of the drawing of the cameras
 
 
 def begin_result(folder: Path) -> None:
-    """Make the folder. Raises UserError where it holds other files, or one in the place of a file
-    of the result that is not the program's.
+    """Make the folder. Raises UserError if it holds other files, or if a file in the place of one
+    of the result's is not the program's.
     """
     names = (INDEX, MODEL, SPLAT, STILL, VIEWS, CAMERAS, MASKS, VERSION, STATE, *VIDEOS)
     mend = "move it away, or choose another --out"
@@ -45,7 +45,7 @@ def begin_result(folder: Path) -> None:
 
 
 def write_model(folder: Path, gaussians: Gaussians, cameras: Sequence[Camera], title: str) -> None:
-    """Write the model's page. cameras: of the photographs."""
+    """Write the model's page. cameras: those of the photographs."""
     write_text(folder / MODEL, page_text(gaussians, cameras, title))
 
 
@@ -60,13 +60,13 @@ def write_result(
     told: Sequence[str] = (),
     state: str = "",
 ) -> None:
-    """Write index.html and the images that it shows, beside the video and the splats, if those are
-    newer than the run's checkpoint, and the run's model. What is not there yet is said to come.
+    """Write index.html and its images. The page shows the run's model and, if they are newer than
+    the checkpoint, the video and the splats; it announces anything missing.
 
-    run: None before there is a checkpoint; then the cameras and masks of the scene are shown, and
-    the page of the model that is there. split: whose evaluation is shown. video: the file's name.
-    scene: its path, or demo. told: what is to be known of the photographs, a line each. state: what
-    is still to be done, in words; "": nothing, and the page is not loaded again.
+    run: None before the first checkpoint; the page then shows the scene's cameras and masks, and
+    the model's page if there is one. split: whose evaluation is shown. video: the file's name.
+    scene: its path, or demo. told: lines about the photographs. state: what is still to be done, in
+    words; "" if nothing is, and the page does not reload.
     """
     views, shown = _later("evaluation"), set()
     if run:
@@ -90,7 +90,7 @@ def write_result(
             told.append(f"left out, as their masks contradict the others': {', '.join(names)}")
     else:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the training tells the same
+            warnings.simplefilter("ignore")  # the training gives the same warnings
             cameras = [one.camera for one in scene_frames(scene, "train")]
         shown = {MODEL} if (folder / MODEL).exists() else set()
         plan = _plan(folder, Path(scene), cameras)
@@ -125,16 +125,16 @@ def write_result(
         "version": version,
     }
     write_text(folder / INDEX, filled("result.html", parts, STILL if run else CAMERAS))
-    write_text(folder / VERSION, f'ppclVersion("{version}");\n')  # last: it has the page loaded
+    write_text(folder / VERSION, f'ppclVersion("{version}");\n')  # last: it makes pages reload
 
 
 def write_preview(training: Training, folder: Path, title: str) -> None:
-    """Write the model's page of a training by now, between two of its steps. Raises UserError as
-    first_gaussians does.
+    """Write the model's page for the present state of a training, between two steps. Raises
+    UserError as first_gaussians does.
     """
     run, renderer = training.present_run(), training.trainer.renderer
     renderer.release()
-    # its own, as the training's would keep room for the fragments of whole images
+    # its own renderer: the training's would keep room for the fragments of whole images
     run.renderer = Renderer(run.dev, run.model, run.config.raster)
     try:
         gaussians = first_gaussians(run)
@@ -144,12 +144,12 @@ def write_preview(training: Training, folder: Path, title: str) -> None:
 
 
 def is_newer(file: Path, other: Path) -> bool:
-    """Whether a file is there, and was written after another one."""
+    """Whether a file exists and was written after another."""
     return file.exists() and file.stat().st_mtime_ns > other.stat().st_mtime_ns
 
 
 def _plan(folder, scene, cameras):
-    """Images of the cameras, and of the masks that a capture has found."""
+    """Write images of the cameras and of a capture's masks; return their HTML."""
     capture = scene / "capture"
     if (capture / "box.png").is_file():
         _copy(capture / "box.png", folder / CAMERAS)
@@ -177,7 +177,7 @@ def _later(what):
 
 
 def _figures(run, found):
-    """[(name, value)] of the table, of what metrics.json holds, if it is there."""
+    """[(name, value)] of the table, including values `found` in metrics.json, if any."""
     rows = [(LABELS[name], f"{value:.4g}") for name, value in found.get("mean", {}).items()]
     if rows:
         rows[0] = (rows[0][0], f"{rows[0][1]} (mean of {len(found['per_image'])} views)")

@@ -1,4 +1,4 @@
-"""The surface of a run as a mesh of few faces with a texture, which is baked from the run's own
+"""Makes the surface of a run as a mesh of few faces with a texture, baked from the run's own
 renderings of its training views.
 """
 
@@ -27,26 +27,26 @@ from pp_studio.export.fusion import COVERED, TRUNCATION
 from pp_studio.export.gltf import make_unlit
 from pp_studio.export.mesh import SEEN_FACES, of_faces, seen_first, surface
 
-FACES = 60_000  # at most: marching cubes make more of the same surface
-SIDE = 2048  # texels
-HIDDEN = 1.5  # voxel sizes behind what a view shows: a texel there is hidden
-LEAST_COSINE = 0.2  # between a texel's normal and the direction to an eye that sees it
-SHARPNESS = 3  # power of that cosine in a view's weight, squared where colours agree
-VIEWS = 16  # of those that see a texel, how many of the largest weights decide its colour
-AT_EDGES = 0.05  # of a view's weight where its depths jump: neighbours there show something else
-# Weight of the views that are darker than what is taken for the colour: half would be the median,
-# but highlights, which move with the eye, add light. How far from it others may be, in luminance.
+FACES = 60_000  # at most; marching cubes make more for the same surface
+SIDE = 2048  # texels on each side
+HIDDEN = 1.5  # a texel is hidden this many voxel sizes behind what a view shows
+LEAST_COSINE = 0.2  # least cosine between a texel's normal and the direction to an eye that sees it
+SHARPNESS = 3  # power of that cosine in a view's weight, which is squared where colours agree
+VIEWS = 16  # at most this many views, those of the largest weights, decide a texel's colour
+AT_EDGES = 0.05  # factor of a view's weight where its depths jump: neighbours show something else
+# Share of the views' weight that is darker than the chosen colour: half would be the median, but
+# highlights, which move with the eye, add light. How far views may differ from it, in luminance.
 DARKER, AGREEING = 0.4, 0.08
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Texels that some view shows whose colours those that none does have, weighted by the fourth power
-# of their distances: from a few of the nearest alone, a base would get rays.
+# Unseen texels get a mean colour of this many seen ones, weighted by distance^-4: from only a few
+# of the nearest, a base would get rays.
 SAMPLES = 1024
-AT_ONCE = 1 << 13  # texels
+AT_ONCE = 1 << 13  # texels in a batch
 
 
 def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> trimesh.Trimesh:
-    """The surface of the training views' depths, of which a box (2, 3) may hold a part, turned by
-    (3, 3); in scene units. Raises UserError as surface() and require() do.
+    """The surface of the training views' depths, or its part in a box (2, 3), with a texture,
+    turned by (3, 3); in scene units. Raises UserError as surface() and require() do.
     """
     require("textured", "xatlas", "fast-simplification")
     import fast_simplification
@@ -93,8 +93,8 @@ def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> 
 def texels(
     uv: np.ndarray, faces: np.ndarray, side: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(rows, columns, faces (T,), shares (T, 3) of their corners) of the texels whose centres lie
-    in a face of a square texture, upside down as glTF's are. uv: (V, 2) in [0, 1]. faces: (F, 3).
+    """(rows, columns, faces (T,), shares (T, 3) of corners) of the texels with centres in a face of
+    a square texture, which is upside down as in glTF. uv: (V, 2) in [0, 1]. faces: (F, 3).
     """
     corners = np.stack([uv[:, 0], 1 - uv[:, 1]], 1)[faces].astype(np.float64) * side - 0.5
     first = np.ceil(corners.min(1)).astype(int)
@@ -102,7 +102,7 @@ def texels(
     a, b, c = corners.transpose(1, 0, 2)
     area = _cross(b - a, c - a)
     found = []
-    # faces of boxes of similar sizes together, each texel of the box for all of them
+    # faces with boxes of similar sizes go together: each texel of a box is tested for all of them
     order = np.argsort(np.maximum(width, height))
     for group in np.array_split(order, max(1, len(faces) // 4096)):
         columns, rows = width[group].max(initial=0), height[group].max(initial=0)
@@ -125,8 +125,8 @@ def _cross(u, v):
 
 def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(T, 3) sRGB colours of texels: what most of the training views that look at them directly
-    show, without highlights. positions, normals: (T, 3), world. Texels that no view sees have those
-    of the others, the nearest most. Raises UserError where there is none.
+    show, without highlights. positions, normals: (T, 3), world. Texels that no view sees get the
+    colours of others, mostly the nearest. Raises UserError if no view sees any.
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     cameras, n = run.cameras("train"), len(positions)
@@ -155,8 +155,8 @@ def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _looked_at(run, camera, positions, normals):
-    """((S,) texels that a view looks at, (S,) its weights by how directly it does, (S, 3) uint8
-    sRGB that it shows there).
+    """((S,) texels that a view sees, (S,) its weights by how directly it looks at them, (S, 3)
+    uint8 sRGB that it shows there).
     """
     rendered, voxel_size = run.render(camera), run.model.grid.voxel_size
     solid = rendered.alpha >= COVERED
@@ -170,7 +170,7 @@ def _looked_at(run, camera, positions, normals):
     x, y, z = camera.project(positions[rows])
     rows_seen = shown & solid[row, column] & (z < depth[row, column] + HIDDEN * voxel_size)
     rows, row, column = rows[rows_seen], row[rows_seen], column[rows_seen]
-    # over black, for straight colours beside the object are noise
+    # rendered over black, as straight colours beside the object are noise
     layers = *np.moveaxis(rendered.over((0.0, 0.0, 0.0)), 2, 0), rendered.alpha
     place = np.stack([y, x])[:, rows_seen] - 0.5
     *channels, alpha = (map_coordinates(one, place, order=1, mode="nearest") for one in layers)
@@ -180,8 +180,8 @@ def _looked_at(run, camera, positions, normals):
 
 
 def agreed(weights: np.ndarray, colours: np.ndarray) -> np.ndarray:
-    """(T, 3): of K views' colours (T, K, 3) of each texel the mean of those that are about as light
-    as the one that views of DARKER of the weight (T, K) are darker than; 0 without weight.
+    """(T, 3): for each texel, the mean of those of K views' colours (T, K, 3) that are about as
+    light as the one at DARKER of the weight (T, K), counted from the darkest; 0 without weight.
     """
     light = colours @ LUMINANCE
     order = np.argsort(light, axis=1)
@@ -193,8 +193,8 @@ def agreed(weights: np.ndarray, colours: np.ndarray) -> np.ndarray:
 
 
 def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:
-    """Write a GLB, unlit, whose positions are float32: relative to the middle, to which its node
-    moves them; or an OBJ with companions(). Raises UserError as atomic_file does.
+    """Write an unlit GLB, with float32 positions relative to the middle, to which its node moves
+    them; or an OBJ with companions(). Raises UserError as atomic_file does.
     """
     if path.suffix.lower() == ".obj":
         _write_obj(path, mesh)
@@ -209,7 +209,7 @@ def write_textured(path: Path, mesh: trimesh.Trimesh) -> None:
 
 
 def companions(path: Path) -> list[Path]:
-    """The files that a textured OBJ needs beside it: its materials, and their texture."""
+    """The files that a textured OBJ needs beside it: its materials and their texture."""
     return [path.with_suffix(".mtl"), path.with_suffix(".png")]
 
 

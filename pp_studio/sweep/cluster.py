@@ -24,34 +24,34 @@ from pp_studio.sweep.plan import Job
 from pp_studio.sweep.table import failed_row, finished_row
 
 LOOPBACK = "127.0.0.1"
-ANSWER = 20  # seconds that a scheduler, and its first worker, have to answer
+ANSWER = 20  # seconds that a scheduler, and then its first worker, have to answer
 TICK = 0.5  # seconds between two looks at the runs
-ENDING = 2.0  # seconds that trainings have for their checkpoints when a sweep is stopped
+ENDING = 2.0  # seconds that trainings have to write their checkpoints when a sweep is stopped
 SETTINGS = {
-    "distributed.scheduler.worker-saturation": 1.0,  # a worker has its one run, none in line
-    "distributed.nanny.pre-spawn-environ": {},  # Dask's one thread for numpy is too few
+    "distributed.scheduler.worker-saturation": 1.0,  # a worker holds one run and queues none
+    "distributed.nanny.pre-spawn-environ": {},  # Dask's default, one thread for numpy, is too few
 }
 
 # ---- on a worker
 
 
 def run_task(job: Job, devices: Sequence[str], stop: str) -> dict[str, Any]:
-    """The row of a job, by the Dask worker that calls this. devices: indices of `pp-cl devices`
-    that the workers take in turn; empty where each has its own default. stop: name of the Event
-    that ends the sweep.
+    """Run a job in the Dask worker that calls this, and return its row. devices: indices of
+    `pp-cl devices` that workers take in turn; empty: each worker uses its default. stop: name of
+    the Event that ends the sweep.
     """
-    # tqdm's own is shared by processes, and a worker that is killed would leak it with a warning
+    # tqdm's own lock is shared by processes; a killed worker would leak it with a warning
     tqdm.set_lock(threading.RLock())
     device = devices[get_worker().name % len(devices)] if devices else None
     return run_job(job, device, Event(stop).is_set)
 
 
 def run_job(job: Job, device: str | None, is_stopped: Callable[[], bool]) -> dict[str, Any]:
-    """The row of a job, trained and evaluated as far as it is not; a failed one says why. What is
-    printed meanwhile is appended to the job's log.
+    """Do what is missing of a job's training and evaluation, and return its row; that of a failed
+    job says why. Output is appended to the job's log.
 
-    is_stopped: asked before the first step and after each; where it is true, the training ends with
-    a checkpoint.
+    is_stopped: called before the first step and after each; if it returns True, the training writes
+    a checkpoint and ends.
     """
     try:
         log = open(job.log, "a", buffering=1, encoding="utf-8")  # noqa: SIM115
@@ -91,17 +91,17 @@ def run_job(job: Job, device: str | None, is_stopped: Callable[[], bool]) -> dic
 
 
 class Deaf(WorkerPlugin):
-    """Workers that leave Ctrl-C, which reaches all processes of a terminal, to the sweep."""
+    """Makes workers ignore Ctrl-C, which a terminal sends to all processes."""
 
     def setup(self, worker: object) -> None:
-        """Ignore it."""
+        """Ignore SIGINT."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
-    """Dask with so many worker processes on this machine. They listen on the loopback address alone
-    and answer only who has the certificate of this very cluster. Raises UserError where they do not
+    """Dask with `workers` worker processes on this machine. They listen only on the loopback
+    address, and answer only holders of this cluster's certificate. Raises UserError if they do not
     start.
     """
     with dask.config.set(SETTINGS):
@@ -128,8 +128,8 @@ def local_client(workers: int) -> Iterator[Client]:
 
 @contextmanager
 def client_of(address: str) -> Iterator[Client]:
-    """Dask whose scheduler is at an address. Raises UserError if none with workers answers there,
-    or if they run several tasks at once.
+    """Dask with the scheduler at an address. Raises UserError if no scheduler with workers answers
+    there, or if its workers run several tasks at once.
     """
     why = f"--scheduler {address}: "
     with ExitStack() as stack:
@@ -148,9 +148,9 @@ def client_of(address: str) -> Iterator[Client]:
 def run_jobs(
     client: Client, jobs: Sequence[Job], devices: Sequence[str], is_stopped: Callable[[], bool]
 ) -> Iterator[dict[str, Any]]:
-    """The row of each job, as they end. devices: see run_task(). Where is_stopped() is true,
-    trainings write their checkpoints and end, and the rows that are left say so; what has not ended
-    ENDING seconds later is left alone.
+    """Yield the row of each job as it ends. devices: see run_task(). Once is_stopped() is True,
+    trainings write their checkpoints and end, and their rows say so; jobs still running ENDING
+    seconds later are left alone.
     """
     for job in jobs:
         job.log.parent.mkdir(parents=True, exist_ok=True)
@@ -165,7 +165,7 @@ def run_jobs(
             job = pending.pop(future)
             if future.status == "finished":
                 yield future.result()
-            elif future.status == "error":  # its workers have ended
+            elif future.status == "error":  # its workers have died
                 yield failed_row(job, f"{one_line(future.exception(), 500)}; see {job.log}")
             else:
                 yield failed_row(job, "the scheduler is gone; the same command goes on")

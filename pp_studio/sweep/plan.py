@@ -16,9 +16,9 @@ Given = tuple[str, str, str]  # key, text of the value, origin, as session.run_c
 
 @dataclass(frozen=True)
 class Job:
-    """A run of a sweep. scene: absolute folder, or demo; name: of the scene in the table. varied:
-    {key: text of the value} of what differs between the settings; given: all that is set. folder:
-    of the run, absolute.
+    """A run of a sweep. scene: absolute folder, or demo; name: the scene's in the table. varied:
+    {key: text of the value} of the settings that differ between runs; given: all settings that are
+    set. folder: the run's, absolute.
     """
 
     scene: str
@@ -32,13 +32,13 @@ class Job:
 
     @property
     def log(self) -> Path:
-        """What is printed while the job runs, beside its folder."""
+        """The file beside the job's folder that collects its output."""
         return Path(f"{self.folder}.log")
 
 
 def read_varied(texts: Sequence[str]) -> dict[str, list[str]]:
-    """{key: texts of the values} of the texts of --vary: values are separated by commas, those of a
-    setting that is a list itself by slashes. Raises UserError naming what makes no sense.
+    """Parse the texts of --vary to {key: texts of the values}: commas separate values, slashes
+    separate the items of a list. Raises UserError naming the part that is wrong.
     """
     varied: dict[str, list[str]] = {}
     for text in texts:
@@ -66,8 +66,8 @@ def plan(
 ) -> list[Job]:
     """The jobs: scene by scene, setting by setting, seed by seed.
 
-    given: what all runs share. Raises UserError for scenes that are missing, for settings that make
-    no sense, and where two runs would have the same folder.
+    given: settings of all runs. Raises UserError if a scene is missing, if settings are invalid, or
+    if two runs would have the same folder.
     """
     if "train.seed" in varied:
         raise UserError("--vary train.seed: write the seeds as --seeds")
@@ -83,14 +83,14 @@ def plan(
         setting = dict(zip(varied, values, strict=True))
         own = [*given, *((key, text, "--vary") for key, text in setting.items())]
         path = configure(preset(preset_name or "tiny"), scene, own).scene.path
-        # another part of a file's name for each text
+        # a different part of a file's name for each text
         quoted = {key: quote(t, safe=",", errors="surrogateescape") for key, t in setting.items()}
         slug = "_".join(f"{key}={text}" for key, text in quoted.items())
         for seed in seeds:
             folder = Path(out).resolve() / name / slug / f"seed-{seed}"
             seeded = (*own, ("train.seed", str(seed), "--seeds"))
             what = path, name, setting, seed, str(folder), preset_name, seeded, tuple(metrics)
-            # two names may be one where the file system ignores case
+            # two names are one if the file system ignores case
             if jobs.setdefault(str(folder).casefold(), job := Job(*what)) is not job:
                 raise UserError(
                     f"{folder}: two runs would be kept there; give each value once, and scenes of"

@@ -1,5 +1,5 @@
-"""The rows of a sweep, read from the folders of its runs, and their table: means and spread over
-seeds, means over scenes; as Markdown and JSON.
+"""Reads the rows of a sweep from its runs' folders and makes their table: means and spread over
+seeds, and means over scenes; as Markdown and JSON.
 """
 
 import statistics
@@ -14,7 +14,7 @@ from pp_cl.files import write_json, write_text
 from pp_studio.sweep.plan import Job
 
 TABLES = ("sweep.json", "sweep.md")
-Row = dict[str, Any]  # of a run, or of means
+Row = dict[str, Any]  # of one run, or means over several
 
 # {key of a row: (column, format of a number)}
 COLUMNS = {
@@ -27,16 +27,16 @@ COLUMNS = {
 
 
 def failed_row(job: Job, error: str) -> Row:
-    """The row of a run that failed: "scene", "settings", "seed", "folder" and "error", one line."""
+    """The row of a failed run: "scene", "settings", "seed", "folder" and "error", one line."""
     about = {"scene": job.name, "settings": job.varied, "seed": job.seed, "folder": job.folder}
     return about | {"error": error}
 
 
 def finished_row(job: Job) -> Row | None:
-    """The row of a run that is trained and evaluated: "scene", "settings", "seed", "folder", its
-    metrics, "points", "seconds" of training (None where the log is lost) and "device"; else None.
+    """The row of a trained and evaluated run: "scene", "settings", "seed", "folder", its metrics,
+    "points", "seconds" of training (None if the log is lost) and "device"; None for other runs.
 
-    Raises UserError where the folder holds a run with other settings.
+    Raises UserError if the folder holds a run with other settings.
     """
     folder = RunFolder(job.folder)
     if not (folder.config.exists() and folder.checkpoint.exists()):
@@ -45,11 +45,11 @@ def finished_row(job: Job) -> Row | None:
     if config.train.iterations != there.train.iterations:
         refuse_setting(folder, "train.iterations", there.train.iterations, config.train.iterations)
     if there.scene.path != config.scene.path:
-        return None  # for the training to refuse or, if it is the same scene, to go on with
+        return None  # the training refuses it or, if it is the same scene, goes on with it
     try:
         result = folder.measured()
     except UserError:
-        return None  # is measured again
+        return None  # evaluate it again
     if not (result and result["finished"] and result["step"] == config.train.iterations):
         return None
     if not {*job.metrics} <= result["mean"].keys():
@@ -62,8 +62,8 @@ def finished_row(job: Job) -> Row | None:
 
 
 def scene_means(rows: Sequence[Row]) -> list[Row]:
-    """{"scene", "settings", "runs", "failed"}, means over the seeds that went well, and "spread",
-    {key: standard deviation} of several, for each scene and setting, in the order of the rows.
+    """{"scene", "settings", "runs", "failed"}, means over successful seeds and, if several,
+    "spread", {key: standard deviation}, for each scene and setting in the order of the rows.
     """
     means = []
     for group in _groups(rows, ("scene", "settings")):
@@ -75,8 +75,8 @@ def scene_means(rows: Sequence[Row]) -> list[Row]:
 
 
 def overall_means(means: Sequence[Row]) -> list[Row]:
-    """{"settings", "scenes", "missing"} and the means over the scenes, each of which counts the
-    same, for each setting of scene_means(). missing: scenes without a run that went well.
+    """For each setting of scene_means(): {"settings", "scenes", "missing"} and the means over the
+    scenes, all with equal weight. missing: scenes without a successful run.
     """
     overall = []
     for group in _groups(means, ("settings",)):
@@ -87,7 +87,7 @@ def overall_means(means: Sequence[Row]) -> list[Row]:
 
 
 def _groups(rows, keys):
-    """Lists of the rows whose values under the keys are the same."""
+    """Lists of the rows that have the same values under the keys."""
     groups = {}
     for row in rows:
         groups.setdefault(repr([row[key] for key in keys]), []).append(row)
@@ -95,7 +95,7 @@ def _groups(rows, keys):
 
 
 def _over(rows, measure=statistics.fmean):
-    """{key: mean} of what is measured, or another measure; a key that a row lacks is left out."""
+    """{key: mean, or another measure} of measured values; keys that a row lacks are left out."""
     columns = {key: [row.get(key) for row in rows] for key in COLUMNS}
     return {
         key: measure(values) for key, values in columns.items() if values and None not in values
@@ -103,8 +103,8 @@ def _over(rows, measure=statistics.fmean):
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The table: a line for each scene and setting, for several scenes one for the mean of each
-    setting, and below it what failed.
+    """The table: a line for each scene and setting; with several scenes, a line for the mean of
+    each setting; and the failed runs below.
     """
     means = scene_means(rows)
     shown = [key for key in COLUMNS if any(key in row for row in means)]
@@ -128,23 +128,23 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def _cell(row, key):
-    """A column's mean and, of several seeds, its spread."""
+    """A column's mean and, with several seeds, its spread."""
     parts = (row, row.get("spread", {}))
     return " ± ".join(format(part[key], COLUMNS[key][1]) for part in parts if key in part) or "-"
 
 
 def run_text(row: Row) -> str:
-    """The run of a row: scene, setting and seed."""
+    """The name of a row's run: scene, setting and seed."""
     return " ".join([row["scene"], *_settings(row), f"seed {row['seed']}"])
 
 
 def _settings(row):
-    """What is varied in a row, as --vary takes it."""
+    """The varied settings of a row, as --vary takes them."""
     return [f"{key}={text}" for key, text in row["settings"].items()]
 
 
 def values_text(row: Row) -> str:
-    """What was measured of a run, or why it failed, in one line."""
+    """One line with the measured values of a run, or why it failed."""
     if "error" in row:
         return f"failed: {row['error']}"
     present = {key: column for key, column in COLUMNS.items() if row.get(key) is not None}
@@ -152,7 +152,7 @@ def values_text(row: Row) -> str:
 
 
 def write_tables(out: Path, rows: Sequence[Row]) -> dict[str, Any]:
-    """Write the rows as TABLES to the folder; returns what the first holds."""
+    """Write the rows to the folder as TABLES; returns the content of the first."""
     means = scene_means(rows)
     content = {"runs": list(rows), "scenes": means, "mean": overall_means(means)}
     write_json(out / TABLES[0], content)

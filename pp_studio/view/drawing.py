@@ -1,4 +1,4 @@
-"""What a run shows to a camera, as 8-bit images: colours, depth, normals, or a photograph."""
+"""Draws what a run shows to a camera as 8-bit images: colours, depth, normals, or a photograph."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,10 +12,10 @@ from pp_cl.files import linear_to_srgb, srgb_to_linear, to_8bit
 from pp_studio.large import render_large
 
 SHOWN = ("colour", "alpha", "depth", "normals", "fragments", "error", "photograph")
-OWN_CAMERA = SHOWN[5:]  # are shown from the nearest training view's own camera
-ERROR_SCALE = 4  # times an error is shown
-DARK = np.array([23, 24, 27]) / 255  # sRGB, where nothing is
-LEAST_ALPHA = 0.5  # of a pixel that has a depth to look at: those below mix edge and background
+OWN_CAMERA = SHOWN[5:]  # shown from the nearest training view's own camera
+ERROR_SCALE = 4  # errors are multiplied by this
+DARK = np.array([23, 24, 27]) / 255  # sRGB of empty pixels
+LEAST_ALPHA = 0.5  # least alpha of a pixel whose depth is used: below it, edge and background mix
 # eleven colours of viridis, from low to high (matplotlib, CC0)
 VIRIDIS = (
     "440154 482475 414487 355f8d 2a788e 21918c 22a884 44bf70 7ad151 bddf26 fde725"  # each RRGGBB
@@ -34,10 +34,10 @@ def draw(
     exposure: float = 0.0,
     on_part: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, str]:
-    """((H, W, 3) uint8, a line on what it shows). views: the run's training views, none where its
-    photographs are gone. show: of SHOWN. early_stop: in place of raster.early_stop. share: of the
-    most opaque points, in (0, 1]. exposure: in stops. on_part: called before each part of the work.
-    Raises UserError where there is no photograph to show, and where the model computes NaN.
+    """((H, W, 3) uint8, a line on it). views: the run's training views, none if its photographs are
+    gone. show: one of SHOWN. early_stop: replaces raster.early_stop. share: of the most opaque
+    points, in (0, 1]. exposure: in stops. on_part: called before each part of the work. Raises
+    UserError if there is no photograph to show, or if the model computes NaN.
     """
     truth, line = np.empty(0), ""
     if show in OWN_CAMERA:
@@ -49,7 +49,7 @@ def draw(
     if show == "photograph":
         image = to_8bit(truth)
     elif show == "fragments":
-        # the whole view, as until="weights" would change the buffers that a training goes on with
+        # the whole view: until="weights" would change buffers with which a training goes on
         between = run.depth_range(camera)
         whole = run.renderer.forward(camera, run.gamma, early_stop=early_stop, depth_range=between)
         counts = whole.fragments()
@@ -83,8 +83,8 @@ def draw(
 
 
 def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:
-    """Which of the cameras is nearest to another: by the distance of the eyes, plus the angle
-    between the axes times the eye's distance from the object's centre (3,).
+    """Index of the camera nearest to another: by the distance of the eyes, plus the angle between
+    the axes times the eye's distance from the object's centre (3,).
     """
     radius = np.linalg.norm(camera.eye - centre)
     apart = [np.linalg.norm(other.eye - camera.eye) for other in cameras]
@@ -93,8 +93,8 @@ def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> i
 
 
 def most_opaque(run: Run, share: float) -> Run:
-    """The run with that share of its points, in (0, 1], those of the highest opacity, and at least
-    one, and so each of its members.
+    """The run, and each of its members, with only a share of its points, in (0, 1]: the most opaque
+    ones, at least one.
     """
     opacity = run.model.cloud.opacity.get()[:, 0]
     count = max(1, round(share * len(opacity)))
@@ -103,7 +103,7 @@ def most_opaque(run: Run, share: float) -> Run:
 
 
 def colour_scale(values: Any, low: float, high: float, is_known: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: viridis from low to high, DARK where no value of (H, W) is known."""
+    """(H, W, 3) uint8: viridis from low to high, DARK where a value of (H, W) is not known."""
     place = (np.where(is_known, values, low) - low) / max(high - low, 1e-12)
     stops = np.linspace(0, 1, len(COLOURS))
     image = np.stack([np.interp(place, stops, COLOURS[:, i]) for i in range(3)], axis=2)
@@ -111,15 +111,15 @@ def colour_scale(values: Any, low: float, high: float, is_known: np.ndarray) -> 
 
 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """(H, W, 3) float64 unit normals in world axes, towards the camera, of the surface that a depth
-    map (H, W) along the camera's axis shows; NaN where a pixel or a neighbour that is needed has
-    none. Of two neighbours the one of the nearer depth is taken, so that edges stay sharp.
+    """(H, W, 3) float64 unit normals in world axes, towards the camera, of the surface in a depth
+    map (H, W) along the camera's axis; NaN where a pixel or a needed neighbour has no depth. Of two
+    neighbours, the one with the nearer depth is used, so that edges stay sharp.
     """
     positions = depth[..., None] * (camera.rays() @ camera.pose[:, :3])
 
     def along(axis):
         steps = np.diff(positions, axis=axis, append=np.nan)
-        before = np.roll(steps, 1, axis)  # whose first is the NaN
+        before = np.roll(steps, 1, axis)  # the NaN comes first here
         ahead_jump, before_jump = (np.abs(step[..., 2:]) for step in (steps, before))
         return np.where(np.isnan(before_jump) | (ahead_jump <= before_jump), steps, before)
 

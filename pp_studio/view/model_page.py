@@ -1,7 +1,7 @@
-"""The page of a model: renderings of it for each tab's camera, the training views as frustums,
-switches, a path of cameras, and the curve of its training.
+"""The page of a model: renderings for each tab's camera, training views as frustums, switches, a
+path of cameras, and the training's curve.
 
-viser's threads only note what tabs want; draw_next() draws it, in the thread that has the device.
+viser's threads only note what tabs request; draw_next() draws it in the thread with the device.
 """
 
 import io
@@ -27,22 +27,22 @@ from pp_studio.view.server import switches
 from pp_studio.view.space import CHOSEN, FRUSTUM, Space, thumbnail
 
 STILL = 0.2  # seconds without movement until the full resolution is drawn
-DRAFT = 4  # times fewer pixels each way while the camera moves
-SLOW = 0.25  # seconds of a draft, above which the browser draws the fitted Gaussians instead
-WAITING = "/waiting"  # the label in the middle of a page that shows nothing yet
+DRAFT = 4  # a draft, while the camera moves, has this many times fewer pixels each way
+SLOW = 0.25  # if a draft takes more seconds, the browser draws the fitted Gaussians instead
+WAITING = "/waiting"  # the label in the middle of a page that shows no image yet
 WHITE = np.full((1, 1, 3), 255, np.uint8)
-MOST_PIXELS = 2**23  # of a rendering
-FPS = 30  # of a path, as `pp-cl render` has it
-MOST_ROWS = 500  # of the curve
+MOST_PIXELS = 2**23  # most pixels of a rendering
+FPS = 30  # frame rate of a path, as in `pp-cl render`
+MOST_ROWS = 500  # most rows of the curve
 LOGGED = ("step", "psnr", "loss")
 BLUE, ORANGE, GREY = "#7fb4ff", "#ffb86b", "#a0a4ab"
 
 
 @dataclass
 class Tab:
-    """A tab of a browser: its camera, with the tab's pixels; when (time.monotonic()) that or a
-    switch last changed; when the last draft was drawn, and the last rendering of full size. splat:
-    the handle of the Gaussians that its browser draws, if the run has any.
+    """A tab of a browser: its camera, in the tab's pixels; when (time.monotonic()) the camera or a
+    switch last changed; when the last draft and the last full-size rendering were drawn. splat: the
+    handle of the Gaussians that its browser draws, if the run has any.
     """
 
     client: Any
@@ -54,13 +54,13 @@ class Tab:
 
 
 class _MovedError(Exception):
-    """A rendering is not wanted any more."""
+    """Raised when a rendering is no longer wanted."""
 
 
 class ModelPage:
-    """run: that of the last take(). views: its training views, none where the photographs are gone.
-    most_pixels: of a rendering. is_training: the model changes while it is shown, and has no memory
-    for a copy. woken: is set when a tab wants something.
+    """run: from the last take(). views: its training views, empty if the photographs are gone.
+    most_pixels: of a rendering. is_training: the model changes while it is shown, and there is no
+    memory for a copy. woken: set when a tab requests something.
     """
 
     def __init__(
@@ -75,16 +75,16 @@ class ModelPage:
         self.run, self.woken = run, threading.Event()
         self._server, self._views, self._most_pixels = server, views, most_pixels
         self._tabs: dict[int, Tab] = {}
-        self._wanted: list[Tab] = []  # those that want a PNG file
-        self._keys: list[Camera] = []  # of the path
+        self._wanted: list[Tab] = []  # tabs that want a PNG file
+        self._keys: list[Camera] = []  # cameras of the path
         self._space = Space(*run.ball)
         cameras = [view.camera for view in views] or run.cameras("train")
-        self._is_drawn = False  # for any tab
-        self._took = 0.0  # seconds, the last draft
+        self._is_drawn = False  # whether any tab has an image
+        self._took = 0.0  # seconds that the last draft took
         self._splat = None if is_training else self._gaussians()
         server.scene.set_up_direction(up_of(cameras))
         self._space.look_through(cameras[0], server.initial_camera)
-        # who looks through a frustum sees the model, not the photograph in the frustum
+        # a tab that looks through a frustum shows the model, not the photograph in the frustum
         server.initial_camera.near = 1.1 * FRUSTUM
         self._frustums = server.scene.add_frame("/views", show_axes=False)
         images: list[Any] = [thumbnail(view.image) for view in views] or [None] * len(cameras)
@@ -153,7 +153,7 @@ class ModelPage:
                 tab = self._tabs.get(client.client_id)
                 if tab is None:
                     tab = self._tabs[client.client_id] = Tab(client, camera)
-                    if self._splat:  # the browser draws it until there is a rendering
+                    if self._splat:  # the browser draws it until a rendering arrives
                         client.scene.set_background_image(WHITE)
                         tab.splat = client.scene.add_gaussian_splats("/splat", **self._splat)
                 tab.camera, tab.moved = camera, time.monotonic()
@@ -167,7 +167,7 @@ class ModelPage:
         await moved(client.camera)
 
     def _by_browser(self, tab):
-        """The Gaussians that the tab's browser draws while its camera moves, if it does."""
+        """The Gaussians that the tab's browser draws while its camera moves, or None."""
         is_wanted = self._took > SLOW and self._show.value == SHOWN[0]
         return tab.splat if is_wanted else None
 
@@ -175,7 +175,7 @@ class ModelPage:
         self._tabs.pop(client.client_id, None)
 
     def _with_tab(self, act):
-        """What calls act(tab) of the tab that an event is of."""
+        """An event handler that calls act(tab) with the event's tab."""
         return lambda event: act(tab) if (tab := self._tabs.get(event.client_id)) else None
 
     def _switched(self, _event):
@@ -216,19 +216,19 @@ class ModelPage:
         self.renew()
 
     def renew(self) -> None:
-        """Have all tabs that rest drawn again, as the model has changed."""
+        """Redraw all tabs at rest, as the model has changed."""
         for tab in list(self._tabs.values()):
             tab.drawn = 0.0
 
     def set_rows(self, rows: Sequence[dict[str, Any]]) -> None:
-        """Draw the curve of the rows of a log, thinned out to about MOST_ROWS."""
+        """Draw the curve of a log's rows, thinned out to about MOST_ROWS."""
         found = [[row[key] for key in LOGGED] for row in rows if all(key in row for key in LOGGED)]
         thinned = found[:: 1 + len(found) // MOST_ROWS]
         self._curve.data = tuple(np.array(thinned, np.float64).reshape(-1, len(LOGGED)).T.copy())
         self._curve.visible = bool(found)
 
     def draw_next(self) -> bool:
-        """Draw what a tab waits for, that which has waited longest; whether there was anything."""
+        """Draw for the tab that has waited longest; return whether any was waiting."""
         self.woken.clear()
         if self._wanted:
             self._send_image(self._wanted.pop(0))
@@ -248,19 +248,19 @@ class ModelPage:
         return False
 
     def tell(self, line: str) -> None:
-        """Write the state of the run and a line below it on the page."""
+        """Show the state of the run on the page, with a line below it."""
         step, steps = self.run.header["step"], self.run.config.train.iterations
         points = self.run.model.cloud.count
         self._status.content = f"step {step} of {steps}, {points} points\n\n{line}"
 
     def _camera(self, tab):
-        """Of the rendering that fills a tab, in its pixels, or fewer where these are too many."""
+        """Camera of a rendering that fills a tab, in its pixels, or fewer if these are too many."""
         width, height = tab.camera.width, tab.camera.height
         scale = min(1.0, (self._most_pixels / (width * height)) ** 0.5)
         return tab.camera.resized(*(max(MIN_SIDE, round(scale * side)) for side in (width, height)))
 
     def _gaussians(self):
-        """Arguments of viser's add_gaussian_splats, with mean colours, if any are fitted."""
+        """Arguments of viser's add_gaussian_splats, with mean colours; None if none are fitted."""
         if (found := kept_gaussians(self.run)) is None:
             return None
         table = found.table
@@ -274,7 +274,7 @@ class ModelPage:
         }
 
     def _image(self, camera, on_part=lambda: None):
-        """What draw() makes of it, as the switches say; None where it refuses, and told why."""
+        """draw() with the page's switches; None if it refuses, which the page then shows."""
         stop, share, exposure = map(_value, (self._stop, self._share, self._exposure))
         options = {"early_stop": stop, "share": share / 100, "exposure": exposure}
         try:
@@ -284,7 +284,7 @@ class ModelPage:
             return None
 
     def _send(self, tab, is_draft):
-        """Draw what a tab shows behind its frustums; but for drafts until its camera moves."""
+        """Draw what a tab shows behind its frustums; unless a draft, stop if its camera moves."""
         start, moved, camera = time.perf_counter(), tab.moved, self._camera(tab)
         if is_draft:
             most = min(camera.width, camera.height) // MIN_SIDE
@@ -316,7 +316,7 @@ class ModelPage:
                 self.tell(f"{line}\n\n{image.shape[1]}x{image.shape[0]}, {took}")
 
     def _send_image(self, tab):
-        """Draw what a tab shows into a file that its user keeps."""
+        """Draw what a tab shows into a file for its user to save."""
         if found := self._image(self._camera(tab)):
             file = io.BytesIO()
             Image.fromarray(found[0]).save(file, "PNG")
@@ -326,12 +326,12 @@ class ModelPage:
 
 
 def announce(server: Any, text: str) -> None:
-    """Say in the middle of the page what it waits for, until a ModelPage shows a rendering."""
+    """Show in the middle of the page what it waits for, until a ModelPage shows a rendering."""
     server.scene.add_label(WAITING, text)
 
 
 def framed(image: np.ndarray, aspect: float) -> np.ndarray:
-    """The (H, W, 3) uint8 image in the middle of one of this width over height, DARK around it."""
+    """The (H, W, 3) uint8 image, padded with DARK to an aspect of width over height."""
     height, width = image.shape[:2]
     across, down = max(round(aspect * height) - width, 0), max(round(width / aspect) - height, 0)
     whole = np.full((height + down, width + across, 3), 255 * DARK, np.uint8)
@@ -340,5 +340,5 @@ def framed(image: np.ndarray, aspect: float) -> np.ndarray:
 
 
 def _value(slider):
-    """What a slider says, within its bounds whatever a tab has sent."""
+    """A slider's value, clipped to its bounds whatever a tab has sent."""
     return float(np.clip(np.nan_to_num(slider.value), slider.min, slider.max))

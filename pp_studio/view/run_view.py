@@ -1,4 +1,4 @@
-"""Shows a run: the model of its last checkpoint, or that of a training between its steps."""
+"""Shows a run: the model of its last checkpoint, or of a training between its steps."""
 
 import math
 import time
@@ -13,15 +13,15 @@ from pp_cl.errors import UserError
 from pp_studio.view.model_page import ModelPage, announce
 from pp_studio.view.server import started
 
-POLL = 1.0  # seconds between two looks at checkpoint and log
-BREAK = 2.0  # times what a rendering took, in which a training is left alone: it gets two thirds
-RENEWED = 1.0  # seconds after which a tab that rests sees the training's model again
+POLL = 1.0  # seconds between checks of checkpoint and log
+BREAK = 2.0  # a training runs undisturbed for this many times a rendering: it gets two thirds
+RENEWED = 1.0  # seconds until a resting tab shows the training's model again
 
 
 class RunView:
-    """Serves a run folder that another process may still train into. page: None while there is no
-    checkpoint; told: of what is wrong, a line on the page. scene: where the run's is now. is_fast:
-    it is shown as fastest() says.
+    """Serves a run folder that another process may still train into. page: None until there is a
+    checkpoint; told: a line on the page about what is wrong. scene: where the run's scene is now.
+    is_fast: show the run with the settings of fastest().
     """
 
     def __init__(
@@ -37,11 +37,11 @@ class RunView:
         self.told = server.gui.add_markdown("")
         self._server, self._dev, self._folder, self._scene = server, dev, folder, scene
         self._is_fast = is_fast
-        self._seen: dict[Any, Any] = {}  # by file: what differs when it is replaced or grows
+        self._seen: dict[Any, Any] = {}  # {file: what changes when it is replaced or grows}
         announce(server, f"reading {folder}")
 
     def serve(self) -> None:
-        """Draw for ever what tabs want, and take up new checkpoints and rows of the log."""
+        """Draw forever what tabs request, and take up new checkpoints and rows of the log."""
         looked = -POLL
         while True:
             if time.monotonic() - looked >= POLL:
@@ -53,7 +53,7 @@ class RunView:
                 self.page.woken.wait(0.1)
 
     def look(self) -> None:
-        """Take up the checkpoint and the log where they have changed; no broken checkpoint."""
+        """Take up the checkpoint, unless it is broken, and the log if they have changed."""
         if self._is_new(self._folder.checkpoint):
             try:
                 self._take(load(self._folder.path, self._dev, scene=self._scene))
@@ -91,7 +91,7 @@ class RunView:
 
 
 def logged(folder: RunFolder) -> list[dict[str, Any]]:
-    """The rows of a run's log, none of one that cannot be read."""
+    """The rows of a run's log; none if it cannot be read."""
     with suppress(UserError):
         return folder.rows()
     return []
@@ -99,13 +99,13 @@ def logged(folder: RunFolder) -> list[dict[str, Any]]:
 
 @contextmanager
 def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
-    """Show a training until the block ends: (address, what to call after each step). Images are
-    drawn there, between two steps, and leave the bits of the training as they are: they use the
-    buffers that its previews use.
+    """Show a training until the block ends: yields (address, a function to call after each step).
+    That function draws images between two steps, in the buffers of the training's previews, so the
+    bits of the training do not change.
     """
     trainer, run = training.trainer, training.present_run()
     cameras = [view.camera for view in trainer.views]
-    most = max(camera.width * camera.height for camera in cameras)  # what memory is planned for
+    most = max(camera.width * camera.height for camera in cameras)  # memory is planned for these
     with started(training.folder.name) as (server, address):
         page = ModelPage(server, run, trainer.views, most_pixels=most, is_training=True)
         page.tell("the first step builds kernels")
@@ -128,7 +128,7 @@ def shown_training(training: Training) -> Iterator[tuple[str, OnStep]]:
                 if page.draw_next():
                     end = time.monotonic()
                     free = end + BREAK * (end - start)
-            except Exception as error:  # of whatever kind: it is no reason to lose a training
+            except Exception as error:  # any error: none may end a training
                 warnings.warn(f"nothing is shown any more: {error!r}", stacklevel=2)
                 free = math.inf
 

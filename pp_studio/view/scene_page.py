@@ -1,5 +1,5 @@
-"""The page of a scene: its cameras with their images, its points, its box and the views that
-are left out. What the user changes about box and views is written to the scene's folder at once.
+"""The page of a scene: its cameras with their images, its points, its box and the dropped views.
+The user's changes to box and views are written to the scene's folder at once.
 """
 
 import threading
@@ -29,17 +29,16 @@ from pp_cl.scene import (
 from pp_studio.view.server import switches
 from pp_studio.view.space import CHOSEN, VIEW, Space, thumbnail
 
-SHOWN_POINTS = 20_000  # that a browser draws while it turns
-WIDE = 0.3  # of the distance of the cameras, half the side of a box that nothing states
-GREY = 150  # of points without colour
-DROPPED, SUGGESTED = (216, 72, 72), (150, 150, 150)  # colours
+SHOWN_POINTS = 20_000  # most points that a browser draws while it turns
+WIDE = 0.3  # half the side of a suggested box, in distances of the cameras
+GREY = 150  # grey level of points without colour
+DROPPED, SUGGESTED = (216, 72, 72), (150, 150, 150)  # colours of a dropped view and suggested box
 UNREADABLE = np.zeros((1, 1, 3), np.uint8)
 
 
 class ScenePage:
-    """Box and dropped views have one place, the folder's file: each change reads it, writes it, and
-    shows what it then says. device: as `pp-cl devices` lists them. Raises UserError as
-    scene_frames does.
+    """Box and dropped views are kept only in the folder's file: each change reads it, writes it,
+    and shows the new content. device: as in `pp-cl devices`. Raises UserError as scene_frames does.
     """
 
     def __init__(self, server: Any, folder: Path, device: str | None = None) -> None:
@@ -49,7 +48,7 @@ class ScenePage:
             split: scene_frames(folder, split, edited=False)
             for split in sorted(scene_splits(folder), key=lambda split: split != "train")
         }
-        # one that lies in two splits is one view, which the page's list takes but once
+        # a view in two splits is one view: the page's list takes each name only once
         self._cameras = {view.name: view.camera for some in self.splits.values() for view in some}
         cameras = list(self._cameras.values())
         self._points, colours = sparse_points(folder)
@@ -58,7 +57,7 @@ class ScenePage:
         up, eyes = up_of(cameras), self._space.page([camera.eye for camera in cameras])
         distances = np.linalg.norm(eyes, axis=1)
         server.scene.set_up_direction(up)
-        # above the first camera, with all of them in sight
+        # above the first camera, where all cameras are in sight
         first = eyes[0] / distances[0]
         server.initial_camera.position = distances.max() * (1.2 * first + 0.6 * up)
         server.initial_camera.look_at = np.zeros(3)
@@ -107,11 +106,11 @@ class ScenePage:
             self._image = gui.add_image(UNREADABLE)
 
     def _box(self):
-        """((2, 3) box of the user or the format, else a suggestion; whether it is none)."""
+        """((2, 3) box of the user or the format, or else a suggestion; whether it is given)."""
         box = scene_box(configure(preset("tiny"), str(self._folder)))
         if box is not None:
             return box, True
-        # of the sparse points near what the cameras look at, else around that
+        # suggest the box of sparse points near what the cameras look at, else a cube around that
         cameras = list(self._cameras.values())
         middle = looked_at(cameras)
         reach = WIDE * np.median([np.linalg.norm(c.eye - middle) for c in cameras])
@@ -123,7 +122,7 @@ class ScenePage:
     # ---- what viser's threads call
 
     def _change(self, toggled=None, **changed):
-        """Write what the user has changed, if it can be. toggled: a view, dropped or kept."""
+        """Write the user's changes, if possible. toggled: a view to drop, or to take back."""
         line = f"written to {EDITS}"
         with self._lock:
             try:
@@ -148,7 +147,7 @@ class ScenePage:
             self._tell("")
 
     def _tell(self, line):
-        """Show what the folder's file says, and a line."""
+        """Show the content of the folder's file, and a line."""
         try:
             dropped, (box, is_given) = read_edits(self._folder).dropped, self._box()
         except UserError as error:
@@ -170,16 +169,16 @@ class ScenePage:
         state = "given" if is_given else "suggested"
         self._status.content = f"{count} of {views} views, box {state}\n\n{line}"
 
-    # ---- what takes long
+    # ---- the slow work
 
     def serve(self) -> None:
-        """Fill the page, then leave it to its users for ever."""
+        """Fill the page, then serve it forever."""
         self.fill()
         self._server.sleep_forever()
 
     def fill(self) -> None:
-        """Put the images into the frustums; and where the scene brings no points, show those of a
-        coarse visual hull of its masks.
+        """Put the images into the frustums; if the scene has no points, show those of a coarse
+        visual hull of its masks.
         """
         for name, frustum in self._frustums.items():
             frustum.image = self._read(name)
@@ -192,7 +191,7 @@ class ScenePage:
                 self._add_points(points, np.full((len(points), 3), GREY, np.uint8))
 
     def _read(self, name):
-        """(h, w, 3) uint8 of a view, reduced, upright as its camera is."""
+        """(h, w, 3) uint8 image of a view, reduced, upright as its camera is."""
         camera = self._cameras[name]
         try:
             return thumbnail(read_rgba(self._folder / name, (camera.width, camera.height)))
@@ -201,7 +200,7 @@ class ScenePage:
 
 
 def hull_points(device: str | None, folder: str) -> np.ndarray:
-    """(N, 3) world positions of a coarse visual hull. Raises UserError where masks leave none."""
+    """(N, 3) world positions of a coarse visual hull. Raises UserError if masks leave none."""
     dev, config = open_device(device), scene_config(folder, "tiny")
     views, box = open_scene(dev, config, ("train",)).splits["train"], scene_box(config)
     views, _, forgiven = agreeing(dev, views, box)
