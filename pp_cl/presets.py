@@ -2,16 +2,16 @@
 
 from typing import Any
 
-# What differs from the defaults in settings.py, which are the tiny preset: minutes on a CPU.
+# Settings that differ from the defaults in settings.py. These are tiny: minutes on a CPU.
 PRESETS: dict[str, dict[str, Any]] = {
     "tiny": {},
-    # for 400 x 400: begins at half the size; 20 minutes on a CPU
+    # for images of 400 x 400: training begins at half the size and takes 20 minutes on a CPU
     "small": {
         "points.count": 170_000,
         "train.iterations": 6_000,
         "train.crop": 160,
     },
-    # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
+    # for images of 800 x 800: training begins at a quarter of the size, to clear fog cheaply
     "full": {
         "points.count": 170_000,
         "raster.radius": 0.75,  # 1 takes longer here, for 0.2 dB less
@@ -19,8 +19,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.crop": 256,
     },
     "paper": {
-        # Stated by the supplemental, as are the default of train.sh_rate, and what is the same in
-        # all presets: gamma, the decay of the SH's rates and their delays of 0, 500 and 1000 steps
+        # The supplemental states these, the default of train.sh_rate, and values that all presets
+        # share: gamma, the decay of the SH's rates and their delays of 0, 500 and 1000 steps
         # (training/schedule.py).
         "points.count": 4_000_000,
         "points.opacity": 1.0,
@@ -37,8 +37,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "network.rate": (3e-4, 5e-5),
         "train.iterations": 50_000,
         "train.crop": 0,
-        # Ours: the supplemental mentions no supersampling, jitter, smoothing or averaging, no rule
-        # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
+        # Our choice: the supplemental mentions no supersampling, jitter, smoothing or averaging and
+        # no rule of pruning. Ours in all presets: the loss, its weight, Adam's eps, opacity's rate.
         "train.smooth_l1": 0.0,
         "train.sh_eps": 0.0197,
         "train.opacity_rate": (3e-2, 3e-3),
@@ -58,15 +58,15 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-# two of full, whose images' mean is shown
+# trains full twice and shows the mean of both images
 PRESETS["best"] = PRESETS["full"] | {"train.members": 2}
 
-# Steps below which a training of a preset says that they are few: with as many, lego has about
-# 31 dB.
+# A training with fewer steps than its preset has here warns that they are few. With this many, lego
+# reaches about 31 dB.
 FEW = {"tiny": 300, "small": 1_000, "full": 1_500, "best": 1_500, "paper": 10_000}
 
-# Pixels of the longer side that a preset reduces larger images to. full is made for 800, but those
-# of 1600 gain by it, too; with 4000 memory leaves points ten pixels apart. None: as they are.
+# A preset reduces larger images to this many pixels on the longer side. full is made for 800, but
+# images of 1600 gain by it, too; with 4000, memory limits points to ten pixels apart. None: as is.
 IMAGE_SIZES = {"tiny": 200, "small": 400, "full": 1600, "best": 1600, "paper": None}
 
 # Settings with a short name on the command line and in session.train_scene().

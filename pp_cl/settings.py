@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-FORMAT = 3  # of config.json: raised when keys are added, change meaning or are removed
-BLOCKS = ("double", "single", "gated")  # what a level of the network computes
+FORMAT = 3  # of config.json: goes up when keys are added, change meaning or are removed
+BLOCKS = ("double", "single", "gated")  # kinds of blocks at a level of the network
 
 
 def setting(

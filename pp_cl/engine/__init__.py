@@ -1,16 +1,16 @@
 """The engine: trains and renders from arrays alone. It knows no folder, no file and no command.
 
-Of the project it imports errors and settings, nothing else. In the order of reading:
+Of the project it imports only errors and settings. In reading order:
 
-step: one step of training, and what is due between steps.
-render: from a model and a camera to an image and back, the one place with the order of the stages.
+step: the Trainer, which runs training step by step.
+render: renders a model and computes gradients; it alone sets the order of the stages.
 model: points in the cells of a grid, and the network.
-camera, grid, views: what these are.
-raster/: points, project, pairs, weights, blend, depth: a stage each, beside its kernels.
-network/: layers is the U-Net on one page; unet launches it; tile_plan leaves out background.
-layers/: the convolutions and the small layers; choice says which is taken where.
+camera, grid, views: define Camera, Grid and View.
+raster/: points, project, pairs, weights, blend, depth: a module for each stage.
+network/: layers is the U-Net on one page; unet launches it; tile_plan skips background.
+layers/: the convolutions and the small layers; choice selects one for each layer.
 training/: target, crops, loss, exposure; optim, state, schedule; smooth, prune.
-device/: device and kernel build and launch by name; buffers, launch, scan, host.
+device/: device and kernel build and launch kernels by name; buffers, launch, scan, host.
 """
 
 import lazy_loader

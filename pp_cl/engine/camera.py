@@ -13,8 +13,9 @@ class Camera:
     """A pinhole camera with OpenCV axes: x right, y down, z forward.
 
     pose: (3, 4) float64 camera-to-world, orthonormal rotation. fx, fy, cx, cy: pixels; the centre
-    of pixel (x, y) is (x + 0.5, y + 0.5). samples: pixels of a viewer's rendering, each way, whose
-    mean a pixel is, for Gaussians alone. The depth range is the model's, not the camera's.
+    of pixel (x, y) is (x + 0.5, y + 0.5). samples: only for Gaussians; each pixel is the mean of
+    samples x samples pixels of a viewer's rendering. The depth range is the model's, not the
+    camera's.
     """
 
     pose: np.ndarray
@@ -40,7 +41,7 @@ class Camera:
     ) -> "Camera":
         """A camera at `eye` whose image shows `target` in its centre, the principal point.
 
-        up: world direction that points up in the image. fy: fx if not given.
+        up: world direction that points up in the image. fy: equals fx if not given.
         """
         pose = look_at(eye, target, up)
         return cls(pose, fx, fx if fy is None else fy, width / 2, height / 2, width, height)
@@ -55,15 +56,13 @@ class Camera:
         return replace(self, pose=np.column_stack([self.pose[:, :3], np.add(self.eye, by)]))
 
     def project(self, positions: ArrayLike) -> np.ndarray:
-        """(3, ...) of world positions (..., 3): x and y in pixels, and depth along the camera's
-        axis.
-        """
+        """Project world positions (..., 3) to (3, ...): x and y in pixels, depth along the axis."""
         x, y, z = np.moveaxis((positions - self.eye) @ self.pose[:, :3], -1, 0)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy, z])
 
     def pixels(self, positions: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of (N, 3) world positions, (N,) each: column and row of the pixel that shows one, and
-        whether one does; where none does both are 0.
+        """(column, row, is_shown), (N,) each: the pixels that show (N, 3) world positions, and
+        whether the image shows them; where it does not, column and row are 0.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y, depth = self.project(positions)
@@ -72,7 +71,7 @@ class Camera:
         return column, row, is_shown
 
     def rays(self) -> np.ndarray:
-        """(H, W, 3) through the pixels' centres, along the world's axes, of depth 1."""
+        """(H, W, 3) vectors of depth 1 from the eye through the pixels' centres, in world axes."""
         y, x = np.mgrid[: self.height, : self.width] + 0.5
         axes = (x - self.cx) / self.fx, (y - self.cy) / self.fy, np.ones_like(x)
         return np.stack(axes, -1) @ self.pose[:, :3].T
@@ -83,7 +82,7 @@ class Camera:
         """(21,) float32, the layout of cl/camera.h.
 
         depth_range: (near, far), Euclidean distances from the eye, world units. centre: world
-        position that is the device's origin, which has to be near for float32.
+        position that becomes the device's origin; float32 needs it close to the scene.
         """
         return np.concatenate(
             [
@@ -95,8 +94,8 @@ class Camera:
         ).astype(np.float32)
 
     def crop(self, x0: int, y0: int, width: int, height: int) -> "Camera":
-        """The camera of columns [x0, x0+width) and rows [y0, y0+height) of this one's image, which
-        they may exceed.
+        """The camera of columns [x0, x0+width) and rows [y0, y0+height) of this camera's image;
+        they may reach outside it.
         """
         return replace(self, cx=self.cx - x0, cy=self.cy - y0, width=width, height=height)
 
@@ -119,7 +118,7 @@ class Camera:
         )
 
     def enlarged(self, factor: int) -> "Camera":
-        """The camera of the image that has factor x factor pixels for each pixel of this one's."""
+        """The camera of an image with factor x factor pixels for each pixel of this camera's."""
         return replace(
             self,
             fx=self.fx * factor,
@@ -131,7 +130,7 @@ class Camera:
         )
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The camera whose image has this many pixels and shows as much across its width."""
+        """The camera of an image of width x height pixels with the same angle across its width."""
         scale = width / self.width
         cx = scale * self.cx
         cy = scale * (self.cy - self.height / 2) + height / 2
@@ -144,9 +143,9 @@ class Camera:
         return replace(self, fx=scale * self.fx, fy=scale * self.fy)
 
     def padded(self, multiple: int, margin: int = 0) -> tuple["Camera", int, int]:
-        """(camera, left, top): enlarged by `margin` pixels on each side, and further so that
-        `multiple` divides both; this camera's image starts at column `left` and row `top` of the
-        larger one.
+        """(camera, left, top): the camera of an image enlarged by `margin` pixels on each side, and
+        further until `multiple` divides width and height. This camera's image starts at its column
+        `left` and row `top`.
         """
         extra_w, extra_h = (
             2 * margin + -(side + 2 * margin) % multiple for side in (self.width, self.height)

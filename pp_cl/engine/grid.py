@@ -15,7 +15,7 @@ from pp_cl.engine.camera import Camera
 
 FLOAT32_BITS = 24
 MOST_IDS = 2**32  # an id has 32 bits
-BRICK = 8  # vertices along each side of a brick, a power of two as cl/grid.h has it
+BRICK = 8  # vertices along each side of a brick, a power of two, as in cl/grid.h
 # steps (x, y, z) to 13 of a vertex's 26 neighbours; the others are their opposites
 HALF_OF_NEIGHBOURS = [step for step in product((0, 1, -1), repeat=3) if step[::-1] > (0, 0, 0)]
 
@@ -27,9 +27,10 @@ class Grid:
     origin: world position of vertex (0, 0, 0). voxel_size: distance of neighbouring vertices, world
     units. dims: number of vertices along x, y and z.
 
-    Ids number the vertices brick by brick of 8x8x8, bricks and the vertices in each x first, so
-    that points in the order of their ids lie near one another in all directions: 16 of them meet
-    few pixels, and what they read is still in a cache. Ids of whole bricks are more than vertices.
+    Ids number the vertices in bricks of 8x8x8; bricks, and vertices in a brick, are numbered x
+    first. Points in the order of their ids are thus close to one another in all directions: 16
+    consecutive ones cover few pixels and read data that is still in a cache. Incomplete bricks use
+    up ids, too, so there are more ids than vertices.
     """
 
     origin: tuple[float, ...]
@@ -45,7 +46,7 @@ class Grid:
 
     @classmethod
     def of_header(cls, stored: dict[str, Any]) -> "Grid":
-        """The grid of what header() gave."""
+        """The grid that header() described."""
         origin = tuple(map(float, stored["origin"]))  # JSON may hold integers beyond 64 bits
         return cls(origin, float(stored["voxel_size"]), tuple(stored["dims"]))
 
@@ -58,20 +59,20 @@ class Grid:
         }
 
     def refined(self) -> "Grid":
-        """The grid of half the spacing that has eight vertices around each of this one's: vertex
+        """The grid of half the spacing with eight vertices around each vertex of this grid: vertex
         (i, j, k) is in the middle of (2 i, 2 j, 2 k) to (2 i + 1, 2 j + 1, 2 k + 1).
         """
         origin = tuple(x - self.voxel_size / 4 for x in self.origin)
         return Grid(origin, self.voxel_size / 2, tuple(2 * n for n in self.dims))
 
     def coarsened(self) -> "Grid":
-        """The grid whose refined() this is."""
+        """The grid whose refined() returns this grid."""
         origin = tuple(x + self.voxel_size / 2 for x in self.origin)
         return Grid(origin, 2 * self.voxel_size, tuple(n // 2 for n in self.dims))
 
     def children(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(ids of refined(), ascending, the place in `ids` of each one's parent), (8 N) uint32
-        both. Raises ValueError where refined() has more vertices than 32 bits can number.
+        """(ascending ids in refined(), index in `ids` of the parent of each), both (8 N) uint32.
+        Raises ValueError if refined() has more vertices than 32 bits can number.
         """
         refined, first = self.refined(), 2 * self.coordinates(ids)
         if refined.id_count > MOST_IDS:
@@ -94,8 +95,8 @@ class Grid:
 
     @cached_property
     def diagonal(self) -> float:
-        """From the first to the last vertex, world units; the voxel size where there is one
-        vertex.
+        """Distance from the first to the last vertex, world units; the voxel size if there is only
+        one vertex.
         """
         return float(np.linalg.norm(np.ptp(self.box, axis=0))) or self.voxel_size
 
@@ -104,9 +105,9 @@ class Grid:
         return replace(self, origin=tuple(float(x) for x in np.add(self.origin, by)))
 
     def rounded(self) -> "Grid":
-        """The grid with a voxel size that float32 holds, and an origin of whole units of its last
-        bit. So float64 holds each vertex and the centre exactly, up to 2^28 voxels from the world's
-        origin, and moves by whole units change nothing else.
+        """The grid with its voxel size rounded to float32 and its origin to multiples of the voxel
+        size's last bit. float64 then holds each vertex and the centre exactly, up to 2^28 voxels
+        from the world's origin, and moves by multiples of that bit are exact.
         """
         unit = 2.0 ** (math.frexp(self.voxel_size)[1] - FLOAT32_BITS)
         origin = tuple(float(x) for x in unit * np.rint(np.divide(self.origin, unit)))
@@ -115,7 +116,7 @@ class Grid:
         )
 
     def packed(self, centre: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
-        """(8,) float32, the layout of cl/grid.h. centre: as Camera.packed has it."""
+        """(8,) float32, the layout of cl/grid.h. centre: as for Camera.packed()."""
         origin = np.subtract(self.origin, centre)
         return np.array([*origin, self.voxel_size, *self.dims, 0], np.float32)
 
@@ -130,7 +131,7 @@ class Grid:
 
     @property
     def id_count(self) -> int:
-        """The ids of whole bricks; all are below it."""
+        """Number of ids in all bricks, including unused ids; every id is below it."""
         return BRICK**3 * math.prod(self._bricks())
 
     def coordinates(self, ids: ArrayLike) -> np.ndarray:
@@ -148,18 +149,18 @@ class Grid:
         return np.dot(brick, (1, nx, nx * ny)) * BRICK**3 + np.dot(vertex, (1, BRICK, BRICK**2))
 
     def ids_of(self, is_chosen: np.ndarray) -> np.ndarray:
-        """(N,) uint32, the ascending ids of the vertices that are True in (nz, ny, nx) bool."""
+        """(N,) uint32: ascending ids of the vertices that is_chosen, (nz, ny, nx) bool, marks."""
         coordinates = np.stack(np.nonzero(is_chosen)[::-1], -1)
         return np.sort(self.ids(coordinates).astype(np.uint32))
 
     def _bricks(self):
-        """Bricks along x, y and z."""
+        """Number of bricks along x, y and z."""
         return [-(-n // BRICK) for n in self.dims]
 
     def in_large_parts(self, ids: np.ndarray, least: int) -> np.ndarray:
-        """(N,) bool: which of the vertices with ids (N,), ascending, are in a connected part
-        (sides, diagonals) of at least `least`; where there is none, those in the largest. It takes
-        the memory of the vertices, not of the box around them.
+        """(N,) bool: True for vertices, given by ascending ids (N,), in a connected part (sides,
+        diagonals) of at least `least` vertices, or in the largest part if all are smaller. Memory
+        grows with the number of vertices, not with the box around them.
         """
         ids, place, found_pairs = np.asarray(ids, np.int64), self.coordinates(ids), []
         for step in HALF_OF_NEIGHBOURS:
@@ -177,8 +178,8 @@ class Grid:
         return size[part] >= min(least, size.max())
 
     def projection(self, camera: Camera) -> np.ndarray:
-        """(3, 4) float64: vertex (i, j, k, 1) -> (u w, v w, w), with pixel (u, v) of the camera and
-        depth w along its optical axis.
+        """(3, 4) float64 matrix from vertex (i, j, k, 1) to (u w, v w, w), where (u, v) is the
+        camera's pixel and w the depth along its optical axis.
         """
         intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
         offset = np.asarray(self.origin) - camera.eye
@@ -191,7 +192,7 @@ class Grid:
 
 def smallest_voxel_size(box: np.ndarray, cells: int) -> float:
     """Voxel size, within 0.1 %, of the finest grid over a (2, 3) box with at most `cells` vertices;
-    1 where the box is one place.
+    1 if the box is a single point.
     """
     size = box[1] - box[0]
     if not size.any():

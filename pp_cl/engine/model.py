@@ -16,16 +16,16 @@ from pp_cl.engine.network.specular import Specular
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 
-REFINING_BYTES = 320  # of the host, which refining takes for each point before it
+REFINING_BYTES = 320  # of host memory that refining uses for each point it replaces
 
 
 class Model:
     """Points and network on a device.
 
-    grid: the vertices in whose cells points lie; grid_buffer: the same, packed, (8) float32 on the
-    device. depth_range: (near, far), distances from the eye in world units, of all cameras. What
-    the device gets is relative to the grid's centre, which refinement keeps. specular: the layer
-    that is fitted once a training has ended, where it is worth having.
+    grid: each point lies in the cell of a vertex; grid_buffer: the packed grid, (8) float32 on the
+    device. depth_range: (near, far), distances from the eye in world units, of all cameras.
+    Positions on the device are relative to the grid's centre, which refinement does not move.
+    specular: the layer fitted at the end of a training, or None.
     """
 
     def __init__(
@@ -52,17 +52,17 @@ class Model:
         return vertices + self.grid.voxel_size * self.dev.download(self.cloud.offset)[:, :3]
 
     def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
-        """(21,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the
-        model's.
+        """(21,) float32: the packed camera, relative to the same centre as grid_buffer.
+        depth_range: replaces the model's.
         """
         return camera.packed(depth_range or self.depth_range, self.grid.centre)
 
     def refine(self) -> Array:
         """Densify: replace every point by the eight around it on the grid of half the spacing,
-        which take over its offset, opacity and SH coefficients. Returns the point that each one
-        comes from, (8 N,) uint32.
+        which take over its offset, opacity and SH coefficients. Returns the row of each new point's
+        parent, (8 N,) uint32.
 
-        Raises ValueError as Grid.children does.
+        Raises ValueError as Grid.children() does.
         """
         ids, parents = self.grid.children(self.dev.download(self.cloud.ids))
         rows = self.dev.upload(parents)
@@ -72,7 +72,7 @@ class Model:
         return rows
 
     def header(self) -> dict:
-        """JSON-able description that load() needs beside the arrays."""
+        """JSON-able description that load() needs in addition to the arrays."""
         header = {
             "grid": self.grid.header(),
             "depth_range": [float(x) for x in self.depth_range],
@@ -101,8 +101,8 @@ class Model:
         *,
         degree: int,
     ) -> Model:
-        """Model of a checkpoint's header and arrays, as pp_cl/checkpoint.py has checked them;
-        the arrays are taken out of `arrays`, net takes the parameters stored there.
+        """Make a Model from a checkpoint's header and arrays, which pp_cl/checkpoint.py has
+        checked. Removes the arrays from `arrays` and writes the stored parameters to net.
         """
         grid = Grid.of_header(header["grid"])
         cloud = PointCloud.load(dev, arrays, degree)

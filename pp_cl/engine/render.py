@@ -1,5 +1,5 @@
-"""The renderer: from a model and a camera to an image, and back to gradients. This is the one place
-that writes the order of the stages.
+"""The renderer: renders a model for a camera and computes gradients from the image's. Only this
+module sets the order of the stages.
 
 project -> pairs -> blend weights -> shade the visible points -> blend their features -> U-Net
 """
@@ -40,7 +40,7 @@ from pp_cl.engine.raster.weights import (
 from pp_cl.errors import UserError
 from pp_cl.settings import RasterConfig
 
-MOST_SIDE = 2**16 - 1  # pixels of an image: the boxes of points have 16 bits
+MOST_SIDE = 2**16 - 1  # pixels along a side of an image: points' boxes have 16 bits
 # far - near of the scenes for which the paper's radius of 0.0015 was chosen
 PAPER_DEPTH_RANGE = 4.0
 
@@ -56,8 +56,8 @@ def point_radius(
 
 
 def is_supersampled(settings: RasterConfig) -> bool:
-    """Whether points can have several samples of a pixel: discs composited by alpha, of which one
-    list is right for all samples.
+    """Whether a pixel can have several samples: only with discs composited by alpha, where one list
+    of fragments is right for all of them.
     """
     return settings.blend == "alpha" and settings.footprint in ("soft", "disc")
 
@@ -73,9 +73,9 @@ def view_table(
     training: bool = False,
     supersampling: int = 1,
 ) -> Table:
-    """The buffers of Renderer for a view of n points with so many pixels, fragments and visible
-    points. until, training: of forward(); with record_weights() if it ends at the weights, with
-    backward() in a training. supersampling: of RenderResult.
+    """The buffers of Renderer for a view of n points with these numbers of pixels, fragments
+    (pairs) and visible points. until, training: as in forward(); "weights" includes the buffers of
+    record_weights(), training those of backward(). supersampling: as in RenderResult.
     """
     table = projection_table(n, settings.footprint) | pairs_table(n, pixels, pairs, supersampling)
     table |= weights_table(n, pixels, pairs if training else 0, supersampling)
@@ -91,16 +91,16 @@ def view_table(
 
 @dataclass
 class RenderResult:
-    """What the stages of a view have made, up to the one that was asked for; arrays are valid until
-    the next view.
+    """The results of a view's stages, up to the last one requested; arrays are valid until the next
+    view.
 
-    camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
-    offset: (left, top) of the view in it. points: the N points as the camera sees them.
-    tile_mask: (rows, columns) bool, the 4x4 tiles of pixels that have fragments; None where the
-    network computes all. supersampling: samples of a pixel, each way. visible_features: float32,
-    one row of 16 for each point of weights.visible, then room for more. features: (H, W, 16)
-    float32, blended from them. image: (H, W, 3) float32, unclamped. computed_fraction: share of the
-    network's multiplications that was done; the others would have seen only background.
+    camera: the view's. size: (H, W) of the rendered image, padded to multiples of 4. offset: (left,
+    top) of the view in the padded image. points: the N points as the camera sees them. tile_mask:
+    (rows, columns) bool, the 4x4 tiles of pixels that have fragments; None if the network computes
+    all tiles. supersampling: samples of a pixel along each axis. visible_features: float32, one row
+    of 16 for each point of weights.visible, then unused rows. features: (H, W, 16) float32, blended
+    from them. image: (H, W, 3) float32, unclamped. computed_fraction: share of the network's
+    multiplications that were computed; the others would have processed only background.
     """
 
     dev: Device
@@ -119,11 +119,11 @@ class RenderResult:
 
     @property
     def transmittance(self) -> Array | None:
-        """(H * W,) float32 of weights."""
+        """(H * W,) float32: weights.transmittance; None with the softmax."""
         return self.weights.transmittance
 
     def fragments(self) -> np.ndarray:
-        """(height, width) int64: the fragments of each pixel, without the padding."""
+        """(height, width) int64: the number of fragments of each pixel, without the padding."""
         counts = np.diff(self.pairs.pixel_offset.get().astype(np.int64))
         return self.cropped(counts.reshape(self.size))
 
@@ -138,10 +138,9 @@ class RenderResult:
 
 
 class Renderer:
-    """Renders a model. Its buffers are reused from view to view. supersampling: of images, as
-    RenderResult has it, 1 or 2. margin: pixels around an image, except in a training, that are
-    rendered as well and cut off: the network takes what lies outside for zeros, and darkens
-    the pixels beside it.
+    """Renders a model. Its buffers are reused from view to view. supersampling: of images, as in
+    RenderResult, 1 or 2. margin: pixels that are rendered around an image and cut off, except in a
+    training: the network pads its input with zeros, which darkens pixels at the border.
     """
 
     def __init__(
@@ -155,8 +154,8 @@ class Renderer:
         self.dev = dev
         self.model = model
         self.settings = settings
-        # Images and a training's steps take turns in memory, as its previews are larger than its
-        # crops. Of each: capacities of the arrays of pairs and of visible points, which grow with
+        # Images and a training's steps take turns in memory, as previews are larger than crops. For
+        # each of the two: capacities of the arrays of pairs and of visible points, which grow with
         # the views.
         self._by_pair = False
         self._capacity, self._visible_capacity = [1, 1], [1, 1]
@@ -186,15 +185,16 @@ class Renderer:
         gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
         times_seen: Array | None = None,
     ) -> RenderResult:
-        """Render a camera, which is padded by the margin and to multiples of net.multiple pixels.
+        """Render a camera's image, padded by the margin and to multiples of net.multiple pixels.
 
-        until: the last stage wanted: blend weights, blended features or the network's image, which
-        alone is supersampled, if it is composited by alpha.
-        gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
-        the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
-        softmax needs the model's. supersampling: instead of the renderer's.
-        training: keep what backward() needs. gradient_tiles: returns that argument of
-        Network.plan_tiles(); called after the wait for the device. times_seen: of find_pairs().
+        until: the last stage to run: blend weights, blended features or the network's image. Only
+        the image is supersampled, if it is composited by alpha.
+        gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: replaces the
+        settings'. depth_range: replaces the model's, for cameras that see beyond it; the softmax
+        needs the model's. supersampling: replaces the renderer's.
+        training: keep the arrays that backward() needs. gradient_tiles: returns the argument of
+        that name for Network.plan_tiles(); called after the wait for the device. times_seen: as for
+        find_pairs().
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         margin = self.margin if until == "image" and not training else 0
@@ -256,13 +256,13 @@ class Renderer:
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
             if specular := self.model.specular:
-                through: Any = weights.transmittance  # which alpha compositing has
+                through: Any = weights.transmittance  # not None with alpha compositing
                 seen = b.features, through, points.camera_buffer
                 specular_forward(dev, specular.parameters, result.image, *seen, side)
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen, is_planned):
-        """(Pairs, BlendWeights, RenderResult.tile_mask; None unless is_planned). Both stages are
+        """(Pairs, BlendWeights, RenderResult.tile_mask or None unless is_planned). Both stages are
         enqueued before the number of pairs is known, and run again with more capacity if it was too
         small.
         """
@@ -290,17 +290,17 @@ class Renderer:
             tile_mask = None
             if is_planned:
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
-            (tile_mask or weights.count).get()  # the host's one wait for the device
+            (tile_mask or weights.count).get()  # the host's only wait for the device
             self._capacity[by_pair] = capacity_needed(pairs)
             if self._capacity[by_pair] == pairs.capacity:
                 return pairs, weights, tile_mask
-            del pairs, weights  # else their arrays would stay beside the larger ones
+            del pairs, weights  # frees their arrays before larger ones are allocated
 
     def backward(
         self, result: RenderResult, grad_image: Array, **options: Any
     ) -> tuple[BlendGradients, GradientParts | None]:
-        """(what backward_features() returns, the network's part of what Network.backward() does),
-        from dL/dimage of result.image. options: of backward_features().
+        """(gradients from backward_features(), parameter gradients from Network.backward()),
+        computed from dL/dimage of result.image. options: for backward_features().
         """
         with self.dev.stage("network backward"):
             grad_features, parts = self.model.net.backward(grad_image)
@@ -317,14 +317,14 @@ class Renderer:
         max_weight: Array | None = None,
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
-        alpha compositing also from dL/dalpha (H * W,), and of the distortion loss of each sample
-        with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless
-        soft points are composited by alpha, there are none of offsets. max_weight: of
+        alpha compositing also from dL/dalpha (H * W,), and from the distortion loss of each sample
+        times distortion_weight (cl/raster/blend.cl). with_offsets: also compute gradients of
+        offsets, if soft points or Gaussians are composited by alpha. max_weight: as for
         blend_backward().
 
-        result: of the last forward(training=True). The gradients of the SH coefficients are those
+        result: from the last forward(training=True). The gradients of the SH coefficients are those
         of the visible points' features times the basis functions in the view's direction; the
-        optimiser multiplies them as it moves each coefficient, and never stores them.
+        optimiser multiplies the two when it updates a coefficient, and never stores the products.
         """
         settings = self.settings
         moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
@@ -346,11 +346,10 @@ class Renderer:
             )
 
     def blend(self, result: RenderResult, features: np.ndarray) -> np.ndarray:
-        """(H, W, 16) float32: features (S, 16) of the visible points result.weights.visible,
-        blended by the weights of a view, without its padding. They take the place of
-        result.features.
+        """(H, W, 16) float32, without padding: features (S, 16) of the visible points
+        result.weights.visible, blended by a view's weights. Overwrites result's features.
 
-        result: of the last forward(training=True).
+        result: from the last forward(training=True).
         """
         self.dev.write(result.visible_features[: len(features)], features)
         view = result.pairs, result.weights, result.visible_features, result.features
@@ -358,8 +357,8 @@ class Renderer:
         return result.cropped(self.dev.download(result.features))
 
     def gather(self, result: RenderResult, pixels: np.ndarray) -> np.ndarray:
-        """(S, 16) float32, the transpose of blend(): of each visible point the sum over the pixels
-        (H, W, 16), without the padding, times its weights there.
+        """(S, 16) float32, the transpose of blend(): for each visible point the sum of pixels (H,
+        W, 16), without padding, times the point's weights there.
         """
         padded = np.zeros((*result.size, 16), np.float32)
         result.cropped(padded)[:] = pixels
@@ -375,11 +374,11 @@ class Renderer:
         *,
         least: float = 0.0,
     ) -> None:
-        """Update what pruning looks at by the last forward(), see raster/weights.py."""
+        """Update max_weight and times_seen from the last forward(), see raster/weights.py."""
         pairs, weights = result.pairs, result.weights
         listed = list_weights(self.dev, self._buffers, pairs, weights)
         record_weights(self.dev, pairs, weights, listed, max_weight, times_seen, least)
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
-        """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of forward()."""
+        """(H, W, 3) float32 numpy image of a camera, clamped to [0, 1]. options: for forward()."""
         return self.forward(camera, gamma, **options).clamped()

@@ -1,5 +1,5 @@
-"""One step of training: draw a crop of a view, render it, loss, backward, optimiser.
-training/between.py has what is due then, session/training.py the loop around it.
+"""One step of training: draw a crop of a view, render it, compute the loss and its gradients,
+update. training/between.py has the work between steps, session/training.py the loop.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Trainer:
     """Optimises a model on views; every random choice is a function of (seed, step), so a run can
     start at any step.
 
-    step: number of steps done. begun: the step at which the optimiser's moments started; above 0
-    if a finished training is extended. state: what training keeps for each point.
+    step: number of steps done. begun: the step at which the optimiser's moments started; above 0 if
+    a finished training is extended. state: the training state of each point.
     """
 
     def __init__(self, dev: Device, config: Config, model: Model, views: list[View]):
@@ -46,7 +46,7 @@ class Trainer:
         self.dev = dev
         self.config = config
         self.model = model
-        self.model.specular = None  # is fitted at the end
+        self.model.specular = None  # fitted at the end
         self.views = views
         self.step = self.begun = 0
         self.renderer = Renderer(dev, model, config.raster)
@@ -59,14 +59,14 @@ class Trainer:
         self.composited = config.raster.blend == "alpha"
         self.targets = Target(dev)
         self._buffers = Buffers(dev)
-        self._terms: Pending[dict[str, float]] | None = None  # of the loss of the last step
-        self.smoother: Smoother | None = None  # made when it is due, anew when the points change
+        self._terms: Pending[dict[str, float]] | None = None  # of the last step's loss
+        self.smoother: Smoother | None = None  # made when due, and again after points change
         self.refine_steps = refine_steps(train)
         self.crops = Crops(views, train, self.refinements_to_come)
-        self.fitted: Fitted | None = None  # by finish()
+        self.fitted: Fitted | None = None  # set by finish()
 
     def follow(self, config: Config) -> None:
-        """Go on with settings whose iterations, refine_at, supersampled and radius are others."""
+        """Go on with settings that differ in iterations, refine_at, supersampled and radius."""
         self.config = config
         self.renderer.settings = config.raster
         self.refine_steps = refine_steps(config.train)
@@ -80,7 +80,7 @@ class Trainer:
 
     @property
     def exposed(self) -> str:
-        """By what images differ from the model's, as Exposure.kind has it."""
+        """The exposure correction that is applied, as Exposure.kind names it."""
         return self.exposure.kind if self.exposure else ""
 
     @property
@@ -149,7 +149,7 @@ class Trainer:
         self.step += 1
         self.check()
         self._terms = self.loss.read(self.step)
-        # the renderer may release them now
+        # so that the renderer can release them
         del rendered, gradients
         between.after_update(self, rates)
         return self._terms
@@ -162,14 +162,14 @@ class Trainer:
         alpha: Array,
         ignored: Array | None,
     ) -> tuple[Array, Array | None]:
-        """(dL/dimage, dL/dalpha or None) of all terms but the distortion loss; their values go to
-        self.loss, which stays on the device. ignored: (H, W) uint8, 1 where a pixel of the crop is.
+        """(dL/dimage, dL/dalpha or None) of all terms but the distortion loss; self.loss keeps
+        their values on the device. ignored: (H, W) uint8, 1 for ignored pixels of the crop.
         """
         image, offset = rendered.image, rendered.offset
         if ignored is not None:
             ignore_target(self.dev, ignored, image, target, alpha, offset)
-        alphas, transmittance = None, rendered.transmittance  # None of a softmax
-        has_mask = self.views[crop.view_index].has_mask  # known, of crop.view it is not
+        alphas, transmittance = None, rendered.transmittance  # None with a softmax
+        has_mask = self.views[crop.view_index].has_mask  # cached here, not in crop.view
         if transmittance is not None and self.loss.mask_weight > 0 and has_mask:
             alphas = transmittance, alpha
         grad_image, grad_alpha = self.loss.forward_backward(
@@ -186,7 +186,7 @@ class Trainer:
         return self._buffers.ignored
 
     def _rising(self, weight):
-        """A weight of the loss that rises from 0 during the training."""
+        """A weight of the loss, scaled so that it rises from 0 during the training."""
         return rising_weight(self.step, self.config.train.iterations, weight)
 
     def check(self) -> None:
@@ -207,16 +207,16 @@ class Trainer:
         return vars(Rates.at(max(self.step - 1, 0), self.config.network, self.config.train))
 
     def render(self, view: View) -> np.ndarray:
-        """(H, W, 3) float32 in [0, 1]: the present model's image of a view."""
+        """(H, W, 3) float32 in [0, 1]: the current model's image of a view."""
         return self.renderer.render(view.camera, self.gamma)
 
     def target(self, view: View) -> np.ndarray:
-        """(H, W, 3) float32 in [0, 1]: what render(view) should be."""
+        """(H, W, 3) float32 in [0, 1]: the image that render(view) should match."""
         return self.targets.whole(view)
 
     def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array} of the model and of the training's state. Raises UserError
-        as check().
+        as check() does.
         """
         self.check()
         exposure = {"exposure": DeviceRows(self.dev, self.exposure.state)} if self.exposure else {}
@@ -225,9 +225,9 @@ class Trainer:
     def restore(
         self, step: int, arrays: dict[str, np.ndarray], begun: int, exposed: str = ""
     ) -> None:
-        """Resume after `step` steps with the training state of a checkpoint, which is taken out of
-        `arrays`; the model has been loaded already. A finished training stores no such state: its
-        moments start anew, and its EMA if that is due.
+        """Resume after `step` steps with a checkpoint's training state, which is removed from
+        `arrays`; the model must be loaded already. A finished training stores no such state: its
+        moments start anew, and so does its EMA if it is due.
         """
         self.step, self.begun = step, begun
         self.crops = Crops(self.views, self.config.train, self.refinements_to_come)

@@ -15,28 +15,28 @@ from pp_cl.errors import UserError
 # costs points but one that is too small carves the object away, translucent parts first; not 0,
 # because the reconstruction filter of NeRF-synthetic leaves alphas of 1 and 2 as far as 3 pixels
 # from the object, and masks that once were JPEG carry noise of that size around their edge (NeRD's
-# captures). Above 8 both end within 1.5 pixels of alpha 0.5.
+# captures). Above 8, both kinds of masks end within 1.5 pixels of alpha 0.5.
 MASK_THRESHOLD = 8
-# pixels of a reduced image, each way: SSIM's window of 11 and the U-Net's two poolings need room
+# least sides of a reduced image: SSIM's window of 11 and the U-Net's two poolings need room
 MIN_SIDE = 16
-LEAST_SHARE = 0.75  # of the size that a preset is made for: further down, details would be lost
+LEAST_SHARE = 0.75  # of the size that a preset is made for; smaller images would lose details
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An image, which is used reduced: its pixels are the means of blocks of downscale x downscale
-    stored pixels.
+    """An image that is used at reduced size: its pixels are the means of blocks of downscale x
+    downscale stored pixels.
 
     name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
     image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
     in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
-    None for one that the program makes itself. shrunk: how many times the stored image was reduced
-    while it was read from its file (shrink()). unshrunk_camera: of the file's image, where that is
-    another one. is_masked: a mask of its own says so where the object fills the image. ignored: (H,
-    W) bool, the pixels that say nothing, neither for the hull nor for the loss; the image is 0
-    there. None: there are none.
+    None for an image that the program made itself. shrunk: how many times the stored image was
+    reduced while it was read from its file (shrink()). unshrunk_camera: camera of the file's image,
+    if it differs. is_masked: the image has a mask, even if the object fills it. ignored: (H, W)
+    bool, True for pixels that neither the hull nor the loss uses; the image is 0 there. None: no
+    such pixels.
     """
 
     name: str
@@ -57,7 +57,7 @@ class View:
 
     @property
     def file_downscale(self) -> int:
-        """How many times the image in its file is reduced in all."""
+        """How many times the image in its file is reduced in total."""
         return self.shrunk * self.downscale
 
     @cached_property
@@ -67,20 +67,20 @@ class View:
 
     @cached_property
     def has_mask(self) -> bool:
-        """Whether some pixel that says something is not wholly opaque."""
+        """Whether any pixel that is not ignored is less than fully opaque."""
         return bool((self.hull_alpha < 255).any())
 
     @property
     def hull_alpha(self) -> np.ndarray:
-        """(H, W) uint8: the alpha of the stored image, 255 where it says nothing."""
+        """(H, W) uint8: the alpha of the stored image, 255 for ignored pixels."""
         alpha = self.image[..., 3]
         return alpha if self.ignored is None else np.where(self.ignored, np.uint8(255), alpha)
 
     def ignored_crop(
         self, box: tuple[int, int, int, int], jitter: tuple[float, float] = (0, 0)
     ) -> np.ndarray | None:
-        """(height, width) bool: the pixels of Target.crop(box, jitter) whose blocks have one that
-        is ignored; None where there are none.
+        """(height, width) bool: True for pixels of Target.crop(box, jitter) whose block contains an
+        ignored pixel; None if none does.
         """
         if self.ignored is None:
             return None
@@ -94,8 +94,8 @@ class View:
         return found if found.any() else None
 
     def ignoring(self, truth: np.ndarray, image: np.ndarray) -> np.ndarray:
-        """(height, width, 3): what an image of this view should be, which is what it is where
-        pixels are ignored.
+        """(height, width, 3): the truth for an image of this view, with the image's own values at
+        ignored pixels.
         """
         ignored = self.ignored_crop((0, 0, *truth.shape[1::-1]))
         return truth if ignored is None else np.where(ignored[..., None], image, truth)
@@ -108,15 +108,15 @@ class View:
     def reduced(self, downscale: int) -> "View":
         """The same image reduced `downscale` times from its stored resolution.
 
-        Raises UserError unless that is a whole number that leaves at least MIN_SIDE pixels each
-        way.
+        Raises UserError unless downscale is a whole number that leaves at least MIN_SIDE pixels
+        each way.
         """
         asked = downscale * self.shrunk if isinstance(downscale, int) else downscale
         check_downscale(self.name, self.file_camera, asked)
         return replace(self, downscale=downscale)
 
     def near_size(self, side: int) -> "View":
-        """The same image reduced to about `side` pixels, as fitting_downscale() has it."""
+        """The same image reduced to about `side` pixels by fitting_downscale()."""
         size = self.stored_camera.width, self.stored_camera.height
         return replace(self, downscale=fitting_downscale(size, side))
 
@@ -133,8 +133,8 @@ class View:
         return (min(side, size[0]), min(side, size[1])) if side else size
 
     def object_bounds(self, margin: int) -> tuple[int, int, int, int]:
-        """(x0, y0, x1, y1): the pixels of the reduced image, half-open, that show the object, and
-        `margin` more on every side, cut off at the image's border.
+        """(x0, y0, x1, y1): the half-open box of the reduced image's pixels that show the object,
+        with `margin` pixels more on every side, cut off at the image's border.
 
         The whole image if its mask is empty.
         """
@@ -189,6 +189,6 @@ def border(image: np.ndarray) -> np.ndarray:
 
 
 def evenly(items: Sequence[Item], most: int | None) -> list[Item]:
-    """At most `most` of the items, spread evenly, the first among them; None: all."""
+    """At most `most` of the items, spread evenly and including the first; None: all items."""
     n = len(items)
     return list(items) if most is None or n <= most else [items[n * i // most] for i in range(most)]

@@ -1,5 +1,5 @@
-"""Device arrays by many: declared as a table, {name: (shape, dtype)}; packed into one buffer; read
-without waiting; and their rows gathered, kept or read piecewise.
+"""Groups of device arrays, declared as a table {name: (shape, dtype)} or packed into one buffer;
+downloads that do not wait; and functions that gather, keep or read rows piecewise.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pyopencl.array import Array
 from pp_cl.engine.device.device import Device, QueuedArray
 from pp_cl.engine.device.launch import row_parts
 
-# bytes of the scratch that rows are moved through: 1.4 % of a training with 4 million points
+# bytes of scratch memory for moving rows: 1.4 % of a training's with 4 million points
 SCRATCH_BYTES = 2**27
-PIECE_BYTES = 2**26  # that the host reads at a time
+PIECE_BYTES = 2**26  # read by the host at a time
 CHANNELS = 16  # words of a row of features
 
 T = TypeVar("T")
@@ -35,15 +35,15 @@ def _row_bytes(shape, dtype):
 
 
 def grown(capacity: int, needed: int) -> int:
-    """The capacity if it holds `needed`, else a quarter more than `needed`."""
+    """The capacity if it holds `needed`, otherwise a quarter more than `needed`."""
     return capacity if needed <= capacity else needed + needed // 4
 
 
 class Buffers:
     """The device arrays of one stage, as attributes named like the rows of its table.
 
-    An array whose shape and dtype stay the same keeps its memory and its content. calls: of
-    replayed() functions.
+    An array whose shape and dtype stay the same keeps its memory and its content. calls: recorded
+    calls of replayed() functions.
     """
 
     def __init__(self, dev: Device):
@@ -55,8 +55,8 @@ class Buffers:
         """Allocate the arrays of the table that are missing or have another shape or dtype,
         uninitialised.
 
-        Old arrays are released before new ones are allocated. Raises UserError where memory does
-        not suffice.
+        Old arrays are released before new ones are allocated. Raises UserError if memory does not
+        suffice.
         """
         changed = [name for name, row in table.items() if not self._fits(name, *row)]
         if changed:
@@ -78,8 +78,8 @@ class Buffers:
 
 
 def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]:
-    """(octets, arrays of these shapes and dtypes that lie in them), all zeros: one launch or
-    transfer handles them all. The arrays are valid as long as the octets are held.
+    """(octets, arrays of these shapes and dtypes within their memory), all zeros: one launch or
+    transfer handles them all. The arrays are valid only while the octets are referenced.
     """
     align = dev.device.mem_base_addr_align // 8
     sizes = [-(-max(1, _row_bytes(*row)) // align) * align for row in rows]
@@ -103,9 +103,9 @@ class PackedArrays:
         self._whole: Any = None
 
     def send(self, rows: list[Row], values: Sequence[np.ndarray]) -> list[Array]:
-        """Arrays of these shapes and dtypes, in the same memory as those before if these were the
-        same, overwritten after what is enqueued. values: of these dtypes; what is behind shorter
-        ones is undefined.
+        """Arrays of these shapes and dtypes, overwritten by `values` after all work enqueued so
+        far; they keep their memory if `rows` is the same as before. values: of these dtypes; if one
+        is shorter than its array, the rest of the array is undefined.
         """
         if rows != self._rows:
             self._rows, self._whole, self._arrays = [], None, []  # frees the old ones first
@@ -121,9 +121,10 @@ class PackedArrays:
 
 
 class Pending(Generic[T]):
-    """A value that the host gets from a download under way.
+    """A value that the host gets from a download in progress.
 
-    values: the target of the download, filled at the event. convert: makes the value of them.
+    values: the target of the download, filled when the event completes. convert: computes the value
+    from them.
     """
 
     def __init__(
@@ -153,8 +154,8 @@ def read_later(
     start: int = 0,
     convert: Callable[[np.ndarray], Any] = lambda values: values,
 ) -> Pending:
-    """array[start:], as the kernels enqueued so far will leave it. convert: applied once to the
-    numpy array, when it is asked for; what it raises, get() raises.
+    """array[start:], as the kernels enqueued so far will leave it. convert: applied to the numpy
+    array by the first get(), which passes on its exceptions.
     """
     values = np.empty((len(array) - start, *array.shape[1:]), array.dtype)
     event = dev.attempt(
@@ -169,15 +170,15 @@ def read_later(
     return Pending(dev, event, values, convert)
 
 
-# ---- rows; none of it takes a second array of a model's size, which may not fit into memory
+# ---- rows; only gather_rows() takes a second array of a model's size, which may not fit
 
 
 def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
     """The rows `keep` of `array`; the content of `array` is lost.
 
-    Rows that fit SCRATCH_BYTES become an array of their own. Others move to the front of the same
-    buffer, piece by piece: ascending indices never lie before their new place, so a piece
-    overwrites nothing that a later one reads. array: (N, ...), rows of whole 4-byte words. keep:
+    If the rows fit SCRATCH_BYTES, they become a new array. Otherwise they move to the front of the
+    same buffer, piece by piece: as indices ascend, no row moves to a higher place, so no piece
+    overwrites rows that a later piece reads. array: (N, ...), rows of whole 4-byte words. keep:
     (M,) uint32, ascending.
     """
     m, row_bytes = len(keep), array.nbytes // len(array)
@@ -222,8 +223,8 @@ def _words(array):
 
 
 class DeviceRows:
-    """Arrays (N, ...) of a device side by side, joined along their second axis. Fetched when asked
-    for: they must not change before. shape, dtype: of the joined array.
+    """Arrays (N, ...) of a device, joined along their second axis. They are downloaded on request
+    and must not change before. shape, dtype: of the joined array.
     """
 
     def __init__(self, dev: Device, *parts: Array) -> None:

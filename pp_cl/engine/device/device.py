@@ -32,22 +32,22 @@ from pp_cl.engine.device.signature import parse_signatures
 from pp_cl.errors import BuildError, UserError
 
 SMALLER = "lower --points or raise --downscale"
-HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
-# Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
-# multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
+HUGE = 2**22  # bytes from which on a buffer gets pages of 2 MiB
+# Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. This many
+# multiply-adds take half a second at 100 GFLOP/s; see docs/devices.md.
 MOST_MULTIPLY_ADDS = 25e9
-UNTIMED = nullcontext()  # a stage
+UNTIMED = nullcontext()  # a stage without timing
 STANDARD = ("-cl-std=CL1.2",)  # options of every build
 
 
 def kernel_folder() -> Path:
-    """The folder of the .cl files: inside the installed package, or beside it in a checkout."""
+    """The folder of the .cl files: inside the installed package, or next to it in a checkout."""
     inside = Path(__file__).parents[2] / "cl"
     return inside if inside.is_dir() else Path(__file__).parents[3] / "cl"
 
 
 def _released(device, nbytes):
-    """Count freed memory off the device's total. device: a weak reference."""
+    """Subtract freed memory from the device's total. device: a weak reference."""
     alive = device()
     if alive is not None:
         alive.bytes -= nbytes
@@ -58,18 +58,18 @@ class Memory(cl.Buffer):
 
 
 class QueuedArray(Array):
-    """An Array whose queue works in order, so that it keeps no events: with those of its transfers
-    it would keep the last dozen numpy arrays that it was copied to.
+    """An Array that keeps no events, as its queue works in order: the events of its transfers would
+    keep alive the last dozen numpy arrays that it was copied to.
     """
 
     def add_event(self, evt: cl.Event) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 class Launch(NamedTuple):
-    """A launch that has been checked. offset: of its first work-item, or None. values: in the
-    kernel's order; arguments: the same by name. watched: it may take too long for a watchdog. own:
-    a kernel that has these arguments for good, if there is one.
+    """A launch that has been checked. offset: of its first work-item, or None. values: arguments in
+    the kernel's order; arguments: the same by name. watched: it may take too long for a watchdog.
+    own: a kernel object that keeps these arguments, or None.
     """
 
     kernel: Kernel
@@ -83,18 +83,18 @@ class Launch(NamedTuple):
 
 
 class Fill(NamedTuple):
-    """An array that is set to one value."""
+    """A fill: all elements of the array are set to the value."""
 
     array: Array
     value: float
 
 
 class Device:
-    """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
+    """One OpenCL device with its queue, programs and buffers. debug: value of PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
-    kernels are launched in parts. launches: so far. waited: CPU seconds of threads that waited for
-    the device; drivers of CPUs have them compute meanwhile. doubts: compare() is called before each
-    replay(), which the device of the tests has.
+    kernels are launched in parts. launches: number so far. waited: CPU seconds of threads that
+    waited for the device; CPU drivers let them compute meanwhile. doubts: call compare(), which
+    only the tests' device has, before each replay().
     """
 
     doubts = False
@@ -110,7 +110,7 @@ class Device:
         profiling: Any = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=profiling)
         ignore_full_files()
-        self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
+        self._maps = cl.CommandQueue(self.context)  # its maps do not wait for kernels
         self.bytes = self.peak_bytes = self.launches = 0
         self.waited = 0.0
         self._recording: list[Any] | None = None
@@ -135,8 +135,7 @@ class Device:
     def program(self, name: str, **defines: int | float | str) -> Program:
         """The Program of cl/<name>.cl built with -D for each define; built once.
 
-        Raises BuildError with the file, the options and the compiler's words when it does not
-        build.
+        Raises BuildError with the file, the options and the compiler's output if the build fails.
         """
         key = name, frozenset(defines.items())
         if key not in self._programs:
@@ -171,7 +170,7 @@ class Device:
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
         """Uninitialised array on the device; zeros under PP_DEBUG=3, so that its scan sees only
-        what kernels wrote.
+        values that kernels wrote.
         """
         array = self._allocate(shape, dtype)
         if self.debug >= 3 and array.nbytes:
@@ -179,9 +178,9 @@ class Device:
         return array
 
     def scratch(self, name: Hashable, n: int, dtype: type = np.float32, *, zeros: int = 0) -> Array:
-        """(n,) or longer, uninitialised, in memory that all calls with this name share: only for
-        what kernels enqueued before the next such call read. zeros: values at its front that are
-        0 when it is allocated, for kernels that leave zeros there.
+        """Uninitialised array, (n,) or longer, in memory that all calls with this name share: valid
+        only for kernels enqueued before the next such call. zeros: number of values at the front
+        set to 0 on allocation, for kernels that leave zeros there.
         """
         held = self._scratch.get(name)
         if held is None or len(held) < n or held.dtype != dtype:
@@ -193,7 +192,7 @@ class Device:
         return held
 
     def constant(self, rows: Sequence[tuple[int, ...]]) -> Array:
-        """The rows as an int32 array on the device, which is made once."""
+        """The rows as an int32 array on the device, uploaded only once."""
         key = tuple(rows)
         if key not in self._constants:
             self._constants[key] = self.upload(key, np.int32)
@@ -218,11 +217,11 @@ class Device:
             self._upload(array, values, is_blocking=True)
 
     def send(self, array: Array, values: np.ndarray) -> None:
-        """Overwrite an array once what is enqueued is done, without waiting for it: `values` must
-        not change any more.
+        """Overwrite an array after all work enqueued so far, without waiting for it; `values` must
+        not change afterwards.
         """
         self._sent.append(self._upload(array, values, is_blocking=False))
-        # an event that is dropped waits for the end of its transfer
+        # dropping an event waits for the end of its transfer
         complete = cl.command_execution_status.COMPLETE
         while len(self._sent) > 1 and self._sent[0].command_execution_status == complete:
             self._sent.popleft()
@@ -261,7 +260,7 @@ class Device:
 
     def copy(self, target: Array, source: Array, start: int = 0) -> None:
         """Copy one array of this device over the rows of another from row `start` on. Raises
-        ValueError where it has other rows or too many.
+        ValueError if its rows differ in size or dtype, or are too many.
         """
         row_bytes, count = source[:1].nbytes, len(source)
         is_alike = (target[:1].nbytes, target.dtype) == (row_bytes, source.dtype)
@@ -281,15 +280,15 @@ class Device:
         self.wait(self.queue.finish)
 
     def wait(self, function: Callable[[], Any]) -> None:
-        """Call a function of the driver that waits. Raises UserError as attempt(): drivers of GPUs
-        often fail there, for lack of memory.
+        """Call a driver function that waits. Raises UserError as attempt() does: GPU drivers often
+        fail here for lack of memory.
         """
         start = time.thread_time()
         self.attempt("finish its work", function)
         self.waited += time.thread_time() - start
 
     def enqueue(self, launch: Launch) -> None:
-        """Enqueue a launch, which has been checked. Raises UserError as attempt()."""
+        """Enqueue a checked launch. Raises UserError as attempt() does."""
         kernel = launch.kernel
         event = self.attempt(
             kernel.run,
@@ -303,7 +302,7 @@ class Device:
         self.launches += 1
         if self._recording is not None:
             self._recording.append(launch)
-        if launch.watched:  # what drivers hand to the system together is timed together
+        if launch.watched:  # systems time together what drivers submit together
             self.queue.flush()
         if self.debug:
             self.observe(kernel, event, launch.arguments)
@@ -319,22 +318,22 @@ class Device:
             self._recording = None
 
     def replay(self, launches: list[Any]) -> None:
-        """Enqueue once more what was recorded; a launch gets a kernel of its own, which stays
-        set to its arguments.
+        """Enqueue recorded launches and fills again; each launch gets its own kernel object, which
+        keeps its arguments.
         """
         for i, launch in enumerate(launches):
             if isinstance(launch, Fill):
                 self._fill(*launch)
                 continue
-            if launch.own is None:  # many calls would be gone before they are repeated
+            if launch.own is None:  # not when recorded: many calls are never repeated
                 own = launch.kernel.with_arguments(launch.values, for_good=True)
                 launch = launches[i] = launch._replace(own=own)
             self.enqueue(launch)
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
-        """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
-        many allocate only at a buffer's first use, or with OUT_OF_RESOURCES, which NVIDIA's says of
-        kernels that fault or run too long as well.
+        """Call function(*args, **kwargs). Raises UserError if the driver fails for lack of memory,
+        which many drivers allocate only at a buffer's first use, or with OUT_OF_RESOURCES, which
+        NVIDIA's also reports for kernels that fault or run too long.
         """
         try:
             return function(*args, **kwargs)
@@ -348,7 +347,7 @@ class Device:
             ) from error
 
     def stage(self, name: str) -> AbstractContextManager[None]:
-        """Times the part of a pass called `name` under PP_DEBUG >= 1 and timed_stages().
+        """Time the block as the stage `name` under PP_DEBUG >= 1 or in timed_stages().
 
         When timed, the queue is drained before and after, so that stages do not overlap.
         """
@@ -391,17 +390,17 @@ class Device:
         return self.attempt(what, QueuedArray, self.queue, shape, dtype, allocator=self._counted)
 
     def _counted(self, nbytes):
-        """Memory that is counted until the last array on it is gone, be it a slice or a view."""
+        """Memory that is counted until the last array, slice or view of it is gone."""
         memory = self._memory(nbytes)
         self.bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.bytes)
-        # weakly: scratch memory that kept its device alive would never end, nor would the device
+        # weakly: otherwise scratch memory and its device would keep each other alive
         weakref.finalize(memory, _released, weakref.ref(self), nbytes)
         return memory
 
     def _memory(self, nbytes):
         memory = Memory(self.context, cl.mem_flags.READ_WRITE, nbytes)
-        if self.is_cpu and nbytes >= HUGE:  # the host's memory: a map shows where it lies
+        if self.is_cpu and nbytes >= HUGE:  # host memory: a map gives its address
             flags = cl.map_flags.WRITE_INVALIDATE_REGION
             place = 0, (nbytes,), np.uint8
             mapped, _ = cl.enqueue_map_buffer(self._maps, memory, flags, *place)
@@ -411,8 +410,8 @@ class Device:
         return memory
 
     def observe(self, kernel: Kernel, event: cl.Event, arguments: dict[str, Any]) -> None:
-        """PP_DEBUG 1, 2: wait, note the kernel's time. PP_DEBUG 3: stop at the first NaN or Inf in
-        an output as well.
+        """Wait for a kernel and record its time. PP_DEBUG 3: also stop at the first NaN or Inf in
+        an output.
         """
         event.wait()
         self._seconds[kernel.label].append((event.profile.end - event.profile.start) * 1e-9)
@@ -420,8 +419,8 @@ class Device:
             check_outputs(kernel, arguments)
 
     def print_profile(self) -> None:
-        """A table on stderr, longest first: passes, median and total time of stages and, at
-        PP_DEBUG 1, of kernel files, else of kernels.
+        """Print a table to stderr, longest first: passes, median and total time of stages and of
+        kernels; with PP_DEBUG 1 of kernel files instead of kernels.
         """
         print_times(self._stage_seconds or {}, self._seconds, by_file=self.debug < 2)
 
@@ -466,11 +465,11 @@ class Program:
 
         size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
         tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
-        multiply_adds: at most so many in all; where they may take too long for a watchdog, several
-        launches share the work-items, cut along the dimension `along`, in which the kernel must use
-        global ids alone. arguments: by parameter name. Raises TypeError (names, dtypes) and
+        multiply_adds: upper bound of the total; if they may take too long for a watchdog, several
+        launches share the work-items, cut along dimension `along`, in which the kernel must use
+        only global ids. arguments: by parameter name. Raises TypeError (names, dtypes) and
         ValueError (shapes) before anything is enqueued, UserError when the work-group is too large
-        for the device or the driver gives up.
+        for the device or the driver fails.
         """
         kernel = self.kernels[kernel_name]
         values = kernel.arguments(arguments)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import psutil
 
-GROUP = Path("/sys/fs/cgroup")  # of this process, as a container shows it
+GROUP = Path("/sys/fs/cgroup")  # the process's control group, as a container shows it
 
 
 def available_bytes() -> int:
-    """Bytes of memory that this process may hold in all: what it holds now, and what is free on the
-    machine and in its container.
+    """Bytes of memory that this process may hold in total: its present memory plus the memory free
+    on the machine and in its container.
     """
     return min([psutil.virtual_memory().available, *_free_in_group()]) + resident_bytes()
 
@@ -23,9 +23,9 @@ def resident_bytes() -> int:
 
 
 def ask_for_huge_pages(address: int, nbytes: int) -> None:
-    """Ask Linux for pages of 2 MiB in memory that is not in use yet: among those of 4 KiB, which
-    most systems give to those who do not ask, random accesses spend much of their time looking up
-    pages. Does nothing elsewhere.
+    """Ask Linux for pages of 2 MiB in memory that is not in use yet: with pages of 4 KiB, the
+    default of most systems, random accesses spend much of their time looking up pages. Does nothing
+    on other systems.
     """
     if sys.platform == "linux":
         first = -(-address // mmap.PAGESIZE) * mmap.PAGESIZE

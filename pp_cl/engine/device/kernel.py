@@ -21,8 +21,8 @@ from pp_cl.errors import UserError
 # them, because PoCL compiles a kernel again for every new work-group size; hence the tail guards.
 DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 
-# Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once: more
-# than a network's layers have. The numbers of visible points, new in each step, would fill memory.
+# How many shapes and sizes of launches a kernel remembers, to check and round them only once: more
+# than a network's layers have. The numbers of visible points, new each step, would fill memory.
 REMEMBERED = 64
 
 
@@ -44,18 +44,18 @@ class Kernel:
         self._kernel = self._made()
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
         self.largest_group: Any = self._kernel.get_work_group_info(limit, device)  # work-items
-        self.most_items = tuple(device.max_work_item_sizes)  # of a group, along each dimension
+        self.most_items = tuple(device.max_work_item_sizes)  # work-items, by dimension
         self.parameters = parameters
         self.names = {p.name for p in parameters}
         self.label = label
-        self.run = f"run {label}"  # what a device may fail to do
+        self.run = f"run {label}"  # for messages of Device.attempt()
         self._device_name = device.name.strip()
         words = {word for p in parameters for word in p.shape or () if word != "?"}
         names = {name for word in words for name in compile_formula(word).co_names}
         self._macros = {name: int(defines[name]) for name in names & defines.keys()}
         letters = {name.lower() for name in names}
-        # (parameter, its name, dtype of a buffer, least and largest integer, letter that a scalar
-        # gives a size to) in order
+        # in order: (parameter, its name, dtype if it is a buffer, least and largest integer, the
+        # letter whose size it gives if it is a scalar)
         self._slots = [
             (
                 p,
@@ -66,8 +66,8 @@ class Kernel:
             )
             for p in parameters
         ]
-        # (parameter, axis, dimension as text, the letter that it is, its formula), letters first:
-        # others are computed of them
+        # (parameter, axis, dimension as text, its letter if it is one alone, its formula), letters
+        # first: the others are computed from them
         dimensions = [
             (p, axis, word, word.lower() if word in names - defines.keys() else "", formula)
             for p in parameters
@@ -75,12 +75,12 @@ class Kernel:
             if word != "?" and (formula := compile_formula(word))
         ]
         self._dimensions = sorted(dimensions, key=lambda d: not d[3])
-        self._checked: set[Any] = set()  # shapes and sizes already found right
+        self._checked: set[Any] = set()  # shapes and sizes already found valid
         self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 
     def arguments(self, values: dict[str, Any]) -> list[Any]:
         """OpenCL arguments in order, from {name: pyopencl Array, None for NULL, or number}. Raises
-        TypeError, ValueError.
+        TypeError (names, dtypes) and ValueError (shapes).
         """
         if values.keys() != self.names:
             missing = [p.name for p in self.parameters if p.name not in values]
@@ -122,12 +122,12 @@ class Kernel:
 
     def _made(self):
         kernel = cl.Kernel(self._program, self._name)
-        # with their types pyopencl packs scalars itself; without, ten of them take it 40 us
+        # given their types, pyopencl packs scalars itself; otherwise ten of them take it 40 us
         kernel.set_scalar_arg_dtypes(self._types)
         return kernel
 
     def with_arguments(self, values: list[Any], *, for_good: bool = False) -> cl.Kernel:
-        """The kernel set to what arguments() returned: for one launch, or a new one for good."""
+        """The kernel with values from arguments(): for one launch, or a new one that keeps them."""
         kernel = self._made() if for_good else self._kernel
         kernel.set_args(*values)
         return kernel
@@ -135,7 +135,8 @@ class Kernel:
     def ranges(
         self, size: int | tuple[int, ...], local: int | tuple[int, ...] | None
     ) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-        """(work-items, work-group) to enqueue, of those given to launch(); None for no work-item.
+        """(work-items, work-group) to enqueue for launch()'s size and local; None if there are no
+        work-items.
 
         Raises UserError when the work-group is too large for the device.
         """
@@ -154,7 +155,7 @@ class Kernel:
             local = (local,) if np.isscalar(local) else tuple(local)
         if 0 in size:
             return None
-        if len(local) > 1:  # Apple's driver for CPUs has groups of one dimension alone
+        if len(local) > 1:  # Apple's CPU driver allows only one-dimensional groups
             local = tuple(map(min, local, self.most_items))
         if math.prod(local) > self.largest_group:
             raise UserError(
@@ -166,7 +167,7 @@ class Kernel:
 
     def _default_group(self, dimensions):
         """The default work-group, halved until the device runs it: rusticl's software renderer runs
-        32 work-items of some kernels.
+        at most 32 work-items of some kernels.
         """
         local = list(DEFAULT_LOCAL[dimensions])
         while math.prod(local) > max(1, self.largest_group):
@@ -187,8 +188,8 @@ class Kernel:
             ) from error
 
     def _check_buffers(self, values, sizes):
-        """Compare the arrays with their parameters. sizes: {letter: size} of the scalars; the sizes
-        of the other letters are added.
+        """Compare the arrays with their parameters. sizes: {letter: size} given by scalars; this
+        adds the sizes of the other letters.
         """
         for p, name, dtype, *_ in self._slots:
             array = values[name]
@@ -212,7 +213,7 @@ class Kernel:
                 expected = sizes.setdefault(letter, size)
             else:
                 known = {n: self._macros.get(n, sizes.get(n.lower())) for n in formula.co_names}
-                if None in known.values():  # of a letter that stands nowhere alone
+                if None in known.values():  # a letter that is never a dimension by itself
                     expected = sizes.setdefault(word, size)
                 else:
                     expected = eval(formula, {}, known)  # noqa: S307 - of compile_formula()
@@ -243,7 +244,7 @@ def _kind(value):
 def cut(
     size: tuple[int, ...], local: tuple[int, ...], parts: int, along: int
 ) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """(offset, work-items) of about so many launches that share `size` work-items, cut between the
+    """(offset, work-items) of about `parts` launches that share `size` work-items, cut between the
     work-groups along one dimension.
     """
     step = -(-size[along] // (local[along] * parts)) * local[along]
@@ -255,8 +256,8 @@ def cut(
 
 @contextmanager
 def quiet_compiler() -> Iterator[None]:
-    """Silences the warning about compiler output, which Intel's compiler gives at every build.
-    PYOPENCL_COMPILER_OUTPUT=1 shows what it said.
+    """Silences the warning about compiler output, which Intel's compiler causes at every build.
+    PYOPENCL_COMPILER_OUTPUT=1 shows the output.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Non-empty compiler output", cl.CompilerWarning)

@@ -1,5 +1,5 @@
-"""How many values a work-item takes and how many work together, on CPUs and on GPUs; and functions
-whose launches are checked once.
+"""How many values a work-item processes and how many work-items cooperate, on CPUs and on GPUs; and
+replayed(), which has a function's launches checked once.
 """
 
 import functools
@@ -11,17 +11,17 @@ from pp_cl.engine.device.device import Device
 P = ParamSpec("P")
 R = TypeVar("R")
 
-SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
-LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
+SMALL_GROUP = 64  # work-items: the fewest that fill what a GPU runs in step
+LARGEST_GROUP = 256  # work-items: GPUs can run this many of any kernel
 
 
 def lanes(dev: Device, on_gpu: int = 1) -> int:
-    """LANES of kernels (cl/lanes.h): neighbouring values that one work-item takes. on_gpu: how many
-    on GPUs, 1 or 4.
+    """LANES of kernels (cl/lanes.h): how many neighbouring values one work-item processes. on_gpu:
+    the number on GPUs, 1 or 4.
 
     A CPU's core has vectors of 16 floats and works on one item at a time. A GPU runs 32 or 64 items
-    in step, which reach memory together, and keeps the values of each in registers: 16 of
-    everything do not fit.
+    in step, which access memory together, and keeps each item's values in registers, which cannot
+    hold 16 of every value.
     """
     return 16 if dev.is_cpu else on_gpu
 
@@ -35,7 +35,7 @@ def channel_ranges(
     dev: Device, height: int, width: int, channels: int
 ) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
     """(work-items, work-group) of a kernel with an item per (LANES channels, x, y) of a feature map
-    (height, width, channels). On GPUs those in step are neighbours in memory.
+    (height, width, channels). On GPUs, items that run in step access neighbouring memory.
     """
     size = (-(-channels // lanes(dev)), width, height)
     return size, (1, 16, 4) if dev.is_cpu else (16, 4, 1)
@@ -50,7 +50,7 @@ def group_ranges(dev: Device, groups: int, members: int) -> tuple[int, int | Non
 
 def group_items(dev: Device) -> int:
     """GROUP of kernels (cl/group.h): work-items that sum or scan together; a power of two on GPUs,
-    1 on CPUs. Of kernels that the device runs in fewer, launch_groups() takes less.
+    1 on CPUs. If the device allows fewer work-items for a kernel, launch_groups() halves the group.
     """
     if dev.is_cpu:
         return 1
@@ -67,10 +67,10 @@ def launch_groups(
     defines: dict[str, Any] | None = None,
     **arguments,
 ) -> None:
-    """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times, each
-    a work-group. A GPU's compiler may allow fewer of one kernel than the device runs of others.
+    """Launch a kernel of cl/<name>.cl with `groups` work-groups of GROUP cooperating work-items.
+    GROUP is halved until the device can run it, as compilers may allow fewer for one kernel.
 
-    most: work-items of a group, a power of two. defines: of the program, to which GROUP is added.
+    most: largest GROUP, a power of two. defines: macros of the program, apart from GROUP.
     arguments: by parameter name.
     """
     items, defines = min(most, group_items(dev)), defines or {}
@@ -82,8 +82,9 @@ def launch_groups(
 
 
 class Call(NamedTuple):
-    """A call of a function: its arguments, what it launched and filled, and what it returned.
-    scratch: Device.scratch_version after it, as launches hold the scratch memory of their time.
+    """A recorded call of a function: its arguments, its launches and fills, and its result.
+    scratch: Device.scratch_version after the call, as its launches refer to scratch memory of that
+    version.
     """
 
     scratch: int
@@ -93,19 +94,19 @@ class Call(NamedTuple):
 
 
 def replayed(function: Callable[P, R]) -> Callable[P, R]:
-    """Make a function check its launches once: called again with the same objects and numbers, it
-    enqueues the same launches and fills, by kernels whose arguments stay set, and returns what it
-    returned before.
+    """Make a function record its launches and fills: called again with the same objects and
+    numbers, it enqueues them again without checks, by kernels whose arguments stay set, and returns
+    the same result.
 
-    What the function does must follow from its arguments alone, and what else it does to the
-    device must last; the device of the tests checks every replay. Its second argument keeps the
-    call: a Workspace or Buffers, which forget it before they allocate.
+    The launches and the result must depend on the arguments alone, and any other effect on the
+    device must last; the tests' device checks every replay. The second argument, a Workspace or
+    Buffers, stores the call and drops it before it allocates.
     """
 
     @functools.wraps(function)
     def replaying(*args: P.args, **named: P.kwargs) -> R:
         place: Any = args[1]
-        # args[0], the device or the network, is that of the place, and would keep itself alive
+        # without args[0], the place's device or network, which the call would keep alive
         dev, given = place.dev, (*args[2:], *named, *named.values())
         call = place.calls.get(function)
         version = dev.scratch_version
@@ -125,7 +126,7 @@ def replayed(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _are_same(given, before):
-    """Whether these are the same objects, or equal numbers."""
+    """Whether each value is the same object as before, or an equal number, string or tuple."""
     return len(given) == len(before) and all(map(_is_same, given, before))
 
 

@@ -1,4 +1,4 @@
-"""PP_DEBUG: what is looked at after each kernel, and the times that are printed in the end."""
+"""PP_DEBUG: the check of outputs after each kernel, and the table of times printed at the end."""
 
 import os
 import sys
@@ -20,7 +20,7 @@ def debug_level() -> int:
 
 
 def check_outputs(kernel: Kernel, arguments: dict[str, Any]) -> None:
-    """Raise FloatingPointError for the first NaN or Inf in an output of a kernel that is done."""
+    """Raise FloatingPointError for the first NaN or Inf in an output of a finished kernel."""
     for p in kernel.parameters:
         array = arguments[p.name]
         if p.is_buffer and not p.const and p.dtype is np.float32 and array is not None:
@@ -35,8 +35,8 @@ def check_outputs(kernel: Kernel, arguments: dict[str, Any]) -> None:
 def print_times(
     stages: dict[str, list[float]], kernels: dict[str, list[float]], *, by_file: bool
 ) -> None:
-    """A table on stderr, longest first: passes, median and total time of stages and of kernels, or
-    of their files. stages, kernels: {name: seconds of each pass}.
+    """Print a table to stderr, longest first: passes, median and total time of stages and of
+    kernels, or of their files. stages, kernels: {name: seconds of each pass}.
     """
     rows: dict[str, list[float]] = defaultdict(list)
     rows |= {f"stage {name}": seconds for name, seconds in stages.items()}

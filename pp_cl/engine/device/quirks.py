@@ -1,4 +1,4 @@
-"""What devices say of themselves, and in what their drivers differ."""
+"""What devices report about themselves, and how their drivers differ."""
 
 import os
 import signal
@@ -10,10 +10,10 @@ import pyopencl as cl
 
 from pp_cl.errors import UserError
 
-# Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
+# Platform of Intel's GPU driver; other drivers of that vendor refuse options they do not know.
 INTEL_PLATFORM = "Intel(R) OpenCL"
-# Files with a kernel that spills, or becomes narrow, with the 128 registers that a thread has there
-# by default, and not with 256, of which half as many threads run (docs/devices.md).
+# Files with a kernel that spills registers, or becomes narrow, with Intel's default of 128
+# registers a thread but not with 256, with which half as many threads run (docs/devices.md).
 SPILLING_ON_INTEL = frozenset(
     (
         "layers/conv_backward",
@@ -22,25 +22,25 @@ SPILLING_ON_INTEL = frozenset(
     )
 )
 
-# bytes of the host that a driver's compiler takes until all kernels of a training are built, by
-# platform; one that is not listed is taken for the one that takes the most
+# bytes of host memory that a driver's compiler uses until all kernels of a training are built, by
+# platform; for platforms that are not listed, the largest is assumed
 COMPILER_BYTES = {"Portable Computing Language": 80 * 2**20, "Intel(R) OpenCL": 620 * 2**20}
 
 
 def compiler_bytes(info: dict[str, Any]) -> int:
-    """Of the host, which the driver's compiler takes in a training. info: of describe()."""
+    """Bytes of host memory that the driver's compiler uses in a training. info: from describe()."""
     return COMPILER_BYTES.get(info["platform"], max(COMPILER_BYTES.values()))
 
 
 def vendor_options(info: dict[str, Any], name: str) -> tuple[str, ...]:
-    """Options of cl/<name>.cl on devices of one vendor. info: of describe()."""
+    """Build options of cl/<name>.cl specific to the device's vendor. info: from describe()."""
     intel_gpu = info["type"] == "GPU" and info["platform"].startswith(INTEL_PLATFORM)
     large = intel_gpu and name in SPILLING_ON_INTEL
     return ("-cl-intel-256-GRF-per-thread",) if large else ()
 
 
 def has_watchdog(device: cl.Device) -> bool:
-    """Whether the system may stop a kernel that takes long: only NVIDIA's driver says so."""
+    """Whether the system may stop a long kernel; True if unknown, as only NVIDIA's driver tells."""
     try:
         return bool(device.kernel_exec_timeout_nv)
     except (cl.Error, AttributeError):
@@ -82,8 +82,8 @@ def _type_name(device):
 
 
 def _memory_bytes(device):
-    """A GPU's memory; for a CPU the machine's or its container's, as PoCL reports a fraction that
-    it does not keep to.
+    """Bytes of a GPU's memory; for a CPU those of the machine or its container, as PoCL reports a
+    fraction but does not enforce it.
     """
     if not (device.type & cl.device_type.CPU and hasattr(os, "sysconf")):
         return device.global_mem_size
@@ -96,7 +96,7 @@ def _memory_bytes(device):
 
 
 def _max_allocation_bytes(device):
-    """What the device allocates at once, or PP_MAX_ALLOCATION (MiB) if that is less."""
+    """Bytes that the device allocates at once, or PP_MAX_ALLOCATION (MiB) if that is less."""
     text = os.environ.get("PP_MAX_ALLOCATION") or "inf"
     try:
         mebibytes = float(text)
@@ -108,8 +108,8 @@ def _max_allocation_bytes(device):
 
 
 def ignore_full_files() -> None:
-    """Leave a write beyond what a file may hold to its error, as Python does: LLVM in drivers
-    catches its signal, asks for a bug report and ends the program.
+    """Let a write beyond the limit of a file's size raise its error, as Python does: LLVM in
+    drivers catches the signal, asks for a bug report and ends the program.
     """
     if hasattr(signal, "SIGXFSZ") and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -11,8 +11,8 @@ BLOCK = 1024  # values that a work-item of a CPU, or a work-group of a GPU, scan
 
 
 def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
-    """Write offsets[i] = sum of values[:i], so that offsets[N] is the total; at most 2^32 - 1,
-    where sums stay.
+    """Write offsets[i] = sum of values[:i], saturating at 2^32 - 1, so that offsets[N] is the
+    total.
 
     values: (N) uint32, N >= 1. offsets: (N+1) uint32.
     """
@@ -22,15 +22,15 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
 
 
 def _block_sums(dev, kernel, n, **arrays):
-    """(blocks,) or longer: what the kernel finds in each block of n numbers."""
-    # of a power of two: numbers of pairs differ from step to step
+    """(blocks,) or longer: the kernel's sum of each block of n numbers."""
+    # rounded up to a power of two, as numbers of pairs differ from step to step
     held = dev.scratch("scan", 1 << (blocks_of(n) - 1).bit_length(), np.uint32)
     _launch(dev, kernel, n, block_sum=held, **arrays)
     return held
 
 
 def blocks_of(n: int) -> int:
-    """The blocks of n values."""
+    """Number of blocks of n values."""
     return -(-n // BLOCK)
 
 
@@ -47,10 +47,10 @@ def read_total(dev: Device, offsets: Array) -> Pending[int]:
 
 
 def nonzero(dev: Device, flags: Array, indices: Array, places: Array, found: Array) -> None:
-    """Write to `indices` where flags are not zero, ascending, and how many are to `found`.
+    """Write the ascending indices of non-zero flags to `indices`, and their number to `found`.
 
-    flags: (N) uint8, N >= 1. indices: (N) uint32. places: (N) uint32, where each of them stands in
-    `indices`; others are left alone. found: (1,) uint32.
+    flags: (N) uint8, N >= 1. indices: (N) uint32. places: (N) uint32, the position of each non-zero
+    flag in `indices`; the others are left unchanged. found: (1,) uint32.
     """
     n = flags.size
     block_sum = _block_sums(dev, "count_nonzero", n, flags=flags)

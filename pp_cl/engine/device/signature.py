@@ -36,8 +36,8 @@ class Parameter:
     name: str
     is_buffer: bool  # a global pointer
     dtype: type
-    width: int  # of the OpenCL vector
-    const: bool  # what it points at
+    width: int  # values in its OpenCL vector
+    const: bool  # whether its data is const
     shape: tuple | None
     may_be_infinite: bool
     may_be_null: bool
@@ -53,7 +53,7 @@ class Parameter:
 def parse_signatures(source: str, file: str) -> dict[str, list[Parameter]]:
     """{kernel name: [Parameter, ...]} of an OpenCL C source that follows docs/conventions.md.
 
-    Raises ValueError naming the file, kernel and line of a parameter that does not.
+    Raises ValueError naming the file, kernel and line of a parameter that does not follow them.
     """
     signatures = {}
     for match in _KERNEL.finditer(source):
@@ -97,10 +97,10 @@ def _parse_parameter(code, comment, where):
 
 @functools.cache
 def compile_formula(text: str) -> CodeType:
-    """A dimension in a buffer's comment, such as `N+1`, `c1 + c2` or `(H-1)/2`, for eval().
-    co_names are the names in it; the division is one of whole numbers.
+    """Compile a dimension in a buffer's comment, such as `N+1`, `c1 + c2` or `(H-1)/2`, for eval().
+    co_names are the names in it; / divides whole numbers.
 
-    Raises ValueError for what is no formula of integers, names, brackets and + - * /.
+    Raises ValueError unless it is a formula of integers, names, brackets and + - * /.
     """
     try:
         if not _FORMULA.fullmatch(text):

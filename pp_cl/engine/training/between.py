@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 
 def after_update(trainer: Trainer, rates: Rates) -> None:
-    """Smooth the SH coefficients, update the EMA, prune and refine, each if due after this
-    step.
+    """Decide on exposure, smooth the SH coefficients, update the EMA, prune and refine, each if it
+    is due after this step.
     """
     train, step = trainer.config.train, trainer.step
     for is_last in (False, True):
@@ -73,7 +73,7 @@ def prune(trainer: Trainer) -> None:
 
 
 def keep_most_visible(trainer: Trainer, count: int) -> None:
-    """Drop all points but the `count` that images show most."""
+    """Drop all points but the `count` most visible in images."""
     keep(trainer, most_visible(trainer.dev, trainer.state, trainer.model.cloud.opacity, count))
 
 
@@ -99,12 +99,12 @@ def refine(trainer: Trainer) -> None:
 
 
 def finish(trainer: Trainer) -> None:
-    """End the training: take the EMA as parameters, and drop the points whose opacity is too
-    low or that too few training views show, and those that then hang in the air by few.
+    """End the training: take the EMA as parameters, and drop the points whose opacity is too low or
+    that too few training views show, then small groups of points left in the air.
     """
     trainer.optimiser.apply_ema()
     if trainer.config.train.prune_weight > 0:
-        trainer.renderer.release()  # for whole views with weights by pair
+        trainer.renderer.release()  # makes room for whole views with weights by pair
         keep(trainer, points_that_views_show(trainer.renderer, trainer.views, trainer.config))
         keep(trainer, points_of_large_parts(trainer.model))
     if trainer.config.train.specular == "auto" and trainer.composited:
@@ -112,7 +112,7 @@ def finish(trainer: Trainer) -> None:
 
 
 def fit_specular(trainer: Trainer) -> None:
-    """Give the model its specular layer, if it is worth having."""
+    """Fit a specular layer, and keep it if it helps on views that it was not fitted to."""
     train = trainer.config.train
     trainer.renderer.supersampling = supersampling_at(trainer.step, train)
 
@@ -125,7 +125,7 @@ def fit_specular(trainer: Trainer) -> None:
 
 
 def whole_target(trainer: Trainer, index: int) -> Array:
-    """(h, w, 3) float32 on the device: what the image of a view, by index, should be."""
+    """(h, w, 3) float32 on the device: the target for the image of a view, by index."""
     camera = trainer.views[index].camera
     image, alpha = trainer.targets.crop(trainer.views[index], (0, 0, camera.width, camera.height))
     if trainer.exposure and trainer.exposed:

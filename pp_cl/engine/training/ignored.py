@@ -1,4 +1,4 @@
-"""Pixels of a target that say nothing: they have no loss and no gradient."""
+"""Ignored pixels of a target: they contribute no loss and no gradient."""
 
 from pyopencl.array import Array
 
@@ -14,10 +14,11 @@ def ignore_target(
     target_alpha: Array,
     offset: tuple[int, int],
 ) -> None:
-    """Make a target (H, W, 3) what the prediction (PH, PW, 3) is, and target_alpha (H, W) -1, where
-    a pixel is ignored.
+    """At ignored pixels, copy the prediction (PH, PW, 3) to the target (H, W, 3), and set
+    target_alpha (H, W) to -1.
 
-    ignored: (H, W) uint8, 1 where it is. offset: (left, top) of the target in the prediction.
+    ignored: (H, W) uint8, 1 for ignored pixels. offset: (left, top) of the target in the
+    prediction.
     """
     height, width = ignored.shape
     dev.program("training/ignored").launch(
@@ -37,7 +38,7 @@ def ignore_target(
 def ignore_gradient(
     dev: Device, ignored: Array, grad_prediction: Array, offset: tuple[int, int]
 ) -> None:
-    """Make dL/dprediction (PH, PW, 3) 0 where a pixel is ignored; as ignore_target() takes it."""
+    """Set dL/dprediction (PH, PW, 3) to 0 at ignored pixels. Arguments as for ignore_target()."""
     height, width = ignored.shape
     dev.program("training/ignored").launch(
         "ignore_gradient",

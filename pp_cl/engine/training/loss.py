@@ -20,7 +20,7 @@ MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS
 def loss_table(
     dev: Device, size: tuple[int, int], padded: tuple[int, int], ssim_weight: float
 ) -> Table:
-    """The buffers of Loss for a target of size (height, width) in a prediction of a larger one."""
+    """The buffers of Loss for a target of size (height, width) in a prediction of size `padded`."""
     height, width = size
     values, has_ssim = lanes_of_loss(dev), ssim_weight != 0 and min(size) >= TAPS
     window_rows = height - TAPS + 1 if has_ssim else 0
@@ -36,8 +36,8 @@ def loss_table(
 
 
 class Loss:
-    """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image + mask_weight * mean
-    (alpha - mask)^2, and what add_distortion() adds; holds its scratch buffers.
+    """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image + mask_weight * mean (alpha
+    - mask)^2, plus the term of add_distortion(); holds its scratch buffers.
 
     D is smooth L1 (Girshick 2015): d^2 / (2 beta) below beta, |d| - beta/2 from there on; L1 where
     beta is 0.
@@ -54,7 +54,7 @@ class Loss:
         self.ssim_weight = ssim_weight
         self.mask_weight = mask_weight
         self._window_rows = 0
-        self._distortion: Any = None  # the download of it
+        self._distortion: Any = None  # its download
         self._further: dict[str, tuple[float, float]] = {}  # {further term: (weight, scale)}
         self._buffers = Buffers(dev)
 
@@ -69,14 +69,14 @@ class Loss:
         shortfall: float = 1.0,
     ) -> tuple[Array, Array | None]:
         """(dL/dprediction (PH, PW, 3), dL/dalpha (PH * PW,) or None), float32, valid until the next
-        call; begins the terms anew.
+        call; resets the terms.
 
         prediction: (PH, PW, 3) float32, unclamped. target: (H, W, 3) float32, lies on the
         prediction's columns left..left+W and rows top..top+H; the gradients are 0 elsewhere.
-        alphas: of the mask term, if there is one: the transmittance (PH * PW,) of the prediction
-        and the target's alpha (H, W) in [0, 1], below 0 where a pixel is ignored. shortfall: 0 to
-        1, weight of pixels whose alpha is below the mask. Raises ValueError where the target
-        reaches outside.
+        alphas: None without a mask term, else the prediction's transmittance (PH * PW,) and the
+        target's alpha (H, W) in [0, 1], below 0 where a pixel is ignored. shortfall: 0 to 1, weight
+        of pixels whose alpha is below the mask. Raises ValueError if the target reaches outside the
+        prediction.
         """
         corner = corner_of(prediction.shape, target.shape, left, top)
         (height, width, _), (ph, pw, _), b = target.shape, prediction.shape, self._buffers
@@ -122,8 +122,8 @@ class Loss:
         self._distortion = read_later(self.dev, distortion)
 
     def read(self, step: int) -> Pending[dict[str, float]]:
-        """{"loss", "l1", "ssim", "psnr"} of the crop of a step, from 1 on, and the further terms.
-        Asking for them raises Diverged if one is not finite.
+        """{"loss", "l1", "ssim", "psnr" and further terms: value} of a step's crop; steps count
+        from 1. Its get() raises Diverged if a value is not finite.
         """
         weight, further, v = self.ssim_weight, self._further, self._window_rows
         distortion = self._distortion
@@ -162,15 +162,15 @@ def _defines(dev):
 
 
 def lanes_of_loss(dev: Device) -> int:
-    """LANES of its kernels: on GPUs 4, as each work-item writes four terms to be summed."""
+    """LANES of the loss kernels: 4 on GPUs, as each work-item writes four terms to be summed."""
     return lanes(dev, on_gpu=4)
 
 
 def corner_of(
     prediction_shape: tuple[int, ...], target_shape: tuple[int, ...], left: int, top: int
 ) -> int:
-    """First value of the prediction under a target at (left, top). Raises ValueError where the
-    target reaches outside.
+    """Index of the prediction's first value under a target at (left, top). Raises ValueError if the
+    target reaches outside the prediction.
     """
     (ph, pw, _), (height, width, _) = prediction_shape, target_shape
     if min(left, top) < 0 or left + width > pw or top + height > ph:

@@ -1,5 +1,5 @@
-"""Smoothing: pulls the SH coefficients of each point towards the mean of its grid neighbours, apart
-from the optimiser, whose moments stay as they are.
+"""Smoothing: pulls the SH coefficients of each point towards the mean of its grid neighbours,
+independently of the optimiser, whose moments do not change.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from pp_cl.engine.device.launch import lanes, row_parts
 
 
 def smoothing_table(n: int) -> Table:
-    """The arrays of a Smoother of n points."""
+    """The arrays of a Smoother for n points."""
     return {"neighbours": ((n, 6), np.uint32), "colour": ((n,), np.uint8)}
 
 
@@ -39,9 +39,9 @@ class Smoother:
 
     def smooth(self, sh: Array, amount: float) -> None:
         """Move every coefficient f, in place: f += amount * (mean of the existing neighbours' f -
-        f), first of the points whose grid indices have an even sum, then of the others.
+        f), first for the points whose grid indices have an even sum, then for the others.
 
-        A point without neighbours keeps its own. amount: 0 to 1. sh: (N, K, 16) float32.
+        A point without neighbours keeps its coefficients. amount: 0 to 1. sh: (N, K, 16) float32.
         """
         n, k, _ = sh.shape
         for colour in (0, 1):

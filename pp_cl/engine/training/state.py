@@ -23,7 +23,7 @@ class PointState:
 
     @staticmethod
     def table(n: int, width: int = 4) -> Table:
-        """The arrays of n points without the averages. width: of PointCloud.offset."""
+        """The arrays of n points without the averages. width: columns of PointCloud.offset."""
         return {
             "max_weight": ((n,), np.float32),
             "times_seen": ((n,), np.float32),
@@ -35,8 +35,8 @@ class PointState:
 
     @staticmethod
     def ema_table(n: int) -> Table:
-        """The averages of n points: of all but their harmonics above degree 0, whose averages would
-        take most of the memory and gain 0.02 dB (docs/recipe.md).
+        """The averages of n points: for all parameters but harmonics above degree 0, whose averages
+        would take most of the memory and gain 0.02 dB (docs/recipe.md).
         """
         table = PointCloud.table(n, sh_blocks(0))
         del table["ids"]
@@ -44,20 +44,22 @@ class PointState:
 
     @property
     def max_weight(self) -> Array:
-        """(N) float32: the sum over an image's pixels of the point's blend weights, the highest of
-        all images since pruning last judged the point.
+        """(N) float32: the sum of the point's blend weights over an image's pixels, its highest
+        value in all images since pruning last judged the point.
         """
         return self._arrays["max_weight"]
 
     @property
     def times_seen(self) -> Array:
-        """(N) float32: number of those images that had a fragment of the point, occluded or not."""
+        """(N) float32: number of images, since pruning last judged the point, with a fragment of
+        it, occluded or not.
+        """
         return self._arrays["times_seen"]
 
     @property
     def second_moments(self) -> dict[str, Array]:
-        """RMSprop's: of "offset", (N, 4), "opacity", (N,), and "sh", (N, 16), of each feature; all
-        float32.
+        """RMSprop's second moments, float32: "offset" (N, 4), "opacity" (N,) and "sh" (N, 16), one
+        for each feature.
         """
         return {name: self._arrays[f"v.{name}"] for name in ("offset", "opacity", "sh")}
 
@@ -90,8 +92,8 @@ class PointState:
 
 def split_opacity(dev: Device, opacity: Array) -> None:
     """Replace every opacity o in [0, 1], (N, 9) float32 of PointCloud, by 1 - sqrt(1 - o), in
-    place, and scale what depends on the direction as o. On a refined grid a ray crosses two points
-    where it crossed one, and their transmittances multiply to 1 - o.
+    place, and scale the columns that depend on the direction like o. On a refined grid a ray
+    crosses two points where it crossed one, and their transmittances multiply to 1 - o.
     """
     n = len(opacity)
     dev.program("training/refine").launch("split_opacity", n, n=n, opacity=opacity)
