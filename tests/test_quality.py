@@ -10,7 +10,7 @@ from pp_cl.cli import main
 
 SEEDS = (0, 1, 2)
 # PSNR of the held-out views, dB, the mean over SEEDS on PoCL; one seed's is off by 0.5
-REACHED = {"demo": 33.06, "ball": 32.79}
+REACHED = {"demo": 33.59, "ball": 32.79}
 WITHIN = 0.3  # dB
 
 
