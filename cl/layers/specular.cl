@@ -13,13 +13,14 @@
 
 // A GPU keeps the values of a pixel in local memory: indexed arrays would spill from registers. Value
 // i of a pixel is PLACE(i) values behind its first one; TOGETHER times LANES pixels are a group's.
+#ifndef TOGETHER
+#define TOGETHER 1
+#endif
 #if LANES == 1
 #define KEPT local
-#define TOGETHER 64
 #define PLACE(i) ((i) * TOGETHER)
 #else
 #define KEPT private
-#define TOGETHER 1
 #define PLACE(i) (i)
 #endif
 

@@ -14,8 +14,7 @@ from pp_cl.engine.device.launch import channel_ranges, lanes, launch_groups
 from pp_cl.engine.layers.tiles import Tiles, all_tiles
 
 GATE, RESAMPLE = "layers/gate", "layers/resample"
-# pixels of a work-group of the specular layer on GPUs: TOGETHER of its kernel
-PIXELS_TOGETHER = 64
+PIXELS_TOGETHER = 64  # pixels of a work-group of the specular layer on GPUs
 SHARE = 0.25  # of a feature in its colour: features vary about four times as much as colours
 
 
@@ -127,7 +126,7 @@ def specular_forward(
     the transmittance (H * W,) of a view. parameters: see network/specular.py. camera: (21,), with
     side x side pixels for each pixel of the image.
     """
-    n = image.shape[0] * image.shape[1]
+    n, together = image.shape[0] * image.shape[1], 1 if dev.is_cpu else PIXELS_TOGETHER
     named: dict[str, Any] = {}
     for name, array in parameters.items():
         layer, kind = name.split(".")
@@ -136,9 +135,13 @@ def specular_forward(
         dev,
         "layers/specular",
         "specular_forward",
-        -(-n // (PIXELS_TOGETHER if lanes(dev) == 1 else lanes(dev))),
+        -(-n // (together * lanes(dev))),
         most=PIXELS_TOGETHER,
-        defines={"LANES": lanes(dev), "HIDDEN": parameters["a.bias"].size},
+        defines={
+            "LANES": lanes(dev),
+            "HIDDEN": parameters["a.bias"].size,
+            "TOGETHER": together,
+        },
         n=n,
         width=image.shape[1],
         side=float(side),
