@@ -56,17 +56,21 @@ ALWAYS_INLINE void dense(
 kernel void specular_forward(
     const uint n,  // pixels
     const uint width,
-    const float side,                   // camera pixels along a side of an image pixel
-    global const float *camera,         // (21) camera.h
-    global const float *transmittance,  // (n)
-    global const float *features,       // (H, W, 16)
-    global const float *weight_a,       // (HIDDEN/16, 1, 1, INPUTS, 16)
-    global const float *bias_a,         // (HIDDEN)
-    global const float *weight_b,       // (HIDDEN/16, 1, 1, HIDDEN, 16)
-    global const float *bias_b,         // (HIDDEN)
-    global const float *weight_c,       // (1, 1, 1, HIDDEN, 16)
-    global const float *bias_c,         // (16)
-    global float *image)                // (H, W, 3)
+    const float side,                        // camera pixels along a side of an image pixel
+    const float extent,                      // world units of 1 in places
+    global const float *camera,              // (21) camera.h
+    global const float *transmittance,       // (n)
+    global const float *features,            // (H, W, 16)
+    global const uint *pixel_offset,         // (n+1)
+    global const ulong *pair_key,            // (P) depth << 32 | pair, sorted within a pixel
+    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
+    global const float *weight_a,            // (HIDDEN/16, 1, 1, INPUTS, 16)
+    global const float *bias_a,              // (HIDDEN)
+    global const float *weight_b,            // (HIDDEN/16, 1, 1, HIDDEN, 16)
+    global const float *bias_b,              // (HIDDEN)
+    global const float *weight_c,            // (1, 1, 1, HIDDEN, 16)
+    global const float *bias_c,              // (16)
+    global float *image)                     // (H, W, 3)
 {
     KEPT floats kept[TOGETHER * INPUTS], other[TOGETHER * HIDDEN];
     const Camera cam = camera_load(camera);
@@ -82,7 +86,7 @@ kernel void specular_forward(
         if (most < LEAST_ALPHA) continue;
 
         KEPT floats *inputs = kept + own, *hidden = other + own;
-        floats direction[3], encoded[INPUTS - CHANNELS];
+        floats direction[3], place[3], encoded[INPUTS - CHANNELS];
         for (int lane = 0; lane < LANES; lane++) {
             const uint pixel = first + min(lane, count - 1);
             for (int c = 0; c < CHANNELS; c++)
@@ -91,8 +95,14 @@ kernel void specular_forward(
             ((float *)direction)[lane] = d.x;
             ((float *)(direction + 1))[lane] = d.y;
             ((float *)(direction + 2))[lane] = d.z;
+            const uint begin = pixel_offset[pixel], end = pixel_offset[pixel + 1];
+            const float3 p = place_of(&cam, d, begin, end, pair_key, pixel_weight_point, extent);
+            ((float *)place)[lane] = p.x;
+            ((float *)(place + 1))[lane] = p.y;
+            ((float *)(place + 2))[lane] = p.z;
         }
-        ENCODE(floats, direction, encoded)
+        ENCODE(floats, direction, OCTAVES, encoded)
+        ENCODE(floats, place, PLACE_OCTAVES, (encoded + DIRECTION_INPUTS))
         UNROLLED_FOR (int i = CHANNELS; i < INPUTS; i++)
             inputs[PLACE(i)] = encoded[i - CHANNELS];
 

@@ -1,22 +1,25 @@
-// The specular layer: a small network turns the features and the viewing direction of one pixel into
-// a colour, which times alpha is added to the image. It is fitted after the training.
+// The specular layer: a small network turns the features, the viewing direction and the place of one
+// pixel into a colour, which times alpha is added to the image. It is fitted after the training.
 #ifndef PP_SPECULAR_H
 #define PP_SPECULAR_H
 
 #include "camera.h"
 #include "common.h"
 
-#define OCTAVES 4
-#define INPUTS (CHANNELS + 3 + 6 * OCTAVES)
+#define OCTAVES 4        // of sines and cosines of the direction
+#define PLACE_OCTAVES 2  // of the place
+#define DIRECTION_INPUTS (3 + 6 * OCTAVES)
+#define PLACE_INPUTS (3 + 6 * PLACE_OCTAVES)
+#define INPUTS (CHANNELS + DIRECTION_INPUTS + PLACE_INPUTS)
 #define HALF_PI 1.57079632679489662f
 
-// encoded[0..26] of the unit vector d[3] (of floats, or of vectors with a lane per pixel), as NeRF
-// encodes positions: d, then sines and cosines of 2^k pi/2 d, by the double-angle formulas.
-#define ENCODE(type, d, encoded)                                                                   \
+// encoded[0..3 + 6 octaves] of d[3] (of floats, or of vectors with a lane per pixel), as NeRF encodes
+// positions: d, then sines and cosines of 2^k pi/2 d, by the double-angle formulas.
+#define ENCODE(type, d, octaves, encoded)                                                          \
     UNROLLED_FOR (int c = 0; c < 3; c++) {                                                         \
         type cosine, sine = sincos(HALF_PI * d[c], &cosine);                                       \
         encoded[c] = d[c];                                                                         \
-        UNROLLED_FOR (int k = 0; k < OCTAVES; k++) {                                               \
+        UNROLLED_FOR (int k = 0; k < octaves; k++) {                                               \
             encoded[3 + 6 * k + c] = sine;                                                         \
             encoded[6 + 6 * k + c] = cosine;                                                       \
             const type twice = 2.0f * sine * cosine;                                               \
@@ -31,6 +34,25 @@ static inline float3 direction_of(const Camera *cam, const uint x, const uint y,
     const float across = (side * (x + 0.5f) - cam->cx) / cam->fx;
     const float down = (side * (y + 0.5f) - cam->cy) / cam->fy;
     return normalize(across * cam->right + down * cam->down + cam->forward);
+}
+
+// The place that a pixel with fragments shows, from the middle of the scene in units of `extent`:
+// where its ray is at the mean distance of its fragments, by blend weight.
+static inline float3 place_of(
+    const Camera *cam,
+    const float3 direction,
+    const uint begin,  // of the pixel's fragments
+    const uint end,
+    global const ulong *pair_key,            // (P) depth << 32 | pair
+    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
+    const float extent) {
+    float weights = 0.0f, distance = 0.0f;
+    for (uint i = begin; i < end && (uint)pixel_weight_point[i] != NONE; i++) {
+        const float b = upper_float(pixel_weight_point[i]);
+        weights += b;
+        distance += b * upper_float(pair_key[i]);
+    }
+    return (cam->eye + distance / weights * direction) / extent;
 }
 
 #endif

@@ -1,10 +1,10 @@
 // Training data of the specular layer (layers/specular.h): pixels of all views, drawn in any order.
 #include "layers/specular.h"
 
-#define ROW (CHANNELS + 6)  // features, direction and residual of a pixel
+#define ROW (CHANNELS + 9)  // features, direction, place and residual of a pixel
 
-// One work-item per chosen pixel: writes its features, its direction and its residual, the target
-// minus the image, over alpha.
+// One work-item per chosen pixel: writes its features, its direction, its place and its residual,
+// the target minus the image, over alpha.
 kernel void specular_rows(
     const uint m,      // chosen pixels
     const uint first,  // row of the first one
@@ -12,14 +12,18 @@ kernel void specular_rows(
     const uint target_width,
     const uint left,  // of the target's corner in the image
     const uint top,
-    const float side,                   // camera pixels along a side of an image pixel
-    global const uint *chosen,          // (m) pixels of the image
-    global const float *camera,         // (21) camera.h
-    global const float *transmittance,  // (?) of the image
-    global const float *features,       // (H, W, 16) of the image
-    global const float *image,          // (H, W, 3)
-    global const float *target,         // (?, target_width, 3)
-    global float *rows)                 // (ROWS, ROW)
+    const float side,                        // camera pixels along a side of an image pixel
+    const float extent,                      // world units of 1 in places
+    global const uint *chosen,               // (m) pixels of the image
+    global const float *camera,              // (21) camera.h
+    global const float *transmittance,       // (HW) of the image
+    global const float *features,            // (H, W, 16) of the image
+    global const uint *pixel_offset,         // (HW+1)
+    global const ulong *pair_key,            // (P) depth << 32 | pair, sorted within a pixel
+    global const ulong *pixel_weight_point,  // (P) weight << 32 | point; no point: the list ends
+    global const float *image,               // (H, W, 3)
+    global const float *target,              // (?, target_width, 3)
+    global float *rows)                      // (ROWS, ROW)
 {
     const uint i = get_global_id(0);
     if (i >= m) return;
@@ -28,10 +32,15 @@ kernel void specular_rows(
     global float *row = rows + ROW * ((size_t)first + i);
     for (int c = 0; c < CHANNELS; c++)
         row[c] = features[(size_t)CHANNELS * pixel + c];
-    vstore3(direction_of(&cam, x, y, side), 0, row + CHANNELS);
+    const float3 direction = direction_of(&cam, x, y, side);
+    vstore3(direction, 0, row + CHANNELS);
+    const uint begin = pixel_offset[pixel], end = pixel_offset[pixel + 1];
+    const float3 place =
+        place_of(&cam, direction, begin, end, pair_key, pixel_weight_point, extent);
+    vstore3(place, 0, row + CHANNELS + 3);
     const float3 wanted = vload3((size_t)target_width * (y - top) + x - left, target);
     const float alpha = 1.0f - transmittance[pixel];
-    vstore3((wanted - vload3(pixel, image)) / alpha, 0, row + CHANNELS + 3);
+    vstore3((wanted - vload3(pixel, image)) / alpha, 0, row + CHANNELS + 6);
 }
 
 // One work-item per pixel of a batch: writes the layer's inputs, and the output that it should give.
@@ -49,10 +58,11 @@ kernel void specular_batch(
     global float *input = inputs + INPUTS * (size_t)i;
     for (int c = 0; c < CHANNELS; c++)
         input[c] = row[c];
+    global const float *direction = row + CHANNELS, *place = direction + 3, *residual = place + 3;
     global float *encoded = input + CHANNELS;
-    const float direction[3] = {row[CHANNELS], row[CHANNELS + 1], row[CHANNELS + 2]};
-    ENCODE(float, direction, encoded)
-    vstore3(0.5f + vload3(0, row + CHANNELS + 3) / unit, i, wanted);
+    ENCODE(float, direction, OCTAVES, encoded)
+    ENCODE(float, place, PLACE_OCTAVES, (encoded + DIRECTION_INPUTS))
+    vstore3(0.5f + vload3(0, residual) / unit, i, wanted);
 }
 
 // One work-item per value: writes the gradient of the mean square of image - wanted.

@@ -46,6 +46,11 @@ class Model:
         self.net = net
         self.specular = specular
 
+    @property
+    def extent(self) -> float:
+        """Half of the grid's diagonal in world units, the unit of places for the specular layer."""
+        return self.grid.diagonal / 2
+
     def positions(self) -> np.ndarray:
         """(N, 3) float64 world positions of the points."""
         vertices = self.grid.positions(self.dev.download(self.cloud.ids))

@@ -122,6 +122,22 @@ class RenderResult:
         """(H * W,) float32: weights.transmittance; None with the softmax."""
         return self.weights.transmittance
 
+    def specular_arguments(self, extent: float) -> dict[str, Any]:
+        """The arguments, by name, with which a kernel computes the inputs of the specular layer:
+        features, direction and place of each pixel. extent: world units of 1 in places.
+        """
+        return {
+            "width": self.size[1],
+            "side": float(self.supersampling),
+            "extent": extent,
+            "camera": self.points.camera_buffer,
+            "transmittance": self.transmittance,
+            "features": self.features,
+            "pixel_offset": self.pairs.pixel_offset,
+            "pair_key": self.pairs.pair_key,
+            "pixel_weight_point": self.weights.pixel_weight_point,
+        }
+
     def fragments(self) -> np.ndarray:
         """(height, width) int64: the number of fragments of each pixel, without the padding."""
         counts = np.diff(self.pairs.pixel_offset.get().astype(np.int64))
@@ -256,9 +272,8 @@ class Renderer:
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
             if specular := self.model.specular:
-                through: Any = weights.transmittance  # not None with alpha compositing
-                seen = b.features, through, points.camera_buffer
-                specular_forward(dev, specular.parameters, result.image, *seen, side)
+                of_view = result.specular_arguments(self.model.extent)
+                specular_forward(dev, specular.parameters, result.image, of_view)
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop, training, times_seen, is_planned):

@@ -159,18 +159,20 @@ def _along_both(rows, columns, x):
     return np.einsum("Yy,Xx,yxc->YXc", rows, columns, x, optimize=True)
 
 
-def encoded_directions(directions: np.ndarray, octaves: int = 4) -> np.ndarray:
-    """(..., 3 + 6 octaves): unit vectors (..., 3), encoded as in cl/layers/specular.h."""
-    angles = [2.0**k * np.pi / 2 * directions for k in range(octaves)]
-    waves = [wave(angle) for angle in angles for wave in (np.sin, np.cos)]
-    return np.concatenate([directions, *waves], -1)
-
-
-def specular(
-    layers: list, parameters: dict, features: np.ndarray, directions: np.ndarray
-) -> np.ndarray:
-    """(H, W, 3) colour that the specular layer adds to pixels of alpha 1, given their features
-    (H, W, 16) and directions (H, W, 3). layers, parameters: as in network().
+def specular_inputs(features: np.ndarray, directions: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(..., 58): what the specular layer gets of pixels with these features (..., 16), unit
+    directions (..., 3) and places (..., 3), encoded as in cl/layers/specular.h.
     """
-    x = np.concatenate([features, encoded_directions(directions)], -1)
+    encoded = [features]
+    for values, octaves in ((directions, 4), (places, 2)):
+        angles = [2.0**k * np.pi / 2 * values for k in range(octaves)]
+        encoded += [values, *(wave(angle) for angle in angles for wave in (np.sin, np.cos))]
+    return np.concatenate(encoded, -1)
+
+
+def specular(layers: list, parameters: dict, *of_pixels: np.ndarray) -> np.ndarray:
+    """(H, W, 3) colour that the specular layer adds to pixels of alpha 1. layers, parameters: as in
+    network(). of_pixels: as for specular_inputs(), (H, W, ...).
+    """
+    x = specular_inputs(*of_pixels)
     return network(layers, parameters, x)["image"] - 0.5

@@ -11,11 +11,15 @@ from pp_cl.engine.layers.conv import pack_bias, pack_weights
 from pp_cl.engine.layers.simple import specular_forward
 from pp_cl.engine.network.layers import convolutions
 from pp_cl.engine.network.specular import INPUTS, Specular
+from pp_cl.engine.raster.weights import NO_POINT
+from pp_cl.engine.render import RenderResult
 from pp_cl.engine.training.specular import ROW, draw_batch, gradient_of_squares, keep_pixels
 from pp_cl.reference import network
 from pp_cl.selftest.case import EPS, SIZES, Case, each, exact, relative
 
-BOUND = 2e-6  # sums of up to 43 products; errors of the double-angle formulas add up
+BOUND = 2e-6  # sums of up to 58 products; errors of the double-angle formulas add up
+EXTENT = 1.7  # world units
+WEIGHTS, FAR = (0.01, 0.9), (1.0, 9.0)  # blend weights and distances of fragments
 PADDED = 2, 1  # (left, top) of an image within the rendered one
 
 
@@ -35,8 +39,9 @@ def random_layer(dev: Device, rng: np.random.Generator) -> tuple[Specular, dict[
 
 
 def _view(dev, rng, height, width, side):
-    """(a result like renderer.forward()'s with random pixels, its (H, W, 3) directions). Some
-    pixels have alpha 0, 1, or less than the layer needs. The middle one looks along an axis.
+    """(a result like renderer.forward()'s with random pixels; directions and places of the pixels,
+    (H, W, 3) each). Some pixels have alpha 0, 1, or less than the layer needs. The middle one looks
+    along an axis. Lists of fragments have 1 to 4, of which an early stop may have dropped some.
     """
     pose = np.eye(3, 4)[[2, 0, 1]]
     sizes = width / 2, height / 2, width, height
@@ -46,17 +51,39 @@ def _view(dev, rng, height, width, side):
     alpha[np.abs(alpha - 0.02) < 1e-3] = 1  # near the threshold, rounding may decide
     features, image = rng.normal(size=(height, width, 16)), rng.random((height, width, 3))
     rays = camera.rays()
-    view: Any = SimpleNamespace(
-        dev=dev,
-        size=(height, width),
-        offset=PADDED,
-        supersampling=side,
+    directions = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    lengths = rng.integers(1, 5, height * width)
+    listed = rng.integers(1, lengths + 1)
+    offset = np.concatenate([[0], np.cumsum(lengths)])
+    pixel = np.repeat(np.arange(height * width), lengths)
+    is_listed = np.arange(offset[-1]) - offset[pixel] < listed[pixel]
+    weights, distances = (rng.uniform(*of, offset[-1]).astype(np.float32) for of in (WEIGHTS, FAR))
+    sums = (np.bincount(pixel, is_listed * x) for x in (weights, weights * np.float64(distances)))
+    mean = (1 / next(sums) * next(sums)).reshape(height, width, 1)
+    view: Any = RenderResult(
+        dev,
+        camera,
+        PADDED,
+        (height, width),
         points=SimpleNamespace(camera_buffer=dev.upload(camera.enlarged(side).packed((1, 9)))),
-        transmittance=dev.upload(1 - alpha.ravel(), np.float32),
-        features=dev.upload(features, np.float32),
-        image=dev.upload(image, np.float32),
+        pairs=SimpleNamespace(
+            pixel_offset=dev.upload(offset, np.uint32),
+            pair_key=dev.upload(_words(distances, pixel)),
+        ),
+        weights=SimpleNamespace(
+            transmittance=dev.upload(1 - alpha.ravel(), np.float32),
+            pixel_weight_point=dev.upload(_words(weights, np.where(is_listed, pixel, NO_POINT))),
+        ),
+        tile_mask=None,
+        supersampling=side,
     )
-    return view, rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    view.features, view.image = dev.upload(features, np.float32), dev.upload(image, np.float32)
+    return view, directions, (camera.eye + mean * directions) / EXTENT
+
+
+def _words(upper, lower):
+    """(?,) uint64: bits of float32 in the upper half, a number in the lower one."""
+    return upper.view(np.uint32).astype(np.uint64) << 32 | lower.astype(np.uint64)
 
 
 def _forward(dev, rng):
@@ -64,13 +91,12 @@ def _forward(dev, rng):
     layer, parameters = random_layer(dev, rng)
     for n in SIZES:
         for height, width, side in ((1, n, 1), (n, 3, 2)):
-            view, directions = _view(dev, rng, height, width, side)
+            view, directions, places = _view(dev, rng, height, width, side)
             before = view.image.get()
-            seen = view.features, view.transmittance, view.points.camera_buffer
-            specular_forward(dev, layer.parameters, view.image, *seen, side)
+            specular_forward(dev, layer.parameters, view.image, view.specular_arguments(EXTENT))
             alpha = 1 - view.transmittance.get().reshape(height, width, 1).astype(np.float64)
-            features = view.features.get()
-            added = network.specular(layer.layers, parameters, features, directions)
+            of_pixels = view.features.get(), directions, places
+            added = network.specular(layer.layers, parameters, *of_pixels)
             is_shown = alpha[..., 0] >= 0.02
             yield relative(
                 view.image.get(), before + np.where(alpha >= 0.02, alpha * added, 0), BOUND
@@ -83,16 +109,17 @@ def _batches(dev, rng):
     for n in SIZES:
         rows, expected = dev.zeros((2 * n + 1, ROW)), np.zeros((2 * n + 1, ROW))
         for first, side in ((0, 1), (n + 1, 2)):
-            view, directions = _view(dev, rng, n + 3, 9, side)
+            view, *seen = _view(dev, rng, n + 3, 9, side)
             left, top = PADDED
             target = rng.random((n, 5, 3)).astype(np.float32)
             y, x = top + np.arange(n), left + rng.integers(0, 5, n)
-            keep_pixels(view, (9 * y + x).astype(np.uint32), dev.upload(target), rows, first)
+            chosen = (9 * y + x).astype(np.uint32)
+            keep_pixels(view, chosen, dev.upload(target), rows, first, EXTENT)
             alpha = 1 - view.transmittance.get().reshape(n + 3, 9)[y, x, None].astype(np.float64)
             missing = target[y - top, x - left].astype(np.float64) - view.image.get()[y, x]
             with np.errstate(divide="ignore"):
                 lacking = np.where(alpha > 0, missing / alpha, np.inf * np.sign(missing))
-            of_pixels = view.features.get()[y, x], directions[y, x], lacking
+            of_pixels = view.features.get()[y, x], *(of_all[y, x] for of_all in seen), lacking
             expected[first : first + n] = np.concatenate(of_pixels, -1)
         found = rows.get()
         usable = np.isfinite(expected).all(1)
@@ -102,9 +129,9 @@ def _batches(dev, rng):
         inputs, wanted = dev.empty((n, 1, INPUTS)), dev.empty((n, 1, 3))
         draw_batch(dev, dev.upload(kept), dev.upload(drawn), unit, inputs, wanted)
         of_rows = kept[drawn].astype(np.float64)
-        seen = of_rows[:, :16], network.encoded_directions(of_rows[:, 16:19])
-        yield relative(inputs.get()[:, 0], np.concatenate(seen, -1), 16 * EPS)
-        yield relative(wanted.get()[:, 0], 0.5 + of_rows[:, 19:] / unit, 2 * EPS)
+        of_pixels, lacking = np.split(of_rows[:, :22], (16, 19), -1), of_rows[:, 22:]
+        yield relative(inputs.get()[:, 0], network.specular_inputs(*of_pixels), 16 * EPS)
+        yield relative(wanted.get()[:, 0], 0.5 + lacking / unit, 2 * EPS)
         image, gradient = dev.upload(rng.random((n, 1, 3)), np.float32), dev.empty((n, 1, 3))
         gradient_of_squares(dev, image, wanted, gradient)
         wrong = image.get().astype(np.float64) - wanted.get()

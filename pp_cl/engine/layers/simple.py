@@ -114,17 +114,10 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
 
 
 def specular_forward(
-    dev: Device,
-    parameters: dict[str, Array],
-    image: Array,
-    features: Array,
-    transmittance: Array,
-    camera: Array,
-    side: int,
+    dev: Device, parameters: dict[str, Array], image: Array, of_view: dict[str, Any]
 ) -> None:
-    """Add the colours of a specular layer to the image (H, W, 3), given the features (H, W, 16) and
-    the transmittance (H * W,) of a view. parameters: see network/specular.py. camera: (21,), with
-    side x side pixels for each pixel of the image.
+    """Add the colours of a specular layer to the image (H, W, 3) of a view. parameters: see
+    network/specular.py. of_view: from RenderResult.specular_arguments().
     """
     n, together = image.shape[0] * image.shape[1], 1 if dev.is_cpu else PIXELS_TOGETHER
     named: dict[str, Any] = {}
@@ -143,12 +136,8 @@ def specular_forward(
             "TOGETHER": together,
         },
         n=n,
-        width=image.shape[1],
-        side=float(side),
-        camera=camera,
-        transmittance=transmittance,
-        features=features,
         image=image,
+        **of_view,
         **named,
     )
 

@@ -1,7 +1,7 @@
-"""The specular layer: a small network that turns the 16 blended features and the viewing direction
-of a pixel into a colour, which is multiplied by alpha and added to the image (as in SNeRG, Hedman
-et al. 2021, section 4). After the training, training/specular.py fits it to the residuals of the
-images, which are mostly reflections.
+"""The specular layer: a small network that turns the 16 blended features, the viewing direction and
+the place of a pixel into a colour, which is multiplied by alpha and added to the image (as in
+SNeRG, Hedman et al. 2021, section 4, which has no place). After the training, training/specular.py
+fits it to the residuals of the images, which are mostly reflections.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pp_cl.engine.network.layers import Layer
 from pp_cl.engine.network.unet import Network
 
 HIDDEN = 32  # channels of both hidden layers
-INPUTS = 43  # features, and the direction as cl/layers/specular.h encodes it
+INPUTS = 58  # features, and the direction and the place as cl/layers/specular.h encodes them
 
 
 def specular_layers() -> list[Layer]:

@@ -21,11 +21,11 @@ from pp_cl.engine.views import View, evenly
 
 KERNELS = "training/specular"
 SIDE = 64  # a batch has SIDE x SIDE pixels
-ROW = 22  # floats stored for a pixel: features, direction, colours
+ROW = 25  # floats stored for a pixel: features, direction, place, colours
 MOST_VIEWS, MOST_ROWS = 128, 2**18  # views rendered for the fit; pixels kept from all of them
 LEAST_ALPHA = 0.5  # pixels below this alpha are not fitted to
 RATE = 5e-3  # first learning rate; it falls to 0 along a cosine
-STEPS = 500  # a fold takes half of them; longer fits adapt to single views
+STEPS = 600  # a fold takes half of them; longer fits adapt to single views
 FOLDS = 3
 LEAST_SCALE = 0.1  # a layer scaled by less than this is dropped
 
@@ -77,13 +77,14 @@ class SpecularFit:
         self._rows = self.dev.empty(*self._table.pop("rows"))
         most, rng = len(self._rows) // len(looked_at), np.random.default_rng(seed)
         counts: list[int] = []
+        extent = renderer.model.extent
         for i in looked_at:
             rendered = renderer.forward(views[i].camera, gamma)
             chosen = _object_pixels(views[i], rendered)
             if len(chosen) > most:
                 chosen = np.sort(rng.choice(chosen, most, replace=False))
             if len(chosen):
-                keep_pixels(rendered, chosen, target(i), self._rows, first=sum(counts))
+                keep_pixels(rendered, chosen, target(i), self._rows, sum(counts), extent)
             counts.append(len(chosen))
             del rendered  # else its arrays would stay beside the larger ones of the next view
         self._fold = np.repeat(np.arange(len(counts)) % FOLDS, counts)
@@ -158,11 +159,16 @@ class SpecularFit:
 
 
 def keep_pixels(
-    rendered: RenderResult, chosen: np.ndarray, target: Array, rows: Array, first: int
+    rendered: RenderResult,
+    chosen: np.ndarray,
+    target: Array,
+    rows: Array,
+    first: int,
+    extent: float,
 ) -> None:
     """Write a row, from `first` on in rows (?, ROW), for each chosen pixel, (m,) uint32 indices
-    into the padded image: its features, its direction, and its residual (target - image) / alpha.
-    target: (h, w, 3).
+    into the padded image: its features, its direction, its place, and its residual (target - image)
+    / alpha. target: (h, w, 3). extent: as for RenderResult.specular_arguments().
     """
     left, top = rendered.offset
     rendered.dev.program(KERNELS).launch(
@@ -170,18 +176,14 @@ def keep_pixels(
         len(chosen),
         m=len(chosen),
         first=first,
-        width=rendered.size[1],
         target_width=target.shape[1],
         left=left,
         top=top,
-        side=float(rendered.supersampling),
         chosen=rendered.dev.upload(chosen),
-        camera=rendered.points.camera_buffer,
-        transmittance=rendered.transmittance,
-        features=rendered.features,
         image=rendered.image,
         target=target,
         rows=rows,
+        **rendered.specular_arguments(extent),
     )
 
 
