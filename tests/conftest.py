@@ -21,7 +21,7 @@ from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 from pp_cl.scene import hull
 from pp_studio.export import QUALITIES, QUICK, texture
 
-# Profiles of Hypothesis: the same few examples each time, or as many as `make fuzz` asks for
+# Profiles of Hypothesis: the same few examples each time, or the number that `make fuzz` sets
 settings.register_profile(
     "short",
     max_examples=60,
@@ -58,12 +58,13 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
-    """Give the session a cache folder that holds only the weights of LPIPS, so that what the user's
-    cache says of drivers is not read. All processes share it, as they take the same device.
+    """Give the session a cache folder that holds only the weights of LPIPS, so that tests do not
+    read the results about drivers in the user's cache. All processes share it, as they take the
+    same device.
     """
     cached = cache_folder() / WEIGHTS_FILE
     folder = tmp_path_factory.getbasetemp()
-    if os.environ.get("PYTEST_XDIST_WORKER"):  # whose folder is inside that of all
+    if os.environ.get("PYTEST_XDIST_WORKER"):  # a worker's base folder lies inside that of all
         folder = folder.parent
     lent = folder / "cache" / WEIGHTS_FILE
     lent.parent.mkdir(exist_ok=True)
@@ -80,9 +81,9 @@ def cache_of_its_own(tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def small_work():
-    """Use as few hull points (to compare masks) and texels as a ball needs, and few steps to fit
-    Gaussians and specular layers, whose quality one file each tests (export/test_splat.py,
-    training/test_specular.py).
+    """Use the few hull points (to compare masks) and texels that a ball needs, and few steps to fit
+    Gaussians and specular layers; export/test_splat.py and training/test_specular.py test their
+    quality.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(hull, "COMPARED_POINTS", 8000)
@@ -167,7 +168,7 @@ def data():
 def runs(tmp_path_factory, session_device):
     """Scenes and finished runs that all processes share."""
     folder = tmp_path_factory.getbasetemp()
-    if os.environ.get("PYTEST_XDIST_WORKER"):  # whose folder is inside that of all
+    if os.environ.get("PYTEST_XDIST_WORKER"):  # a worker's base folder lies inside that of all
         folder = folder.parent
     (folder / "shared").mkdir(exist_ok=True)
     return Runs(folder / "shared")
@@ -175,7 +176,7 @@ def runs(tmp_path_factory, session_device):
 
 @pytest.fixture(scope="session")
 def scene(runs):
-    """Folder of a small scene, which tests must not change."""
+    """Folder of a small scene. Tests must not change it."""
     return runs.ball()
 
 

@@ -67,7 +67,9 @@ SOME = {
 
 
 def test_equal_content_gives_equal_bytes(dev, tmp_path):
-    """Also where arrays come in pieces. That they come back: tests/test_properties.py."""
+    """Arrays written in pieces give the same bytes. tests/test_properties.py tests that they come
+    back.
+    """
     rows = {name: DeviceRows(dev, dev.upload(array)) for name, array in SOME.items()}
     for name, arrays in (("a", SOME), ("b", SOME), ("c", rows)):
         save_checkpoint(tmp_path / f"{name}.npz", {"step": 3}, arrays)
@@ -80,7 +82,7 @@ def test_forms_and_single_arrays_are_read_without_the_others(folder, config):
     header, arrays = contents(config)
     write_run(folder, config, header, arrays)
     data = bytearray(folder.checkpoint.read_bytes())
-    data[data.index(arrays["points.sh2"].tobytes())] ^= 1  # read, it is corrupt
+    data[data.index(arrays["points.sh2"].tobytes())] ^= 1  # reading this array would fail
     folder.checkpoint.write_bytes(data)
     with opened_run(folder, config) as stored:
         assert stored.header["step"] == STEP
@@ -134,7 +136,7 @@ def test_what_fits_is_read_as_it_was_written(folder, config, step):
     [
         (10, {"points__sh_degree": 1, "network__widths": "16,24,40"}),
         (53, {"train__ema": "false", "train__exposure": "off", "network__blocks": "gated"}),
-        (30, {"points__sh_degree": 0}),  # gains are not yet decided on
+        (30, {"points__sh_degree": 0}),  # the run has not decided on gains yet
         (53, {"train__refine_at": "0.5,1", "downscale": 1}),  # the averages have begun
     ],
 )
@@ -219,7 +221,7 @@ def test_a_finished_run_holds_no_state_and_an_unfinished_one_does(folder, config
     write_run(folder, config, contents(config)[0], model)
     assert "is missing" in refusal(folder, config)
     header, arrays = contents(config, 55)
-    del arrays["average.out.bias"]  # once they have begun
+    del arrays["average.out.bias"]  # averages have begun, so it is required
     write_run(folder, config, header, arrays)
     assert "average.out.bias is missing" in refusal(folder, config)
     del header["grid"]
@@ -257,7 +259,7 @@ def bomb(path):
 
 
 def claimed(path):
-    """4 GiB in the directory, of which there is nothing."""
+    """Claim 4 GiB in the zip's directory for a member that does not have them."""
     data = path.read_bytes()
     place = data.rindex(b"PK\x01\x02")
     size = (2**32 - 2).to_bytes(4, "little") * 2
@@ -282,7 +284,7 @@ FILES = {
 def test_a_file_that_cannot_be_is_refused_before_memory_is_taken(folder, config, damage):
     write_run(folder, config, *contents(config))
     damage(folder.checkpoint)
-    refusal(folder, config)  # what is imported on the way is not counted below
+    refusal(folder, config)  # imports happen here, and are not counted below
     tracemalloc.start()
     try:
         refusal(folder, config)
@@ -303,7 +305,7 @@ def test_a_file_that_may_not_be_read_is_not_called_corrupt(folder, config, monke
 
 
 def test_a_training_does_not_go_on_from_it(scene, tmp_path, monkeypatch):
-    """What other commands say of a run that cannot be read: tests/commands/test_refused.py."""
+    """tests/commands/test_refused.py tests the other commands on a run that cannot be read."""
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
     file = tmp_path / "run" / "checkpoint.npz"
     header, arrays = load_checkpoint(file)

@@ -33,7 +33,7 @@ def saved(monkeypatch):
     "every, minutes, expected",
     [
         (1000, 7.5, [8, 16, 24, 32, 40, 48, 56, 60]),
-        # any checkpoint begins the minutes anew
+        # each checkpoint restarts the count of minutes
         (10, 7.5, [8, 10, 18, 20, 28, 30, 38, 40, 48, 50, 58, 60]),
     ],
 )

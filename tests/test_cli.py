@@ -74,7 +74,7 @@ SIGINT = "signal.raise_signal(signal.SIGINT)"
     ],
 )
 def test_a_further_interrupt_shows_no_traceback(told, then, status):
-    """Of a process whose main() has told of the first."""
+    """main() has already reported the first interrupt."""
     lines = f"""
         import signal
         from pp_cl import cli

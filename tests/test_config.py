@@ -29,7 +29,7 @@ def test_presets_are_valid_and_survive_json(name, tmp_path):
 
 
 def test_paper_preset_keeps_the_supplementals_numbers():
-    """What the supplemental states; the delays in steps hold for our 50,000 iterations."""
+    """The numbers that the supplemental states; delays in steps hold for our 50,000 iterations."""
     paper = preset("paper")
     assert paper.points.count == 4_000_000 and paper.points.sh_degree == 2
     raster = paper.raster
@@ -180,7 +180,7 @@ def test_masks_in_the_folder_of_a_scene_move_with_it(tmp_path):
 
 
 def test_a_training_that_begins_again_writes_the_same_settings(scene, tmp_path):
-    """It was stopped before its first checkpoint; a time of 0 minutes stays a time."""
+    """The training was stopped before its first checkpoint; 0 minutes stay 0."""
     folder, given = RunFolder(tmp_path), [("train.iterations", "30", "--iterations")]
     written = run_config(folder, scene, None, given).to_json()
     folder.configure(written)

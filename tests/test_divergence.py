@@ -9,7 +9,7 @@ from support.runs import arguments, rows
 from pp_cl.engine.training.optim import Optimiser
 
 SAVED = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"
-# {what happens: (the step after which, to what, other settings, what is said)}
+# {case: (step after which NaN appears, in which array, other settings, part of the message)}
 DIVERGENCES = {
     "points": (15, "points", {}, "the loss is not finite at step 16 (loss, l1, ssim, psnr)"),
     "preview": (20, "points", {"train__checkpoint_every": 10}, "holds NaN after step 20"),
@@ -55,7 +55,7 @@ def _poison(monkeypatch, after, what):
 
 
 def test_a_training_that_diverges_at_its_end_is_not_finished(scene, tmp_path, monkeypatch):
-    """Averages would hide it."""
+    """Averages would hide the NaN."""
     _poison(monkeypatch, 60, "moment")
     line = failure(*arguments(scene, tmp_path / "run"))
     assert "holds NaN or Inf; " in line and "checkpoint.npz of step 50 is kept" in line

@@ -15,7 +15,7 @@ def test_what_has_no_end_is_named_by_its_kind():
         deep = [deep]
     assert quoted(deep) == "a list"
     assert shown("\ud800") == "?"
-    assert len(quoted(10**5000)) <= 100  # Python 3.10 may print them
+    assert len(quoted(10**5000)) <= 100  # Python 3.10 may print such numbers
 
 
 def test_every_message_is_one_line():

@@ -14,7 +14,7 @@ from pp_cl.metrics.psnr_ssim import psnr
 
 @pytest.fixture(scope="module")
 def run(runs, tmp_path_factory):
-    """A finished run on the ball, at a size whose reduction is no multiple of 4."""
+    """A finished run on the ball. Its reduced images have sides that are no multiples of 4."""
     changes = {"train__iterations": 40, "train__crop": 28, "train__prune_weight": 0}
     return runs.trained(tmp_path_factory.mktemp("evaluate") / "run", runs.ball(size=60), **changes)
 

@@ -19,14 +19,14 @@ from pp_studio.export.points import coloured_points, in_world, write_ply
 from pp_studio.export.splat import splats, write_splat_glb
 
 FAR = np.array([1e6, -1e6, 1e6])
-UNIT = 2.0**-24  # of the eyes: float64 holds them exactly 1e6 away, and the grid too
+UNIT = 2.0**-24  # eyes are multiples: float64 holds them exactly 1e6 away, and the grid, too
 CHANGES = {"train__iterations": 24, "train__prune_every": 8, "train__prune_weight": 0.05}
 CHANGES |= {"train__refine_at": "0.5,1.0", "points__count": 400}
 
 
 def trained(folder, by):
-    """(header, arrays, mean PSNR of the test views, folder) of a small training of the ball,
-    moved.
+    """(header, arrays, mean PSNR of the test views, folder) of a small training on the ball, moved
+    by `by`.
     """
     scene = write_ball_scene(folder / "ball")
     move_scene(folder / "ball", by, UNIT)
@@ -59,7 +59,7 @@ def test_exact_moves_give_the_same_bits(at_origin, far):
         assert np.array_equal(array, expected_arrays[name]), name
     grid, other = header["grid"], expected["grid"]
     assert (grid["voxel_size"], grid["dims"]) == (other["voxel_size"], other["dims"])
-    assert (np.subtract(grid["origin"], other["origin"]) == FAR).all()  # the world's, exactly
+    assert (np.subtract(grid["origin"], other["origin"]) == FAR).all()  # exact: origins are float64
     assert header["depth_range"] == expected["depth_range"]
 
 
@@ -69,7 +69,7 @@ def far_run(far, session_device):
 
 
 def glb_points(path):
-    """(N, 3) places in the world of the points of a file."""
+    """(N, 3) world positions of the points in a GLB file."""
     cloud = trimesh.load(path)
     [name] = cloud.graph.nodes_geometry
     place, _ = cloud.graph[name]

@@ -1,7 +1,7 @@
-"""Calls that change files fail, processes are killed: one line, nothing half written under a final
-name, and the next start comes to the bytes of an undisturbed run.
+"""If a call that changes files fails or the process is killed, there is one line of error, no half
+written file under its final name, and the next start gives the bytes of an undisturbed run.
 
-Some faults of each kind here; `make faults` (FAULTS=all) tries all of them.
+A few faults of each kind are tried here; `make faults` (FAULTS=all) tries all.
 """
 
 import errno
@@ -32,14 +32,14 @@ from support.scenes import write_ball_scene
 
 ROOT = Path(__file__).parents[1]
 ALL = os.environ.get("FAULTS") == "all"
-PARTS = range(8 if ALL else 1)  # that workers share
-KILLS = 8 if ALL else 2  # of a part
+PARTS = range(8 if ALL else 1)  # the workers share them
+KILLS = 8 if ALL else 2  # kills in each part
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc"),
     pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning"),
 ]
-# every mechanism of the loop is due in so many steps
+# every mechanism of the loop runs within these steps
 CHANGES = {
     "train__iterations": 30,
     "points__count": 300,
@@ -55,7 +55,7 @@ def bench(tmp_path_factory):
 
 
 class Bench:
-    """A folder with a scene and templates of runs. run: where commands are disturbed."""
+    """A folder with a scene and templates of runs. run: the folder that the faults disturb."""
 
     def __init__(self, folder):
         scene, self.run = write_ball_scene(folder / "scene", 4, 16), folder / "run"
@@ -72,14 +72,14 @@ class Bench:
         shutil.copytree(self.run, interrupted)
         self.calls(trained, evaluate)
         shutil.copytree(self.run, evaluated)
-        # {name: (what the run is at first, command, what it is undisturbed at the end)}
+        # {name: (the run's template, or None, command, the files at an undisturbed end)}
         self.commands = {
             "training": (None, train, content(trained)),
             "training that goes on": (interrupted, train, content(trained)),
             "evaluation": (trained, evaluate, content(evaluated)),
             "evaluation again": (evaluated, evaluate, content(evaluated)),
         }
-        self._seen = set()  # states from which the next start came to the right end
+        self._seen = set()  # states from which the next start ended correctly
 
     def calls(self, begin, words):
         restore(self.run, begin)
@@ -116,11 +116,11 @@ def numbers(calls, beginning):
     "name", ["training", "training that goes on", "evaluation", "evaluation again"]
 )
 def test_a_call_that_fails(bench, name, part):
-    """As of a broken disk, and as of a full one that stays so."""
+    """The fault comes once, as from a broken disk, or stays, as from a full one."""
     begin, words, expected = bench.commands[name]
     calls, wrong = bench.calls(begin, words), []
     tried = range(1, len(calls) + 1)
-    if not ALL:  # the last of each kind
+    if not ALL:  # only the last call of each kind
         tried = sorted({call.split()[0]: n for n, call in enumerate(calls, 1)}.values())
     for number in tried[part :: len(PARTS)]:
         restore(bench.run, begin)
@@ -139,8 +139,8 @@ def test_a_call_that_fails(bench, name, part):
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("name", ["training", "evaluation"])
 def test_a_process_that_is_killed(bench, name, part):
-    """Again and again, at random moments and in front of random calls; sometimes it comes to its
-    end.
+    """The process is killed again and again, at random moments and before random calls; sometimes
+    it reaches its end.
     """
     begin, words, expected = bench.commands[name]
     rng, count = np.random.default_rng(part), len(bench.calls(begin, words))

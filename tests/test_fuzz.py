@@ -1,6 +1,7 @@
-"""Damaged and odd input on all that pp-cl reads is taken and sound, or refused in one line.
+"""Damaged and odd input to any reader of pp-cl is accepted with sound values, or refused in one
+line.
 
-A few examples of each surface here; `make fuzz` tries as many as it is told, other ones each time.
+A few examples for each reader are tried here; `make fuzz` tries a given number of new ones.
 """
 
 import argparse
@@ -54,11 +55,12 @@ from pp_cl.scene.sparse import sparse_points
 from tools.convert_scene import dealt
 
 LONGEST = 60  # seconds for an input
-MEMORY = 6 * 2**30  # bytes of addresses more than when the module began; PoCL takes some
-MOST_PIXELS = 2**26  # bytes of pixels that a small file may unfold to without a word
+MEMORY = 6 * 2**30  # bytes of addresses beyond those when the module begins; PoCL takes some
+MOST_PIXELS = 2**26  # bytes of pixels to which a small file may unfold without a warning
 MOST_MESSAGE = 1500  # characters of a refusal: two paths and a reason
 SIDE = 16
-# {surface: (module of tools/scene_formats, arguments of its write(), where the scene lies in it)}
+# {name: (module of tools/scene_formats, arguments of its write(), where the scene lies in its
+# folder)}
 FORMATS = {
     **{name: (name, {}, "") for name in ("nerf_synthetic", "nerfstudio", "neus", "nsvf", "llff")},
     "colmap": ("colmap", {"binary": True}, ""),
@@ -76,9 +78,9 @@ SETTINGS = {
     "train.log_every": 1,
     "scene.downscale": 1,
 }
-# --set words of a training that takes a moment
+# --set options of a training that takes a moment
 set_words = functools.partial(runs.set_words, SETTINGS)
-# what makes a command end soon, whatever else it is told; others are refused in any case
+# options that end a command soon, whatever its other ones; commands not listed are refused anyway
 ENDING = {
     "render": ["--seconds", "0.1", "--fps", "10"],
     "train": set_words(train__iterations=1),
@@ -89,7 +91,7 @@ ENDING = {
 
 
 class Hang(BaseException):
-    """An input took too long. Not an Exception: readers turn those into messages."""
+    """An input took too long. It is no Exception, as readers turn those into messages."""
 
 
 def hang(*_):
@@ -97,7 +99,7 @@ def hang(*_):
 
 
 def ball_views():
-    """The splits of a ball at the origin, seen from around it."""
+    """The splits of a ball at the origin, seen from a ring of cameras."""
     cameras = enumerate(ring_cameras(5, SIDE))
     return dealt(
         {"train": [View(f"r_{i}.png", camera, ball_image(camera)) for i, camera in cameras]}
@@ -105,13 +107,13 @@ def ball_views():
 
 
 class World:
-    """Templates of scenes and runs below a folder, and the device of all runs."""
+    """Templates of scenes and runs in a folder, and the device of all runs."""
 
     def __init__(self, folder, device):
         self._folder, self.device = folder, device
 
     def scene(self, name="nerf_synthetic", folder=None):
-        """The scene in a format, or a copy of it in a folder."""
+        """The scene in the format `name`, or a copy of it in `folder`."""
         module, options, place = FORMATS[name]
         files = self._folder / name
         if not files.exists():
@@ -141,8 +143,8 @@ class World:
 
     @contextlib.contextmanager
     def watched(self):
-        """An empty folder to work in, which is the current one; a hang is a failure, and so is a
-        warning that is not pp-cl's own.
+        """Yields an empty folder as the working directory; fails if the block hangs, or warns by
+        any warning other than pp-cl's own.
         """
         folder = self._folder / "input"
         shutil.rmtree(folder, ignore_errors=True)
@@ -154,8 +156,8 @@ class World:
                 warnings.catch_warnings(record=True) as caught,
             ):
                 patch.chdir(folder)
-                warnings.simplefilter("always", append=True)  # behind what is left out on purpose
-                warnings.filterwarnings("ignore", module=r"PIL\.")  # as pp_cl/files/image.py does
+                warnings.simplefilter("always", append=True)  # intended filters keep precedence
+                warnings.filterwarnings("ignore", module=r"PIL\.")  # as in pp_cl/files/image.py
                 yield folder
         finally:
             signal.alarm(0)
@@ -175,7 +177,7 @@ def world(tmp_path_factory, session_device):
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, limits[1]))
         try:
             world = World(folder, session_device)
-            world.train()  # builds the kernels, too, which no input has to wait for
+            world.train()  # also builds the kernels, so that no input waits for them
             yield world
         finally:
             resource.setrlimit(resource.RLIMIT_AS, limits)
@@ -187,7 +189,7 @@ def taken(function):
         return function()
     except UserError as error:
         check_line(str(error))
-    except OSError:  # of which the command line makes a line
+    except OSError:  # the command line makes a message of it
         pass
     return None
 
@@ -232,7 +234,7 @@ def check_written(folder):
 
 
 def fuzzed(share=1.0):
-    """A share of the examples of a surface: a tenth of the profile's, for files take long."""
+    """Settings for `share` of the usual examples: a tenth of the profile's, as files take long."""
     return settings(max_examples=max(1, round(share * settings.default.max_examples / 10)))
 
 
@@ -314,7 +316,7 @@ def test_sparse_points_and_edits(world, data):
 
 
 def drawn_image(draw, folder):
-    """(a new image file of some kind, its RGBA where the kind keeps it without loss)."""
+    """(A new image file of some kind, its RGBA or None if the kind loses something)."""
     width, height = one(draw, (8, 8), (1, 1), (13, 7))
     noise = np.random.default_rng(draw(st.integers(0, 9))).integers(0, 256, (height, width, 4))
     kind = one(draw, "PNG", "PNG", "PNG", "JPEG", "WEBP", "EXR", "EXR")
@@ -355,7 +357,7 @@ def test_an_image(world, data):
         assert size and rgba.shape == (size[1], size[0], 4) and rgba.dtype == np.uint8
         assert mask is None or (mask.shape == rgba.shape[:2] and mask.dtype == np.uint8)
         assert rgba.nbytes < MOST_PIXELS or file.stat().st_size * 2000 > rgba.nbytes
-        if pixels is not None and file.read_bytes().startswith(whole[:8]):  # with its checksums
+        if pixels is not None and file.read_bytes().startswith(whole[:8]):  # PNG has checksums
             assert np.array_equal(rgba, pixels)
 
 

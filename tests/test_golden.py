@@ -31,8 +31,8 @@ SETTINGS = {
     "train.specular": "off",
 }
 
-# A network's rate changed by 1e-7 of itself and the form for GPUs move the loss by up to 2e-3 in
-# the first 30 steps and 1e-2 later, the result by 0.02 dB and 9 points.
+# Changing a network's rate by 1e-7 of itself, or using the GPU form, changes the loss by up to 2e-3
+# in the first 30 steps and 1e-2 later, and the result by 0.02 dB and 9 points.
 EARLY_STEPS, EARLY, LATE, DECIBELS, POINTS = 30, 0.005, 0.02, 0.1, 0.02
 
 

@@ -19,7 +19,7 @@ from pp_cl.files.image import read_rgba
 from pp_cl.run import MARGIN, load
 from pp_cl.scene.outline import OUTLINE
 
-BALL = 0.8  # its radius, support.scenes
+BALL = 0.8  # the ball's radius, support.scenes
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
     }
     assert found["work"] is None
     assert found["grid"]["dims"] == header["grid"]["dims"]
-    # 24 pixels across, angle of view 0.7, from a distance of 4
+    # images are 24 pixels wide, at an angle of view of 0.7, from a distance of 4
     pixels = 12 / math.tan(0.35) * header["grid"]["voxel_size"] / 4
     assert found["grid"]["voxel_size_pixels"] == pytest.approx(pixels, rel=0.02)
     assert found["files"]["checkpoint.npz"] == (finished / "checkpoint.npz").stat().st_size
@@ -85,7 +85,7 @@ def test_work_is_what_a_view_and_a_step_compute(finished, facts, capsys, dev):
     fragments, dropped, drawn = np.mean(counted, 0)
     assert found["views"] == 8 and found["drawn"] == drawn
     assert found["fragments"] == {"found": fragments, "blended": fragments - dropped}
-    # crops are as large as these images, and no fragment is without gradients
+    # a crop covers the whole image, and each fragment has a gradient
     step = {"side": 24, "touched": drawn, "with_gradients": fragments - dropped}
     assert found["step"] == step and 0 < dropped < fragments
     network = found["network"]

@@ -21,12 +21,12 @@ SIZES = ((48, 48), (37, 29), (24, 40))
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Views of three sizes, the ball off the middle in some; a crop of 24 pixels fits all but
-    one axis.
+    """Views of three sizes, in some of which the ball is off the middle. A crop of 24 pixels fits
+    along all axes but one.
     """
     folder = tmp_path_factory.mktemp("mixed") / "ball"
     splits = {}
-    of_test = ring_cameras(37, 48)[5::12][:3]  # none of which is one of training
+    of_test = ring_cameras(37, 48)[5::12][:3]  # none of these is a training camera
     for split, cameras in (("train", ring_cameras(9, 48)), ("test", of_test)):
         views = []
         for i, camera in enumerate(cameras):

@@ -20,7 +20,7 @@ def test_the_notebook_makes_a_video_and_a_page(tmp_path, monkeypatch):
     for source in sources:
         *body, last = ast.parse(source.replace("1500", "20")).body
         exec(compile(ast.Module(body, []), str(NOTEBOOK), "exec"), names)  # noqa: S102
-        if isinstance(last, ast.Expr):  # whose value a notebook shows
+        if isinstance(last, ast.Expr):  # a notebook shows the value of a last expression
             shown.append(eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names))  # noqa: S307
         else:
             exec(compile(ast.Module([last], []), str(NOTEBOOK), "exec"), names)  # noqa: S102

@@ -1,5 +1,5 @@
-"""What a user has in the folders that commands write to stays as it is: a command leaves it alone,
-or refuses in one line. A disk that is full leaves nothing half written.
+"""A user's files in folders that commands write to stay as they are: a command leaves them alone,
+or refuses in one line. A full disk leaves nothing half written.
 """
 
 import errno
@@ -15,8 +15,8 @@ from pp_cl.cli import main
 
 VIDEO = ["render", "run", "--seconds", "0.2", "--fps", "10"]
 EXPORT = ["export", "run", "--format"]
-# what writes by a mechanism of its own: a run, an evaluation, a file, a folder, a page, a table
-# {name: (words; files that the words name, which may be replaced)}
+# Each kind of output has its own way of writing: runs, evaluations, files, folders, pages, tables.
+# {name: (words; files named in them, which may be replaced)}
 COMMANDS = {
     "train": (None, ()),
     "eval": (["eval", "run", "--save-images"], ()),
@@ -29,7 +29,7 @@ COMMANDS = {
     "info": (["info", "run", "--picture", "a.png", "--json", "a.json"], ("a.png", "a.json")),
     "sweep": (None, ()),
 }
-STATE = ("config.json", "checkpoint.npz", "log.jsonl")  # of a run, which is what its name says
+STATE = ("config.json", "checkpoint.npz", "log.jsonl")  # a run owns files with these names
 OLD = 1_000_000_000
 
 
@@ -51,7 +51,7 @@ def words_for(name, scene):
 
 
 def files(folder):
-    """{path: (bytes, time)} of the files below a folder."""
+    """{path: (bytes, time)} of all files in a folder."""
     paths = [path for path in folder.rglob("*") if path.is_file()]
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in paths}
 

@@ -9,7 +9,7 @@ from pp_cl.cli import main
 
 def test_the_split_val_is_measured_where_there_is_one(tmp_path):
     scene = write_ball_scene(tmp_path / "ball", splits=("train", "val", "test"))
-    (Path(scene) / "test" / "r_0.png").write_bytes(b"")  # is not read
+    (Path(scene) / "test" / "r_0.png").write_bytes(b"")  # the test split must not be read
     changes = {"train__iterations": 2, "train__eval_every": 1}
     assert main(arguments(scene, tmp_path / "run", **changes)) == 0
     alone = write_ball_scene(tmp_path / "alone", splits=("train",))

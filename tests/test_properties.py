@@ -41,7 +41,7 @@ SETTINGS = [(key, item) for key, _, item in every_setting(Config()) if not key.s
 
 @st.composite
 def given_settings(draw):
-    """(key, a value within its limits)."""
+    """(A key, a value within its limits)."""
     key, item = draw(st.sampled_from(SETTINGS))
     limits, several = item.metadata, isinstance(item.default, tuple)
     kind = type(item.default[0]) if several else type(item.default)
@@ -63,7 +63,7 @@ def test_settings_are_themselves_again_from_their_file(tmp_path, pair):
     (tmp_path / "config.json").write_text(config.to_json())
     try:
         assert load_config(tmp_path / "config.json") == config
-    except UserError as error:  # the rules beyond limits
+    except UserError as error:  # rules other than limits
         first, last = config.train.offset_rate
         assert config.train.crop % 4 or (first > 0) != (last > 0)
         assert pair[0] in ("train.crop", "train.offset_rate") and pair[0] in str(error)

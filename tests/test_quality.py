@@ -1,4 +1,4 @@
-"""Quality has a floor: what the preset tiny reaches in 300 steps, of two scenes without data."""
+"""The preset tiny must reach a PSNR in 300 steps, on two scenes that need no data."""
 
 import json
 
@@ -9,7 +9,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 
 SEEDS = (0, 1, 2)
-# PSNR of the held-out views, dB, the mean over SEEDS on PoCL; one seed's is off by 0.5
+# mean PSNR of the held-out views in dB, over SEEDS on PoCL; a single seed is off by up to 0.5
 REACHED = {"demo": 33.59, "ball": 32.79}
 WITHIN = 0.3  # dB
 

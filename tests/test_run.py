@@ -23,7 +23,7 @@ from pp_cl.session.training import open_training
 
 @pytest.fixture(scope="module")
 def trained(scene, tmp_path_factory):
-    """(Run, folder) trained from Python with the settings of support.runs."""
+    """(Run, folder), trained from Python with the settings of support.runs."""
     out = tmp_path_factory.mktemp("runs") / "python"
     return pp_cl.train_scene(scene, out, downscale=2, settings=SETTINGS), out
 
@@ -50,7 +50,7 @@ def test_a_run_renders_what_the_evaluation_saves(trained, capsys):
 def test_the_border_of_an_image_is_as_bright_as_the_background_within(trained):
     run = pp_cl.load(trained[1])
     camera = run.cameras("test")[0].resized(64, 64)
-    camera = replace(camera, fx=camera.fx / 3, fy=camera.fy / 3)  # the ball is in the middle
+    camera = replace(camera, fx=camera.fx / 3, fy=camera.fy / 3)  # the ball covers the middle only
     image = to_8bit(run.render(camera).colour).astype(int)
     assert (np.abs(image[:8] - image[4, 4]) <= 1).all() and (image != image[4, 4]).any()
     run.renderer.margin = 0

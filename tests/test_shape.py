@@ -44,7 +44,7 @@ def test_a_run_before_and_after(dev, scene, mesh, trained):
     before, after = facts["before"], facts["after"]
     assert facts["surface"] == surface.count
     assert before == overlap(surface, hull.grid, hull.ids)
-    assert before["recall"] > 0.8  # not those just outside of the ball
+    assert before["recall"] > 0.8  # the hull lacks vertices just outside of the ball
     assert 0 < after["points"] < before["points"]
     with np.load(trained / "checkpoint.npz") as stored:
         assert after == overlap(surface, hull.grid, stored["points.ids"])

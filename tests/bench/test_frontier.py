@@ -19,7 +19,7 @@ from pp_cl.run import load
 
 @pytest.fixture(scope="module")
 def whole(finished):
-    """The run's folder, and what was measured of it."""
+    """The run's folder, and the measurements that --json wrote."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frontier, "SECONDS", 0.0)
         file = finished.parent / "b.json"
@@ -36,7 +36,7 @@ def run(whole, dev, tmp_path):
 
 @pytest.fixture
 def unmeasured(monkeypatch):
-    """Fails the test that measures again."""
+    """Makes the test fail if anything is measured again."""
 
     def fail(_run):
         raise AssertionError("measured again")
@@ -92,7 +92,7 @@ def test_the_fastest_row_is_hardly_worse_than_the_default():
     default = row(10.0, 30.0, is_default=True)
     fast, worse, slower = row(6.0, 29.91), row(3.0, 29.89), row(8.0, 30.5)
     assert fastest_row([slower, default, worse, fast]) is fast
-    assert fastest_row([row(9.2, 30.0), default, worse]) is default  # at its knee
+    assert fastest_row([row(9.2, 30.0), default, worse]) is default  # 9.2 ms are too small a gain
     by_chance = row(5.0, 30.0, early_stop=0.0), row(6.0, 30.0, least=9.0)
     assert fastest_row([*by_chance, default]) is default
 
@@ -111,13 +111,13 @@ def test_a_curve_for_each_knob_goes_through_the_default(whole, tmp_path):
     assert curve(right, "default") == [default]
     front = sorted([row["ms"], row["psnr"]] for row in rows if row["is_frontier"])
     assert curve(right, "frontier") == front
-    assert curve(left, "early stop")[0] == [stops[0][0], pytest.approx(4e-6)]  # has no logarithm
+    assert curve(left, "early stop")[0] == [stops[0][0], pytest.approx(4e-6)]  # 0 has no logarithm
 
 
 def test_what_is_fastest_is_kept_until_the_checkpoint_changes(run, dev, unmeasured):
     file = run.folder.frontier
     kept = json.loads(file.read_text())
-    # whichever it was, half of the points are now
+    # mark the row with half of the points as the fastest, whichever it was
     chosen = next(one for one in kept["rows"] if one["setting"]["points"] == 0.5)
     for one in kept["rows"]:
         one["is_fast"] = one is chosen

@@ -10,7 +10,7 @@ def test_runs_take_turns(monkeypatch):
     monkeypatch.setattr(timing, "SECONDS", 0.0)
     calls = []
     times = interleave({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, rounds=3)
-    assert "".join(calls) == "ab" * 4  # the first round is not measured
+    assert "".join(calls) == "ab" * 4  # one round more, which is not measured
     assert [len(t) for t in times.values()] == [3, 3]
     assert len(interleave({"a": lambda: None})["a"]) == timing.LEAST_ROUNDS
 
@@ -32,7 +32,7 @@ ROWS = [
     network_row("direct", "forward", 2.0, 0.0),
     network_row("winograd", "train", 3.0, 1e-5),
     {"bench": "raster", "blend": "alpha", "ms": 8.0, "max_err": 1e-7},
-    {"bench": "train", "blend": "alpha", "ms": 8.0},  # has no error
+    {"bench": "train", "blend": "alpha", "ms": 8.0},  # lacks max_err
 ]
 
 

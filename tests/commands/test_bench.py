@@ -41,11 +41,11 @@ def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
     for row in rows:
         if row["bench"] == "conv":
             height, width, ci, co, k = row["shape"]
-            passes = 1 if row["direction"] == "forward" else 2  # of inputs and of weights
+            passes = 1 if row["direction"] == "forward" else 2  # for inputs and for weights
             operations = passes * 2e-6 * k * k * ci * co * height * width
             assert row["rel_l2"] < 1e-5 and row["gflops"] == pytest.approx(operations / row["ms"])
         elif row["bench"] == "unet":
-            assert 0 < row["rel_l2"] < 10 * 2e-6 and row["max_err"] > 0  # ten layers
+            assert 0 < row["rel_l2"] < 10 * 2e-6 and row["max_err"] > 0  # the U-Net has ten layers
         elif row["bench"] == "raster":
             assert row["forward_ms"] + row["backward_ms"] == pytest.approx(
                 sum(row["stages_ms"].values())

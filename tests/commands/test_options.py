@@ -42,7 +42,7 @@ def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypat
     monkeypatch.setattr("pp_cl.drivers.list_devices", lambda **_: [])
     file = tmp_path / "a.json"
     for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):
-        assert main(["devices", *words]) == 2  # none works
+        assert main(["devices", *words]) == 2  # no device works
         assert capsys.readouterr().out == ("\n" if str(file) in words else "[]\n")
     assert json.loads(file.read_text()) == []
 
@@ -95,7 +95,7 @@ def test_an_empty_value_is_refused(words, capsys):
     ],
 )
 def test_options_whose_value_may_be_left_out(tmp_path, monkeypatch, words, found):
-    """They take the word behind them; without one, --json prints and --metrics are all."""
+    """Options take the word after them. Without a word, --json prints and --metrics means all."""
     monkeypatch.chdir(tmp_path)
     given = {}
     monkeypatch.setattr("pp_cl.commands.compare.run", lambda options: given.update(vars(options)))

@@ -11,7 +11,7 @@ ROW = {"psnr": 27.314, "points": 1200}
 
 
 class Terminal(io.StringIO):
-    """Text that is shown to somebody."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self):
         return True
@@ -19,7 +19,7 @@ class Terminal(io.StringIO):
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
-    """What takes seconds takes hundredths."""
+    """Shortens intervals of seconds to hundredths."""
     monkeypatch.setattr(progress, "REDRAWN", 0.02)
     monkeypatch.setattr(progress, "LINES_APART", 0.02)
     monkeypatch.setattr(progress, "_told", 0.0)
@@ -53,7 +53,7 @@ def test_lines_of_all_stages_have_their_distance(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(progress, "LINES_APART", 0.5)
     monkeypatch.setattr(progress, "_told", time.monotonic())
-    for _ in range(20):  # none of these is as long as that
+    for _ in range(20):  # each stage is shorter than the distance between lines
         with progress.Progress("reading", stream=stream):
             time.sleep(0.06)
     assert 1 <= stream.getvalue().count("\n") <= 3

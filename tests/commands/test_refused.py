@@ -14,7 +14,7 @@ from pp_cl.run import Run
 TRAIN = "train BALL --out new"
 OF_RUNS = ("eval", "render", "view", "export --format ply", "info --picture a.png")
 SHAPE = "compare --mesh ball.ply"
-WRITTEN = [  # what the command line alone tells, of whatever runs there are
+WRITTEN = [  # refused from the command line alone, whether the runs exist or not
     ("trian", "did you mean train?"),
     (f"{TRAIN} --iters 6", "did you mean --iterations?"),
     (f"{TRAIN} --preset smal", "did you mean small?"),
@@ -45,7 +45,7 @@ WRITTEN = [  # what the command line alone tells, of whatever runs there are
 ]
 REFUSED = [
     (f"{TRAIN} --set trian.seed=1", "did you mean train.seed?"),
-    # what is missing, broken or not what it is to be
+    # input that is missing, broken or of another kind
     *((f"{command} none", "none") for command in (*OF_RUNS, SHAPE)),
     *((f"{command} empty", "empty") for command in (*OF_RUNS, SHAPE)),
     *((f"{command} young", "checkpoint.npz") for command in (*OF_RUNS, SHAPE) if command != "view"),
@@ -63,7 +63,7 @@ REFUSED = [
     ("compare run --mesh none.ply", "none.ply"),
     ("compare run", "--mesh"),
     ("bench train --scene none", "none"),
-    # where nothing can be written
+    # outputs that cannot be written
     *((f"{command} --out /proc/a", "/proc/a") for command in ("train BALL", "eval run")),
     ("train BALL --out full", "full"),
     ("train BALL --out file", "file"),
@@ -87,7 +87,7 @@ REFUSED = [
     # devices
     *((f"{command} run --device abacus", "abacus") for command in ("eval", "render")),
     *((f"{command} --device abacus", "abacus") for command in (TRAIN, "bench unet", "selftest")),
-    # options that are unknown, of other commands or subjects, or do not fit each other
+    # options that are unknown, belong to other commands or subjects, or exclude each other
     ("info run --scene run --masks run", "--masks"),
     ("info run --set train.seed=1", "--set"),
     ("info run --preset tiny", "--preset"),
@@ -151,8 +151,8 @@ REFUSED = [
 
 @pytest.fixture(scope="module")
 def folder(scene, finished, tmp_path_factory):
-    """What all cases see, as none writes anything: a run, runs that lack something, a mesh, files
-    in the way.
+    """A folder that all cases share, as none writes anything: a run, runs that lack something, a
+    mesh, and files where outputs would go.
     """
     folder = tmp_path_factory.mktemp("refused")
     for name in ("run", "young", "unknown"):
@@ -170,7 +170,7 @@ def folder(scene, finished, tmp_path_factory):
 
 
 def check_refused(words, named, folder, capsys):
-    """One line names what is wrong; the folder, in which the command is given, stays as it is."""
+    """Check that the last line names what is wrong and the working folder is unchanged."""
     before = sorted(folder.rglob("*"))
     assert main(words) == 2
     said = capsys.readouterr().err.splitlines()
@@ -188,7 +188,7 @@ def test_what_makes_no_sense_is_one_line(tmp_path, capsys, monkeypatch, line, na
 @pytest.mark.parametrize("line, named", REFUSED, ids=[line[:60] for line, _ in REFUSED])
 def test_bad_input_is_one_line_and_nothing_is_done(folder, scene, capsys, monkeypatch, line, named):
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(Run, "render", None)  # that nothing is computed
+    monkeypatch.setattr(Run, "render", None)  # fails if anything is rendered
     monkeypatch.setitem(sys.modules, "pp_studio.sweep.cluster", None)
     words = [scene if word == "BALL" else word for word in line.split()]
     check_refused(words, named, folder, capsys)

@@ -52,7 +52,7 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_to_the_same_bytes(
 def test_a_signal_in_the_last_step_changes_nothing_but_the_status(
     scene, whole, tmp_path, capsys, monkeypatch
 ):
-    """A command that trains first, as make, ends there."""
+    """A command that trains first, such as make, ends there."""
     signalling(monkeypatch, 60, signal.SIGINT)
     assert main(arguments(scene, tmp_path / "run")) == 130
     assert "; the training is finished" in capsys.readouterr().err.splitlines()[-1]
@@ -63,8 +63,8 @@ def test_a_signal_in_the_last_step_changes_nothing_but_the_status(
 def test_a_second_signal_stops_at_once_and_so_does_one_in_the_first_step(
     scene, tmp_path, capsys, monkeypatch, at, saved, status
 ):
-    """What is promised is the last checkpoint, where there is one; the first step builds kernels,
-    for half a minute, and a process that waited for them would wait for nothing.
+    """Only the last checkpoint is promised, if there is one. The first step builds kernels for half
+    a minute, and waiting for them would save nothing.
     """
     train_step, file = Trainer.train_step, tmp_path / "run" / "checkpoint.npz"
 
@@ -83,7 +83,7 @@ def test_a_second_signal_stops_at_once_and_so_does_one_in_the_first_step(
 
 @pytest.mark.parametrize("number", STOPPING)
 def test_what_follows_from_a_signal_is_not_told(capsys, monkeypatch, number):
-    """Another process was ended by it, too, or a module was half imported."""
+    """The signal also ended another process, or interrupted an import."""
 
     def broken(*_):
         try:
@@ -101,7 +101,9 @@ def test_what_follows_from_a_signal_is_not_told(capsys, monkeypatch, number):
 @pytest.mark.unix
 @pytest.mark.parametrize("number", STOPPING)
 def test_a_process_ends_soon_whatever_it_is_doing(number):
-    """Handlers do not run while a lock is waited for, which no signal interrupts, or a compiler."""
+    """Handlers do not run while the process waits for a lock, which no signal interrupts, or a
+    compiler.
+    """
     code = """
         import ctypes, sys
         from pp_cl import cli
@@ -130,7 +132,7 @@ def test_a_process_ends_soon_whatever_it_is_doing(number):
 
 
 def test_ignored_signals_stay_ignored(monkeypatch):
-    """nohup and & in a script rely on it."""
+    """Scripts with nohup and & rely on it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with first_signal() as caught:

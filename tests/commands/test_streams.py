@@ -55,7 +55,7 @@ def test_letters_that_an_encoding_lacks(tmp_path):
 
 
 def test_the_streams_of_a_caller_are_left_alone(monkeypatch):
-    """Texts that are no files, as a notebook has them."""
+    """The streams are not files, as in a notebook."""
     out, err = io.StringIO(), io.StringIO()
     monkeypatch.setattr("sys.stdout", out)
     monkeypatch.setattr("sys.stderr", err)

@@ -55,12 +55,14 @@ def failing_step(self):
 
 
 def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, monkeypatch):
-    """As a training advises that fails in its first steps; nothing of it shows in the next."""
+    """A training that fails in its first steps advises other settings; the next one keeps nothing
+    of it.
+    """
     scene, out, plain = write_ball_scene(tmp_path / "ball"), tmp_path / "run", tmp_path / "plain"
     with monkeypatch.context() as patch:
         patch.setattr("pp_cl.engine.step.Trainer.train_step", failing_step)
         assert main(arguments(scene, out, network__rate="100,100")) == 2
-    write_png(out / "previews" / "step_000001.png", np.zeros((8, 8, 3)))  # of other settings
+    write_png(out / "previews" / "step_000001.png", np.zeros((8, 8, 3)))  # by the first settings
     words = {"network__rate": "0.002,0.001", "train__iterations": 12, "train__refine_at": "1,1"}
     assert main([*arguments(scene, out, **words), "--preset", "small"]) == 0
     assert main([*arguments(scene, plain, **words), "--preset", "small"]) == 0
@@ -100,7 +102,7 @@ def test_a_checkpoint_goes_on_with_what_the_model_does_not_depend_on(tmp_path):
 def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
     tmp_path, monkeypatch
 ):
-    """Or they would be missing for ever where a kill comes between."""
+    """Otherwise, if the process is killed in between, they would be missing for ever."""
     scene, folder, found = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run"), {}
 
     def saving(path, header, arrays):

@@ -19,8 +19,8 @@ from pp_cl.drivers import (
 
 @pytest.fixture
 def listed(monkeypatch):
-    """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a
-    Device. No speed is kept.
+    """A function that sets what list_devices() returns; open_device() then returns the cl.Device
+    instead of a Device. No speed is kept.
     """
     monkeypatch.setattr(drivers, "Device", lambda d: d)
     monkeypatch.setattr(speeds, "kept_speeds", lambda _: {})
@@ -46,8 +46,8 @@ def test_without_speeds_a_gpu_that_works_comes_first(listed):
 
 
 CHOICES = {"0:0": 0, "1:0": 1, "1:1": 2, "intel": 1, "Portable": 0, "h200": 2, "cuda": 2}
-# PoCL's devices carry the name of the processor: a whole name goes before a part of another
-CHOICES |= {"Intel(R) Xeon(R)": 1, "xeon": 1}  # of several the one that is taken by default
+# A PoCL device is named after the processor: a match of the whole name wins over a part of a name.
+CHOICES |= {"Intel(R) Xeon(R)": 1, "xeon": 1}  # "xeon" fits several: the default one of them
 
 
 @pytest.mark.parametrize("choice", CHOICES)
@@ -59,7 +59,7 @@ def test_choice_by_index_and_name(listed, monkeypatch, choice, variable):
         fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1"),
     ]
     listed(*listed_devices)
-    monkeypatch.setenv("PP_DEVICE", choice if variable else "0:0")  # an argument comes first
+    monkeypatch.setenv("PP_DEVICE", choice if variable else "0:0")  # an argument takes precedence
     assert open_device(None if variable else choice) is listed_devices[CHOICES[choice]][1]
 
 
@@ -130,12 +130,12 @@ def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_p
     )
     assert ran.returncode == 0, ran.stderr
     assert "set XDG_CACHE_HOME to keep them" in ran.stderr
-    assert not os.path.exists(ran.stdout.strip())  # gone with the process
+    assert not os.path.exists(ran.stdout.strip())  # the folder is removed with the process
 
 
 @pytest.mark.unix
 def test_a_cache_folder_in_which_nothing_runs_is_replaced(tmp_path, monkeypatch):
-    """On a file system that is mounted noexec PoCL ends the process."""
+    """PoCL ends the process if its cache is on a file system mounted noexec."""
     caches = {"XDG_CACHE_HOME": tmp_path / "a", "POCL_CACHE_DIR": tmp_path / "b"}
     for name, folder in caches.items():
         monkeypatch.setenv(name, str(folder))

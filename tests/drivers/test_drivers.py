@@ -28,8 +28,8 @@ def compiled(library, *flags):
 
 @pytest.fixture
 def vendors(tmp_path, monkeypatch):
-    """A folder with PoCL, to which drivers are added by name and flags; the only one of this
-    machine. Nothing is known of them yet.
+    """Replaces this machine's drivers by PoCL alone, with an empty cache; returns a function that
+    compiles and adds a driver, by name and flags.
     """
     folder = tmp_path / "vendors"
     folder.mkdir()
@@ -52,7 +52,7 @@ def python(code):
 
 
 def listed(code="import sys; from pp_cl.cli import main; sys.exit(main(['devices', '--json']))"):
-    """{name of a device or driver: its row} of `pp-cl devices` in a fresh process."""
+    """{name of a device or driver: its row}, as `pp-cl devices` prints them in a fresh process."""
     return {os.path.basename(row["name"]): row for row in json.loads(python(code))}
 
 
@@ -64,24 +64,24 @@ def test_drivers_that_crash_and_one_that_builds_nothing(vendors, tmp_path):
     assert "SIGABRT" in found["crash.icd"]["problem"] and "SIGABRT" in found["late.icd"]["problem"]
     assert found["unbuilding"]["problem"].startswith("does not run")
     assert [row["index"] for row in found.values() if row["problem"] is None]
-    # later processes try nothing and load nothing that hurts; with a new driver they do
+    # later processes try no driver and load no harmful one, until a new driver is added
     opened = "from pp_cl import drivers; {} print(drivers.open_device().name)"
     assert python(opened.format("drivers._probe = None;")).strip() in found
     vendors("other", "-DCRASHES")
     assert python(opened.format("")).strip() in found
-    # what was found of the drivers before is still known
+    # the results about the drivers before are still kept
     kept = sorted(file.read_text().count("other.icd") for file in (tmp_path / "cache").iterdir())
     assert kept == [0, 1]
 
 
-@pytest.mark.slow  # a driver hangs for 20 s before it counts as one that does
+@pytest.mark.slow  # a driver counts as hanging after 20 s
 def test_a_driver_that_hangs(vendors):
     vendors("crash", "-DCRASHES")
     vendors("hang", "-DHANGS")
     vendors("broken")
     start = time.monotonic()
     found = listed()
-    assert time.monotonic() - start < 60  # 20 for the one, then all others again
+    assert time.monotonic() - start < 60  # 20 s for the driver that hangs, then all others again
     assert {"crash.icd", "hang.icd", "unbuilding"} < set(found)
     assert "20 seconds" in found["hang.icd"]["problem"]
     left = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
@@ -91,7 +91,7 @@ def test_a_driver_that_hangs(vendors):
 
 
 def test_intels_runtime_is_found_beside_pp_cl(tmp_path, monkeypatch):
-    """As pip lays it out, with a driver of the tests in its place; not where drivers are chosen."""
+    """A driver of the tests lies where pip installs Intel's; OCL_ICD_VENDORS ends the search."""
     compiled(tmp_path / "libintelocl.so")
     about = tmp_path / "intel_opencl_rt-1.dist-info"
     about.mkdir()

@@ -1,4 +1,4 @@
-"""The device that was the fastest when measured is taken."""
+"""The device that measured fastest is taken by default."""
 
 import json
 from types import SimpleNamespace
@@ -15,8 +15,8 @@ POCL, INTEL = "Portable Computing Language", "Intel(R) OpenCL"
 
 @pytest.fixture
 def measured(monkeypatch, tmp_path):
-    """Sets {name of a device: its speed} that the next measurement finds; a list of how many of
-    them there were.
+    """A function that sets the speeds the next measurement of these devices finds, and returns a
+    list that grows by a number with each measurement.
     """
     monkeypatch.setenv("PP_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("PP_DEVICE", raising=False)
@@ -44,7 +44,7 @@ def test_the_fastest_is_taken_and_measured_once(measured):
     found = [fake("A", "cpu"), fake("B", "gpu", gpu=True, index="1:0"), fake("C", "c", index="2:0")]
     counts = measured(found, 5.0, 7.0, 6.0)
     assert first(found) == "1:0"
-    measured(found, 9.0, 1.0, 1.0)  # on a busy day
+    measured(found, 9.0, 1.0, 1.0)  # another result, which must not be measured
     assert first(found) == first(found[::-1]) == "1:0" and counts == [1]
     assert first(found[:1]) == "0:0" and first([found[0], found[2]]) == "2:0" and counts == [1]
 
@@ -56,7 +56,7 @@ def test_another_version_is_measured_anew(measured):
     newer = [found[0], fake("B", "b", index="1:0", version="2")]
     measured(newer, 5.0, 6.0)
     assert first(newer) == "1:0" and counts == [1, 2]
-    assert first(found) == "0:0" and counts == [1, 2]  # another environment, with the older one
+    assert first(found) == "0:0" and counts == [1, 2]  # in an environment with the older driver
 
 
 def test_intels_driver_goes_before_another_of_cpus_that_is_not_clearly_faster(measured):
@@ -74,9 +74,9 @@ def test_intels_driver_goes_before_another_of_cpus_that_is_not_clearly_faster(me
 def test_what_does_not_work_or_cannot_be_measured_is_not_taken(measured):
     found = [fake("A", "a"), fake("B", "b", index="1:0", problem="does not run: x")]
     counts = measured(found, 1.0, 2.0)
-    assert first(found) == "0:0" and counts == []  # there is nothing to choose
+    assert first(found) == "0:0" and counts == []  # a single device works, so nothing is measured
     found = [fake("A", "a", gpu=True), fake("B", "b", index="1:0")]
-    measured(found[1:], 2.0)  # the first gives up
+    measured(found[1:], 2.0)  # the first device fails in the measurement
     assert first(found) == "1:0" and first(found) == "1:0" and counts == [1]
 
 
@@ -90,7 +90,7 @@ def test_a_damaged_file_is_measured_anew(measured, tmp_path, content):
 
 
 def test_without_a_cache_nothing_is_measured(measured, tmp_path, monkeypatch):
-    """Each command would choose anew."""
+    """Otherwise each command would choose anew."""
     (tmp_path / "file").touch()
     monkeypatch.setenv("PP_CACHE", str(tmp_path / "file" / "cache"))
     found = [fake(POCL, "a"), fake(INTEL, "b", index="1:0"), fake("B", "g", gpu=True, index="2:0")]

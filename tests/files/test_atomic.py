@@ -20,7 +20,7 @@ from pp_cl.files.atomic import (
     write_text,
 )
 
-DEAD = 2**22 + 1  # the number of no process: Linux has none above 2^22
+DEAD = 2**22 + 1  # no process has this number: Linux has none above 2^22
 
 
 def failing_folder_sync(monkeypatch, number):
@@ -71,14 +71,14 @@ def test_a_name_that_is_no_utf_8_is_written_escaped(tmp_path):
 def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
     own = "pp-cl.tmp"
     gone = [f".a.png.{DEAD}.{own}", f"x/y/.b.{DEAD}.{own}", f"x/.video.{DEAD}.{own}.mp4"]
-    gone.append(f".own.{os.getpid()}.{own}")  # of another process that had our number
+    gone.append(f".own.{os.getpid()}.{own}")  # left by another process that had our number
     staying = [f".{own}", f".a.{own}", f".a.b.{own}", f"a.{DEAD}.{own}", f".a.{DEAD}.{own}file"]
-    staying += ["x/log.jsonl", f".a.{DEAD}.tmp"]  # of another program
-    staying += [f".a.{os.getppid()}.{own}"] * (os.name == "posix")  # it is still being written
+    staying += ["x/log.jsonl", f".a.{DEAD}.tmp"]  # a file of another program
+    staying += [f".a.{os.getppid()}.{own}"] * (os.name == "posix")  # our parent still writes it
     for name in gone + staying:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("half")
-    (tmp_path / f".link.{DEAD}.{own}").symlink_to(tmp_path / "x")  # behind which nothing is lost
+    (tmp_path / f".link.{DEAD}.{own}").symlink_to(tmp_path / "x")  # its target must keep its files
     folder = tmp_path / "x" / f".page.{DEAD}.pp-cl.tmp"
     folder.mkdir()
     (folder / "index.html").write_text("half")
@@ -88,7 +88,7 @@ def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
 
 
 def test_windows_waits_for_a_reader_and_replaces_no_folder(tmp_path, monkeypatch):
-    """As it refuses to rename over what another process reads, and over folders."""
+    """Windows refuses to rename over a file that another process reads, and over folders."""
     refusals, real = [1, 1], os.replace
 
     def replace(source, target):

@@ -46,14 +46,14 @@ WIDTH, HEIGHT = 13, 9
 
 
 def srgb(linear):
-    """By hand: IEC 61966-2-1, then 8 bits."""
+    """The transfer function of IEC 61966-2-1, written out, rounded to 8 bits."""
     linear = np.clip(np.asarray(linear, np.float64), 0, 1)
     low, high = 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
     return np.rint(255 * np.where(linear <= 0.0031308, low, high))
 
 
 def stored(path, channels, data=None, display=None, tiled=False):
-    """Write channels, float16 or float32, with data and display windows ((x0, y0), (x1, y1))."""
+    """Write float16 or float32 channels; data, display: the windows as ((x0, y0), (x1, y1))."""
     kind = OpenEXR.tiledimage if tiled else OpenEXR.scanlineimage
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": kind}
     if tiled:
@@ -66,7 +66,7 @@ def stored(path, channels, data=None, display=None, tiled=False):
 
 
 def colours(rng, dtype, alpha):
-    """({channel: plane}, expected (H, W, 4) of 8 bits): HDR, some pixels above 1."""
+    """({channel: plane}, expected (H, W, 4) of 8 bits); light is HDR, with some pixels above 1."""
     light = rng.uniform(0, 1.4, (HEIGHT, WIDTH, 3)).astype(dtype)
     share = rng.uniform(0.2, 1, (HEIGHT, WIDTH)).astype(dtype) if alpha else None
     given = light * share[..., None] if alpha else light

@@ -64,7 +64,7 @@ def test_masks_of_other_programs(tmp_path, rgba):
     Image.fromarray(np.ones_like(gray)).save(tmp_path / "a.jpg")
     with pytest.raises(UserError, match=r"a\.jpg: .* 1 .* write 255"):
         read_mask(tmp_path / "a.jpg")
-    labels.putpalette([0, 0, 0, 128, 0, 0])  # as programs that follow objects write them
+    labels.putpalette([0, 0, 0, 128, 0, 0])  # as object trackers write them
     labels.save(path)
     with pytest.raises(UserError, match=r"a\.png: .*colours.* white where the object is"):
         read_mask(path)
@@ -73,8 +73,8 @@ def test_masks_of_other_programs(tmp_path, rgba):
 
 
 def test_colour_noise_and_coloured_rims_are_no_colours(tmp_path, rng):
-    """As JPEG's subsampled colours leave them (NeRD's captures, 36 levels), and programs that blend
-    (DTU as NeuS has it); a quarter of an image in colour is another thing.
+    """JPEG subsamples colours (NeRD's captures, up to 36 levels) and programs blend rims (DTU in
+    NeuS's form); but an image with colours in a quarter of its pixels is no mask.
     """
     y, x = np.mgrid[:300, :400]
     gray = np.where(np.hypot(y - 150, x - 200) < 100, 255, 0)
@@ -120,13 +120,13 @@ def test_colours_of_other_spaces_become_srgb(tmp_path):
 
 
 def test_a_checksum_that_is_wrong_is_refused(tmp_path):
-    """Of smooth pixels, where a changed bit leaves the compressed stream readable."""
+    """Pixels are smooth, so that the compressed stream stays readable after a changed bit."""
     y, x = np.mgrid[:64, :64]
     image = np.dstack([x * 2, y * 2, x + y, np.full_like(x, 255)]).astype(np.uint8)
     path = tmp_path / "a.png"
     write_png(path, image)
     content = path.read_bytes()
-    for place in range(41, len(content) - 16, 3):  # in the compressed pixels
+    for place in range(41, len(content) - 16, 3):  # places in the compressed pixels
         changed = bytearray(content)
         changed[place] ^= 1 << place % 8
         path.write_bytes(changed)

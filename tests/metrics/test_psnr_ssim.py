@@ -27,7 +27,7 @@ def test_psnr_is_capped_so_that_it_stays_a_number():
     a = np.zeros((1000, 1000, 3), np.uint8)
     assert psnr(a, a) == PSNR_CAP
     b = a.copy()
-    b[0, 0, 0] = 1  # 113 dB
+    b[0, 0, 0] = 1  # a PSNR of 113 dB without the cap
     assert psnr(a, b) == PSNR_CAP
 
 

@@ -1,5 +1,5 @@
-"""Published results: as the supplemental prints them, for the scenes they were measured on and for
-no other.
+"""Published results equal those in the supplemental, and are shown only for the scenes that they
+were measured on.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ def cameras(focal=1111.111, size=800, count=2):
 
 @pytest.mark.parametrize("table", ["synthetic", "co3d"])
 def test_every_mean_that_is_printed_is_the_mean_of_its_row(table):
-    """So no number was mistaken for another when the tables were copied."""
+    """It shows that no number was mistaken for another when the tables were copied."""
     checked = 0
     for name, method in tables()[table]["methods"].items():
         for metric in METRICS:

@@ -38,7 +38,7 @@ def test_the_grid_grows_around_the_mesh_in_step(dev):
 
 
 def test_overlap_by_hand():
-    """Vertices (1, 0), (0, 1), (1, 1) of a 3x2x1 grid, and four points, two of them there."""
+    """A 3x2x1 grid has surface vertices (1, 0), (0, 1), (1, 1); two of four points are there."""
     grid = Grid((0.0, 0, 0), 1.0, (3, 2, 1))
     ids = grid.ids(np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (2, 1, 0)]))
     surface = Surface(grid, np.array([[0b010], [0b011]], np.uint32), 3)

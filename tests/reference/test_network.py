@@ -1,5 +1,6 @@
-"""The float64 twins of the layers against scipy's functions, their gradients as adjoints or by
-finite differences; that of the network against one written out by hand, and its differences.
+"""Test the layers' float64 twins against scipy's functions, and their gradients as adjoints or by
+finite differences; the network's twin against one written out here, and its gradients by
+differences.
 """
 
 import numpy as np
@@ -36,7 +37,7 @@ def test_convolution_and_its_gradients(rng, height, width, ci, co, k):
     for o in range(co):
         planes = [correlate(wide[0][..., i], wide[1][o, i], mode="constant") for i in range(ci)]
         assert relative_error(out[..., o], sum(planes) + bias[o]) < 1e-13
-    # it is linear in both
+    # both gradients are adjoints, as the layer is linear in each input
     of_x, of_weight = (
         convolution(grad_out, flipped(weight)),
         convolution_backward_weights(x, grad_out, k),
@@ -68,8 +69,8 @@ def test_gate(rng):
 
 
 def unet(x, parameters, blocks):
-    """(H, W, 3) image, layer by layer as the paper has it, of parameters {"enc0.a.weight": (CO, CI,
-    K, K), "enc0.a.bias": (CO,), ...}.
+    """(H, W, 3) image, computed layer by layer as in the paper. parameters: {"enc0.a.weight": (CO,
+    CI, K, K), "enc0.a.bias": (CO,), ...}.
     """
 
     def layer(name, *sources, relu=True):
@@ -85,7 +86,7 @@ def unet(x, parameters, blocks):
 
     skip0 = block("enc0", np.asarray(x, np.float64))
     skip1 = block("enc1", pool(skip0))
-    # enlarged before the 1x1 convolution, as the paper has it: the same function
+    # as in the paper, enlarged before the 1x1 convolution: the result is the same
     up1 = layer("up1", upsample(block("enc2", pool(skip1))), relu=False)
     up0 = layer("up0", upsample(block("dec1", up1, skip1)), relu=False)
     return 0.5 + 0.5 * layer("out", block("dec0", up0, skip0), relu=False)
@@ -93,8 +94,8 @@ def unet(x, parameters, blocks):
 
 @pytest.mark.parametrize("blocks", BLOCKS)
 def test_network_and_its_gradients(rng, blocks):
-    """Steps this small cross no kink of a ReLU: but for gates the network is piecewise linear in
-    each parameter, so the differences are exact there.
+    """Steps this small cross no kink of a ReLU. Except for gates, the network is piecewise linear
+    in each parameter, so the differences are exact there.
     """
     layers = unet_layers((4, 5, 6), 7, 3, blocks)
     parameters = {}

@@ -85,7 +85,7 @@ def directions(count):
 
 
 def far_from(hull, places):
-    """(P,) bool: which places have no vertex of the hull within two voxels."""
+    """(P,) bool: True for places that have no vertex of the hull within two voxels."""
     distances, _ = cKDTree(hull.grid.positions(hull.ids)).query(places)
     return distances > 2 * hull.grid.voxel_size
 
@@ -97,9 +97,7 @@ def test_without_masks_nothing_disagrees():
 
 
 def wires(count):
-    """Views of the edges of a cube, of wires 1.5 pixels wide, with masks of all pixels that show
-    them.
-    """
+    """Views of a cube's edges as wires, 1.5 pixels wide. A mask has all pixels that show them."""
     along = np.column_stack([np.linspace(-0.45, 0.45, 700), *np.zeros((2, 700))])
     ends = np.stack(np.meshgrid(0, (-0.45, 0.45), (-0.45, 0.45)), -1).reshape(-1, 1, 3)
     edges = np.concatenate([np.roll(along + ends, axis, -1) for axis in range(3)]).reshape(-1, 3)
@@ -114,7 +112,7 @@ def wires(count):
 
 
 def test_exact_masks_are_not_accused(dev):
-    """Each view carves a little that no other does, of thin parts much."""
+    """Each view carves a little that no other does, but much of thin parts."""
     views = wires(60)
     agreement = agreeing(dev, views)
     hull = build_grid(dev, agreement.views, 20_000)

@@ -48,7 +48,7 @@ def test_one_view_does_not_bound(dev):
 
 
 def placed(place, scale=1.0):
-    """The views with eyes scaled about the object's centre, which comes to lie at `place`."""
+    """The views with eyes scaled about the object's centre and moved so that it lies at `place`."""
     return [
         view.moved(place + scale * (view.camera.eye - CENTRE) - view.camera.eye)
         for view in ball_views()

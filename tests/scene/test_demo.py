@@ -9,8 +9,8 @@ from pp_cl.scene.hull import build_grid
 
 
 def coverage(camera):
-    """((H, W) share of 4x4 rays a pixel that come within 4e-4 of the object, (H, W) the same for
-    1e-5).
+    """((H, W) share of a pixel's 4x4 rays that come within 4e-4 of the object, (H, W) share of
+    those within 1e-5).
     """
     sub = (np.arange(4) + 0.5) / 4
     x = (np.arange(camera.width)[:, None] + sub).ravel()
@@ -31,8 +31,8 @@ def coverage(camera):
 
 @pytest.mark.parametrize("width, height", ((31, 33), (33, 18)))
 def test_silhouettes_equal_the_oracle(dev, width, height):
-    """Alpha lies between the shares of the rays that touch and of those that come within the
-    tracer's tolerance.
+    """Alpha lies between the share of rays that touch the object and the share that comes within
+    the tracer's tolerance of it.
     """
     camera = Camera.look_at((1.5, -2.8, 1.2), (0, 0, 0), fx=40, width=width, height=height)
     image = render(dev, camera)
@@ -59,7 +59,7 @@ def test_the_mesh_is_the_object(dev):
 
 @pytest.mark.large
 def test_the_scene_shows_the_whole_mesh(dev):
-    """64 + 16 views; the mesh projects onto the masks, which carve a hull that holds it."""
+    """There are 64 + 16 views. The mesh projects onto the masks, and their hull contains it."""
     train, test = (demo_views(dev, split, size=64) for split in SPLITS)
     assert (len(train), len(test)) == (64, 16)
     vertices, _ = demo_mesh(dev, 64)

@@ -42,7 +42,7 @@ def test_training_and_info_obey_the_box_and_leave_out_what_was_dropped(folder, t
 
 
 def test_a_run_knows_its_scene_after_views_were_dropped(folder, tmp_path, capsys, monkeypatch):
-    """It is measured; a training would have other bits, and says why it does not go on."""
+    """The run can be evaluated; a training would have other bits, so it refuses and says why."""
     run, half = tmp_path / "run", tmp_path / "half"
     assert main(arguments(str(folder), run, train__iterations=2)) == 0
     train_and_interrupt(str(folder), half, 11, monkeypatch)

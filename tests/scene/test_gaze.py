@@ -1,4 +1,4 @@
-"""Cameras that look at no one place, and are right, are not told that their axes are wrong."""
+"""Correct cameras that do not look at one place do not lead to a message about wrong axes."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def rotation(rng):
 
 
 def wall(rng, aim):
-    """Eyes on a square before a wall that look the same way, give or take `aim`."""
+    """Eyes on a square, which all look the same way at a wall, give or take `aim`."""
     eyes = np.c_[rng.uniform(-0.3, 0.3, (COUNT, 2)), np.zeros(COUNT)]
     return eyes, eyes + [0, 0, 1] + rng.normal(0, aim, (COUNT, 3))
 

@@ -42,15 +42,15 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
     )
     carver = Carver(dev, [full])
     assert carver.carve(Grid((0, 0, 0), 0.1, (1, 1, 1))).all()
-    assert not carver.carve(Grid((0, 9, 0), 0.1, (1, 1, 1))).any()  # beside
-    assert not carver.carve(Grid((5, 0, 0), 0.1, (1, 1, 1))).any()  # behind
+    assert not carver.carve(Grid((0, 9, 0), 0.1, (1, 1, 1))).any()  # beside what the camera sees
+    assert not carver.carve(Grid((5, 0, 0), 0.1, (1, 1, 1))).any()  # behind the camera
 
 
 def test_what_two_of_many_images_see_is_dropped(dev):
     here, there, one = np.zeros(3), np.array([9.0, 9, 9]), Grid((0, 0, 0), 0.1, (1, 1, 1))
     ahead = [(place, place + 4 * axis) for place in (here, there) for axis in np.eye(3)][1:]
     image = np.full((64, 64, 4), 255, np.uint8)
-    image[0, 0] = 0  # so that there is a mask
+    image[0, 0] = 0  # without it there is no mask
     views = [View("full", ball_camera(eye, place), image) for place, eye in ahead]
     carver = Carver(dev, views)
     assert not carver.carve(one).any()
@@ -59,7 +59,7 @@ def test_what_two_of_many_images_see_is_dropped(dev):
 
 @pytest.mark.exact
 def test_the_left_and_upper_borders_belong_to_an_image(dev):
-    """Numbers that float32 holds exactly: the 5x5 vertices project to pixels 0, 16, 32, 48, 64 of
+    """float32 holds all numbers exactly: the 5x5 vertices project to pixels 0, 16, 32, 48, 64 of
     64.
     """
     camera = Camera(np.eye(3, 4), 64, 64, 32, 32, 64, 64)
@@ -93,7 +93,7 @@ def test_the_voxel_size_is_found(dev, points, carvings):
     from_centre = np.linalg.norm(lattice - CENTRE, axis=1)
     assert in_hull[from_centre < RADIUS].all(), "a vertex inside the ball is lost"
     pixel = 4 / 96
-    assert from_centre[in_hull].max() < 1.6 * RADIUS + 2 * pixel  # the hull of 12 tangent cones
+    assert from_centre[in_hull].max() < 1.6 * RADIUS + 2 * pixel  # the hull is 12 tangent cones
     for axis in range(3):  # the grid is tight
         reached = positions_of(found)[:, axis]
         np.testing.assert_allclose(
@@ -103,8 +103,8 @@ def test_the_voxel_size_is_found(dev, points, carvings):
 
 @pytest.mark.large
 def test_the_cell_cap_limits_the_grid(dev, carvings, monkeypatch):
-    """The ball fills about half of its box, so 8000 cells hold some 4000 of the 7000 points asked
-    for.
+    """The ball fills about half of its box, so 8000 cells hold some 4000 of the 7000 requested
+    points.
     """
     monkeypatch.setattr(hull, "CELL_CAP", 8000)
     found = build_grid(dev, ball_views(), 7000)
@@ -114,8 +114,8 @@ def test_the_cell_cap_limits_the_grid(dev, carvings, monkeypatch):
 
 @pytest.mark.large
 def test_masks_are_widened_by_a_pixel_of_the_reduced_images(dev):
-    """Three stored pixels more on either side: they are the camera's distance over its focal length
-    wide.
+    """Masks grow by three stored pixels on either side. A pixel's width on the object is the
+    camera's distance divided by its focal length.
     """
     views = ball_views()
     grid = Grid.centred_in(CENTRE + 1.3 * RADIUS * np.array([[-1], [1]]), RADIUS / 60)
@@ -131,8 +131,8 @@ def test_masks_are_widened_by_a_pixel_of_the_reduced_images(dev):
 @pytest.mark.large
 @pytest.mark.parametrize("focal", (2.7, 6.0))
 def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
-    """focal 2.7: only the corners are free; 6: one pixel, so that no side of any image bounds the
-    object.
+    """focal 2.7: the masks leave only the corners free; 6: only one pixel, so that no side of an
+    image bounds the object.
     """
     views = ball_views(focal=focal)
     for view in views:
@@ -155,7 +155,7 @@ def cropped(view):
 
 
 def test_images_cropped_to_the_object_bound_it(dev):
-    """Without doubts their hull has ten times the volume."""
+    """Without Carver.doubts the hull would have ten times the volume."""
     views = ball_views(24, (200, 200))
     whole, tight = (build_grid(dev, v, 3000) for v in (views, [cropped(v) for v in views]))
     assert tight.grid.voxel_size**3 < 1.4 * whole.grid.voxel_size**3
@@ -163,9 +163,7 @@ def test_images_cropped_to_the_object_bound_it(dev):
 
 @pytest.mark.parametrize("whole", (2, 3))
 def test_close_ups_bound_the_object_only_where_no_image_shows_it_whole(dev, whole):
-    """A vertex of the ball that lies beside ten close-ups, whose borders are free but for a
-    corner.
-    """
+    """A vertex of the ball lies outside ten close-ups, whose masks hold only a corner pixel."""
     views = ball_views()
     image = np.zeros((8, 8, 4), np.uint8)
     image[0, 0] = 255
@@ -194,7 +192,7 @@ def test_depth_range_holds_every_point(dev, stated):
 @pytest.mark.large
 @pytest.mark.parametrize("distance", (1.6, 0.5))
 def test_depth_range_of_close_cameras(dev, distance):
-    """1.6: outside the hull's box, inside the enlarged ball; 0.5: inside the box."""
+    """1.6 is outside the hull's box, but inside the enlarged ball; 0.5 is inside the box."""
     found = build_grid(dev, ball_views(), 2000)
     camera = ball_camera(CENTRE + np.array([distance, 0, 0]), CENTRE)
     near, far = depth_range([replace(ball_views()[0], stored_camera=camera)], found)
@@ -225,8 +223,8 @@ def test_impossible_counts(dev, points):
 
 
 def test_lego_has_the_published_shape(dev, data):
-    """Its grid of 4.04 million points has 194x345x232 vertices (PlenopticPoints supplemental, Table
-    4).
+    """In the supplemental (PlenopticPoints, Table 4) the grid of 4.04 million points has
+    194x345x232 vertices.
     """
     views = load_scene(data / "nerf_synthetic/lego").splits["train"]
     found = build_grid(dev, views, 20000)

@@ -1,4 +1,4 @@
-"""Pixels that are said to show something else than the object, as a hand, change nothing."""
+"""Pixels marked as showing a hand or the like, not the object, change nothing."""
 
 import json
 
@@ -18,7 +18,7 @@ from pp_cl.engine.views import View
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import load_scene
 
-HAND = np.s_[14:31, 20:29]  # rows, columns that cut the ball's outline
+HAND = np.s_[14:31, 20:29]  # rows, columns of the hand, which cuts the ball's outline
 SPLITS = ("train", "test")
 
 
@@ -52,7 +52,7 @@ def elsewhere(scene):
 
 
 def as_nerfstudio_names_them(scene):
-    """White where an image is of use, beside the object's alpha."""
+    """Write masks that are white in usable pixels, besides the object's alpha."""
     hand_masks(scene / "of_use", 255, 0)
     for split in SPLITS:
         file = scene / f"transforms_{split}.json"
@@ -67,7 +67,7 @@ WAYS = (in_the_scene, elsewhere, as_nerfstudio_names_them)
 
 
 def trained(scene, out, words):
-    """(arrays, mean metrics) of a training that weighs all there is."""
+    """(arrays, mean metrics) of a training with exposure corrections and SSIM."""
     sets = set_words(SETTINGS, train__iterations=20, train__exposure="on", train__ssim_weight=0.2)
     status, lines = spoken(["train", scene, "--out", out, *words, "--downscale", "2", *sets])
     assert status == 0, lines
@@ -78,7 +78,7 @@ def trained(scene, out, words):
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory):
-    """Of a hand that hides what is behind it."""
+    """The results with a hand that hides what is behind it."""
     folder = tmp_path_factory.mktemp("hand")
     scene = with_hand(folder / "scene", (255, 0, 90, 255))
     return trained(scene, folder / "run", in_the_scene(scene))
@@ -93,14 +93,16 @@ def same(one, other):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_ignored_pixels_have_no_effect_on_a_bit(tmp_path, expected, way):
-    """Whether they are opaque, which adds to the hull, or transparent, which takes from it."""
+    """It does not matter whether these are opaque, which adds to the hull, or transparent, which
+    takes from it.
+    """
     scene = with_hand(tmp_path / "scene", (0, 200, 0, 0))
     assert same(trained(scene, tmp_path / "run", way(scene)), expected)
 
 
 @pytest.mark.parametrize("ignores", [False, True])
 def test_the_network_learns_the_same_where_tiles_are_left_out(dev, monkeypatch, ignores):
-    """Ignored pixels are white, but have another gradient than the white around them."""
+    """Ignored pixels are as white as those around them, but have another gradient."""
     ignored = np.zeros((128, 128), bool)
     ignored[:40, :36] = ignores
     views = []
@@ -117,14 +119,14 @@ def test_the_network_learns_the_same_where_tiles_are_left_out(dev, monkeypatch, 
         model = Model(dev, hull.grid, depth_range(views, hull), cloud, net=net)
         trainer = Trainer(dev, config, model, views)
         trainer.train_step()
-        return trainer.optimiser.moments["m"].get()  # a tenth of the gradients
+        return trainer.optimiser.moments["m"].get()  # 0.1 times the gradients
 
     whole, planned = gradient(2**30), gradient(1)
     assert np.linalg.norm(whole - planned) < 1e-5 * np.linalg.norm(whole)
 
 
 def test_the_lens_moves_them_as_it_moves_the_image(tmp_path, dev):
-    """What is beside them is as without the hand, but for the ringing of the spline."""
+    """Other pixels are as without the hand, except for the ringing of the spline."""
     scene = with_hand(tmp_path / "scene", (255, 0, 90, 255))
     hand_masks(scene / "ignore")
     write_ball_scene(tmp_path / "ball")

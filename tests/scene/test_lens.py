@@ -23,7 +23,7 @@ LENSES = {
 
 
 def test_the_formula_by_hand():
-    """x = 0.3, y = -0.2: r^2 = 0.13."""
+    """At x = 0.3, y = -0.2, r^2 is 0.13."""
     x, y = LensDistortion(0.1, 0.01, 0.002, -0.003, 0.5).apply(np.array(0.3), np.array(-0.2))
     radial = 1 + 0.1 * 0.13 + 0.01 * 0.13**2 + 0.5 * 0.13**3
     assert x == pytest.approx(0.3 * radial + 2 * 0.002 * -0.06 - 0.003 * (0.13 + 2 * 0.09))
@@ -31,7 +31,7 @@ def test_the_formula_by_hand():
 
 
 def test_a_fisheye_by_hand():
-    """A direction t radians off the axis lies t + k1 t^3 + ... + k4 t^9 focal lengths off the
+    """A direction t radians off the axis appears t + k1 t^3 + ... + k4 t^9 focal lengths from the
     centre.
     """
     lens, turn = LENSES["bent fisheye"], np.array([np.cos(0.7), np.sin(0.7)])
@@ -49,7 +49,7 @@ def test_without_coefficients_nothing_changes(dev, rng):
 
 @pytest.mark.parametrize("name", LENSES)
 def test_opencv_undistorts_alike(dev, name):
-    """To two levels of 255 where a pixel is seven: colours as well as alpha."""
+    """Colours and alpha agree within two levels of 255; a shift by a pixel would change seven."""
     cv2, lens = pytest.importorskip("cv2"), LENSES[name]
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     value = np.rint(127 + 60 * np.sin(u / 9) + 60 * np.cos(v / 7)).astype(np.uint8)
@@ -74,7 +74,7 @@ def test_opencv_undistorts_alike(dev, name):
 
 @pytest.mark.parametrize("name", LENSES)
 def test_one_colour_stays_one_colour(dev, name):
-    """The colours at the border of what is transparent do not bleed."""
+    """Colours of transparent pixels do not bleed into their neighbours."""
     image = np.full((120, 161, 4), (200, 30, 90, 255), np.uint8)
     assert np.array_equal(undistort(dev, image, CAMERA, LENSES[name]), image)
     image[:, :80] = (0, 255, 0, 0)
@@ -84,7 +84,7 @@ def test_one_colour_stays_one_colour(dev, name):
 
 
 def test_a_lens_that_folds_is_refused(tmp_path):
-    """1 + 3 k1 r^2 < 0 from r = 0.58 on."""
+    """For k1 = -1 the image folds, 1 + 3 k1 r^2 < 0, from r = 0.58 on."""
     assert LensDistortion(k1=float("nan")).folds(CAMERA)
     assert LensDistortion(k1=-1.0).folds(CAMERA) and not LensDistortion(k1=-0.5).folds(CAMERA)
     data = write_scene(tmp_path)
@@ -108,8 +108,8 @@ def test_images_of_a_scene_are_undistorted(dev, tmp_path):
 
 @pytest.mark.parametrize("factor", (2, 3, 5))
 def test_reducing_a_warp_as_it_is_read_is_reducing_the_warped_image(dev, data, factor):
-    """At most a level of 255 apart in 99.9 % of the pixels: the whole warp is rounded once more.
-    To reduce first, and to warp the small image, differs by more in a fifth of them.
+    """99.9 % of the pixels are at most a level of 255 apart, as the whole warp is rounded once
+    more. If the image is reduced first and then warped, a fifth of them differ by more.
     """
     image = read_rgba(data / "ethiopian_head_photos/DSC_0033.jpg")
     camera = Camera(np.eye(3, 4), 1200.0, 1200.0, 503.0, 495.0, 1000, 1000)

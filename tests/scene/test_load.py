@@ -43,7 +43,7 @@ def test_missing_folder_format_and_split(tmp_path):
 
 
 def test_a_split_without_images(tmp_path):
-    """The first of every eight is for testing, so that a single one leaves none for training."""
+    """The first of every eight images is for testing, so a single one leaves none for training."""
     nerfstudio.write(tmp_path, {"train": views(1)})
     file = tmp_path / "transforms.json"
     file.write_text(file.read_text().replace("train_filenames", "names"))
@@ -80,7 +80,9 @@ def test_some_views_of_a_split_are_read_and_no_others(tmp_path):
 def test_as_many_images_are_read_at_once_as_memory_holds(
     monkeypatch, lens, source, factor, workers, per_pixel
 ):
-    """12 megapixels of float64 beside one another would take gigabytes on many cores."""
+    """On many cores, images of 12 megapixels in float64 would take gigabytes if all were read at
+    once.
+    """
     monkeypatch.setattr("pp_cl.scene.load.os.cpu_count", lambda: 64)
     camera = Camera(np.eye(3, 4), 4000, 4000, 2000, 1500, 4000, 3000)
     phone = ImageFile("a.jpg", camera, lens=lens)

@@ -33,7 +33,7 @@ def disc(size=60, radius=20.0, soft=0.0):
 
 
 def over(alpha, colour, background):
-    """uint8 RGBA, opaque: a colour in [0, 1] over another by alpha."""
+    """(H, W, 4) uint8, opaque: a colour in [0, 1], composited over another by alpha."""
     image = alpha[..., None] * np.array(colour) + (1 - alpha[..., None]) * np.array(background)
     return np.dstack([np.rint(255 * image), np.full(alpha.shape, 255)]).astype(np.uint8)
 
@@ -52,7 +52,7 @@ def test_a_uniform_background_is_cut_out(rng, background):
 
 
 def test_soft_edges_lose_the_background(rng):
-    """The colour of a half transparent pixel is the object's, not a mixture with the screen."""
+    """A half transparent pixel gets the object's colour, not a mixture with the screen."""
     alpha, colour = disc(soft=1.2), np.array([0.8, 0.3, 0.2])
     found = cut_out(over(alpha, colour, (0.0, 1.0, 0.0)), "a.png", TOLERANCE) / 255
     edge = (found[..., 3] > 0.3) & (found[..., 3] < 1)
@@ -63,7 +63,7 @@ def test_soft_edges_lose_the_background(rng):
 
 
 def test_spots_of_the_backgrounds_colour_stay():
-    """What the object encloses is taken for the object; a bay that reaches the border is not."""
+    """Spots that the object encloses count as the object; a bay open to the border does not."""
     alpha = disc()
     image = over(alpha, (0.6, 0.1, 0.1), (1, 1, 1))
     image[26:34, 26:34, :3] = 255
@@ -82,7 +82,7 @@ def test_a_border_of_many_colours_is_refused(rng):
 
 
 def test_an_object_at_the_border_does_not_decide():
-    """Less than half of the border is the object's: the background is the other colour."""
+    """The object covers less than half of the border, so the other colour is the background."""
     image = over(np.zeros((40, 40)), (0, 0, 0), (1, 1, 1))
     image[:25, :30, :3] = (200, 30, 30)
     found = cut_out(image, "a.png", TOLERANCE)[..., 3]
@@ -109,7 +109,7 @@ def test_a_folder_of_masks(tmp_path, rng, named):
 
 
 def test_a_folder_of_masks_is_one_like_that_of_the_scene(tmp_path):
-    """In the same tree as the images, or by number where names are there once."""
+    """Masks lie in the same tree as the images, or are found by number if names are unique."""
     scene, masks, frames = tmp_path / "scene", tmp_path / "masks", []
     for i, camera in enumerate(ring_cameras(10, 24)):
         image = f"{'ab'[i % 2]}/{i // 2}.png" if i < 8 else f"c/{i:06d}.png"
@@ -155,8 +155,8 @@ def test_a_ball_on_white_has_the_hull_of_its_masks(dev, tmp_path):
 
 
 def test_without_masks_points_fill_what_all_cameras_see(dev, tmp_path):
-    """Two rings of cameras: the middle is in every image, and the box ends where no camera
-    looks.
+    """Two rings of cameras: the middle is in every image, and the box ends beyond the view of all
+    cameras.
     """
     scene = opaque_ball(tmp_path / "white")
     config = configure(preset("tiny"), scene)
@@ -172,7 +172,7 @@ def test_without_masks_points_fill_what_all_cameras_see(dev, tmp_path):
 
 
 def test_a_box_that_is_given():
-    """That it holds the points: tests/scene/test_hull.py."""
+    """tests/scene/test_hull.py tests that the points lie in it."""
     given = [("scene.box", "1,-1,-0.5,-0.9,0.8,0.5", "test")]
     box = scene_box(configure(preset("tiny"), "demo", given))
     np.testing.assert_array_equal(box, [[-0.9, -1, -0.5], [1, 0.8, 0.5]])
@@ -193,7 +193,7 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
     (tmp_path / "masks/r_2.png").rename(tmp_path / "masks/other.png")
     with pytest.raises(UserError, match=r"train/r_2\.png: has no mask, but others have"):
         load_scene(tmp_path / "ball", masks=rule)
-    agreed = agreeing(dev, views)  # a mask that is white says that the object fills the image
+    agreed = agreeing(dev, views)  # a white mask says that the object fills the image
     assert (
         agreed.views == views and disagreements(views, build_grid(dev, views, 1000).grid.box) == []
     )
@@ -201,7 +201,7 @@ def test_a_mask_for_some_images_only(dev, tmp_path):
 
 @pytest.mark.parametrize("sigma", (0, 3))
 def test_masks_that_are_half_transparent_are_told(dev, tmp_path, sigma, recwarn):
-    """Sharp ones, whose edges are not counted, are not."""
+    """Sharp masks are not reported: their edges do not count."""
     scene = write_ball_scene(tmp_path / "ball", views=6, size=40)
     for file in (tmp_path / "ball").rglob("*.png"):
         rgba = read_rgba(file)
@@ -223,7 +223,7 @@ def test_inverted_masks_are_told(dev, tmp_path):
 
 
 def test_the_choice_is_kept_with_the_run(tmp_path, monkeypatch):
-    """A relative folder of masks becomes an absolute path."""
+    """A relative folder of masks is stored as an absolute path."""
     scene = opaque_ball(tmp_path / "white", (20, 220, 40))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "masks").mkdir()

@@ -9,7 +9,7 @@ from pp_cl.scene.outline import outline
 
 
 def ball_points(per_radius, shell=False):
-    """(Grid, ids) of the vertices in the ball; shell: of the outer two layers only."""
+    """(Grid, ids) of the vertices in the ball; shell: only its outer two layers."""
     voxel_size = RADIUS / per_radius
     n = 2 * per_radius + 3
     grid = Grid(tuple(CENTRE - voxel_size * (n - 1) / 2), voxel_size, (n, n, n))
@@ -27,7 +27,7 @@ def test_the_silhouette_is_that_of_the_ball_without_gaps(per_radius, shell):
     assert found.shape == (80, 96)
     wrong = found != truth
     assert wrong.sum() < 0.12 * truth.sum()
-    y, x = np.nonzero(wrong)  # only along the border, within the spacing of the points
+    y, x = np.nonzero(wrong)  # pixels are wrong only along the border, within the points' spacing
     radius = np.sqrt(truth.sum() / np.pi)
     off = np.abs(np.hypot(x + 0.5 - camera.cx, y + 0.5 - camera.cy) - radius)
     assert off.max() < radius / per_radius + 2.5
@@ -51,7 +51,7 @@ def test_points_behind_the_camera_and_outside_the_image_are_not_drawn():
 
 
 def test_a_cut_off_object_has_no_outline_along_the_border():
-    """The camera is so near that the ball fills the image."""
+    """The camera is so close that the ball fills the image."""
     grid, ids = ball_points(20)
     camera = ball_camera(CENTRE + [1.2, 0, 0], CENTRE)
     assert silhouette(grid, ids, camera).all() and not outline(grid, ids, camera).any()

@@ -35,11 +35,11 @@ def test_blocks_become_their_mean(rng, factor):
         (11, 8, 1),  # 5.28e8 bytes: just below 2^29
         (12, 8, 2),
         (150, 8, 4),
-        (300, 8, 8),  # 4: 9e8
+        (300, 8, 8),  # reduced by 4: 9e8
         (300, 1, 1),
         (300, 7, 7),
-        (170, 12, 4),  # 3: 9e8
-        (5000, 8, 8),  # too many even so: as small as the training wants them
+        (170, 12, 4),  # reduced by 3: 9e8
+        (5000, 8, 8),  # still too many, so they get the training's reduction
     ],
 )
 def test_the_least_reduction_that_fits(count, downscale, factor):
@@ -55,7 +55,7 @@ def scene(tmp_path):
 
 
 def large(monkeypatch, most=8 * 4 * 50 * 50):
-    """Scenes are large from `most` bytes on: eight images of 98 pixels are halved."""
+    """Count scenes as large from `most` bytes on: eight images of 98 pixels are then halved."""
     monkeypatch.setattr("pp_cl.scene.image_file.MOST_IMAGE_BYTES", most)
 
 
@@ -77,7 +77,7 @@ def test_a_large_scene_is_kept_reduced_and_stays_itself(dev, scene, monkeypatch)
         pixels = read_rgba(f"{scene}/{view.name}")
         assert (view.shrunk, view.downscale, view.file_downscale) == (2, 2, 4)
         np.testing.assert_array_equal(view.image, shrink(pixels, 2))
-        assert same(view.camera, before.camera)  # exact, since 2 is a power of two
+        assert same(view.camera, before.camera)  # exact, as a division by 2
         assert same(view.file_camera, before.stored_camera)
         assert before.file_camera is before.stored_camera
     header = identity(whole)

@@ -1,5 +1,5 @@
-"""Cameras that are wrong in ways known of other programs are refused with the reading in which they
-are right, and right in it; wrong masks of some views are none of them.
+"""Cameras that are wrong in the ways of known programs are refused with the reading that is right,
+and accepted in it; wrong masks of some views are not taken for wrong cameras.
 """
 
 import json
@@ -28,11 +28,11 @@ BALLS = [
     ((-0.4, 0.5, 0.7), 0.2),
     ((0, -0.8, 0), 0.2),
 ]
-SWAP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of y and z
+SWAP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # swaps y and z
 
 
 def balls(camera):
-    """(H, W, 4) uint8 image of an object that has no symmetry."""
+    """(H, W, 4) uint8 image of an object without symmetry."""
     rays = camera.rays() / np.linalg.norm(camera.rays(), axis=-1, keepdims=True)
     shown = np.zeros(rays.shape[:2], bool)
     for place, radius in BALLS:
@@ -46,7 +46,7 @@ def whole(camera):
 
 
 def posed(change):
-    """The views with cameras whose 4x4 camera-to-world matrices change(pose) makes."""
+    """A function that applies change() to the views' 4x4 camera-to-world matrices."""
 
     def changed(views):
         poses = [change(whole(view.stored_camera))[:3] for view in views]
@@ -62,7 +62,7 @@ def pictured(change):
 
 def scalar_last(pose):
     x, y, z, w = Rotation.from_matrix(pose[:3, :3].T).as_quat()
-    read = Rotation.from_quat([y, z, w, x]).as_matrix()  # of the file's x, y, z, w
+    read = Rotation.from_quat([y, z, w, x]).as_matrix()  # the file's x, y, z, w, read as w, x, y, z
     return np.column_stack([read.T, read.T @ pose[:3, :3].T @ pose[:3, 3]])
 
 
@@ -111,7 +111,7 @@ def same(given):
     return given
 
 
-# {what is wrong: (format, change of views, change of the folder, the reading)}
+# {what is wrong: (format, change of the views, change of the folder, the right reading)}
 WRONG = {
     "scalar last": ("colmap", posed(scalar_last), same, "xyzw"),
     "centres": ("colmap", posed(centre_for_translation), same, "centres"),
@@ -212,7 +212,7 @@ def test_pictures_are_turned_where_their_masks_fit_only_so(dev, tmp_path):
 
 
 def backed(view):
-    """The object is brighter than what is behind it, which masks leave in the pictures."""
+    """The view with a background, which its mask leaves in the picture, and a brighter object."""
     image = view.image.copy()
     image[..., :3] = np.where(image[..., 3:] > 0, 128 + image[..., :3] // 2, image[..., :3] // 4)
     return replace(view, image=image)

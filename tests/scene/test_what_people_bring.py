@@ -1,5 +1,5 @@
-"""Scenes as other programs, phones and people leave them: each trains, and what was done about it
-is one line, or it is refused with the reason. All are of a ball.
+"""Scenes as other programs, phones and people leave them. Each trains, with a line about what was
+done to it, or is refused with the reason. All show a ball.
 """
 
 import json
@@ -21,11 +21,11 @@ from pp_cl.scene.load import list_split
 from pp_cl.scene.readers.frame import GL_FROM_CV
 from tools.convert_scene import convert
 
-VIEWS = 14  # of which 12 are for training
+VIEWS = 14  # 12 of these are for training
 
 
 def a_ball(folder, form):
-    """The ball in a format, its masks in a folder of their own; images are broader than high."""
+    """Write the ball in a format, with masks in their own folder. Images are wider than high."""
     cameras = [camera.crop(0, 3, 48, 42) for camera in ring_cameras(VIEWS, 48)]
     views = [View(f"{i}.png", camera, ball_image(camera)) for i, camera in enumerate(cameras)]
     convert(held_out(views), folder, form)
@@ -61,7 +61,7 @@ def moved(*pairs):
 
 
 def images(change, suffix=".png", names="images"):
-    """Write each image anew, as change(image) has it: Pillow's image, or bytes of a file."""
+    """A function that writes each image anew, as the result of change(image)."""
 
     def write(folder):
         for file in sorted((folder / names).iterdir()):
@@ -91,8 +91,9 @@ def turned(image):
 
 
 def workspace(folder):
-    """What COLMAP's automatic reconstruction leaves where the photographs lie elsewhere: a model of
-    distorted images, and an undistorted one of as many beside its images, a few pixels larger.
+    """Make the workspace of COLMAP's automatic reconstruction with the photographs elsewhere: a
+    model of distorted images, and one of as many undistorted images, a few pixels larger, beside
+    these.
     """
     moved(("images", "dense/0/images"))(folder)
     shutil.copytree(folder / "sparse/0", folder / "dense/0/sparse")
@@ -109,7 +110,7 @@ def undistorted(folder):
 
 
 def cut_out(folder):
-    """Images are cut-outs, of which some have masks beside them."""
+    """Turn images into cut-outs; some of them keep a mask as well."""
     for file in sorted((folder / "images").iterdir()):
         mask = folder / f"masks/{file.name}.png"
         image = Image.open(file).convert("RGB")
@@ -162,7 +163,9 @@ def without_masks_named(folder):
 
 
 def renamed(change):
-    """Give the images of a transforms.json, and its paths of them, the names that change makes."""
+    """A function that names the images and their paths in transforms.json: change(i) is (path,
+    name).
+    """
 
     def rename(folder):
         for i, file in enumerate(sorted((folder / "images").iterdir())):
@@ -179,7 +182,9 @@ def accent(i):
 
 
 def code_page(folder):
-    """Names in the code page of a Windows in Chinese, of images that are there in UTF-8."""
+    """A model with names in the code page of a Chinese Windows, while its images have names in
+    UTF-8.
+    """
     file = folder / "sparse/0/images.bin"
     for image in sorted((folder / "images").iterdir()):
         name = f"\u7167{image.name[2:]}"
@@ -214,7 +219,7 @@ def with_commas(folder):
         file.write_text(file.read_text().replace(".", ","))
 
 
-# {report: (format, what is done to the folder, what is said)}
+# {report: (format, function of the folder, part of the message)}
 TRAINS = {
     "an accent in another form": ("nerfstudio", renamed(accent), ""),
     "paths from where a tool was run": (

@@ -1,5 +1,5 @@
-"""The cases of `pp-cl selftest`, each a test. The guards of the buffers show strays and reads of
-what nobody wrote.
+"""Each case of `pp-cl selftest` is a test here; guarded buffers detect stray writes and reads of
+undefined values.
 """
 
 from pathlib import Path
@@ -13,8 +13,8 @@ pytestmark = pytest.mark.kernels
 
 
 def marks(case):
-    """Comparisons with NaN are exact; the simulator takes minutes for cases of other wings, beside
-    which tests run their kernels.
+    """Cases that compare NaN are exact. All but those of layers and device take minutes in the
+    simulator, which runs their kernels in other tests, too.
     """
     if case.name == "layers: tiles":
         return pytest.mark.exact
@@ -26,7 +26,7 @@ def test_passes(dev, case):
     row = run_case(dev, case)
     assert row.passed, row
     assert row.case == case.name and not row.reason and row.error <= row.bound
-    if case.hard:  # what a naive formula can do is not hard
+    if case.hard:  # the naive formula must fail a hard case
         assert row.hard.error <= row.hard.bound and not row.hard.naive <= row.hard.bound
 
 
@@ -44,7 +44,7 @@ def test_the_page_of_hard_cases_lists_them():
     assert len(shown) >= 30
 
 
-# of the kernels that work in another way on GPUs; `make test-gpu-form` runs all tests so
+# cases whose kernels work differently on GPUs; `make test-gpu-form` runs all tests in that form
 GPU_CASES = (
     "device: scan",
     "device: compact and gather rows",
@@ -81,14 +81,14 @@ def test_as_on_gpus(dev, monkeypatch, name):
 @pytest.mark.large
 @pytest.mark.parametrize("name", ["device: scan", "loss: L1 and SSIM", "loss: mask"])
 def test_groups_are_no_larger_than_a_kernel_allows(dev, monkeypatch, name):
-    """Compilers allow fewer work-items of kernels that take many registers."""
+    """Compilers allow fewer work-items for kernels that take many registers."""
     limit_groups(dev, monkeypatch, 32)
     assert run_case(dev, BY_NAME[name]).passed
 
 
 @pytest.mark.large
 def test_a_point_is_moved_by_one_group_or_not_at_all(dev, monkeypatch):
-    """Its 16 work-items wait for each other."""
+    """The kernel needs all 16 work-items of a point in one group, as they wait for each other."""
     limit_groups(dev, monkeypatch, 8)
     row = run_case(dev, BY_NAME["rmsprop: degree 2"])
     assert "rmsprop_move: a work-group of 16 work-items, but" in row.reason

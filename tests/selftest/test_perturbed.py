@@ -1,7 +1,6 @@
-"""A sign or a comparison flipped in any kernel file is seen, and so is a naive formula in the place
-of a stable one; the case that it concerns is named. Each builds kernels of its own, so these are
-for the night and for changes of cl/: `make test-slow`. A fault in a kernel is seen by the cases
-themselves (test_cases.py), too.
+"""A flipped sign or comparison in any kernel file fails its case, and so does a naive formula in
+place of a stable one. Each test builds kernels of its own: run `make test-slow` nightly and after
+changes of cl/. Faults in a kernel also fail the cases themselves (test_cases.py).
 """
 
 import shutil
@@ -13,7 +12,7 @@ from pp_cl.engine.device.device import Program
 from pp_cl.selftest.run import CASES, run_cases
 
 KERNELS = device_module.kernel_folder()
-# (kernel file, text that stands there once, what it becomes, the case that must fail)
+# (kernel file, text that stands in it once, its replacement, the case that must fail)
 FLIPS = [
     ("device/rows", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
     ("device/scan", "sum += total", "sum -= total", "device: scan"),
@@ -90,7 +89,7 @@ FLIPS = [
     ("metrics/lpips", "* scale_a - load_part", "* scale_a + load_part", "metrics: LPIPS"),
     ("metrics/shape", "at.x + 0.5f", "at.x - 0.5f", "metrics: vertices on a box"),
 ]  # fmt: skip
-# alike, the text becomes a naive formula that a hard case is about
+# here the replacement is a naive formula, which a hard case must detect
 NAIVE = [
     ("raster/footprint/soft.h", "fmax(1.0f - d, LEAST_RHO)", "(1.0f - d)",
      "alpha: a point on the ray"),
@@ -137,7 +136,7 @@ def test_a_fault_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped,
     case = next(case for case in CASES if case.name == name)
     monkeypatch.setattr(dev, "is_cpu", acts_as_cpu(dev, file, text))
     assert [row.passed for row in run_cases(dev, [case])] == [True]
-    if path_of(file) == KERNELS / file:  # a header, which kernels of its wing and bench/ include
+    if path_of(file) == KERNELS / file:  # a header, included by its folder's kernels and by bench/
         folder = shutil.copytree(KERNELS, tmp_path / "cl")
         (folder / file).write_text((folder / file).read_text().replace(text, flipped))
         monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)
@@ -151,16 +150,17 @@ def test_a_fault_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped,
 
 
 def acts_as_cpu(dev, file, text):
-    """What the device does, but for what CPUs or GPUs alone run."""
+    """dev.is_cpu, except for a kernel that only CPUs or only GPUs run."""
     if file == "raster/lists_by_key":
         return False
     return dev.is_cpu or file == "raster/lists_by_bucket" or file.startswith("layers/winograd")
 
 
 def flipping(file, text, flipped):
-    """Makes Programs with the text, which must stand in the file once, replaced.
+    """A factory of Programs that replaces `text` in the source of `file`, where it must stand once.
 
-    Their options are the file's own, so that drivers find what they have built before.
+    The options stay those of the file, so that a driver finds in its cache what it has built
+    before.
     """
 
     def made(dev, name, source, **more):

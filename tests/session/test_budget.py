@@ -18,8 +18,8 @@ SMALL = {key: value for key, value in SETTINGS.items() if key != "train.iteratio
 
 
 def simulated(minutes, refine_at, seconds_of, built=0.0, supersampled=0.0):
-    """(seconds, its TrainConfig, steps of its refinements) of a training whose step lasts
-    seconds_of(share of the steps done, refinements done), after kernels were built.
+    """Simulate a training whose steps take seconds_of(share of the steps done, refinements done),
+    after `built` seconds for kernels. Returns (seconds, its TrainConfig, steps of its refinements).
     """
     train = TrainConfig(
         iterations=8000, minutes=minutes, refine_at=refine_at, supersampled=supersampled
@@ -46,16 +46,16 @@ def test_the_promise_is_kept_as_fog_clears_and_grids_are_refined(
 ):
     rng = np.random.default_rng(1)
 
-    def seconds_of(share, level):  # fog makes the first steps dear; others share the machine
+    def seconds_of(share, level):  # fog slows the first steps; others use the machine
         busy = 2.0 if 0.5 < share < 0.6 else 1.0
         return 0.05 * dearer**level * (1 + np.exp(-9 * share)) * busy * rng.uniform(0.5, 1.5)
 
     total, train, refined = simulated(minutes, refine_at, seconds_of, 10.0, supersampled)
     assert 0.8 * 60 * minutes < total < 1.15 * 60 * minutes
-    if minutes > 1:  # else nothing is pruned between two refinements
+    if minutes > 1:  # in one minute nothing is pruned between two refinements
         assert len(refined) == sum(share < 1 for share in refine_at)
     shares = [step / train.iterations for step in refined]
-    most = 0.25 if supersampled else 0.2  # more that was guessed comes after them
+    most = 0.25 if supersampled else 0.2  # supersampled steps come later, and their time is a guess
     assert all(abs(share - asked) < most for share, asked in zip(shares, refine_at, strict=False))
 
 
@@ -63,8 +63,8 @@ def test_what_comes_before_the_first_step_is_in_the_minutes():
     config = Config(train=TrainConfig(iterations=8000, minutes=2, refine_at=(1.0, 1.0)))
     budget = Budget(config, 0)
     for step in range(1, 11):
-        plan = budget.plan(config, step, 60 + 0.1 * step)  # of reading, carving and building
-    assert 600 < plan.iterations < 1000  # clearing fog makes later ones shorter
+        plan = budget.plan(config, step, 60 + 0.1 * step)  # 60 s of reading, carving and building
+    assert 600 < plan.iterations < 1000  # the plan expects faster steps once fog has cleared
     assert config.train.iterations == 8000
 
 
@@ -88,7 +88,7 @@ def test_a_training_without_time_ends_soon_and_in_order():
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock by which each step takes 50 ms: two looks at it are 50 ms apart."""
+    """A clock that advances by 50 ms at each look, so a step takes 50 ms."""
     now = [0.0]
 
     def perf_counter():
@@ -108,7 +108,7 @@ def test_a_run_takes_its_minutes_however_often_it_is_stopped(scene, tmp_path, cl
         train__refine_at="0.35,1",
         points__count=300,
         train__supersampled=0.25,
-        train__specular="off",  # a third of so few seconds
+        train__specular="off",  # it would take a third of the few seconds
     )
     folder, train_step = RunFolder(tmp_path / "run"), Trainer.train_step
     for stopped_at in (5, 30, 100):
@@ -121,17 +121,17 @@ def test_a_run_takes_its_minutes_however_often_it_is_stopped(scene, tmp_path, cl
         monkeypatch.setattr(Trainer, "train_step", stepping)
         assert main(words) == 130
     planned = json.loads(folder.config.read_text())
-    planned["train"]["supersampled"] = 0.2  # as a plan may leave it
+    planned["train"]["supersampled"] = 0.2  # a value that a plan may have chosen
     folder.config.write_text(json.dumps(planned))
     assert main(words) == 0
     train, last = json.loads(folder.config.read_text())["train"], folder.rows()[-1]
-    assert last["finished"] and 4.5 < last["seconds"] < 7.5  # of the steps alone, half of all
+    assert last["finished"] and 4.5 < last["seconds"] < 7.5  # the steps take half of the time
     assert last["step"] == train["iterations"] and train["minutes"] == 0.2
     (refined,) = refine_steps(TrainConfig(**train))
     assert 0.15 < refined / last["step"] < 0.6
     points = {row["step"]: row["points"] for row in folder.rows()}
     assert points[refined // 5 * 5] < 600 < points[-(-refined // 5) * 5 + 5]
     status, lines = spoken(words)
-    assert status == 0 and not lines  # it is finished, and nothing was wrong
+    assert status == 0 and not lines  # the run is finished without warnings
     status, (line,) = spoken([*words, "--iterations", "9"])
     assert status == 2 and "--minutes" in line

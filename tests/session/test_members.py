@@ -1,4 +1,4 @@
-"""A run of several trainings, of whose images the mean is shown."""
+"""A run of several trainings shows the mean of their images."""
 
 import json
 
@@ -57,7 +57,7 @@ def test_it_resumes_in_either_member(scene, both, tmp_path, monkeypatch, capsys,
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "train_step", stopping)
             assert main(arguments(scene, out, **SETTINGS)) == 130
-    assert not load(out, dev).others  # the second is not finished
+    assert not load(out, dev).others  # the second member is not finished
     assert main(arguments(scene, out, **SETTINGS)) == 0
     assert checkpoint(out) == checkpoint(both)
     assert checkpoint(out / "member-2") == checkpoint(both / "member-2")

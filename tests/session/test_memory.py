@@ -29,8 +29,8 @@ GRID = Grid((0, 0, 0), 0.02, (64, 64, 64))
 
 @pytest.fixture
 def plain(dev, monkeypatch):
-    """A device of the test's own, in a machine with memory to spare."""
-    gc.collect()  # what earlier tests left in reference cycles would be counted
+    """A new device without guards, in a machine with memory to spare."""
+    gc.collect()  # earlier tests may have left buffers in reference cycles, which would be counted
     monkeypatch.setattr("pp_cl.session.memory.available_bytes", lambda: 2**45)
     made = Device(dev.device)
     made.info |= {"memory_bytes": 2**45, "max_allocation_bytes": 2**45}
@@ -44,7 +44,7 @@ BALL = {"points.count": 4000, "scene.downscale": 1, "network.blocks": "double"}
     "size, settings",
     [
         (400, {}),
-        (128, BALL | {"train.refine_at": "0.4,1"}),  # to eight times the points
+        (128, BALL | {"train.refine_at": "0.4,1"}),  # the refinement makes eight times the points
         (128, BALL | {"raster.footprint": "disc", "raster.radius": 0.1}),
     ],
 )
@@ -64,7 +64,7 @@ def test_it_is_within_15_percent_of_what_a_training_takes(
 
 
 class Card(Device):
-    """Notes what kernels are launched in which groups."""
+    """A device that records which kernels are launched in which groups."""
 
     def __init__(self, device):
         super().__init__(device)
@@ -76,8 +76,8 @@ class Card(Device):
 
 
 def test_a_small_card_gets_the_points_that_fit(dev, tmp_path, monkeypatch, capsys):
-    """In the form for GPUs, with what all of these have: --memory 0.1, 28 MiB of it at once,
-    groups of 256, local memory of 32 KiB. They are refined as with more memory.
+    """The GPU form runs within limits that every GPU offers: --memory 0.1, allocations of 28 MiB,
+    groups of 256, local memory of 32 KiB. Points are refined as with more memory.
     """
     monkeypatch.setenv("PP_FORM", "gpu")
     monkeypatch.setenv("PP_MAX_ALLOCATION", "28")
@@ -130,7 +130,7 @@ def memory_plan(dev, base="tiny", images=3, size=(800, 600), **changes):
 
 
 def test_each_compute_unit_has_memory_of_its_own(dev, cpu_form, plain, monkeypatch):
-    """Where convolutions transform their tiles; as on a server with 128 cores."""
+    """Convolutions transform tiles in a buffer per compute unit, which adds up on 128 cores."""
     planned, shared, taken = [], [], []
     for units in (2, 256):
         made = Device(dev.device)
@@ -154,7 +154,7 @@ def needed(dev, base="tiny", points=171_262, step=0, **changes):
 def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
     once = {"train__refine_at": "0.35,1", "train__supersampled": "0"}
     halfway = needed(dev, "small", points=118_025, step=600, **once)
-    assert halfway.points < needed(dev, "small", **once).points  # so it goes on where it began
+    assert halfway.points < needed(dev, "small", **once).points  # it still fits
     last = needed(dev, "small", points=600_000, step=4000, **once)
     assert last.points == 600_000
 
@@ -168,7 +168,7 @@ def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):
 
 
 def test_a_grid_is_not_refined_beyond_what_ids_can_number(dev):
-    """Of a thin object, whose few points lie in the largest grid."""
+    """A thin object has few points even in the largest grid."""
     made = memory_plan(dev, "full", train__refine_at="0.3,0.6")
     largest, larger = (Grid((0, 0, 0), 1e-3, (n, 512, 512)) for n in (256, 257))
     made.check_points(largest, 1000, (2, 6))
@@ -214,7 +214,7 @@ def test_the_memory_asked_for(plain):
 
 
 def test_the_hosts_memory(plain, monkeypatch):
-    """Of images and of a CPU's buffers."""
+    """The host must hold the images, and on a CPU the buffers, too."""
     image_files = {"images": 300, "size": (4000, 3000), "scene__downscale": "1"}
     available = "pp_cl.session.memory.available_bytes"
     monkeypatch.setattr(available, lambda: resident_bytes() + 2 * GIB)
@@ -256,8 +256,8 @@ def test_a_refinement_that_does_not_fit_has_less_to_refine_or_keeps_what_is_lear
     scene = write_ball_scene(tmp_path / "ball", size=64)
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
-    settings |= {"train__supersampled": 0}  # else that would be given up first
-    settings |= {"train__specular": "off"}  # whose fit would be what does not fit
+    settings |= {"train__supersampled": 0}  # otherwise supersampling would be given up first
+    settings |= {"train__specular": "off"}  # otherwise its fit would need too much memory
     schedule = "pp_cl.engine.training.schedule"
     monkeypatch.setattr(f"{schedule}.LEFT_BY_PRUNING", 0.05)
     monkeypatch.setattr(f"{schedule}.prunings", lambda train, start, end: int(end > start + 1))

@@ -11,7 +11,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.engine.step import Trainer
 
-LOOKS = "pp_cl.engine.training.schedule.PRUNE_LOOKS", 4  # points are judged within few steps
+LOOKS = "pp_cl.engine.training.schedule.PRUNE_LOOKS", 4  # 4 looks at points are enough for pruning
 
 
 def test_a_finished_run_is_left_alone(scene, finished, capsys):
@@ -24,7 +24,7 @@ def test_a_finished_run_is_left_alone(scene, finished, capsys):
 def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, capsys):
     words = ["train", scene, "--out", str(finished)]
     assert main(words) == main([*words, "--iterations", "59"]) == 0
-    assert main(["train", "--out", str(finished)]) == 0  # the scene, too
+    assert main(["train", "--out", str(finished)]) == 0  # the scene is taken from the run, too
     assert capsys.readouterr().out.count("is finished (60 steps)") == 3
     assert failure("train", "--out", finished / "other").startswith("pp-cl: SCENE: ")
     told = failure(*words, "--points", "1600", "--iterations", "61")
@@ -38,7 +38,7 @@ def measured_psnr(out):
 
 @pytest.fixture(scope="module")
 def refined(scene, tmp_path_factory):
-    """(Folder of a finished run that was refined once, command line of a longer one)."""
+    """(Folder of a finished run with one refinement, function of the words of a longer one)."""
     out, changes = tmp_path_factory.mktemp("runs") / "refined", {"train__refine_at": "0.35,1"}
     changes |= {"points__count": 300, "train__checkpoint_every": 3, "train__prune_weight": 0.05}
     changes["raster__radius"] = 1  # points lie 3 pixels apart
@@ -72,13 +72,13 @@ def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
     assert all(a["points"] >= b["points"] for a, b in itertools.pairwise(log[3:]))
     before, after = measured_psnr(out), measured_psnr(whole)
     assert after > before + (1 if iterations == 80 else -0.5), (before, after)
-    for step in (20, stop):  # before the first step, and later on
+    for step in (20, stop):  # stop before the first new step, then later
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "train_step", interrupted_after(step))
             assert main(words(stopped, iterations)) == 130
         assert load_checkpoint(stopped / "checkpoint.npz")[0]["step"] == step
         assert main(["eval", str(stopped), "--metrics", "psnr"]) == 0
-    assert main(words(stopped, 20)) == 2  # it is on its way to more
+    assert main(words(stopped, 20)) == 2  # it is already extended to more steps
     assert main(words(stopped, iterations)) == 0
     assert checkpoint(stopped) == checkpoint(whole)
 
@@ -120,7 +120,7 @@ def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(*LOOKS)
     scene = write_ball_scene(tmp_path / "ball")
     changes = {"train__refine_at": "0.9,1", "points__count": 300, "train__prune_weight": 0.05}
-    changes |= {"downscale": 1, "train__supersampled": 0.07}  # from step 56 on
+    changes |= {"downscale": 1, "train__supersampled": 0.07}  # supersampled from step 56 on
     assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
     whole = checkpoint(tmp_path / "whole")
     points = {row["step"]: row["points"] for row in rows(tmp_path / "whole")[:-1]}

@@ -16,7 +16,7 @@ from pp_cl.session.training import open_training
     ids=["coarse", "between", "dense"],
 )
 def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
-    """It is kept, so that the run and its resume have it."""
+    """config.json holds it, so the run and its resume use the same radius."""
     scene, out = write_ball_scene(tmp_path / "ball", views=8, size=64), tmp_path / "run"
     words = ["train", scene, "--out", out, "--points", str(points), "--iterations", "1"]
     assert spoken(words)[0] == 0
@@ -25,7 +25,7 @@ def test_an_open_radius_is_a_pixel_within_bounds(tmp_path, points, radius):
 
 @pytest.mark.parametrize("wrong, opacity", [(0, "on"), (4, "off")])
 def test_opacity_has_no_direction_where_masks_contradict(tmp_path, capsys, wrong, opacity):
-    """It would fit each view's wrong mask."""
+    """Such an opacity would learn the wrong mask of each view."""
     scene, out = write_ball_scene(tmp_path / "ball", views=24), tmp_path / "run"
     for number in range(0, 6 * wrong, 6):
         file = tmp_path / f"ball/train/r_{number}.png"
@@ -39,7 +39,7 @@ def test_opacity_has_no_direction_where_masks_contradict(tmp_path, capsys, wrong
 
 
 def test_settings_never_change(dev, tmp_path, scene):
-    """What a training decides is in settings of its own, which config.json has."""
+    """A training records its decisions in a copy of the settings, which config.json holds."""
     folder, given = RunFolder(tmp_path / "run"), [("points.count", 500, "test")]
     config = run_config(folder, scene, "tiny", [*given, ("train.iterations", 2, "test")])
     asked, chosen = config.to_json(), open_training(dev, folder, config, None)

@@ -15,12 +15,12 @@ PATH = re.compile(r"`((?:pp_cl|pp_studio|cl|tests|tools|docs)/[\w./]+)`")
 CARD = re.compile(r"\b([ABHLV]\d{2,3}|[RG]TX|GeForce|Radeon|Instinct|MI\d{3})\b")
 FIGURE = re.compile(r"\d (ms|s|seconds|minutes|dB|times)\b|^\|.*\| *[\d.,]+ *\|", re.MULTILINE)
 PUBLISHED = "RTX 5090, by 3dgrut's README"
-PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x[._]")  # as in cl/W/x.cl and x_forward
+PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x[._]")  # placeholders such as cl/W/x.cl and x_forward
 FILE = re.compile(r"`((?:\w+/)*\w+\.(?:py|cl|h))`")
-PLACES = ("", "cl", "pp_cl", "pp_cl/engine", "pp_studio")  # that paths in a page begin at
+PLACES = ("", "cl", "pp_cl", "pp_cl/engine", "pp_studio")  # a page's paths start in one of these
 FUNCTION = re.compile(r"`(?:\w+\.)*(\w+)\([^`\n]*\)`")
 NAME = re.compile(r"`(?:\w+\.)*(\w*_\w*|[A-Z]\w+)`")
-OF_THE_CODE = ("CONTRIBUTING", "architecture", "conventions")  # others have formulas
+OF_THE_CODE = ("CONTRIBUTING", "architecture", "conventions")  # the other pages contain formulas
 
 
 def named_files(text: str, folder: Path) -> list[Path]:
@@ -32,7 +32,7 @@ def named_files(text: str, folder: Path) -> list[Path]:
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.stem)
 def test_named_files_exist(path):
     files = named_files(path.read_text("utf-8"), path.parent)
-    if not (ROOT / ".github").exists():  # the unpacked source archive
+    if not (ROOT / ".github").exists():  # .github is missing from the unpacked source archive
         lines = (ROOT / "MANIFEST.in").read_text("utf-8").splitlines()
         (left_out,) = (line.split()[1:] for line in lines if line.startswith("exclude "))
         files = [file for file in files if file not in {ROOT / name for name in left_out}]
@@ -46,7 +46,7 @@ def sources() -> list[Path]:
 
 
 def named_code(text: str, *, with_formulas: bool) -> tuple[set[str], set[str]]:
-    """(files, names of functions and, where a page has no formulas, of all else in code)."""
+    """(files, names of functions and, unless the page has formulas, of all else in code style)."""
     names = {*FUNCTION.findall(text), *([] if with_formulas else NAME.findall(text))}
     files = {file for file in FILE.findall(text) if not PLACEHOLDER.search(file)}
     return files, {name for name in names if not PLACEHOLDER.search(name)}
@@ -108,8 +108,8 @@ def test_named_settings_exist(path):
 
 
 def typed_figures(text: str) -> list[str]:
-    """Paragraphs with the tables below them, and items of lists, that name a GPU and state a figure
-    which no command wrote.
+    """Paragraphs with their tables, and list items, that name a GPU and state a figure not written
+    by a command.
     """
     paragraphs = re.split(r"\n\n(?!\|)|\n(?=- )", BLOCK.sub("", text).replace(PUBLISHED, ""))
     return [one for one in paragraphs if CARD.search(one) and FIGURE.search(one)]

@@ -11,8 +11,8 @@ SOURCES = {
 
 
 def helpers_without_static(source):
-    """Every function that is no kernel is static, those in macros included: a plain inline one has
-    no definition to link with where a compiler declines to inline it.
+    """Functions other than kernels that are not static, including those in macros. A plain inline
+    function has no definition to link with if the compiler declines to inline it.
     """
     source = re.sub(r"//.*|[ ]*\\$", "", source, flags=re.M)
     heads = re.findall(r"^ *((?:\w+[\s*]+)+)(\w+)\s?\([^{};]*\)\s*\{", source, re.M)
@@ -21,7 +21,7 @@ def helpers_without_static(source):
 
 
 def silent_kernels(source):
-    """The lines above a kernel say who a work-item is, what it reads and what it writes."""
+    """Kernels without a comment above, which must say what a work-item is, reads and writes."""
     heads = re.finditer(r"^kernel\b[^(]*?(\w+)\(", source, re.M)
     above = {m[1]: source[: m.start()].splitlines()[-1:] for m in heads}
     return [f"{n}: no comment above it" for n, x in above.items() if not x or x[0][:2] != "//"]

@@ -8,19 +8,19 @@ import pytest
 from tools import docs_tables
 
 ROOT = Path(__file__).parents[2]
-# underscores that are public all the same
+# names with an underscore that may be used
 OF_TUPLES, OTHERS = ("_replace", "_asdict", "_fields"), ("self", "cls", "os")
 
 
 def faults(source, public):
-    """What a module imports of pp_cl that is not public, and the underscores that it reaches."""
+    """Imports from pp_cl that are not public, and uses of names with an underscore."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found += [one.name for one in node.names if one.name.partition(".")[0] == "pp_cl"]
         elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "pp_cl":
             names = {one.name for one in node.names}
-            whole = {name for name in names if f"{node.module}.{name}" in public}  # a module
+            whole = {name for name in names if f"{node.module}.{name}" in public}  # whole modules
             found += [f"{node.module}.{n}" for n in names - whole - public.get(node.module, set())]
         elif isinstance(node, ast.Attribute) and node.attr[0] == "_" and node.attr[:2] != "__":
             owner = getattr(node.value, "id", None)

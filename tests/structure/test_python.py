@@ -1,4 +1,6 @@
-"""The rules of the Python sources that no linter knows, and those of import-linter (setup.cfg)."""
+"""Test the rules of the Python sources that no linter knows, and the contracts of import-linter
+(setup.cfg).
+"""
 
 import ast
 from pathlib import Path
@@ -10,8 +12,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def untyped_functions(source):
-    """Public functions and methods have types on all parameters; ruff asks for that of the result,
-    and knows no public ones.
+    """Parameters of public functions and methods without a type. ruff checks the types of results,
+    but does not know which functions are public.
     """
     tree = ast.parse(source)
     owners = [n for n in ast.walk(tree) if isinstance(n, ast.ClassDef) and n.name[0] != "_"]

@@ -19,7 +19,7 @@ KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
 
 
 def test_every_kernel_file_is_launched_by_its_own_wing():
-    """Its cases in the selftest: tests/selftest/test_perturbed.py."""
+    """tests/selftest/test_perturbed.py checks that it has cases in the selftest."""
     orphans = []
     for path in KERNEL_FILES:
         name = path.relative_to(ROOT / "cl").with_suffix("").as_posix()
@@ -50,8 +50,8 @@ def test_setup_cfg_declares_every_package_that_is_imported():
 
 
 def test_commands_that_install_work_in_a_checkout_and_with_the_wheel(monkeypatch):
-    """Messages name the packages of an extra themselves: pp-cl is on no index, and what it was
-    installed from is not known.
+    """Messages list the packages of an extra, not pp-cl[extra]: pp-cl is on no index, and a message
+    cannot know where it was installed from.
     """
     setup = configparser.ConfigParser()
     setup.read(ROOT / "setup.cfg")
@@ -98,14 +98,14 @@ def test_lint_installs_no_driver():
 
 
 def packed(folder, tmp_path):
-    """The files that setuptools packs into the source archive of a folder."""
+    """The files that setuptools packs into a source archive of the folder."""
     command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
     subprocess.run(command, cwd=folder, capture_output=True, check=True)
     return set((tmp_path / "pp_cl.egg-info" / "SOURCES.txt").read_text("utf-8").splitlines())
 
 
 def test_the_source_archive_lacks_what_is_not_free(tmp_path):
-    """Images of others' scenes under CC BY-NC-SA; their pages say so."""
+    """Images of other authors' scenes are under CC BY-NC-SA, as their pages say."""
     found = packed(ROOT, tmp_path)
     assert {"docs/capture.png", "cl/common.h", "pp_cl/engine/step.py"} <= found
     assert not {"docs/orbits.png", "docs/make.png"} & found

@@ -17,7 +17,7 @@ def turned(cameras, rotation, shift):
 
 @pytest.fixture
 def tilted(rng):
-    """(cameras, points, up) of an object in a world whose up is no axis."""
+    """(cameras, points, up) of an object in a world where up is no axis."""
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     rotation *= np.sign(np.linalg.det(rotation))
     shift = np.array([5.0, -3.0, 2.0])
@@ -27,7 +27,7 @@ def tilted(rng):
 
 
 def test_up_is_found_whatever_the_axes(tilted):
-    """Of a whole ring, of one side, and of one camera."""
+    """It is found from a whole ring of cameras, from one side, and from a single camera."""
     cameras, _, up = tilted
     np.testing.assert_allclose(up_of(cameras), up, atol=1e-6)
     assert up_of(cameras[:3]) @ up > 0.99
@@ -35,7 +35,7 @@ def test_up_is_found_whatever_the_axes(tilted):
 
 
 def test_up_is_not_fooled_by_cameras_that_all_look_down():
-    """Their mean upper edge leans outwards only where they stand on one side."""
+    """The mean of their upper edges leans outwards only if they all stand on one side."""
     cameras = ring_cameras(4, 64)[:2]
     assert up_of(cameras)[2] > 0.95
 
@@ -99,12 +99,12 @@ def test_cameras_between_others_see_the_same_from_half_way(tilted):
         distance = np.linalg.norm(camera.eye - centre)
         assert distance == pytest.approx(np.linalg.norm(eyes[i] - centre), rel=0.05)
         apart = np.linalg.norm(eyes - camera.eye, axis=1)
-        assert apart.min() > 0.2  # a twelfth of the ring is 2
+        assert apart.min() > 0.2  # the ring's cameras are 2 apart
         x, y, depth = camera.project(centre)
         assert (x, y) == pytest.approx(cameras[i].project(centre)[:2]) and depth > 0
         np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-9)
     assert between(cameras[:1]) == cameras[:1]
-    assert between([cameras[0], cameras[6]]) == [cameras[0], cameras[6]]  # opposite ones
+    assert between([cameras[0], cameras[6]]) == [cameras[0], cameras[6]]  # for opposite cameras
 
 
 def test_a_path_goes_smoothly_through_its_cameras():

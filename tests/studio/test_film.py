@@ -1,4 +1,4 @@
-"""What a film of a run shows from one frame to the next."""
+"""Test how a film of a run changes from frame to frame."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ from pp_studio.camera_path import around
 from pp_studio.commands.render import FPS, SECONDS
 from pp_studio.large import render_large
 
-FRAMES = 36  # of a film that flickers: 10 degrees apart
-OPAQUE, NEAR = 0.95, 0.01  # alpha of the surface; depths that are of one place, as a share
+FRAMES = 36  # of an orbit with visible flicker: 10 degrees apart
+OPAQUE, NEAR = 0.95, 0.01  # least alpha of the surface; relative difference of depths at a place
 
 
 @pytest.fixture(scope="module")
@@ -20,8 +20,8 @@ def run(runs, scene, session_device, tmp_path_factory):
 
 
 def flicker(cameras, views):
-    """Mean change of a place on the surface, in 1/255, from one of two frames to the other, by the
-    depth that the first shows.
+    """Mean change, in 1/255, of places on the surface from the first of two frames to the second.
+    The first frame's depth finds them.
     """
     (first, second), (before, after) = cameras, views
     rows, columns = np.nonzero(before.alpha >= OPAQUE)

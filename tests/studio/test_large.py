@@ -9,7 +9,7 @@ from pp_cl import RenderedView
 from pp_cl.run import load
 from pp_studio.large import parts, render_large, smooth_outlines, woven
 
-N = 4  # pixels of an image for one of the training
+N = 4  # pixels of an image along a pixel of the training
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def run(runs, scene, tmp_path, dev):
 def test_it_is_woven_of_images_at_the_scale_of_the_training(run):
     camera = run.cameras("test")[0]
     assert parts(run, camera) == 1
-    large = camera.resized(4 * camera.width - 3, 4 * camera.height - 5)  # no whole number of blocks
+    large = camera.resized(4 * camera.width - 3, 4 * camera.height - 5)  # no multiples of a block
     calls = []
     whole = woven(run, large, N, lambda: calls.append(1))
     assert len(calls) == 16 == parts(run, large) ** 2
@@ -35,7 +35,7 @@ def test_it_is_woven_of_images_at_the_scale_of_the_training(run):
         width=24,
         height=24,
     )
-    # the pixel (x, y) of 4 x 4 is (x + 0.5) / 4 - 0.5 of the small image's pixels from its middle
+    # pixel (x, y) of a 4 x 4 block lies (x + 0.5) / 4 - 0.5 small pixels from the block's middle
     part = run.render(small.shifted(1.5 / 4 - 0.5, 3.5 / 4 - 0.5), supersampling=1)
     for name in ("colour", "alpha", "depth"):
         rows, columns = getattr(whole, name)[3::4, 1::4].shape[:2]
@@ -55,7 +55,7 @@ def test_it_is_woven_of_images_at_the_scale_of_the_training(run):
 
 
 def teeth(alpha):
-    """Pixels, root mean square: by how much the outline of a ball departs from a smooth one."""
+    """Root mean square distance, in pixels, of the ball's outline from a smooth one."""
     outline = max(find_contours(alpha, 0.5), key=len)
     radius = np.linalg.norm(outline - outline.mean(0), axis=1)
     return float(np.std(radius - gaussian_filter1d(radius, N, mode="wrap")))
@@ -71,7 +71,9 @@ def test_an_outline_is_as_smooth_as_that_of_an_enlarged_image(run):
 
 
 def drawn(radius):
-    """A view of 240x240 pixels, gold with stripes inside a radius (240, 240) over white."""
+    """A 240x240 view, gold with stripes within a radius over white, and (240, 240) distances from
+    its middle.
+    """
     y, x = np.mgrid[:240, :240] - 119.5
     alpha = np.clip(radius(np.arctan2(y, x)) - np.hypot(x, y) + 0.5, 0, 1).astype(np.float32)
     gold = np.stack([0.8 + 0.2 * np.sin(x), 0.6 + 0 * x, 0.1 + 0 * x], 2)

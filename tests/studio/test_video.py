@@ -28,7 +28,7 @@ def test_a_video_is_read_back(tmp_path, suffix, size):
     path = tmp_path / f"video.{suffix}"
     write_video(path, frames(*size), 12.5)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
-    if suffix == "mp4":  # a page plays it before it is there as a whole
+    if suffix == "mp4":  # a page can play it before it is complete
         content = path.read_bytes()
         assert 0 < content.index(b"moov") < content.index(b"mdat")
     with imageio.get_reader(str(path)) as reader:
@@ -96,8 +96,8 @@ def test_webm_keeps_what_is_transparent(tmp_path):
 
 @pytest.mark.unix
 def test_a_full_disk_is_one_line_and_leaves_no_video(tmp_path):
-    """Of which ffmpeg says nothing; a limit on the size of a file stands for it, in a process of
-    its own.
+    """ffmpeg does not report it. A limit on the size of files, in a process of its own, imitates
+    it.
     """
     script = (
         "import resource, signal, sys\n"

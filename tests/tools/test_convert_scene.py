@@ -7,7 +7,7 @@ from pp_cl.scene.load import load_scene, scene_format
 from tools.convert_scene import FORMATS, convert, main
 
 READER = {"nerf_synthetic": "transforms", "nerfstudio": "transforms"}
-PLACE = {"co3d": "object/sequence"}  # of the scene in what is written
+PLACE = {"co3d": "object/sequence"}  # where the scene lies in the written folder
 
 
 @pytest.mark.parametrize("name", FORMATS)

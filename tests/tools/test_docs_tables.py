@@ -35,7 +35,7 @@ def test_a_table():
 
 @pytest.mark.parametrize("name", ["cl/a.cl", "pp_cl/engine/raster/b.py", "pp_cl/run.py"])
 def test_no_release_states_figures_of_older_code(tmp_path, capsys, name):
-    """Of two files one is of the code as it was before a file that decides changed."""
+    """One of two results was measured before a deciding file of the code changed."""
     results, code = tmp_path / "docs" / "results", tmp_path / name
     results.mkdir(parents=True)
     code.parent.mkdir(parents=True)
@@ -61,7 +61,7 @@ def test_documents_are_up_to_date(path):
 
 
 def test_all_results_are_shown_once():
-    """Those of kinds by a marker of their own, or else by the one of all kinds."""
+    """A result of several kinds has a marker for each, or one for all kinds together."""
     shown = TOOL.marked(ROOT)
     assert len(shown) == len(set(shown))
     assert {name for name in TABLES if "/" not in name} <= set(shown) <= set(TABLES)

@@ -16,5 +16,5 @@ def test_a_row_is_what_a_training_took(session_device, tmp_path, monkeypatch):
     assert 0.9 < row["device_ratio"] < 1.1
     assert row["device_plan"] == pytest.approx(row["device_ratio"] * row["device"])
     assert row["host_plan"] == pytest.approx(row["host_ratio"] * row["host"])
-    assert row["host"] > row["device"] > 0  # a CPU's memory is the host's
+    assert row["host"] > row["device"] > 0  # on a CPU, device memory is part of the host's
     assert all(column["cell"].format(**row) for column in MEMORY)

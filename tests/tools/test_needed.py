@@ -13,7 +13,7 @@ def test_the_picture_shows_hull_points_and_tiles(finished, dev, tmp_path, monkey
     assert hull.sum() == run.header["initial_points"] and points.sum() == run.model.cloud.count
     assert (hull | ~points).all()
     image, is_computed = needed.tiles(run)
-    assert image.shape == (32, 32, 3) and is_computed.all()  # so small an image is not planned
+    assert image.shape == (32, 32, 3) and is_computed.all()  # an image this small is not planned
     monkeypatch.setattr("pp_cl.engine.network.unet.LEAST_FROZEN", 0)
     large = run.cameras("train")[0].resized(160, 160)
     monkeypatch.setattr(type(run), "cameras", lambda self, split: [large])

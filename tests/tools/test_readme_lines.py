@@ -18,8 +18,8 @@ def test_the_commands_are_those_that_a_reader_types():
 @pytest.mark.slow
 @pytest.mark.parametrize("driver", ROWS)
 def test_the_lines_are_what_the_commands_print(driver):
-    """To the last digit, but for the seconds, on the processor that README names; on another one
-    within what its sums, in another order, make of a training.
+    """On the processor that README names all digits agree except for the seconds. Another one sums
+    in another order, which changes a training slightly.
     """
     if driver not in DRIVERS:
         pytest.skip(f"{driver} is not installed")

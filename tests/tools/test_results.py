@@ -57,7 +57,7 @@ def test_tables_and_plots(tmp_path):
 
 
 def test_work_is_told_in_shares(tmp_path, monkeypatch):
-    """Of 1000 cells 200 are of the hull, and 100 have points."""
+    """Of 1000 cells, 200 are in the hull and 100 have points."""
     cells = {"box": 1000, "hull": 200, "left": 100}
     cells |= {"checkpoint_bytes": 2 * 2**20, "box_bytes": 20 * 2**20}
     counted = {"drawn": 50.0, "fragments": {"found": 800.0, "blended": 600.0}}
@@ -128,7 +128,7 @@ def test_lego_has_its_highlights_apart(tmp_path, monkeypatch):
 
 
 def test_what_fits_into_the_minutes_is_measured(tmp_path, monkeypatch):
-    """A device that takes twice as long as an H200, where PyTorch is missing."""
+    """The device takes twice as long as an H200, and PyTorch is missing."""
     now = [0.0]
 
     def part(name):

@@ -4,7 +4,7 @@ from tools import road
 
 
 def test_the_page_is_what_a_step_calls(plain):
-    """Those who change the step run `make docs`."""
+    """After a change of the step, run `make docs`."""
     if not plain.is_cpu:
         pytest.skip("the page is of CPUs")
     assert road.page(road.traced(plain)) == road.FILE.read_text("utf-8")

@@ -35,7 +35,7 @@ def splatting(camera):
 
 
 def path_camera(camera):
-    """A camera of nerfstudio's camera_path: the angle across the height."""
+    """A camera in nerfstudio's camera_path; fov is the angle across the height."""
     fov = np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))
     return {"camera_to_world": np.ravel(world(camera)).tolist(), "fov": fov, "aspect": 1}
 

@@ -38,8 +38,8 @@ def edit(folder, change):
 @pytest.mark.parametrize("size", [(40, 24), (24, 40), (33, 33)])
 @pytest.mark.parametrize("kind", ["ndc_isotropic", "ndc_norm_image_bounds", None])
 def test_projection_follows_pytorch3d(tmp_path, rng, size, kind):
-    """x_camera = x_world R + T with x to the left and y up; NDC of f x / z + p; x_ndc of 1 is the
-    left border where the image is square, and for ndc_isotropic where x is the shorter side.
+    """x_camera = x_world R + T, with x to the left and y up; NDC are f x / z + p. x_ndc of 1 is the
+    left border of a square image, or for ndc_isotropic if x is the shorter side.
     """
     folder = tmp_path / "apple" / "1_2_3"
     (folder / "images").mkdir(parents=True)
@@ -81,7 +81,7 @@ def test_set_lists_of_version_1(tmp_path):
 
 
 def test_the_first_set_list_with_both_splits_counts(sequence):
-    """fewview_train has its training frames among the test frames as well: they are no test."""
+    """The test frames of fewview_train include its training frames, which must not be tested."""
     lists = sequence.parent / "set_lists"
     many = lists / "set_lists_manyview_dev_0.json"
     rows = [row for listed in json.loads(many.read_text()).values() for row in listed]
@@ -102,8 +102,8 @@ def test_without_lists_every_eighth_is_held_out(sequence):
 
 
 def test_a_linked_sequence(sequence):
-    """Sequences may lie on another disk: the annotations are beside the link. A frame with an empty
-    mask is left out.
+    """The sequence may be a link to another disk; its annotations lie beside the link. A frame with
+    an empty mask is left out.
     """
     edit(sequence, lambda frame: frame["mask"].update(mass=0))
     elsewhere = sequence.parent.parent / "elsewhere"
@@ -132,8 +132,8 @@ BAD = {
 }
 
 
-# the others train without these frames
-REFUSED = ("no frame number", "mass in words")  # what the order of the frames needs
+# in the other cases, a training leaves the frame out
+REFUSED = ("no frame number", "mass in words")  # the frames' order needs these keys
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -16,8 +16,8 @@ from tools.capture_demo import align, cameras
 from tools.scene_formats import colmap
 
 SIZE = (30, 22)
-# What COLMAP 3.8 found of images by tools/capture_demo.py: six of the 64 images with their
-# first 2D points, one with none, which COLMAP's model_converter then wrote in both forms.
+# COLMAP 3.8's result for images by tools/capture_demo.py: six of the 64 images with their first 2D
+# points, one without any, written in both forms by COLMAP's model_converter.
 BY_COLMAP = Path(__file__).parent / "colmap_models"
 
 
@@ -50,8 +50,8 @@ def test_a_model_is_found_in_the_usual_places(written, place):
 
 
 def test_a_projection_by_hand(tmp_path):
-    """x_cam = R(q) x + t, pixels with the centre of the first at 0.5, as COLMAP's documentation
-    has it. A quarter turn about z: q = (cos 45, 0, 0, sin 45).
+    """x_cam = R(q) x + t; the centre of the first pixel is at 0.5, as COLMAP's documentation says.
+    The rotation is a quarter turn about z: q = (cos 45, 0, 0, sin 45).
     """
     (tmp_path / "images" / "sub").mkdir(parents=True)
     write_png(tmp_path / "images" / "sub" / "a b.png", np.zeros((22, 30, 3)))
@@ -142,7 +142,7 @@ def test_2d_points_take_no_memory(tmp_path):
     (tmp_path / "cameras.bin").write_bytes(lens)
     with (tmp_path / "images.bin").open("wb") as file:
         file.write(image + struct.pack("<Q", count))
-        file.truncate(file.tell() + 24 * count)  # a hole: no space on the disk
+        file.truncate(file.tell() + 24 * count)  # a hole, which takes no space on the disk
     tracemalloc.start()
     _, [image] = read_model(tmp_path)
     assert image.name == "a.png" and tracemalloc.get_traced_memory()[1] < 2**20
@@ -189,7 +189,7 @@ BAD_TEXT = {
 }
 
 
-# the others train without these images
+# {case: split whose bad image is left out, while the others train}
 LEFT_OUT = {
     "a parameter is missing": "train",
     "huge principal point": "train",
@@ -215,7 +215,7 @@ def test_bad_text(text, case):
 
 
 def test_of_several_models_the_largest_is_read(written):
-    """As COLMAP leaves sparse/0 with two images where the rest is in sparse/1."""
+    """COLMAP may leave sparse/0 with two images and the rest in sparse/1."""
     folder, _ = written
     (folder / "sparse/0").rename(folder / "sparse/3")
     for kind in ("cameras", "images"):
@@ -230,13 +230,15 @@ def test_of_several_models_the_largest_is_read(written):
     with pytest.warns(UserWarning, match="of 2 models, the largest with images next to it is read"):
         assert len(scene_frames(folder)) == 9
     for file in (*(folder / "images").iterdir(), *(folder / "sparse/3").iterdir()):
-        file.rename(folder / file.name)  # as RealityScan has it
+        file.rename(folder / file.name)  # RealityScan writes images and model to one folder
     shutil.rmtree(folder / "sparse")
     assert [one.name for one in scene_frames(folder)][:2] == ["000001.png", "000002.png"]
 
 
 def test_models_of_later_versions_are_named(binary):
-    """SIMPLE_DIVISION, number 12, has as many parameters as PINHOLE. It costs its one view."""
+    """SIMPLE_DIVISION, number 12, has as many parameters as PINHOLE. Only the view that has it is
+    lost.
+    """
     file = binary / "sparse" / "0" / "cameras.bin"
     data = file.read_bytes()
     file.write_bytes(data[:12] + struct.pack("<i", 12) + data[16:])

@@ -25,7 +25,7 @@ from pp_cl.scene.readers.common import (
 from tools.convert_scene import convert
 
 FAIL = fail_at("file")
-# of each format: the folders of its images and of its masks, None where they are the images' alpha
+# {format: (folder of the images, folder of the masks or None if they are the images' alpha)}
 FOLDERS = {
     "co3d": ("images", "masks"),
     "colmap": ("images", "masks"),
@@ -38,7 +38,9 @@ FOLDERS = {
 
 @pytest.fixture
 def made(tmp_path):
-    """A function that gives of a format (folder of a scene, of its images, of its masks)."""
+    """A function that writes a format and returns (the scene's folder, that of images, that of
+    masks).
+    """
 
     def make(name):
         given = held_out(views(centred=name == "llff", alike=name in ("llff", "nsvf")))
@@ -74,9 +76,9 @@ HARM = {
         "a mask that cannot be|an image of another shape|the scene's files describe",
     ),
 }
-# Images that only their folder lists are not missed where they are gone. Nor are masks: the hull of
-# the others' tells (tests/scene/test_silhouette.py). Cameras of NeuS and NSVF are of no stated
-# size.
+# If the folder is the only list of images, a deleted one is not missed. Nor is a deleted mask: the
+# hull of the other masks shows that (tests/scene/test_silhouette.py). NeuS and NSVF state no size
+# for cameras.
 HARMED = [
     (name, place, harm)
     for name in FOLDERS
@@ -110,8 +112,8 @@ def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(
 
 @pytest.mark.parametrize("name", ["colmap", "llff", "nerfstudio"])
 def test_images_that_were_reduced(made, name):
-    """After their cameras were found, as people do to save time. The cameras of other formats are
-    for no stated size, or for the images as they are.
+    """People reduce images to save time, after the cameras were found. In other formats cameras
+    state no size, or are for the images as they are.
     """
     folder, images, _ = made(name)
     before = scene_frames(folder)
@@ -194,7 +196,7 @@ def test_places_in_a_list_of_which_some_are_gone():
 
 @pytest.mark.unix
 def test_paths_as_windows_writes_them(tmp_path):
-    """Also as the name of a file, where a zip of Windows was unpacked elsewhere."""
+    """The path may also be the file's name, if a zip made on Windows was unpacked elsewhere."""
     (tmp_path / "images").mkdir()
     write_png(tmp_path / r"images\b.png", np.zeros((2, 2)))
     assert find_image(tmp_path, r"images\b.png", FAIL) == r"images\b.png"
@@ -256,7 +258,7 @@ def test_json_of_at_most_so_many_bytes(tmp_path, monkeypatch):
 
 
 def test_lines_of_numbers(tmp_path):
-    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf1 2.5\r\n\r\n-3e2\r\n")  # as Windows does
+    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf1 2.5\r\n\r\n-3e2\r\n")  # as Windows writes it
     assert read_numbers(tmp_path / "a.txt") == [[1, 2.5], [-300]]
 
 
@@ -275,7 +277,7 @@ HEADERS = {
 
 @pytest.mark.parametrize("case", HEADERS)
 def test_headers_that_lie(tmp_path, case):
-    """Of a .npy file with 16 numbers."""
+    """The headers are of a .npy file with 16 numbers."""
     header = HEADERS[case].encode().ljust(1000) + b"\n"
     content = b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header + bytes(128)
     (tmp_path / "a.npy").write_bytes(content)

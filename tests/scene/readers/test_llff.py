@@ -11,8 +11,8 @@ FILE = "poses_bounds.npy"
 
 
 def test_axes_are_down_right_and_back(tmp_path):
-    """A camera at (0, 0, 5) that looks along -z with x to the right: its axes in the world are
-    down (0, -1, 0), right (1, 0, 0), back (0, 0, 1).
+    """A camera at (0, 0, 5) looks along -z with x to the right. Its axes, given in world
+    coordinates, are down (0, -1, 0), right (1, 0, 0) and back (0, 0, 1).
     """
     (tmp_path / "images").mkdir()
     write_png(tmp_path / "images" / "a.JPG.png", np.zeros((22, 30, 3)))

@@ -38,8 +38,8 @@ def test_a_projection_is_known_up_to_its_scale(tmp_path, scale):
 
 
 def test_a_projection_by_hand(tmp_path):
-    """K [R | t] of a camera at (1, 2, 3) that looks along +x, its image's right along -y, its down
-    along -z: world axes as rows of R, t = -R c.
+    """The matrix is K [R | t]: a camera at (1, 2, 3) looks along +x, its image's right is -y and
+    its down is -z. R has the camera's axes as rows, t = -R c.
     """
     rotation = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]])
     world = np.array([[50, 0, 16], [0, 40, 10], [0, 0, 1]]) @ np.column_stack(
@@ -67,14 +67,14 @@ def test_the_box_is_that_of_the_stated_sphere(scene):
 
 
 def test_the_sphere_gives_the_depth_range(scene):
-    """Centre (0.1, 0, 0.2), radius 0.5."""
+    """Its centre is (0.1, 0, 0.2), its radius 0.5."""
     matrix = np.diag([0.5, 0.5, 0.5, 1])
     matrix[:3, 3] = 0.1, 0, 0.2
     edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
     for image_file in read_split(scene, "train", []):
         distance = np.linalg.norm(image_file.camera.eye - [0.1, 0, 0.2])
         assert image_file.depth_range == pytest.approx((distance - 0.5, distance + 0.5))
-    matrix = np.diag([10.0, 10, 10, 1])  # the cameras are within
+    matrix = np.diag([10.0, 10, 10, 1])  # this sphere contains the cameras
     edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
     near, far = read_split(scene, "train", [])[0].depth_range
     assert near == pytest.approx(1e-2) and far > 10
@@ -120,7 +120,7 @@ def test_bad_cameras(scene, case):
 
 
 def test_masks_belong_to_images_of_their_number(scene, dev):
-    """DTU has image/000000.png and mask/000.png; one of another number is none."""
+    """In DTU, mask/000.png belongs to image/000000.png; a mask of another number to none."""
     before = [one.name for one in scene_frames(scene)]
     for file in (scene / "mask").iterdir():
         file.rename(file.with_name(f"{int(file.stem):03d}.png"))

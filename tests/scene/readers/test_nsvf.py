@@ -20,7 +20,7 @@ def test_splits_are_those_of_the_names(scene):
 
 
 def test_where_there_is_no_2_test_is_1(tmp_path):
-    """As in NSVF's Tanks and Temples and BlendedMVS."""
+    """NSVF's Tanks and Temples and BlendedMVS are numbered like this."""
     many = views(alike=True)
     nsvf.write(tmp_path, {"train": many[:6], "test": many[6:]})
     for folder in ("rgb", "pose"):

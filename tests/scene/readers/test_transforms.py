@@ -28,7 +28,7 @@ def test_views_and_names(tmp_path, capfd):
 
 
 def test_projection_follows_opengl(tmp_path, rng):
-    """A world point lands where the format's own rules (y up, looking along -z) put it."""
+    """The format's own rules (y up, looking along -z) give the pixel of a world point."""
     data = write_scene(tmp_path)
     focal = 0.5 * SIZE[0] / math.tan(0.35)
     for frame, view in zip(data["frames"], load_scene(tmp_path).splits["train"], strict=True):
@@ -40,7 +40,7 @@ def test_projection_follows_opengl(tmp_path, rng):
 
 
 def test_nerfstudio_names(tmp_path):
-    """A frame's own key goes before the file's."""
+    """A frame's own keys override the file's."""
 
     def edit(data):
         data.update(
@@ -63,13 +63,13 @@ def test_nerfstudio_names(tmp_path):
 
 
 def test_an_image_that_is_turned(tmp_path):
-    """Without EXIF that says so, nothing tells which way."""
+    """Without an EXIF orientation, the direction of the turn is unknown."""
     write_scene(tmp_path, edit=lambda data: data.update(w=SIZE[1], h=SIZE[0]))
     refused(tmp_path, tmp_path / "transforms_train.json", "w: is for", "turned", "upright")
 
 
 def test_angles_of_images_that_were_reduced(tmp_path):
-    """They stay; what is in pixels is scaled: tests/scene/readers/test_common.py."""
+    """Angles stay; tests/scene/readers/test_common.py tests values in pixels, which are scaled."""
     camera = train_views(tmp_path, w=2 * SIZE[0], h=2 * SIZE[1])[0].camera
     assert camera.fx == pytest.approx(0.5 * SIZE[0] / math.tan(0.35))
     assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
@@ -205,7 +205,7 @@ def test_what_is_perspective_by_its_keys_is_read_and_motion_is_told(tmp_path):
 
 @pytest.mark.parametrize("keys", ({"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}))
 def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
-    """The latter writes the tangential coefficients as zeros beside."""
+    """colmap2nerf writes the tangential coefficients, too, as zeros."""
     keys |= {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0, "p2": 0}
     write_scene(tmp_path, edit=lambda data: data.update(keys))
     [one, *_] = transforms.read_split(tmp_path, "train", [])

@@ -4,11 +4,11 @@ from support.scenes import ring_cameras
 
 from pp_studio.capture.box import MARGIN, find_world
 
-RADIUS, WIDE = 0.8, 1.1  # of the ball, and of half the cloth on which it lies
+RADIUS, WIDE = 0.8, 1.1  # the ball's radius; half the width of the cloth below it
 
 
 def upright(vectors, tilt):
-    """(N, 3) vectors in the world whose table is tilted by so much."""
+    """(N, 3) vectors in a world whose table is tilted by `tilt` radians."""
     return vectors @ np.array(
         [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
     )
@@ -17,7 +17,7 @@ def upright(vectors, tilt):
 @pytest.mark.parametrize("share", [0.1, 0.3])
 @pytest.mark.parametrize("tilt", [0, 0.05, 0.1])
 def test_a_table_is_no_part_of_the_object(share, tilt):
-    """Whichever points were found of both: chance does not decide."""
+    """The box is the same whichever points were found on ball and table."""
     rng = np.random.default_rng(0)
     cameras, sizes = ring_cameras(12, 100), []
     for _ in range(8):
@@ -34,7 +34,7 @@ def test_a_table_is_no_part_of_the_object(share, tilt):
 
 
 def test_a_base_is_part_of_the_object():
-    """It is narrower than what stands on it."""
+    """It is narrower than the object on it."""
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(2000, 3))
     ball *= RADIUS / np.linalg.norm(ball, axis=1, keepdims=True)

@@ -26,7 +26,7 @@ from tools.capture_demo import align, cameras, room
 
 colmap = pytest.importorskip("pycolmap")
 SIZE, COUNT = 300, 12
-WRONG = 6.0  # of the true focal length
+WRONG = 6.0  # times the true focal length
 
 
 def near():
@@ -69,7 +69,7 @@ def shot(captured):
 
 
 def capture(source, scene, *more):
-    """(exit status, lines on stderr) of the command, but for those of its progress."""
+    """(exit status, lines on stderr without progress) of the command."""
     status, lines = spoken(["capture", source, "--out", scene, *more])
     return status, [line for line in lines if line.startswith("pp-cl")]
 
@@ -95,7 +95,7 @@ def off(scene, true=None):
 
 def test_photographs_become_a_scene(captured):
     assert scene_format(captured) == "transforms" and off(captured).position < 0.03
-    assert off(captured).degrees < 4  # their places on an arc hardly tell how it is turned
+    assert off(captured).degrees < 4  # places on an arc hardly fix the rotation
     views = load_scene(captured, ("train", "test")).splits
     assert (len(views["train"]), len(views["test"])) == (10, 2)
     box = np.array(json.loads((captured / "transforms.json").read_text())["aabb"])
@@ -104,11 +104,11 @@ def test_photographs_become_a_scene(captured):
         rows, columns = np.nonzero(view.image[..., 3] > 127)
         middle = view.camera.project(np.zeros(3))[:2]
         assert np.linalg.norm(middle - [columns.mean(), rows.mean()]) < 0.1 * SIZE
-        assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
+        assert -view.camera.pose[2, 1] > 0  # the image's top points up
 
 
 def test_the_scene_states_no_digits_that_threads_decide(captured):
-    """Two captures of 49 photographs differed by 1e-14, which a training makes visible."""
+    """Two captures of 49 photographs differed by 1e-14, which a training amplifies."""
     decimals = re.findall(r"\.(\d+)", (captured / "transforms.json").read_text())
     assert max(map(len, decimals)) == 9
 
@@ -130,7 +130,7 @@ def test_nothing_in_the_scene_is_distorted(captured):
 
 @pytest.mark.slow
 def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
-    """That of larger photographs, which EXIF may keep: with it, few images have a place."""
+    """EXIF may keep the focal length of larger photographs. With it, few images would be placed."""
     work = captured / "capture"
     database = Path(shutil.copy(work / "database.db", tmp_path))
     with quiet(database), colmap.Database.open(database) as db:
@@ -148,7 +148,9 @@ def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
 
 
 def test_wrong_matches_do_not_pull_at_the_cameras():
-    """One point of twenty is another in each photograph, some pixels away, as in a pattern."""
+    """In each photograph, one point of twenty is off by some pixels, as if a pattern was
+    mismatched.
+    """
     colmap.set_random_seed(0)
     model = colmap.synthesize_dataset(
         colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=400)
@@ -169,7 +171,7 @@ def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
     words = shot[0], scene, "--masks", shot[1]
     before = changed(scene)
     assert capture(*words) == (0, []) and changed(scene) == before
-    for name in ("masks.json", "scene.json"):  # killed before they were written
+    for name in ("masks.json", "scene.json"):  # as if killed before these were written
         (scene / "capture" / name).unlink()
     assert capture(*words) == (0, [])
     after = changed(scene)
@@ -263,7 +265,9 @@ def test_what_is_the_users_stays(captured, shot, tmp_path):
 
 
 def test_masks_that_the_user_has_mended_are_kept(captured, shot, tmp_path):
-    """And refused by name where their images are made anew; one option replaces them."""
+    """If their images must be made anew, the command refuses and names the mask; --replace-masks
+    replaces it.
+    """
     scene = shutil.copytree(captured, tmp_path / "scene")
     mended = scene / "masks" / "003.png"
     Image.new("L", (SIZE, SIZE), 255).save(mended)
@@ -278,7 +282,7 @@ def test_masks_that_the_user_has_mended_are_kept(captured, shot, tmp_path):
 
 
 def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
-    """As they are not taken: the masks that the user has mended would be gone."""
+    """They are only reported: taking them would delete the masks that the user has mended."""
     scene, later = shutil.copytree(captured, tmp_path / "scene"), shot[0] / "later.jpg"
     later.touch()
     try:
@@ -315,7 +319,7 @@ def test_videos(shot, tmp_path):
     sharp = [np.array(Image.open(file)) for file in sorted(shot[0].iterdir())]
     soft = [np.array(Image.fromarray(one).filter(ImageFilter.GaussianBlur(3))) for one in sharp]
     frames = [frame for two in zip(soft, sharp, strict=True) for frame in two] * 10
-    write_video(tmp_path / "video.mp4", frames, 24)  # 240 frames, of which each second one is sharp
+    write_video(tmp_path / "video.mp4", frames, 24)  # 240 frames, every second one sharp
     taken = take_images(tmp_path / "video.mp4", tmp_path / "images")["images"]
     chosen = [int(one["name"][:6]) for one in taken]
     assert len(chosen) > 100 and all(number % 2 for number in chosen)
@@ -328,7 +332,7 @@ def test_videos(shot, tmp_path):
 @pytest.mark.unix
 @pytest.mark.slow
 def test_a_full_disk(shot, tmp_path):
-    """The database may not grow: one line that names it; with room again the command goes on."""
+    """The database cannot grow: one line names it, and with space again the command continues."""
     scene = tmp_path / "scene"
     words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
     limited = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (3 << 20, 3 << 20))"
@@ -381,7 +385,7 @@ def turned(dev, folder, steps, wall=None):
 
 @pytest.mark.slow
 def test_an_object_that_turns(dev, tmp_path):
-    """Its cameras are found though its pattern is that of other steps, too, and it is noticed."""
+    """Cameras are found though the pattern repeats at other steps, and the turning is noticed."""
     scene = tmp_path / "scene"
     photographs, masks = turned(dev, tmp_path, range(14))
     assert capture(photographs, scene, "--masks", masks) == (0, [])
@@ -389,13 +393,13 @@ def test_an_object_that_turns(dev, tmp_path):
     assert found(scene, "matches")["turns"] and found(scene, "poses")["placed"] == 14
     assert off(scene, cameras(SIZE, "turntable")).position < 0.01
     before = found(scene, "matches")["line"]
-    (scene / "capture/matches.json").unlink()  # as where it is stopped while matches are removed
+    (scene / "capture/matches.json").unlink()  # as if stopped while matches are removed
     assert capture(photographs, scene, "--masks", masks) == (0, [])
     assert found(scene, "matches")["line"] == before and found(scene, "poses")["placed"] == 14
 
 
 def test_a_film_on_white_is_placed_and_cut_out_by_itself(dev, tmp_path):
-    """Nothing stands out from behind, so that colour decides; that is said."""
+    """No structure stands out behind the object, so colour decides, and the line says so."""
     scene = tmp_path / "scene"
     photographs, masks = turned(dev, tmp_path, range(14), 1.0)
     film = [read_rgba(file)[..., :3] for file in sorted(photographs.iterdir())]
@@ -416,7 +420,7 @@ def test_a_film_on_white_is_placed_and_cut_out_by_itself(dev, tmp_path):
 
 @pytest.mark.slow
 def test_a_wall_places_no_cameras(dev, tmp_path):
-    """Of an object that turns by too much between its photographs."""
+    """The object turns by too much between its photographs."""
     scene = tmp_path / "scene"
     refused(turned(dev, tmp_path, range(0, 72, 8))[0], scene, named=scene)
     assert found(scene, "matches")["turns"] and (scene / "capture" / "turns").exists()

@@ -1,4 +1,4 @@
-"""docs/capture.md says how exact a capture is: the row of the photos, measured again."""
+"""Test the row for photographs in docs/capture.md, which says how exact a capture is."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ ROW = re.compile(
 
 @pytest.mark.slow
 def test_the_demo_in_a_room_is_as_exact_as_the_page_says(dev, tmp_path):
-    """Within a quarter more for cameras, and 0.005 for masks."""
+    """Cameras may be off by a quarter more than stated, masks by 0.005."""
     [stated] = ROW.findall(PAGE.read_text("utf-8"))
     position, degrees, overlap = map(float, stated)
     write_photographs(dev, tmp_path / "taken", 400)

@@ -10,14 +10,14 @@ VIEWS, ROUND, SHOWN = 60, 30, 400
 
 
 def descriptors(rng, count):
-    """(N, 128) uint8 of COLMAP's length."""
+    """(N, 128) uint8, normalised as COLMAP's."""
     found = rng.exponential(1, (count, 128)) ** 2
     shares = np.sqrt(found / found.sum(1, keepdims=True))
     return np.minimum(np.rint(features.UNIT * shares), 255).astype(np.uint8)
 
 
 def test_matches_are_each_others_best_and_clearly_so(rng):
-    """As a search among all of them finds; some are there twice, and match nothing."""
+    """The matches are those of an exhaustive search; descriptors that occur twice match nothing."""
     one, noise = descriptors(rng, 300), rng.integers(-3, 4, (300, 128))
     other = np.clip(rng.permutation(one)[:200] + noise[:200], 0, 255).astype(np.uint8)
     other[10] = other[20]
@@ -34,8 +34,8 @@ def test_matches_are_each_others_best_and_clearly_so(rng):
 
 
 def round_of(rng, is_still):
-    """(places, descriptors) of two rounds around an object, each of whose views shares a half with
-    the next; or of a wall that stands still and is the same in all.
+    """(places, descriptors) of two rounds around an object, where each view shares half of its
+    descriptors with the next; is_still: of a wall that stands still and is the same in all views.
     """
     places, found = [], []
     known = descriptors(rng, ROUND * SHOWN // 2 + SHOWN // 2)
@@ -57,14 +57,14 @@ def test_pairs_are_neighbours_and_what_shows_the_same_in_another_round(rng):
 
 
 def test_a_wall_that_stands_still_chooses_no_pairs(rng):
-    """Behind a turntable: it is as like itself in each."""
+    """The wall behind a turntable looks equally alike in all views."""
     pairs = features.pairs_of(*round_of(rng, True))
     assert len(pairs) == VIEWS * features.OVERLAP
 
 
 @pytest.mark.parametrize("factor", [1, 3])
 def test_features_of_reduced_photographs_lie_where_they_were(tmp_path, factor):
-    """In a JPEG that is decoded at a half, and reduced further."""
+    """The JPEG is decoded at half its size, and reduced further."""
     shown = np.full((1200, 1200), 90.0)
     rows, columns = np.mgrid[:1200, :1200] + 0.5
     middles = [(300.25, 410.5), (700.0, 820.75), (900.5, 250.0)]

@@ -22,7 +22,7 @@ SIZE = 96, 64
 
 @pytest.fixture
 def shots():
-    """Twelve sharp (64, 96, 3) images of which none is like another."""
+    """Twelve sharp (64, 96, 3) images, no two of which are alike."""
     return np.random.default_rng(0).integers(0, 256, (12, *SIZE[::-1], 3), np.uint8)
 
 
@@ -33,8 +33,8 @@ def folder(tmp_path):
 
 
 def test_photographs_of_other_programs(shots, folder, tmp_path):
-    """16 bits a channel, CMYK, a TIFF whose tags have no room in a JPEG, EXIF that is broken; the
-    rest of one, and what is there twice, are left out.
+    """16 bits per channel, CMYK, a TIFF with tags too large for a JPEG, broken EXIF. A truncated
+    file and a copy of another image are left out.
     """
     heif = pytest.importorskip("pillow_heif")
     for i, image in enumerate(shots):
@@ -42,7 +42,7 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
     cv2.imwrite(str(folder / "deep.png"), shots[0, ::-1].astype(np.uint16) * 257)
     Image.fromarray(shots[1, ::-1]).convert("CMYK").save(folder / "print.jpg")
     tags = TiffImagePlugin.ImageFileDirectory_v2()
-    tags[34377] = bytes(100_000)  # Photoshop's
+    tags[34377] = bytes(100_000)  # a tag of Photoshop's
     Image.fromarray(shots[2, ::-1]).save(folder / "layers.tif", tiffinfo=tags)
     for i, name in enumerate(("a.avif", "b.bmp", "c.jfif"), 4):
         Image.fromarray(shots[i, ::-1]).save(folder / name)
@@ -76,7 +76,7 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
 
 
 def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
-    """A cut-out may still hold the wall behind the object."""
+    """A cut-out may still contain the wall behind the object."""
     pycolmap = pytest.importorskip("pycolmap")
     sharp = np.kron(shots, np.ones((1, 4, 4, 1), np.uint8))
     alpha = np.zeros((*sharp.shape[1:3], 1), np.uint8)
@@ -95,8 +95,8 @@ def test_features_are_not_looked_for_where_alpha_is_0(shots, folder, tmp_path):
 
 
 def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
-    """EXIF tells of the sensor as it was before they were cropped to a square and reduced: 5184 by
-    3456 pixels, of which 5728 are an inch. COLMAP would begin with 46 / 25.4 * 5728 = 10374 pixels.
+    """EXIF describes the sensor before the photographs were cropped to a square and reduced: 5184
+    by 3456 pixels, 5728 to an inch. COLMAP would begin with 46 / 25.4 * 5728 = 10374 pixels.
     """
     pytest.importorskip("pillow_heif")
     pycolmap = pytest.importorskip("pycolmap")
@@ -120,7 +120,7 @@ def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
 
 
 def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
-    """As matches and poses depend on the numbers; the second takes longest."""
+    """Matches and poses depend on the numbers; here the second image takes longest."""
     pycolmap = pytest.importorskip("pycolmap")
     taken = [{"name": f"{i}.png", "lens": "", "size": (600, 600), "focal": None} for i in range(9)]
     taken[0]["size"] = 304, 600
@@ -138,7 +138,7 @@ def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
 
 @pytest.mark.unix
 def test_names_that_colmap_can_list(shots, tmp_path):
-    """In ASCII, without spaces or a leading #, each once whatever the case of its letters."""
+    """Names are ASCII, without spaces or a leading #, and unique if case is ignored."""
     names = ["#a.png", "_a.png", "b c.png", "b  c.png", "b_c.png", "B_C.PNG", "d.png", "d.jpg"]
     names += ["e.png", os.fsdecode(b"foto_\xe9.png"), os.fsdecode(b"foto_\xea.png")]
     for name, image in zip(names, shots, strict=False):
@@ -168,14 +168,14 @@ def remade(video, name, *options):
 
 
 def test_a_video_that_states_no_length(video, tmp_path):
-    """As browsers record them."""
+    """Browsers record such videos."""
     live = remade(video, "live.webm", ["-c", "copy", "-f", "webm", "-live", "1"])
     whole, found = (take_images(one, tmp_path / one.stem)["images"] for one in (video, live))
     assert [one["name"] for one in found] == [one["name"] for one in whole] and len(found) > 40
 
 
 def test_a_video_that_is_shown_turned(video, tmp_path, caplog):
-    """As phones make them: upright, without a word of ffmpeg's."""
+    """Phones make such videos: frames are upright, and ffmpeg logs nothing."""
     fragments = ["-c:v", "libx264", "-f", "mp4", "-movflags", "frag_keyframe+empty_moov"]
     flat = remade(video, "flat.mp4", fragments)
     turned = remade(flat, "turned.mp4", "-display_rotation", "90", ["-c", "copy", *fragments[2:]])
@@ -184,8 +184,8 @@ def test_a_video_that_is_shown_turned(video, tmp_path, caplog):
 
 
 def display(colour, transfer):
-    """Signal in [0, 1] of BT.2020 by which a display in HLG or PQ shows an sRGB colour, white at
-    203 candela per square metre (BT.2100, BT.2408).
+    """BT.2020 signal in [0, 1] with which an HLG or PQ display shows an sRGB colour; white has 203
+    candela per square metre (BT.2100, BT.2408).
     """
     level = np.asarray(colour) / 255
     light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
@@ -207,9 +207,9 @@ def display(colour, transfer):
     [("arib-std-b67", "bt2020", 12), ("smpte2084", "unknown", 5)],
 )
 def test_a_video_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primaries, off):
-    """10 bits of BT.2020, as phones make them; other programs leave its primaries to be guessed.
-    Off by what HLG's system gamma, which ffmpeg applies to each channel, makes of colours; without
-    tone mapping they are washed out, by 30 and more.
+    """Phones record 10 bits of BT.2020; other programs omit the primaries. ffmpeg applies HLG's
+    system gamma to each channel, which changes colours by `off` at most; without tone mapping they
+    would be washed out by 30 and more.
     """
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     colours = np.array([(180, 120, 60), (90, 140, 180), (128, 128, 128), (60, 100, 50)], np.uint8)
@@ -251,8 +251,8 @@ def test_what_is_no_video_is_one_line_without_the_programs_banner(tmp_path):
 
 
 def test_photographs_of_several_rounds(shots, tmp_path):
-    """In a folder each, beside some at the top, without leading zeros; masks, raw files and what
-    the program has made are none.
+    """Each round has a folder, some images lie above them, and numbers lack leading zeros; masks,
+    raw files and pp-cl's own images are not taken.
     """
     places = [f"{i}.png" for i in (1, 2, 9, 10)]
     places += [f"{place}/{i}.png" for place in ("low", "high/1") for i in (8, 9, 10, 11)]
@@ -275,7 +275,9 @@ def test_photographs_of_several_rounds(shots, tmp_path):
 
 
 def test_what_a_film_repeats_takes_the_place_of_no_other_picture(tmp_path, rng):
-    """A film that was made constant: the camera moved for 40 frames, then one of them stands."""
+    """The film has a constant frame rate: the camera moved for 40 frames, then the last one
+    repeats.
+    """
     shown = rng.integers(0, 256, (40, *SIZE[::-1], 3), np.uint8)
     write_video(tmp_path / "film.webm", [*shown, *[shown[-1]] * 260], 24)
     found = take_images(tmp_path / "film.webm", tmp_path / "images")
@@ -284,7 +286,7 @@ def test_what_a_film_repeats_takes_the_place_of_no_other_picture(tmp_path, rng):
 
 @pytest.fixture
 def moving(tmp_path, rng):
-    """A film of a smooth picture that moves to the left."""
+    """A film of a smooth picture moving to the left."""
     pytest.importorskip("imageio_ffmpeg")
     wide = Image.fromarray(rng.integers(0, 256, (6, 40, 3), np.uint8)).resize((800, 120))
     shown = [np.array(wide)[:, 4 * k : 4 * k + 160] for k in range(80)]
@@ -303,7 +305,9 @@ def test_pixels_of_a_film_become_square(moving, tmp_path):
 
 
 def test_a_frame_is_of_one_moment(moving, tmp_path):
-    """Where the lines of two alternate, whether the film states it or not."""
+    """A film whose lines alternate between two moments is deinterlaced, whether it states this or
+    not.
+    """
     woven = ["-vf", "tinterlace=interleave_top", "-c:v", "libx264", "-f", "matroska"]
     rough = [
         np.mean([np.abs(np.diff(image, 2, 0)).mean() for image in taken(film, tmp_path)])

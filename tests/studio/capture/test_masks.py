@@ -30,15 +30,15 @@ from pp_studio.capture.masks import mask_file, outline_sheet, program_words, wri
 
 SIZE, VIEWS = 96, 12
 SCREEN = (20, 200, 60)
-WALL = [0.25, 0.55, 0.3]  # its mean colour
+WALL = [0.25, 0.55, 0.3]  # mean colour of the wall
 
 
 class Capture:
     """An object before walls of noise: photographs in a folder, true masks, sparse points.
 
     views: (camera, (H, W, 4) uint8) pairs. surface: (N, 3). spoil: changes the first photographs,
-    `spoiled` of them. wall: gives the colours behind the object in a camera's image; else the noise
-    of each differs.
+    `spoiled` of them. wall: returns the colours behind the object for a camera; if None, each image
+    has noise of its own.
     """
 
     def __init__(self, folder, views, box, surface, spoil=None, spoiled=1, wall=None):
@@ -131,19 +131,19 @@ def test_a_box_that_cuts_the_object_grows(capture):
 
 
 def turned(folder, views, box, surface, wall):
-    """A Capture of an object that turns, whose wall has no points, as it stands still."""
+    """A Capture of an object that turns. Its wall stands still, and so has no points."""
     return without_wall(Capture(folder, views, box, surface, wall=wall))
 
 
 def without_wall(capture):
-    """A Capture whose wall has no points."""
+    """Removes the wall's points from a Capture."""
     capture.points = capture.points[: capture.count]
     capture.seen = [seen[seen < capture.count] for seen in capture.seen]
     return capture
 
 
 def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
-    """A plain ball upon one with a pattern, before a camera at each of two heights."""
+    """A plain ball lies on one with a pattern, before cameras at two heights."""
     middle, views, plain = np.array([0, 0, 1.05]), [], []
     for camera in ring_cameras(2 * VIEWS, SIZE, distance=6.0):
         image = ball_image(camera)
@@ -173,8 +173,8 @@ def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
 
 
 def share_held(capture, place, wanted):
-    """Of the pixels in a place of the first photograph that show the object, or do not: those that
-    the mask holds, first without votes, then with them.
+    """Shares of the pixels in `place` of the first photograph that belong to the object (wanted) or
+    not, which the mask holds: [without votes, with them].
     """
     shares = []
     for rounds in (0, cut.ROUNDS):
@@ -195,7 +195,7 @@ def test_the_other_views_carve_what_one_takes_for_the_object(tmp_path):
         image[place] = image[38:58, 36:60]
 
     capture = ball(tmp_path / "scene", bystander)
-    capture.seen[0] = capture.seen[0][capture.seen[0] < capture.count]  # it hides the wall
+    capture.seen[0] = capture.seen[0][capture.seen[0] < capture.count]  # the wall is hidden
     alone, voted = share_held(capture, place, wanted=False)
     assert alone > 0.5
     assert voted < 0.6 * alone
@@ -241,8 +241,8 @@ def test_a_mask_that_the_user_has_written_has_the_shape_of_its_image(capture):
 
 
 def test_given_masks_come_first(capture, tmp_path):
-    """They are those of the photographs before their distortion was removed, and named like them or
-    like their sources, as spaces are none of COLMAP's.
+    """They fit the photographs before undistortion, and have the names of these or of their
+    sources, which may contain spaces.
     """
     folder, names = given_masks(capture, tmp_path / "given"), []
     (folder / "03.png").rename(folder / "my photo (3).png")
@@ -280,7 +280,7 @@ def before_a_screen(capture):
 
 
 def test_a_uniform_background_shows_through_gaps(dev, tmp_path):
-    """Of the demo, whose rings enclose most of it."""
+    """The object is the demo, whose rings enclose most of the background."""
     around = cameras(2 * SIZE, "turntable")[:: 72 // VIEWS]
     views = [(one, render(dev, one)) for one in around]
     surface = demo_mesh(dev, 64)[0][::20]
@@ -291,7 +291,7 @@ def test_a_uniform_background_shows_through_gaps(dev, tmp_path):
 
 
 def test_an_object_of_the_backgrounds_colour_is_refused(capture):
-    """Its points say where it is, and its mask would not hold them."""
+    """Its points show where it is, but its mask would not contain them."""
     before_a_screen(capture)
     for one, mask in zip(capture.image_files, capture.truth, strict=True):
         rgb = np.array(Image.open(capture.folder / one.name))
@@ -303,7 +303,7 @@ def test_an_object_of_the_backgrounds_colour_is_refused(capture):
 
 
 def test_spots_of_the_backgrounds_colour_are_no_gaps(capture):
-    """One on the ball is seen from a few sides, but the others see the ball behind it."""
+    """A few views see the spot on the ball, but the others see the ball behind it."""
     before_a_screen(capture)
     spotted = 0
     for one in capture.image_files:
@@ -378,7 +378,7 @@ def test_a_box_without_an_object_is_refused(capture, case):
 
 
 def test_a_image_beside_the_object_has_an_empty_mask(capture):
-    """As videos have them, where they begin or end; the others are cut out all the same."""
+    """Videos may have such images at the beginning or end; the others are cut out nevertheless."""
     one = capture.image_files[3]
     eye, ahead = 3 * one.camera.eye, one.camera.pose[:, 2] + 0.84 * one.camera.pose[:, 0]
     camera = Camera.look_at(eye, eye + ahead, fx=one.camera.fx, width=SIZE, height=SIZE)

@@ -1,4 +1,4 @@
-"""What runs pycolmap ends when it is told to, whatever pycolmap does."""
+"""A signal ends a process that runs pycolmap, whatever pycolmap does."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ LIMIT = 30  # seconds; a quiet machine takes less than one
 @pytest.mark.parametrize("number", [15, 2])
 @pytest.mark.parametrize("where", ["isolated", "here"])
 def test_a_signal_is_one_line_and_its_status(number, where):
-    """pycolmap wrote a stack trace of SIGTERM, and Ctrl-C waited for the end of its work."""
+    """Without care, pycolmap writes a stack trace on SIGTERM, and Ctrl-C waits until it is done."""
     work = "import time; print('begun', flush=True); time.sleep(600)"
     lines = f"""
         import sys

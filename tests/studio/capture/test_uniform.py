@@ -13,13 +13,13 @@ SIDE = 160
 Y, X = (np.indices((SIDE, SIDE)) + 0.5) / SIDE - 0.5
 BALL = np.hypot(X, Y) < 0.3
 WHITE = np.full((SIDE, SIDE), 255.0)
-# a window at the left, and a lens that darkens its corners by a quarter
+# light from a window at the left, and a lens whose corners are a quarter darker
 GRADED = 240 * (1 - 0.1 * X) * (1 - 0.5 * (X * X + Y * Y))
 PLANKS = 128 + 30 * np.sin(40 * X) * np.cos(9 * Y)
 
 
 def image(behind, noise=0.0, ball=(150, 60, 40)):
-    """The ball before the grey levels of a wall, (H, W, 3) uint8."""
+    """(H, W, 3) uint8: the ball before a wall of given grey levels."""
     colours = np.where(BALL[..., None], ball, behind[..., None])
     noise = np.random.default_rng(0).normal(0, noise, colours.shape) if noise else 0
     return np.uint8(np.clip(colours + noise + 0.5, 0, 255))
@@ -35,7 +35,7 @@ def test_the_mask_of_a_uniform_background(behind, noise):
 
 
 def test_a_dark_shade_of_white_is_told_from_white():
-    """As of a white thing that is lit from the side: little noise leaves a narrow margin."""
+    """A white thing lit from one side has such shades; little noise allows a narrow margin."""
     mask = uniform_mask(image(WHITE, ball=(236, 236, 236)), "") > 127
     assert (mask == BALL).mean() > 0.99
 
@@ -52,7 +52,7 @@ def test_an_object_that_reaches_the_border_leaves_no_mask():
 
 @pytest.mark.parametrize("is_uniform", [False, True])
 def test_all_images_have_a_mask_where_some_have_alpha(tmp_path, is_uniform):
-    """As features are looked for within them; nothing is left out of those without."""
+    """Features are looked for within these masks; images without alpha lose no features."""
     shown = image(WHITE)
     Image.fromarray(shown).save(tmp_path / "a.jpg")
     Image.fromarray(np.dstack([shown, np.uint8(255 * (Y < 0))])).save(tmp_path / "b.png")

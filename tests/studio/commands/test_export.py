@@ -20,7 +20,7 @@ def unfinished(tmp_path_factory):
 
 @pytest.fixture
 def copied(unfinished, tmp_path):
-    """A copy of it, in a folder whose name is no UTF-8, and whose scene is gone."""
+    """A copy of the run, in a folder whose name is not UTF-8, with its scene gone."""
     run = tmp_path / "run \udcff"
     shutil.copytree(unfinished, run)
     config = json.loads((run / "config.json").read_text())
@@ -29,7 +29,7 @@ def copied(unfinished, tmp_path):
     return run
 
 
-# so little training shows no surface; tests/studio/export/test_formats.py writes a mesh
+# no mesh, as so little training shows no surface; tests/studio/export/test_formats.py writes one
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "mesh"])
 def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(name, copied, capsys):
     assert main(["export", str(copied), "--format", name]) == 0
@@ -37,7 +37,7 @@ def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(name, co
     shown = ascii(str(written)).strip("'")
     assert written.exists() and f"wrote {shown}: " in said.out
     assert "unfinished, step 20 of 60" in said.out
-    # it has neither a scene's test views, nor the images that Gaussians are fitted to
+    # the scene is needed for its test views, and for the images that Gaussians are fitted to
     is_fitted = name.startswith("splat") or name in ("html", "gallery")
     assert ("/nowhere/at/all" in said.err) == (name == "scene" or is_fitted)
     there = [path.name for path in written.parent.iterdir() if path.name[0] != "."]

@@ -24,12 +24,12 @@ from pp_studio.export.result import begin_result
 
 @pytest.fixture(scope="module")
 def made(runs, tmp_path_factory):
-    """(scene, what was made of it) of a ball."""
+    """(scene of a ball, folder that `pp-cl make` made of it)."""
     scene = runs.ball(views=12, size=32)
 
     def make(folder):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(render, "LEAST_HEIGHT", 32)  # of the video, which would take a minute
+            patch.setattr(render, "LEAST_HEIGHT", 32)  # a full video would take a minute
             status, lines = spoken(["make", scene, "--out", folder / "out", "--minutes", "0.1"])
         assert status == 0, lines
 
@@ -63,7 +63,7 @@ def test_the_same_command_does_only_what_is_left(made, capsys):
 def test_with_more_minutes_a_finished_model_is_trained_on(made, capsys, monkeypatch):
     scene, folder = made
     monkeypatch.setattr(render, "LEAST_HEIGHT", 32)
-    monkeypatch.setattr(make, "LEAST_MORE", -100)  # however busy the machine is
+    monkeypatch.setattr(make, "LEAST_MORE", -100)  # train however busy the machine is
     before, folder = folder, shutil.copytree(folder, folder.with_name("more"))
     passed = json.loads((folder / "make.json").read_text())["passed"]
     words = ["make", scene, "--out", str(folder), "--minutes", f"{passed + 0.25:.3f}"]
@@ -73,7 +73,7 @@ def test_with_more_minutes_a_finished_model_is_trained_on(made, capsys, monkeypa
     assert "<title>A &lt;ball&gt;</title>" in (folder / "index.html").read_text("utf-8")
     assert "A &lt;ball&gt;" in (folder / "model.html").read_text("utf-8")
     checkpoint = (folder / "run/checkpoint.npz").read_bytes()
-    for more in ([], ["--minutes", "0.1"]):  # what is there is of more
+    for more in ([], ["--minutes", "0.1"]):  # the result already had more minutes
         assert main([*words[:4], *more]) == 0
         assert (folder / "run/checkpoint.npz").read_bytes() == checkpoint
     assert "A &lt;ball&gt;" in (folder / "index.html").read_text("utf-8")
@@ -86,7 +86,7 @@ def load_header(run):
 
 @pytest.fixture
 def minutes(monkeypatch):
-    """A function that lets so many minutes pass."""
+    """A function that advances the clock by a number of minutes."""
     now = [0.0]
     monkeypatch.setattr(make.time, "monotonic", lambda: now[0])
 
@@ -174,7 +174,7 @@ def test_commands_of_a_run_take_the_one_that_was_made(made, tmp_path, capsys, mo
     monkeypatch.setattr(
         "pp_studio.view.run_view.RunView", lambda _, __, run, *___, **____: shown.append(run)
     )
-    with pytest.raises(AttributeError):  # of what is not there to serve
+    with pytest.raises(AttributeError):  # the mock has no attributes to serve
         main(["view", str(folder), "--port", "0"])
     assert shown[0].path == folder / "run"
 
@@ -210,7 +210,7 @@ def test_what_is_not_its_own_stays(made, tmp_path):
 
 
 class Enough(Exception):
-    """The steps are known."""
+    """Raised to end the command once the test knows its steps."""
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
-"""`pp-cl make` is stopped by signals at moments of all its stages: one line within seconds, the
-status of the signal, and the same command comes to the result of one that nothing stopped.
+"""Signals stop `pp-cl make` at moments of all its stages: it prints one line within seconds and
+exits with the signal's status, and the same command then gives the result of an undisturbed one.
 """
 
 import signal
@@ -24,7 +24,9 @@ MADE = {"export": ["splat.ply", "run/gaussians.npz"], "render": ["video.mp4", "v
 
 
 def begun(scene, out):
-    """The command that makes something of a scene in so many steps as no clock decides."""
+    """The words of a `make` command whose training has a fixed number of steps, which no clock
+    changes.
+    """
     begin_result(out)
     folder = RunFolder(out / "run")
     given = {**SETTINGS, "train.iterations": 300, "scene.downscale": 1}
@@ -34,7 +36,7 @@ def begun(scene, out):
 
 
 def begins(process, stage):
-    """Whether the process comes to a stage, or a later one; it is then at its beginning."""
+    """Wait until the process begins `stage` or a later one. Returns False if it ends first."""
     marks = tuple(f"== pp-cl {name} " for name in STAGES[STAGES.index(stage) :])
     return any(line.startswith(marks) for line in iter(process.stdout.readline, ""))
 
@@ -54,13 +56,13 @@ def test_any_moment_will_do(runs, tmp_path):
     for moment in range(MOMENTS):
         stage, part = STAGES[moment * len(STAGES) // MOMENTS], moment % (MOMENTS // len(STAGES))
         number = (signal.SIGINT, signal.SIGTERM)[moment % 2]
-        for name in MADE.get(stage, ()):  # by an attempt that came further
+        for name in MADE.get(stage, ()):  # an earlier attempt may have made it
             (tmp_path / "out" / name).unlink(missing_ok=True)
         with subprocess.Popen(words, stdout=PIPE, stderr=PIPE, text=True) as process:
             if not begins(process, stage):
                 continue
             time.sleep(0.3 * part)
-            if process.poll() is not None:  # what is kept of a render made this one short
+            if process.poll() is not None:  # a kept part of a render made it end early
                 continue
             process.send_signal(number)
             start = time.monotonic()

@@ -38,7 +38,7 @@ def test_a_video_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp
 
 @pytest.mark.parametrize("suffix", ["gif", "webp"])
 def test_a_video_whose_frames_would_fill_the_memory_is_not_begun(trained, tmp_path, suffix):
-    """Pillow keeps them all: 200 of 960x540 took 450 MB as WebP, with imageio 46 as MP4."""
+    """Pillow keeps all frames: 200 of 960x540 took 450 MB as WebP; by imageio, 46 MB as MP4."""
     out = tmp_path / f"video.{suffix}"
     words = ("render", trained, "--out", out, "--seconds", "60", "--size", "1920x1080")
     assert "--format mp4" in failure(*words)
@@ -65,7 +65,7 @@ def test_a_video_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeyp
     assert main(words) == 0
     assert "rendered 2 of 4 frames" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == [tmp_path / "video.gif"]
-    assert main([*words, "--background", "black"]) == 0  # a video is made anew
+    assert main([*words, "--background", "black"]) == 0  # other options: no frame is reused
     assert "rendered 4 of 4 frames" in capsys.readouterr().out
     done[0].parent.mkdir()
     (done[0].parent / ".mine.png").write_bytes(b"mine")
@@ -111,7 +111,7 @@ def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys)
 
 
 def test_what_frames_cost_decides_how_they_are_drawn(trained, tmp_path, monkeypatch, capsys):
-    """By a clock that only renderings of a finer image advance."""
+    """The clock advances only while images with more pixels are rendered."""
     clock, real, asked = [0.0], render_video.render_large, []
 
     def slow(run, camera, *, most, **options):
@@ -133,7 +133,7 @@ def test_what_frames_cost_decides_how_they_are_drawn(trained, tmp_path, monkeypa
     assert set(asked) == {4} and "frames are" not in capsys.readouterr().out
     coarser = frames("coarser", "0.5")
     assert asked[-4:] == [2] * 4 and "otherwise they would take 0.7 min" in capsys.readouterr().out
-    frames("none", "0.01")  # no Gaussians are there
+    frames("none", "0.01")  # no Gaussians have been fitted
     assert asked[-4:] == [2] * 4
     monkeypatch.setattr(render_video, "kept_gaussians", first_gaussians)
     gaussians = frames("gaussians", "0.01")
@@ -142,7 +142,7 @@ def test_what_frames_cost_decides_how_they_are_drawn(trained, tmp_path, monkeypa
     for one, other in zip(whole, gaussians, strict=True):
         assert 20 < psnr(one[..., :3], other[..., :3]) < 60
     (tmp_path / "gaussians/00002.png").unlink()
-    again = frames("gaussians", "1")  # goes on as it was begun
+    again = frames("gaussians", "1")  # continues in the way it began
     assert asked == [] and "as they were begun" in capsys.readouterr().out
     np.testing.assert_array_equal(again, gaussians)
 
@@ -168,7 +168,7 @@ def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
     channels = {name: channel.pixels for name, channel in file.channels().items()}
     assert len(channels) == 6 + 16 and channels["R"].shape == (24, 24)
     there = channels["A"] > 0.5
-    distance = 4.0  # of the cameras from the ball's centre
+    distance = 4.0  # from the cameras to the ball's centre
     assert there.any() and (np.abs(channels["Z"][there] - distance) < 1).all()
     assert np.isinf(channels["Z"][channels["A"] == 0]).all()
 

@@ -105,10 +105,10 @@ def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkey
     assert sweep.returncode == 0
     assert [line[:8] for line in told] == [f"[{i} of 4]" for i in (1, 2, 3, 4)]
     begun = [line for log in out.glob("*/*.log") for line in log.read_text().splitlines()]
-    assert len(begun) == 5  # one run twice
+    assert len(begun) == 5  # one run began twice
     rows = json.loads((out / "sweep.json").read_text())["runs"]
     plan, dev = jobs_of(scenes, tmp_path / "alone", [1, 2]), open_device()
-    monkeypatch.setattr(specular, "STEPS", 500)  # as in the workers, which no fixture reaches
+    monkeypatch.setattr(specular, "STEPS", 500)  # as in the workers, which fixtures do not reach
     for row, job in zip(rows, plan, strict=True):
         expected = undisturbed(dev, job)
         assert (row["scene"], row["seed"]) == (job.name, job.seed)
@@ -144,7 +144,7 @@ def test_a_signal_ends_a_sweep_and_its_workers_soon(scenes, tmp_path, number):
 
 @pytest.fixture
 def scheduler():
-    """Address of a scheduler with one worker, started as a user does."""
+    """Address of a scheduler with one worker, started like a user's."""
     tool = [sys.executable, "-m", "dask"]
     local = ["--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0"]
     with subprocess.Popen(

@@ -43,7 +43,7 @@ def status(address):
 @pytest.mark.unix
 @pytest.mark.parametrize("what, number", [("run", signal.SIGTERM), ("ball", signal.SIGINT)])
 def test_the_address_works_and_a_signal_ends_it_cleanly(begun, what, number):
-    """Of a run, and of a scene."""
+    """The subject is a run, or a scene."""
     process = started(begun.with_name(what), "--port", "0")
     try:
         address = process.stdout.readline().split()[1]

@@ -65,7 +65,7 @@ def test_they_read_back_as_a_scene(run, tmp_path):
             assert np.array_equal(view.image, to_8bit(rendered.rgba()))
             rgba = view.image / 255
             over_white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
-            covered = rendered.alpha > 0.2  # below, colours that alpha cannot carry are cut
+            covered = rendered.alpha > 0.2  # with less alpha, colours are clipped
             assert np.abs(over_white - rendered.colour)[covered].mean() < 0.01
 
 

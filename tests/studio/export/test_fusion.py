@@ -15,7 +15,7 @@ GRID = Grid((-1.0, -1.05, -1.1), 0.06, (34, 36, 38))
 
 
 def ball_view(camera):
-    """What a perfect run shows of a ball at the origin."""
+    """The view that a perfect run renders of a ball at the origin."""
     rays = camera.rays()
     a, b = (rays**2).sum(-1), rays @ camera.eye
     disc = b**2 - a * (camera.eye @ camera.eye - RADIUS**2)
@@ -36,7 +36,7 @@ def test_the_sign_is_that_of_the_ball(views):
     field = fuse(GRID, views).distances
     assert field.shape == GRID.dims[::-1] and np.abs(field).max() <= 1
     assert (field[radii() < RADIUS - GRID.voxel_size] < 0).all()
-    # above and below, where the ring of cameras sees, and the grid's corners beside them
+    # above and below the ball as well, which the ring sees, and at the grid's corners
     assert np.mean(field[radii() > RADIUS + GRID.voxel_size] > 0) > 0.97
 
 
@@ -59,7 +59,9 @@ def test_a_ray_that_slips_through_hollows_nothing(views):
 
 
 def test_views_that_agree_do_not_scatter(views):
-    """In truth, by what a pixel spans of a slanted surface; with views 3 voxels off, by half."""
+    """Scatter is only what a pixel spans of a slanted surface. If half of the views are off by 3
+    voxels, it is half of these.
+    """
     agreeing = fuse(GRID, views)
     surface = (np.abs(radii() - RADIUS) < GRID.voxel_size / 2) & (agreeing.near > 10)
     least = np.median(agreeing.scatter[surface])
@@ -74,7 +76,7 @@ def test_views_that_agree_do_not_scatter(views):
 
 
 def test_what_no_view_shows_is_closed_by_the_hull_of_the_points(views):
-    """A ball seen from above alone, of whose points none lies below a plane."""
+    """A ball seen only from above, whose points end at a plane below."""
     cameras = [
         Camera.look_at((x, y, 4), (0, 0, 0), (0, 1, 0), fx=130, width=100, height=100)
         for x, y in ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.5))

@@ -7,7 +7,7 @@ from pp_studio.export.harmonics import basis, fit_harmonics, observe
 
 
 def test_the_functions_of_the_basis_are_orthogonal():
-    """By a quadrature that is exact for their products; none is 0."""
+    """A quadrature that is exact for products of two functions gives 0, and no function is 0."""
     z, weights = np.polynomial.legendre.leggauss(4)
     turn = np.arange(8) * np.pi / 4
     across = np.sqrt(1 - z**2)[:, None] * np.array([np.cos(turn), np.sin(turn)])[:, None]
@@ -20,7 +20,7 @@ def test_the_functions_of_the_basis_are_orthogonal():
 
 
 def drawn(run, coefficients, seen):
-    """(HW, 3): coefficients (N, 9, 3), blended over white."""
+    """(HW, 3) image of coefficients (N, 9, 3), blended over white."""
     towards, matrix = run.model.positions() - seen.camera.eye, blend_matrix(seen)
     at = basis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
     return matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
@@ -43,7 +43,7 @@ def test_images_of_known_harmonics_are_reproduced(run, rng, monkeypatch):
         found = fit_harmonics(run, 3)
     for seen in observe(run, run.cameras("train")[::4], ""):
         error = np.abs(drawn(run, found, seen) - drawn(run, known, seen))
-        assert error.mean() < 0.0016 and error.max() < 0.035  # 0.0008 and 0.017 by the ridge
+        assert error.mean() < 0.0016 and error.max() < 0.035  # the ridge causes 0.0008 and 0.017
 
 
 def test_points_that_no_view_shows_keep_zero(run):

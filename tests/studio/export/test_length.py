@@ -13,7 +13,7 @@ from pp_cl.scene.lens import LensDistortion
 from pp_studio.export.formats import export_run
 from pp_studio.export.length import metres_per_unit, set_length, surface_point
 
-RADIUS = 0.8  # of the ball, scene units
+RADIUS = 0.8  # of the ball, in scene units
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def text_of(one, position):
 
 
 def rims(one, share):
-    """Two points of the ball, left and right of its middle in an image, and their distance."""
+    """Two points on the ball, left and right of its middle in an image, and their distance."""
     towards = one.camera.eye / np.linalg.norm(one.camera.eye)
     right = np.cross(one.camera.pose[:, 1], towards)
     right /= np.linalg.norm(right)

@@ -30,7 +30,7 @@ def test_it_is_the_ball(run, mesh):
 
 def test_vertices_have_the_colours_of_the_ball_there(mesh):
     expected = 255 * (0.5 + 0.4 * np.sin(4 * mesh.vertices + [0, 1, 2]))  # support/scenes.py
-    high = mesh.vertices[:, 2] > 0  # which the cameras see well
+    high = mesh.vertices[:, 2] > 0  # the cameras see these well
     assert np.median(np.abs(mesh.colours - expected)[high]) < 30
 
 
@@ -53,7 +53,7 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
                 "extensions": {"KHR_materials_unlit": {}},
             }
         ]
-    elif suffix == "stl":  # of corners without colours, a vertex for each
+    elif suffix == "stl":  # STL has no colours, and a vertex for each corner
         assert np.array_equal(np.float32(read.triangles), mesh.vertices[mesh.faces])
         return
     else:
@@ -75,12 +75,12 @@ def test_fairing_smooths_noise_and_keeps_what_is_held(rng):
     firm = ball.vertices[:, 2] > 1
     assert np.abs(found - noisy)[firm].max() < 0.02
     away = [np.abs(np.linalg.norm(v, axis=1) - 10)[~firm].mean() for v in (noisy, found)]
-    assert away[1] < 0.7 * away[0]  # it does not shrink
+    assert away[1] < 0.7 * away[0]  # smoothing does not shrink the ball
     assert roughness(found) < 0.75 * roughness(noisy)
 
 
 def test_what_no_view_shows_comes_last_and_is_said(run, mesh, tmp_path):
-    """The cameras look down at the ball."""
+    """The cameras look down at the ball, so its lower half comes last."""
     height = mesh.vertices[mesh.faces].mean(1)[:, 2]
     assert len(height) / 2 < mesh.seen < len(height)
     assert height[mesh.seen :].max() < 0 < height[: mesh.seen].max()
@@ -114,7 +114,7 @@ def test_crumbs_are_left_out_and_said(run, monkeypatch):
         return fused
 
     monkeypatch.setattr(module, "fuse", with_a_crumb)
-    monkeypatch.setattr(module, "LOOSE", 0.2)  # of a small ball
+    monkeypatch.setattr(module, "LOOSE", 0.2)  # the ball is small
     with pytest.warns(UserWarning, match="1 loose parts are left out"):
         found = surface(run)
     assert trimesh.Trimesh(found.vertices, found.faces).body_count == 1

@@ -7,7 +7,7 @@ from pp_studio.export.harmonics import observe
 
 @pytest.fixture(autouse=True)
 def observed_pixels(run, monkeypatch):
-    """What is compared with it is drawn as an observation is."""
+    """Renders with one sample a pixel, as observations do, so that both can be compared."""
     monkeypatch.setattr(run.renderer, "supersampling", 1)
 
 

@@ -37,7 +37,7 @@ from pp_studio.export.page import (
 def page(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "view.html"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(QUALITIES, QUICK, (300, 0.0))  # as many steps as make it look like the run
+        patch.setitem(QUALITIES, QUICK, (300, 0.0))  # enough steps to look like the run
         path.write_text(page_text(fitted_gaussians(run), run.cameras("train"), "ball"))
     return path
 
@@ -51,7 +51,7 @@ def header_of(page):
 
 
 def unpacked(header, rows):
-    """(records of GAUSSIAN, the origin of their positions) that a page holds."""
+    """(records of GAUSSIAN, the origin of their positions), read from a page's data."""
     table = np.zeros(len(rows), GAUSSIAN)
     table["position"] = header["unit"] * rows["place"].astype(float)
     table["opacity"] = rows["opacity"] / 255
@@ -65,7 +65,7 @@ def unpacked(header, rows):
 
 
 def predicted(page, camera):
-    """(H, W, 3) uint8: what the page is to draw, in float64."""
+    """(H, W, 3) uint8: the image that the page must draw, computed in float64."""
     header = header_of(page)
     rows = np.frombuffer(base64.b64decode(element(page, "gaussians")), PACKED)
     distance = np.linalg.norm(camera.eye - header["centre"])
@@ -105,7 +105,7 @@ def test_gaussians_are_kept_to_within_a_step(rng):
     assert after["opacity"] == pytest.approx(before["opacity"], abs=0.6 / 255)
     size = np.linalg.norm(before["covariance"], axis=(1, 2))
     wrong = np.linalg.norm(after["covariance"] - before["covariance"], axis=(1, 2)) / size
-    assert np.quantile(wrong, 0.98) < 0.05  # where the clipped ends of the sizes are not
+    assert np.quantile(wrong, 0.98) < 0.05  # the rest are sizes clipped at the ends
     wrong = np.abs(after["harmonics"] - before["harmonics"])
     assert np.quantile(wrong, 0.98) < 0.6 * max(about["span"]) / 255
 
@@ -123,7 +123,9 @@ def test_a_browser_draws_what_the_run_shows(run, page):
 
 
 def test_a_browser_draws_gaussians_by_their_rules_in_all_sizes(run, page):
-    """Those of the fit, and means of its pixels, or as they were fitted in finer ones."""
+    """Smaller windows than the fit's show means of its pixels; larger ones show its finest,
+    enlarged.
+    """
     [first, *_] = run.cameras("test")
     header = header_of(page)
     assert header["windows"] == [2, 8]
@@ -186,13 +188,13 @@ def test_a_browser_sorts_the_gaussians_from_far_to_near(page):
 
 
 def looking(eye, target, up, fov):
-    """The page's camera of 48 x 30 pixels that looks so, as the address says it."""
+    """The page's camera of 48 x 30 pixels for these parts of its address."""
     focal = 15 / np.tan(np.radians(fov) / 2)
     return Camera.look_at(eye, target, up, fx=focal, width=48, height=30)
 
 
 def check_address(page, fragment, camera):
-    """The page at an address shows what a camera sees; returns that, (H, W, 3) uint8."""
+    """Check that the page at an address shows a camera's view; returns it as (H, W, 3) uint8."""
     script = f"""ppcl.show(); const shown = ppcl.canvas.toDataURL();
         ppcl.setCamera({page_camera(camera)}); return [shown, ppcl.canvas.toDataURL()];"""
     urls = ask(page, script, fragment + "&w=48&h=30")
@@ -206,7 +208,7 @@ def test_the_address_says_the_camera(run, page):
     camera = looking((1, -3.5, 1.2), (0.1, 0, 0), (0, 0.1, 1), 40)
     fragment = "#eye=1,-3.5,1.2&target=0.1,0,0&up=0,0.1,1&fov=40"
     shown = check_address(page, fragment, camera)
-    assert psnr(shown, predicted(page, camera)) > 40  # nearer than a test view: more edges
+    assert psnr(shown, predicted(page, camera)) > 40  # closer than a test view, with more edges
     header = header_of(page)
     first = looking(header["eye"], header["centre"], header["up"], header["fov"])
     check_address(page, "#eye=1,2&target=x&up=,,&fov=-3", first)
@@ -247,14 +249,14 @@ def test_mouse_and_keys_move_the_camera(page):
     up = np.array(header["up"])
     turned = [np.cross(up, at - centre) for at in (eye, first)]
     cosine = turned[0] @ turned[1] / np.prod([np.linalg.norm(t) for t in turned])
-    assert np.arccos(cosine) == pytest.approx(60 / 200, abs=1e-4)  # radians, of 60 pixels
-    # the hand moved down, so the eye rises by 20 pixels' worth
+    assert np.arccos(cosine) == pytest.approx(60 / 200, abs=1e-4)  # 60 pixels, in radians
+    # the pointer moved 20 pixels down, so the eye rises by as much
     rise = [np.arcsin((at - centre) @ up / distances[1]) for at in (eye, first)]
     assert rise[0] - rise[1] == pytest.approx(20 / 200, abs=1e-4)
 
 
 def test_what_rests_after_a_movement_is_drawn_in_full(page):
-    """Though the frames of a movement may be coarser, and in an order that is a little old."""
+    """During a movement, frames may be coarser and sorted in a slightly older order."""
     with new_page(page.as_uri()) as tab:
         first = tab.screenshot()
         tab.drag((300, 300), [(12, 3)] * 10)
@@ -268,7 +270,7 @@ def test_what_rests_after_a_movement_is_drawn_in_full(page):
 
 
 def seen_from(azimuth, elevation):
-    """A camera that looks at the origin from there, in degrees, x ahead and z up."""
+    """A camera at these angles, in degrees, that looks at the origin; x is ahead and z is up."""
     a, e = np.radians([azimuth, elevation])
     eye = 4 * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
     return Camera.look_at(eye, (0, 0, 0), fx=50, width=32, height=32)
@@ -305,7 +307,7 @@ def test_beyond_the_photographs_it_fades(run, page):
     assert opacities[:2] == (1, 1) and opacities[3] == 0.1
     assert opacities[2] == pytest.approx(0.55, abs=0.05)
     assert words == (0, 0, pytest.approx(0, abs=0.1), 1)
-    assert ask(page, script) == [0.1, 1]  # turned there by keys
+    assert ask(page, script) == [0.1, 1]  # keys turned the view there
 
 
 def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):

@@ -20,7 +20,7 @@ from pp_studio.export.result import begin_result, write_model, write_result
 
 
 def shown(folder):
-    """(text of the page, the files that it names)."""
+    """(The page's text, the files that it names)."""
     text = (folder / "index.html").read_text("utf-8")
     assert "<!--" not in text
     return text, set(re.findall(r'(?:src|href|content)="([\w.]+\.\w+)"', text))
@@ -38,7 +38,7 @@ def test_before_the_training_it_shows_cameras_and_masks(tmp_path):
     assert named == {"cameras.png"} and "poses: 7 of 9 images" in text and "3 minutes" in text
     drawn = read_rgba(folder / "cameras.png")
     assert drawn.shape == (500, 1000, 4) and drawn[..., :3].min() < 100
-    assert text.count("still to come") == 3  # the model, the video, the evaluation
+    assert text.count("still to come") == 3  # model, video and evaluation
     for name in ("box.png", "masks.png"):
         shutil.copy(folder / "cameras.png", scene / "capture" / name)
     write_result(folder, "Ball", "video.mp4", scene=str(scene))
@@ -47,24 +47,24 @@ def test_before_the_training_it_shows_cameras_and_masks(tmp_path):
 
 @pytest.fixture(scope="module")
 def begun(runs, tmp_path_factory):
-    """(folder of a result before its training, with the hull's model, {facts of write_result})."""
+    """(Folder of a result before its training, with the hull's model; {facts for write_result})."""
     scene, folder = runs.ball(views=12, size=60), tmp_path_factory.mktemp("result") / "made"
     begin_result(folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hull, "POINTS", 10_000)  # as few as a processor draws at once
+        patch.setattr(hull, "POINTS", 10_000)  # few enough for a processor to draw at once
         write_model(folder, *hull_gaussians(scene), "Ball")
     return folder, {"scene": scene, "state": "3 minutes left"}
 
 
 def open_page(folder, facts):
-    """A new_page() of the result, renewed so that it has a title that nobody has seen yet."""
+    """A new_page() of the result, rewritten first so that its title is a new one."""
     write_result(folder, "Ball", "video.mp4", **facts)
     return new_page((folder / "index.html").as_uri())
 
 
 def test_an_open_page_renews_itself_and_keeps_the_look(begun):
     folder, facts = begun
-    text = "document.documentElement?.textContent ?? ''"  # also while it is loaded again
+    text = "document.documentElement?.textContent ?? ''"  # works while the page reloads, too
     with open_page(folder, facts) as page:
         model = "document.querySelector('iframe').src"
         assert page.evaluate(model).endswith("/model.html")
@@ -116,9 +116,9 @@ def test_a_hull_has_the_colours_of_its_photographs(runs):
     assert [(one.width, one.height) for one in cameras] == [(60, 60)] * 12
     positions = gaussians.table["position"] + gaussians.origin
     radii = np.linalg.norm(positions, axis=1)
-    assert 0.75 < np.median(radii) < 0.95  # of the ball it is 0.8
+    assert 0.75 < np.median(radii) < 0.95  # the ball's radius is 0.8
     surface = 0.8 * positions / radii[:, None]
-    is_seen = np.abs(surface[:, 2]) < 0.5  # the cameras are above, all around
+    is_seen = np.abs(surface[:, 2]) < 0.5  # the cameras are above it, all around
     wrong = 0.5 + CONSTANT * gaussians.table["harmonics"][:, 0] - ball_colour(surface)
     assert np.abs(wrong[is_seen]).mean() < 0.06
     normals = Rotation.from_quat(np.roll(gaussians.table["turn"], -1, axis=1)).apply([0, 0, 1])
@@ -144,7 +144,7 @@ def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
     assert named == {"model.html", "thumbnail.png"} and "<title>Ball</title>" in text
     assert text.count("still to come") == 2
     (folder / "video.mp4").write_bytes(b"film")
-    os.utime(folder / "video.mp4", ns=(10**18 - 1,) * 2)  # of the checkpoint before
+    os.utime(folder / "video.mp4", ns=(10**18 - 1,) * 2)  # older than the checkpoint
     write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     assert shown(folder)[1] == {"model.html", "thumbnail.png"} and pages == ["first"]
     for name in ("video.mp4", "splat.ply"):
@@ -159,6 +159,6 @@ def test_what_comes_later_takes_its_place(trained, tmp_path, monkeypatch):
     text, named = shown(folder)
     assert named == {"model.html", "video.mp4", "splat.ply", "views.png", "thumbnail.png"}
     assert "30.5 (mean of 2 views)" in text and "LPIPS" in text and "still to come" not in text
-    assert pages == ["first", "fitted"]  # the model's page is that of the splat now
+    assert pages == ["first", "fitted"]  # the model's page shows the splat now
     write_result(folder, "Ball", "video.mp4", run=trained, split="test")
     assert len(pages) == 2

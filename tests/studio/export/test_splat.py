@@ -39,7 +39,7 @@ from pp_studio.export.splat import (
 )
 from tools.splat_quality import beside_hull
 
-# of the training code of 3D Gaussian splatting, for its degree 3
+# the layout of 3D Gaussian splatting's training code at degree 3
 LAYOUT = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
 LAYOUT += [*(f"f_rest_{i}" for i in range(45)), "opacity", *(f"scale_{i}" for i in range(3))]
 LAYOUT += [f"rot_{i}" for i in range(4)]
@@ -95,12 +95,12 @@ def test_what_is_no_colour(run, ply):
     size = np.linalg.eigvalsh(found["covariance"]) ** 0.5
     size /= DEVIATION * run.config.raster.radius * grid.voxel_size
     assert size.min() > 0.02 and size.max() < 2 * np.exp(MOST_OF_GAUSSIANS)
-    assert np.median(size[:, 2] / size[:, 0]) > 1.1  # none of them stayed a ball
+    assert np.median(size[:, 2] / size[:, 0]) > 1.1  # most are no longer balls
     assert all((vertex[f"n{axis}"] == 0).all() for axis in "xyz")
 
 
 def likeness(run, path, scale):
-    """PSNR of test views that are drawn in windows of `scale` times their size."""
+    """Mean PSNR of test views that are drawn `scale` times as large and averaged."""
     found, measured = read_splats(path), []
     for camera in run.cameras("test"):
         large = turned(run, camera.resized(scale * camera.width, scale * camera.height))
@@ -120,7 +120,7 @@ def test_the_engine_draws_them_as_viewers_do(run, ply):
         viewers = draw_splats(found, turned(run, camera))
         assert psnr(to_8bit(view.colour), to_8bit(viewers)) > 50
         np.testing.assert_array_equal(view.alpha == 0, np.isinf(view.depth))
-    small = run.cameras("test")[0]  # in which viewers would draw them too wide
+    small = run.cameras("test")[0]  # viewers would draw them too wide here
     as_is = drawn.render(small).colour
     mended = drawn.render(window_camera(small, 1.0, kept)).colour
     wanted = to_8bit(run.render(small).colour)
@@ -142,7 +142,7 @@ def test_points_of_a_cell_begin_as_one_that_looks_like_them(run):
         away = cKDTree(places).query(positions, p=np.inf)[0] / run.model.grid.voxel_size
         assert away.max() < 1e-4 if cell == 0 else cloud.count < 0.7 * len(places)
         assert away.max() <= cell
-    # what a cell holds of one colour stays of that colour
+    # merging points of one colour in a cell keeps that colour
     sh = cloud.sh[0].get()[:, 0, :3] * CONSTANT
     assert coefficients[:, 0].min() - 1e-5 < sh.min() and sh.max() < coefficients[:, 0].max() + 1e-5
 
@@ -199,7 +199,7 @@ def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatc
         assert one.name == other.name and (one.image == other.image).all()
     rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
     assert [view.image.shape for view in found[len(images) :]] == rendered
-    with monkeypatch.context() as patch:  # as if they were large, and enough
+    with monkeypatch.context() as patch:  # pretend that the images are large, and enough
         patch.setattr("pp_cl.engine.views.MIN_SIDE", 8)
         patch.setattr(gaussians, "MIN_SIDE", 8)
         patch.setattr(gaussians, "LARGEST", 15)
@@ -218,8 +218,8 @@ def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatc
 
 
 def test_the_spz_says_the_same_with_y_up(y_up, ply, tmp_path):
-    """To its bits: half a deviation of a place, 1/255 of an opacity, exp(1/32) of a deviation,
-    5/128 of a harmonic.
+    """Errors are within the format's steps: half a deviation of a place, 1/255 of an opacity,
+    exp(1/32) of a deviation, 5/128 of a harmonic.
     """
     table, _ = y_up
     write_splat_spz(tmp_path / "a.spz", table)
@@ -229,17 +229,17 @@ def test_the_spz_says_the_same_with_y_up(y_up, ply, tmp_path):
     assert 1 / (1 + np.exp(-found.opacities)) == pytest.approx(table["opacity"], abs=3e-3)
     assert found.scales == pytest.approx(np.log(table["deviations"]), abs=0.04)
     same = np.abs((found.quats * table["turn"]).sum(1)) / np.linalg.norm(found.quats, axis=1)
-    assert same.min() > 0.999  # the cosine of half an angle
+    assert same.min() > 0.999  # cosine of half an angle
     assert found.sh0 == pytest.approx(table["harmonics"][:, 0], abs=0.02)
-    rest = table["harmonics"][:, 1:].clip(-127 / 128, 127 / 128)  # what 8 bits hold
+    rest = table["harmonics"][:, 1:].clip(-127 / 128, 127 / 128)  # the range of 8 bits
     assert np.abs(found.shN - rest).max() < 0.0392
     assert (tmp_path / "a.spz").stat().st_size < ply.stat().st_size / 9
 
 
 @pytest.mark.parametrize(("unit", "sign"), [(100, 0), (1e7, -1), (1e-6, 1), (0.1, 0)])
 def test_the_spz_holds_objects_of_any_size(y_up, unit, sign, tmp_path):
-    """In millimetres too, where its places have fewest bits; what is far too large or too small for
-    it is scaled.
+    """In millimetres, too, for which the format's places have the fewest bits. Sizes far beyond its
+    range are scaled.
     """
     table = y_up[0].copy()
     table["position"] *= unit
@@ -265,7 +265,7 @@ def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
         "colorSpace": "srgb_rec709_display",
     }
     prefix, found = "KHR_gaussian_splatting:", read_splats(ply)
-    flip = np.array([1, -1, -1])  # half a turn around x
+    flip = np.array([1, -1, -1])  # a half turn around x
     assert arrays["POSITION"] * flip == pytest.approx(found["positions"], abs=1e-5)
     assert gltf["accessors"][0]["max"] == pytest.approx(arrays["POSITION"].max(0))
     assert arrays[prefix + "OPACITY"][:, 0] == pytest.approx(found["opacity"], abs=1e-5)
@@ -283,7 +283,7 @@ def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
 
 
 def test_a_needle_beside_the_hull_is_measured(run):
-    """By tools/splat_quality.py, whose images from below and above show all of it."""
+    """tools/splat_quality.py measures it: its images from below and above show the whole needle."""
     cloud = begun(run, fit_harmonics(run, steps=0), 0)
     settings = gaussians.config_of(run, 1).raster
 
@@ -298,7 +298,7 @@ def test_a_needle_beside_the_hull_is_measured(run):
     offset, opacity = cloud.offset.get(), cloud.opacity.get()
     highest = run.model.positions()[:, 2].argmax()
     unit = DEVIATION * run.config.raster.radius * run.model.grid.voxel_size
-    offset[highest, 3:9] = [0, 0, np.log(0.5 / unit), 0, 0, 0]  # upwards, half a unit wide
+    offset[highest, 3:9] = [0, 0, np.log(0.5 / unit), 0, 0, 0]  # a needle upwards, half a unit long
     opacity[highest] = 0
     opacity[highest, 0] = 0.9
     cloud.offset.set(offset)

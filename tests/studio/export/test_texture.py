@@ -12,7 +12,7 @@ from pp_studio.export.texture import agreed, companions, texels, write_textured
 
 
 def test_texels_are_each_in_one_face(rng):
-    """Of two triangles that are a square, up to those on their common edge."""
+    """Two triangles form a square; only texels on their common edge are in both."""
     uv = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9], [0.5, 0.5]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 4, 4]])
     row, column, face, shares = texels(uv, faces, 40)
@@ -47,7 +47,7 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     assert said == f"{len(solid.vertices)} vertices, {told}, unlit"
     assert 300 < len(solid.faces) <= 600 and solid.visual.uv.shape == (len(solid.vertices), 2)
     gltf, stored = glb(tmp_path / "a.glb")
-    # the light of the photographs is in the texture: lamps would be a second one
+    # unlit, as the texture already contains the light of the photographs
     assert gltf["materials"][0]["extensions"] == {"KHR_materials_unlit": {}}
     assert gltf["extensionsUsed"] == ["KHR_materials_unlit"]
     outwards = stored["POSITION"] - stored["POSITION"].mean(0)
@@ -56,7 +56,7 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     up = up_of(run.cameras("train"))
     turn = Rotation.align_vectors([(0, 1, 0)], [up])[0].as_matrix()
     assert np.abs(turn @ up - (0, 1, 0)).max() < 1e-6
-    # the cameras look down at the ball
+    # the cameras look down at the ball, so faces below are guessed
     assert seen > len(solid.faces) / 2 and solid.triangles_center[seen:, 1].max() < 0
     solid.vertices = solid.vertices @ turn
     for camera in run.cameras("test"):
@@ -86,7 +86,7 @@ def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
     assert np.array_equal(*(np.asarray(image.convert("RGB")) for image in images))
     first = path.read_text().splitlines()[0]
     assert first.startswith("# seen_faces ") and "shown by no photograph" in first
-    path.unlink()  # what lies beside it may be another's
+    path.unlink()  # its companions may be a user's now
     with pytest.raises(UserError, match=r"a\.(mtl|png): pp-cl did not write this"):
         check_target("textured", run.folder.path, path)
     for one in companions(path):
@@ -95,7 +95,7 @@ def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
 
 
 def test_highlights_are_left_out(rng):
-    """Of ten views, four of which show a highlight in place of the colour."""
+    """Four of ten views show a highlight instead of the colour."""
     colours = np.array([0.4, 0.3, 0.2]) + 0.02 * rng.normal(size=(50, 10, 3))
     colours[:, ::3] = 0.95
     weights = rng.uniform(0.8, 1, (50, 10))

@@ -74,13 +74,13 @@ def test_a_stopped_run_goes_on_and_is_measured(job):
     assert row["error"] == "stopped" and (row["scene"], row["seed"]) == ("ball", 4)
     header, _ = load_checkpoint(RunFolder(job.folder).checkpoint)
     assert header["step"] == 6 and not header["finished"]
-    assert cluster.run_job(job, None, lambda: True) == row  # not one step more
+    assert cluster.run_job(job, None, lambda: True) == row  # it makes no further step
     assert load_checkpoint(RunFolder(job.folder).checkpoint)[0] == header
     row = cluster.run_job(job, None, lambda: False)
     assert row == finished_row(job) and row["psnr"] > 5
     assert len(re.findall(rf"process {os.getpid()}\n", job.log.read_text())) == 3
     checkpoint = RunFolder(job.folder).checkpoint.stat()
-    assert cluster.run_job(job, None, lambda: False) == row  # is not trained again
+    assert cluster.run_job(job, None, lambda: False) == row  # it is not trained again
     assert RunFolder(job.folder).checkpoint.stat() == checkpoint
 
 

@@ -6,7 +6,7 @@ from pp_studio.sweep.table import markdown, write_tables
 
 
 def row(scene, seed, psnr=None, ssim=0.5, points=100, seconds=1.0, *, setting=None, error=None):
-    """The row of a run; a failed one without psnr."""
+    """The row of a run, or of a failed run if psnr is None."""
     head = {"scene": scene, "settings": setting or {}, "seed": seed, "folder": f"{scene}/{seed}"}
     if psnr is None:
         return head | {"error": error or "broken"}
@@ -47,11 +47,11 @@ def test_the_files(tmp_path):
     a, b = stored["scenes"]
     spread = {"psnr": 3.0, "ssim": 0.25, "points": 3, "seconds": 1.0}
     means = {"psnr": 21.5, "ssim": 0.625, "points": 101.5, "seconds": 1.5}
-    # of two values the standard deviation is the distance over the root of 2
+    # the standard deviation of two values is their distance divided by the root of 2
     means["spread"] = pytest.approx({name: value / 2**0.5 for name, value in spread.items()})
     assert a == {"scene": "a", "settings": {}, "runs": 2, "failed": 0} | means
     assert (b["runs"], b["failed"], b["psnr"], b["spread"]) == (1, 1, 31.0, {})
-    # scenes count the same, whatever their runs
+    # scenes have equal weight, whatever their number of runs
     means = {"psnr": 26.25, "ssim": 0.4375, "points": 56.25, "seconds": 5.75}
     assert stored["mean"] == [{"settings": {}, "scenes": 2, "missing": 0} | means]
     assert (tmp_path / "sweep.md").read_text() == markdown(ROWS)

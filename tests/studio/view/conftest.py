@@ -5,7 +5,7 @@ from pp_studio.view.server import started
 
 @pytest.fixture(scope="session")
 def trained(runs, scene, tmp_path_factory):
-    """Folder of a finished run of the ball, 24 x 24 pixels; not to be changed."""
+    """Folder of a finished run of the ball at 24 x 24 pixels. Tests must not change it."""
     return runs.trained(tmp_path_factory.mktemp("viewed") / "run", scene, train__iterations=40)
 
 

@@ -7,7 +7,7 @@ from support.viewing import drawing, wait
 from pp_cl.files.run_folder import RunFolder
 from pp_studio.view.run_view import RunView
 
-MIDDLE, ASIDE = (330, 310), (600, 560)  # of the rendering, in a window of 1000 x 700
+MIDDLE, ASIDE = (330, 310), (600, 560)  # places in the rendering; the window has 1000 x 700
 
 
 def shown(page, accept):

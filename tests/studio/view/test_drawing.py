@@ -46,7 +46,7 @@ def test_the_error_is_that_of_the_nearest_view_from_its_own_camera(run, views):
     assert line == f"{view.name}, error x4" and name == view.name
     rendering = to_8bit(run.render(view.camera).colour).astype(int)
     expected = np.minimum(4 * np.abs(rendering - photo), 255)
-    assert np.abs(error - expected).max() <= 5  # both are rounded, four times
+    assert np.abs(error - expected).max() <= 5  # both are rounded, then scaled by four
     assert photo.min() < 250 and error.max() > 5
     with pytest.raises(UserError, match="photographs"):
         draw(run, [], near, "error")
@@ -62,8 +62,8 @@ def test_a_share_of_the_points_is_of_each_member_and_keeps_the_specular_layer(ru
 
 
 def test_fragments_are_those_of_the_pairs(run, monkeypatch):
-    monkeypatch.setattr(run.renderer, "supersampling", 1)  # as of a view until its weights
-    camera = replace(CAMERA, width=45, height=43)  # is padded
+    monkeypatch.setattr(run.renderer, "supersampling", 1)  # views until "weights" have one sample
+    camera = replace(CAMERA, width=45, height=43)  # the renderer must pad it
     image, line = draw(run, [], camera, "fragments")
     view = run.renderer.forward(camera, run.gamma, until="weights")
     fragments = view.cropped(np.diff(view.pairs.pixel_offset.get().astype(int)).reshape(view.size))
@@ -74,7 +74,7 @@ def test_fragments_are_those_of_the_pairs(run, monkeypatch):
 def test_the_nearest_view_counts_place_and_direction():
     cameras, centre = ring_cameras(6, 48), np.zeros(3)
     assert [nearest_view(cameras, camera, centre) for camera in cameras] == list(range(6))
-    away = replace(cameras[2], pose=cameras[2].pose * [-1, 1, -1, 1])  # looks outwards
+    away = replace(cameras[2], pose=cameras[2].pose * [-1, 1, -1, 1])  # it looks outwards
     assert nearest_view([away, cameras[2]], cameras[2], centre) == 1
 
 

@@ -22,7 +22,7 @@ from pp_studio.view.drawing import draw
 from pp_studio.view.model_page import STILL, ModelPage
 from pp_studio.view.run_view import RunView, shown_training
 
-CAMERA = ring_cameras(3, 96)[2]  # of tabs, finer than the training, as JPEG loses less then
+CAMERA = ring_cameras(3, 96)[2]  # for tabs: finer than the training's images, so JPEG loses less
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def view(served, dev, copied):
 
 @contextlib.contextmanager
 def looking(view, address, camera=CAMERA):
-    """A Tab at a camera, of whose renderings none is drawn yet."""
+    """A Tab at a camera, before any rendering of it is drawn."""
     with tab(address) as opened:
         opened.look(camera, view.page._space)
         wait(lambda: any(np.allclose(t.camera.eye, camera.eye) for t in view.page._tabs.values()))
@@ -48,7 +48,7 @@ def drawn(view):
 
 
 def like(view, camera, **look):
-    """Whether a rendering is what draw() gives, but for what JPEG takes."""
+    """A check that an image equals draw()'s, apart from JPEG's losses."""
     expected, _ = draw(view.page.run, view.page._views, camera, **look)
     return lambda image: image.shape == expected.shape and np.abs(image - expected).mean() < 4
 
@@ -72,12 +72,12 @@ def test_switches_change_what_is_drawn(view, served):
         ("Reset", True, {"show": "depth"}),
         ("Show", "colour", {}),
         ("Points shown, %", 20, {"share": 0.2}),
-        ("Points shown, %", -7, {"share": 0.01}),  # what no slider says
+        ("Points shown, %", -7, {"share": 0.01}),  # a value beyond the slider
     )
     checks = [like(view, CAMERA, **look) for _, _, look in changes]
     with looking(view, served[1]) as opened, drawing(view.page):
         for (label, value, _), check in zip(changes, checks, strict=True):
-            if label == "Show depth":  # a key
+            if label == "Show depth":  # a command with a key
                 opened.send("CommandTriggerMessage", uuid=opened.handles[label]["uuid"])
             else:
                 opened.set(label, value)
@@ -151,7 +151,7 @@ def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monke
         with monkeypatch.context() as patch:
             patch.setattr("pp_studio.view.model_page.draw", move)
             assert view.page.draw_next()
-        assert view.page.draw_next()  # the next one
+        assert view.page.draw_next()  # this one is completed
         opened.image(like(view, CAMERA))
 
 
@@ -162,7 +162,7 @@ def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copi
     monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)
     with looking(view, served[1]):
         [seen] = view.page._tabs.values()
-        assert seen.splat.visible  # until there is a rendering
+        assert seen.splat.visible  # until a rendering is drawn
         assert seen.splat.buffer.shape[0] == len(table)
         assert view.page.draw_next() and not seen.splat.visible
         view.page._took = 1e9
@@ -220,7 +220,9 @@ def test_a_run_whose_images_are_gone_is_still_shown(served, dev, copied):
 
 @pytest.fixture
 def training(dev, scene, tmp_path, runs):
-    """A training of 15 steps in the folder run; what it leaves alone is in the folder alone."""
+    """A training of 15 steps in the folder run; the folder alone has the result of one without a
+    page.
+    """
     alone = runs.trained(tmp_path / "alone", scene, train__iterations=15)
     config = load_config(alone / "config.json")
     return open_training(dev, RunFolder(tmp_path / "run"), config, None)

@@ -56,7 +56,7 @@ def test_cameras_points_and_a_suggested_box_are_shown(page, opened, folder):
 
 
 def test_a_view_of_two_splits_is_listed_once(served, folder):
-    """The page's list throws in the browser where two items are equal."""
+    """The page's list raises an error in the browser if two items are equal."""
     shutil.copy(folder / "transforms_test.json", folder / "transforms_val.json")
     names = ScenePage(served[0], folder)._view.options
     assert len(names) == len(set(names)) == 10
@@ -91,7 +91,7 @@ def test_views_are_dropped_and_taken_back(page, opened, folder):
     assert edits(folder) == {"dropped": ["train/r_4.png"]} and page._drop.label == "Take back"
     assert tuple(page._frustums["train/r_4.png"].color) == DROPPED
     assert "train/r_4.png" not in [view.name for view in scene_frames(folder)]
-    # what an editor has written meanwhile stays
+    # what an editor wrote in the meantime stays
     (folder / "pp_cl.json").write_text('{"dropped": ["train/r_1.png", "train/r_4.png"]}')
     opened.set("Drop", True)
     wait(lambda: edits(folder) == {"dropped": ["train/r_1.png"]})

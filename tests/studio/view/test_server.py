@@ -35,7 +35,7 @@ def test_a_training_takes_the_next_free_port(monkeypatch):
 
 
 def test_a_tab_cannot_have_it_published(served, monkeypatch):
-    """viser would ask a server on the internet to forward strangers."""
+    """viser would ask a server on the internet to let strangers in."""
     asked = []
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *place: asked.append(place))
     server, address = served
@@ -43,7 +43,7 @@ def test_a_tab_cannot_have_it_published(served, monkeypatch):
         opened.send("ShareUrlRequest")
         server.gui.add_button("pressed").on_click(lambda _: server.gui.add_markdown("a line"))
         opened.receive("GuiButtonMessage")
-        opened.set("pressed", True)  # comes after
+        opened.set("pressed", True)  # its answer comes after that of the request
         opened.receive("GuiMarkdownMessage")
     assert not asked
 
@@ -54,7 +54,7 @@ def test_broken_requests_leave_no_traceback(served, capfd, caplog):
         with socket.create_connection(("127.0.0.1", served[0].get_port()), SECONDS) as stream:
             stream.sendall(junk)
     with tab(served[1]) as opened:
-        opened._socket.send(json.dumps({"type": "x"}))  # text
+        opened._socket.send(json.dumps({"type": "x"}))  # a text, not binary
         with pytest.raises(websockets.exceptions.ConnectionClosed):
             opened.receive("never")
     with warnings.catch_warnings(record=True) as caught, tab(served[1]):

@@ -35,7 +35,7 @@ def test_a_camera_comes_back_as_it_went(frustum):
     np.testing.assert_allclose(camera.eye, CAMERA.eye, rtol=1e-12)
     np.testing.assert_allclose(camera.fx, CAMERA.fx)
     assert (camera.width, camera.height, frustum.aspect) == (48, 40, 1.2)
-    assert np.abs(SPACE.page(CAMERA.eye)).max() > 1000  # radii
+    assert np.abs(SPACE.page(CAMERA.eye)).max() > 1000  # in units of radii
 
 
 @pytest.mark.parametrize(
