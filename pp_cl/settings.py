@@ -219,9 +219,9 @@ class TrainConfig:
     )
     specular: str = setting(
         "auto",
-        "specular layer, fitted after the last step: colours of a pixel by its features and its"
-        " direction; auto: as far as it explains views that it was not fitted to; needs"
-        " raster.blend=alpha",
+        "specular layer, fitted after the last step: colours of a pixel by its features, its"
+        " direction and its place; auto: as far as it explains views that it was not fitted to;"
+        " needs raster.blend=alpha",
         choices=("auto", "off"),
     )
     members: int = setting(
