@@ -112,12 +112,12 @@ TRAININGS = [
 CURVES = [
     Training(name, scene, preset, None, downscale, test, minutes=minutes)
     for name, scene, preset, downscale, test, budgets in (
-        ("lego", LEGO, "tiny", 4, ALL_VIEWS, (0.5, 1, 2, 4, 8)),
-        ("lego", LEGO, "small", 2, ALL_VIEWS, (2, 4, 8, 16)),
-        ("lego", LEGO, "full", 1, ALL_VIEWS, (5, 10, 20, 40)),
-        ("ethiopian_head", HEAD, "tiny", None, None, (1, 2, 4, 8)),
-        ("mary_rose", "real/mary_rose", "tiny", None, None, (1, 2, 4, 8)),
-        ("DTU scan37", "real/dtu_scan37", "tiny", None, None, (1, 2, 4, 8)),
+        ("lego", LEGO, "tiny", 4, ALL_VIEWS, (0.5, 1, 2, 4)),
+        ("lego", LEGO, "small", 2, ALL_VIEWS, (1.5, 3, 6, 12)),
+        ("lego", LEGO, "full", 1, ALL_VIEWS, (4, 8, 16, 32)),
+        ("ethiopian_head", HEAD, "tiny", None, None, (0.5, 1, 2, 4)),
+        ("mary_rose", "real/mary_rose", "tiny", None, None, (0.5, 1, 2, 4)),
+        ("DTU scan37", "real/dtu_scan37", "tiny", None, None, (0.5, 1, 2, 4)),
     )
     for minutes in budgets
 ]
