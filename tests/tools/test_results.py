@@ -145,7 +145,7 @@ def test_what_fits_into_the_minutes_is_measured(tmp_path, monkeypatch):
     left_out = TOOL.measure_within(tmp_path, 9)
     assert now[0] / 60 == 8
     assert left_out == [
-        "lego_15000 (too little time)",
+        "lego_22000 (too little time)",
         "pytorch (install PyTorch)",
         "stages_full (too little time)",
     ]
