@@ -32,6 +32,7 @@ Its parts are capture, train, eval, export and render. The same command goes on 
 MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
 # least minutes of each preset: on two cores with AVX-512 `small` takes 7 for its steps, `full` 25
 PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
+LARGER = [*PRESET_FROM][::-1]
 # Evaluation, splat and video, after the training, take this share of the minutes that the capture
 # leaves, within these bounds in minutes.
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
@@ -54,11 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=shared.number(0.1, MOST_MINUTES),
         metavar="N",
         help=f"minutes for all of it ({MINUTES:g}; a third of them is the training's, also where"
-        " cameras and masks take longer); with more of them a finished model is trained on",
+        " cameras and masks take longer); with more of them a finished model is trained on, or, if"
+        " they allow for larger images, anew",
     )
     add(
         "--preset",
-        choices=list(PRESET_FROM)[::-1],
+        choices=LARGER,
         help="of the training (by its minutes: tiny below 8, small below 30, then full)",
     )
     add("--title", metavar="TEXT", help="of the page (the name of FOLDER)")
@@ -121,8 +123,9 @@ def run(options: argparse.Namespace) -> None:
 
             training.on_preview = renew
 
-        def train(*words):
-            step("train", scene, "--out", str(folder), *words, *masks, *device, follow=follow)
+        def train(*words, follow=follow):
+            more = {"follow": follow} if follow else {}
+            step("train", scene, "--out", str(folder), *words, *masks, *device, **more)
 
         if clock.is_renamed:
             (out / MODEL).unlink(missing_ok=True)
@@ -148,8 +151,17 @@ def run(options: argparse.Namespace) -> None:
             train(*preset, "--minutes", f"{minutes:.3g}")
         else:  # keep the run's preset; train refuses another
             train(*preset, *clock.iterations())
-        if clock.goes_on(folder):
-            train(*clock.iterations())
+        if minutes := clock.more(folder):
+            before = read_json(folder.config)["preset"]
+            trained = max(0.0, folder.rows()[-1]["seconds"] / 60 + minutes)
+            wanted = options.preset or _preset(trained, share)
+            if LARGER.index(wanted) > LARGER.index(before):
+                # in more steps on images as small, it would only learn its photographs by heart
+                kept = folder.path.rename(out / f"run-{before}")
+                print(f"the preset is {wanted} now; {kept} is the model so far", flush=True)
+                train("--preset", wanted, "--minutes", f"{minutes:.3g}", follow=None)
+            else:
+                train(*clock.extended(folder, minutes))
         split = "test" if "test" in scene_splits(scene) else "train"
         show("Trained; the figures follow.", split)
         print(f"wrote {page}: with the model; figures, splat and video follow", flush=True)
@@ -254,23 +266,27 @@ class _Clock:
         )
         return left - after
 
-    def goes_on(self, folder: "RunFolder") -> bool:
-        """Whether a finished training goes on: more minutes are asked for than it was planned for,
-        and some are left. iterations() then gives as many as fit in them.
+    def more(self, folder: "RunFolder") -> float:
+        """The minutes in which a finished training goes on; 0 unless more minutes are asked for
+        than it was planned for, and some are left.
         """
-        left, rows = self.minutes - self.passed, folder.rows()
-        if self._planned >= self.minutes or left < LEAST_MORE or len(rows) < 2:
-            return False
+        left = self.minutes - self.passed
+        if self._planned >= self.minutes or left < LEAST_MORE or len(folder.rows()) < 2:
+            return 0.0
         self._planned, self._until = self.minutes, self.minutes
+        return self._divided(left)
+
+    def extended(self, folder: "RunFolder", minutes: float) -> list[str]:
+        """The arguments of a finished training that goes on for these minutes."""
+        rows = folder.rows()
         end = rows.pop()  # the training's last step is in the row before
         late = next(row for row in rows if row["step"] >= LATE * end["step"])
         took, last = rows[-1]["seconds"] - late["seconds"], rows[-1]
         seconds = took / max(last["step"] - late["step"], 1) or last["seconds"] / last["step"]
         ending = end["seconds"] - last["seconds"]
-        more = (60 * self._divided(left) - ending) / seconds
-        self._iterations = end["step"] + max(1, round(more))
+        self._iterations = end["step"] + max(1, round((60 * minutes - ending) / seconds))
         self.keep()
-        return True
+        return self.iterations()
 
     def iterations(self) -> list[str]:
         """The arguments of a training that goes on after it was finished."""
