@@ -100,7 +100,9 @@ def place(
 
 
 def _mapped_turned(database, images, folder, count):
-    """The models of a turned object that its strong pairs give, and one with weaker pairs, too."""
+    """pycolmap's models of a turned object: those of its strong pairs, and, unless these place all
+    images, one to which weaker pairs add the others.
+    """
     (strong := folder / "strong").mkdir()
     found = _mapped(database, images, strong, count, STRONG)
     best = max(found, key=lambda one: one.num_reg_images(), default=None)
@@ -129,12 +131,11 @@ def _mapped(database, images, folder, count, share=None, begun=None):
             options.min_num_matches = max(options.min_num_matches, int(share * usual))
             options.mapper.init_min_tri_angle = CLOSER
             options.ba_refine_extra_params = False  # _refined_turned() finds them
-        begin = {}
+        begin, done = {}, 0
         if begun is not None:
-            (begin := folder / "begun").mkdir()
-            begun.write(begin)
-            begin = {"input_path": begin}
-        done = begun.num_reg_images() if begun is not None else 0
+            (at := folder / "begun").mkdir()
+            begun.write(at)
+            begin, done = {"input_path": at}, begun.num_reg_images()
         with Progress("poses", count, "image", done=done) as bar:
             models = colmap.incremental_mapping(
                 database, images, folder, options, next_image_callback=bar.update, **begin
