@@ -399,16 +399,20 @@ def test_an_object_that_turns(dev, tmp_path):
 
 
 def test_a_film_on_white_is_placed_and_cut_out_by_itself(dev, tmp_path):
-    """No structure stands out behind the object, so colour decides, and the line says so."""
+    """No structure stands out behind the object, so colour decides, and the line says so. Half a
+    turn also shows the pattern on its other side, which must not draw cameras there.
+    """
     scene = tmp_path / "scene"
-    photographs, masks = turned(dev, tmp_path, range(14), 1.0)
+    photographs, masks = turned(dev, tmp_path, range(36), 1.0)
     film = [read_rgba(file)[..., :3] for file in sorted(photographs.iterdir())]
     write_video(tmp_path / "film.mp4", film, 24)
     assert capture(tmp_path / "film.mp4", scene) == (0, [])
     assert "the background is uniform" in found(scene, "frames")["line"]
     assert "as on a turntable" in found(scene, "matches")["line"]
-    assert found(scene, "poses")["placed"] == 14
-    assert "14 before a uniform background" in found(scene, "masks")["line"]
+    assert found(scene, "poses")["placed"] == 36
+    true = cameras(SIZE, "turntable")
+    assert off(scene, true).position < 0.03 and off(scene, true).degrees < 2
+    assert "36 before a uniform background" in found(scene, "masks")["line"]
     shares = []
     for one in poses.image_files(colmap.Reconstruction(scene / "capture" / "model")):
         number = int(Path(one.name).stem)
