@@ -30,15 +30,12 @@ from pp_cl.settings import Config
 FORMAT = 4  # raised when the arrays change their meaning
 MOST_HEADER = 2**24  # bytes; a view takes some 400
 MOST_LENGTH = 1e30  # world units; float32 cannot hold products of larger lengths
-# {key of the header: its types in JSON}, and the keys that it may lack
-KEYS: dict[str, tuple] = dict.fromkeys(
-    ("step", "initial_points", "format", "extended_from"), (int,)
-)
-KEYS |= dict.fromkeys(("views", "depth_range", "left_out", "notes"), (list,))
-KEYS |= dict.fromkeys(("finished", "specular"), (bool,)) | {"exposed": (str, bool)}
-KEYS |= {"grid": (dict,), "pixels": (dict, type(None))}
-# exposed is true in runs of 0.3.0
-OPTIONAL = {"extended_from", "exposed", "left_out", "notes", "specular"}
+# {key of the header: its types in JSON}; a header may lack the OPTIONAL ones
+REQUIRED: dict[str, tuple] = dict.fromkeys(("step", "initial_points", "format"), (int,))
+REQUIRED |= dict.fromkeys(("views", "depth_range"), (list,))
+REQUIRED |= {"finished": (bool,), "grid": (dict,), "pixels": (dict, type(None))}
+OPTIONAL: dict[str, tuple] = {"extended_from": (int,), "left_out": (list,), "notes": (list,)}
+OPTIONAL |= {"specular": (bool,), "exposed": (str, bool)}  # exposed is true in runs of 0.3.0
 MEND = "delete it to train again, or restore a copy"
 OTHER_RUN = "its config.json may belong to another run"
 Arrays = Mapping[str, np.ndarray | DeviceRows]
@@ -191,11 +188,12 @@ def _refused(path):
 
 def _problem_of_header(header, steps):
     """How a header differs from one that a training of `steps` steps writes; "" if it does not."""
-    if lacking := sorted(KEYS.keys() - OPTIONAL - header.keys()):
+    known = REQUIRED | OPTIONAL
+    if lacking := sorted(REQUIRED.keys() - header.keys()):
         return f"its header lacks {lacking[0]}"
-    if unknown := sorted(header.keys() - KEYS.keys()):
+    if unknown := sorted(header.keys() - known.keys()):
         return f"its header holds {shown(unknown[0], 40)}, which this version does not know"
-    if wrong := [key for key, value in header.items() if type(value) not in KEYS[key]]:
+    if wrong := [key for key, value in header.items() if type(value) not in known[key]]:
         return f"{wrong[0]} in its header has the wrong type"
     if not 1 <= header["step"] <= steps:
         return f"it is of step {shown(str(header['step']))}, but its config.json has {steps} steps"

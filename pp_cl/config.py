@@ -319,7 +319,7 @@ def scene_config(
     """
     # here, so that --help needs neither numpy nor OpenCL
     from pp_cl.engine.views import MIN_SIDE, fitting_downscale
-    from pp_cl.scene.load import scene_frames
+    from pp_cl.scene.listing import scene_frames
 
     given = list(given)
     config = configure(preset(preset_name), scene, given)

@@ -29,7 +29,8 @@ from pp_cl.progress import track
 from pp_cl.scene.hull import misplaced
 from pp_cl.scene.identity import difference, unpacked_views
 from pp_cl.scene.image_file import ImageFile
-from pp_cl.scene.load import DEMO, Scene, list_split, open_scene, scene_format, scene_frames
+from pp_cl.scene.listing import DEMO, list_split, scene_format, scene_frames
+from pp_cl.scene.load import Scene, open_scene
 from pp_cl.settings import Config
 
 COMPARED_VIEWS = 2  # training images whose pixels show whether a scene is the run's

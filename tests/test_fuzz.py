@@ -48,7 +48,8 @@ from pp_cl.files.run_folder import Log, RunFolder
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.scene.load import load_scene, scene_splits
+from pp_cl.scene.listing import scene_splits
+from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points

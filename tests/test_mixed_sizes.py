@@ -12,7 +12,8 @@ from pp_cl.engine.views import View
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.hull import build_grid
-from pp_cl.scene.load import load_scene, scene_frames
+from pp_cl.scene.listing import scene_frames
+from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.session.memory import MemoryPlan
 

@@ -23,7 +23,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.scene.demo import ANGLE, DISTANCE, demo_frames, render
-from pp_cl.scene.load import scene_frames
+from pp_cl.scene.listing import scene_frames
 from pp_studio.video import write_video
 
 WIDER = 1.6  # factor of the angle of view, so that the room is seen around the object

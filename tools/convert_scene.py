@@ -18,7 +18,8 @@ from pp_cl.drivers import open_device
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
-from pp_cl.scene.load import open_scene, scene_splits
+from pp_cl.scene.listing import scene_splits
+from pp_cl.scene.load import open_scene
 from pp_cl.scene.readers.common import SPLITS, hold_out
 
 FOLDER = Path(__file__).with_name("scene_formats")

@@ -65,6 +65,7 @@ ON_GPUS = {
     "Instant-NGP": (2.7, 35.65),
     "gsplat": (13.5, 32.13),
 }
+RASTERISED = (("grid", 250_000, 200), ("grid", 4_000_000, 800), ("pulsar", 100_000, 800))
 NETWORKS = (("128,256,512", 256), ("32,64,128", 200))  # widths, side of the image
 
 
@@ -78,7 +79,7 @@ class Training:
     name: str
     scene: str
     preset: str
-    steps: int | None = None  # None: the preset's number, or as many as its minutes allow
+    iterations: int | None = None  # None: the preset's number, or as many as its minutes allow
     downscale: int | None = None
     test: str | None = None
     is_captured: bool = False  # `scene` is a folder of photographs, from which `capture` makes one
@@ -122,98 +123,90 @@ CURVES = [
     for minutes in budgets
 ]
 
-QUALITY = [
-    {"head": "scene", "cell": "{name}"},
-    {"head": "size", "cell": "{size}"},
-    {"head": "preset, steps", "cell": "`{preset}`, {steps:,}"},
-    {"head": "minutes", "cell": "{minutes:.2f}"},
-    {"head": "PSNR", "cell": "{psnr:.2f}"},
-    {"head": "PSNR: r_1 to r_13, others", "cell": "{psnr_highlights:.2f}, {psnr_others:.2f}"},
-    {"head": "SSIM", "cell": "{ssim:.4f}"},
-    {"head": "LPIPS", "cell": "{lpips:.4f}"},
-    {"head": "points", "cell": "{points:,}"},
-    {"head": "ms a frame", "cell": "{frame_ms:.0f}"},
-]
 # {preset: the training that stages() continues to time its steps}
 STEPS = {"tiny": "lego_8000", "full": "lego_22000"}
 # {part: the most minutes it takes on an H200} that --minutes measures, the most telling first
 WORTH = {"demo_1500": 1.0, "lego_8000": 1.5, "lego_22000": 4.4}
 WORTH |= {"rasteriser": 1.0, "pytorch": 1.0, "stages_tiny": 0.5, "stages_full": 1.0}
-RASTERISER = [
-    {"head": "scene", "cell": "{scene}"},
-    {"head": "points", "cell": "{points:,}"},
-    {"head": "side", "cell": "{size}"},
-    {"head": "blend", "cell": "{blend}"},
-    {"head": "forward, ms", "cell": "{forward_ms:.1f}"},
-    {"head": "backward, ms", "cell": "{backward_ms:.1f}"},
-    {"head": "error", "cell": "{max_err:.1e}"},
-]
-PYTORCH = [
-    {"head": "widths", "cell": "{widths}"},
-    {"head": "side", "cell": "{size}"},
-    {"head": "variant", "cell": "`{variant}`"},
-    {"head": "forward, ms", "cell": "{forward_ours_ms:.2f}, {forward_torch_ms:.2f}"},
-    {"head": "ratio", "cell": "{forward_ratio:.2f}"},
-    {"head": "with backward, ms", "cell": "{train_ours_ms:.2f}, {train_torch_ms:.2f}"},
-    {"head": "ratio", "cell": "{train_ratio:.2f}"},
-    {"head": "relative L2 error", "cell": "{rel_l2:.1e}, {torch_rel_l2:.1e}"},
-]
-STAGES = [
-    {"head": "stage", "cell": "{stage}"},
-    *({"head": f"{preset}, ms", "cell": f"{{ms_{preset}:.2f}}"} for preset in STEPS),
-]
-MEMORY = [
-    {"head": "training", "cell": "{name}"},
-    {"head": "points at the peak", "cell": "{points:,}"},
-    {"head": "device: plan", "cell": "{device_plan:.0f} MiB"},
-    {"head": "measured", "cell": "{device:.0f} MiB"},
-    {"head": "host: plan", "cell": "{host_plan:.0f} MiB"},
-    {"head": "measured", "cell": "{host:.0f} MiB"},
-]
-SPLATS = [
-    {"head": "run", "cell": "{name}"},
-    {"head": "steps", "cell": "{steps:,}"},
-    {"head": "seconds", "cell": "{seconds:.0f}"},
-    {"head": "Gaussians", "cell": "{gaussians:,}"},
-    {"head": "PSNR", "cell": "{psnr_same:.1f}"},
-    {"head": "three times as large", "cell": "{psnr_larger:.1f}"},
-    {"head": "beside the hull", "cell": "{beside:.1%}"},
-]
-# {part whose training a splat is fitted to: its name in the rows}
+# {part whose run is examined: its name in the rows} by splats(), work() and meshes(); TRADED: by
+# frontier()
 SPLATTED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_6000": "lego 400x400"}
 SPLATTED |= {"ethiopian_head": "ethiopian_head"}
-STABILITY = [
-    {"head": "hard case", "cell": "{case}"},
-    {"head": "naive formula", "cell": "{what}"},
-    {"head": "gives", "cell": "{naive}"},
-    {"head": "ours", "cell": "{error}"},
-    {"head": "bound", "cell": "{bound}"},
-]
-# {part whose run work() examines: its name in the rows}; TRADED: the run of frontier()
 WORKED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_22000": "lego 800x800"}
-TRADED = "lego_8000"
-WORK = [
-    {"head": "run", "cell": "{name}"},
-    {"head": "cells of the box", "cell": "{box:,}"},
-    {"head": "in the hull, with a point", "cell": "{hull:.1%}, {left:.1%}"},
-    {"head": "checkpoint; with all cells", "cell": "{stored:.0f} MiB; {whole:.0f} MiB"},
-    {"head": "fragments a view, blended", "cell": "{fragments:,.0f}, {blended:.0%}"},
-    {"head": "network of a whole image's", "cell": "{computed:.0%}"},
-    {"head": "points drawn, with gradients in a step", "cell": "{drawn:.0%}, {touched:.0%}"},
-]
-MESHES = [
-    {"head": "run", "cell": "{name}"},
-    {"head": "faces", "cell": "{faces:,}"},
-    {"head": "of them guessed", "cell": "{guessed:.1%}"},
-    {"head": "parts", "cell": "{parts}"},
-    {"head": "Euler number", "cell": "{euler}"},
-    {"head": "roughness, degrees", "cell": "{roughness:.1f}"},
-    {"head": "from the surface: mean, median", "cell": "{mean:.2f}, {median:.2f}"},
-    {"head": "surface from it", "cell": "{back:.2f}"},
-]
-# {part whose mesh is measured: its name in the rows}
 MESHED = {"demo_1500": "demo, 1,500 steps", "ethiopian_head": "ethiopian_head, 8,000 steps"}
-DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
+TRADED = "lego_8000"
+
+
+def columns(text: str) -> list[dict[str, str]]:
+    """The columns of a table, written as `head = cell | head = cell`."""
+    pairs = (column.split(" = ") for column in text.split(" | "))
+    return [{"head": head, "cell": cell} for head, cell in pairs]
+
+
+QUALITY = (
+    "means over the held-out views; minutes of training alone",
+    "scene = {name} | size = {size} | preset, steps = `{preset}`, {steps:,}"
+    " | minutes = {minutes:.2f} | PSNR = {psnr:.2f}"
+    " | PSNR: r_1 to r_13, others = {psnr_highlights:.2f}, {psnr_others:.2f} | SSIM = {ssim:.4f}"
+    " | LPIPS = {lpips:.4f} | points = {points:,} | ms a frame = {frame_ms:.0f}",
+)
+# {table: (what the numbers are, with {steps} and {torch} from tables(); its columns())}
+TABLES = {
+    "trainings": QUALITY,
+    "curves": QUALITY,
+    "rasteriser": (
+        "milliseconds, medians of interleaved runs, and the largest error against float64",
+        "scene = {scene} | points = {points:,} | side = {size} | blend = {blend}"
+        " | forward, ms = {forward_ms:.1f} | backward, ms = {backward_ms:.1f}"
+        " | error = {max_err:.1e}",
+    ),
+    "pytorch": (
+        "ours, PyTorch's, theirs over ours; medians of interleaved runs, {torch}",
+        "widths = {widths} | side = {size} | variant = `{variant}`"
+        " | forward, ms = {forward_ours_ms:.2f}, {forward_torch_ms:.2f}"
+        " | ratio = {forward_ratio:.2f}"
+        " | with backward, ms = {train_ours_ms:.2f}, {train_torch_ms:.2f}"
+        " | ratio = {train_ratio:.2f} | relative L2 error = {rel_l2:.1e}, {torch_rel_l2:.1e}",
+    ),
+    "stages": (
+        "medians of a step on lego ({steps})",
+        " | ".join(["stage = {stage}", *(f"{name}, ms = {{ms_{name}:.2f}}" for name in STEPS)]),
+    ),
+    "memory": (
+        "the most memory that a few steps take",
+        "training = {name} | points at the peak = {points:,}"
+        " | device: plan = {device_plan:.0f} MiB | measured = {device:.0f} MiB"
+        " | host: plan = {host_plan:.0f} MiB | measured = {host:.0f} MiB",
+    ),
+    "demo": ("runs of the demo", "measured on = {what} | result = {result}"),
+    "meshes": (
+        "meshes as exported; roughness is the mean angle of neighbouring faces, distances are in"
+        " spacings",
+        "run = {name} | faces = {faces:,} | of them guessed = {guessed:.1%} | parts = {parts}"
+        " | Euler number = {euler} | roughness, degrees = {roughness:.1f}"
+        " | from the surface: mean, median = {mean:.2f}, {median:.2f}"
+        " | surface from it = {back:.2f}",
+    ),
+    "splats": (
+        "processor seconds a core; means over five test views, drawn as viewers draw splats",
+        "run = {name} | steps = {steps:,} | seconds = {seconds:.0f} | Gaussians = {gaussians:,}"
+        " | PSNR = {psnr_same:.1f} | three times as large = {psnr_larger:.1f}"
+        " | beside the hull = {beside:.1%}",
+    ),
+    "stability": (
+        "errors against float64",
+        "hard case = {case} | naive formula = {what} | gives = {naive} | ours = {error}"
+        " | bound = {bound}",
+    ),
+    "work": (
+        "what runs compute; means over eight training views",
+        "run = {name} | cells of the box = {box:,} | in the hull, with a point = {hull:.1%},"
+        " {left:.1%} | checkpoint; with all cells = {stored:.0f} MiB; {whole:.0f} MiB"
+        " | fragments a view, blended = {fragments:,.0f}, {blended:.0%}"
+        " | network of a whole image's = {computed:.0%}"
+        " | points drawn, with gradients in a step = {drawn:.0%}, {touched:.0%}",
+    ),
+}
 
 
 # ---- parts: each returns its measurements
@@ -241,22 +234,19 @@ def key_of(training: Training) -> str:
         name = "_".join(Path(training.scene).parts[-2:])
     if training.minutes:
         return f"{name}_{training.preset}_{training.minutes:g}_minutes"
-    return f"{name}_{training.steps}" if training.steps else name
+    return f"{name}_{training.iterations}" if training.iterations else name
 
 
 def train(training: Training, store: Path) -> dict:
-    """Train and evaluate; returns a row of QUALITY."""
+    """Train and evaluate; returns a row of trainings or curves."""
     run, scene = store / key_of(training), scene_of(training.scene)
     if training.is_captured:
         scene, photographs = store / f"{key_of(training)}_scene", scene
         run_program(*PP_CL, "capture", photographs, "--out", scene)
     words = ["--preset", training.preset, "--out", run]
-    if training.steps:
-        words += ["--iterations", training.steps]
-    if training.minutes:
-        words += ["--minutes", training.minutes]
-    if training.downscale:
-        words += ["--downscale", training.downscale]
+    for option in ("iterations", "minutes", "downscale"):
+        if number := getattr(training, option):
+            words += [f"--{option}", number]
     run_program(*PP_CL, "train", scene, *words)
     words = ["--scene", scene_of(training.test)] if training.test else []
     found = read_found(store, *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
@@ -285,20 +275,16 @@ def train(training: Training, store: Path) -> dict:
 
 
 def rasteriser(store: Path) -> list[dict]:
-    """Rows of RASTERISER."""
+    """Rows of rasteriser."""
     rows = []
-    for scene, points, size in (
-        ("grid", 250000, 200),
-        ("grid", 4000000, 800),
-        ("pulsar", 100000, 800),
-    ):
+    for scene, points, size in RASTERISED:
         words = ["--scene", scene, "--points", points, "--size", size]
         rows += read_found(store, *PP_CL, "bench", "raster", *words)["rows"]
     return rows
 
 
 def pytorch(store: Path) -> list[dict]:
-    """Rows of PYTORCH: the paper's network and a narrow one, both of double blocks."""
+    """Rows of pytorch: the paper's network and a narrow one, both of double blocks."""
     rows = []
     for widths, side in NETWORKS:
         for variant in ("direct", "auto"):
@@ -318,7 +304,7 @@ def stages(preset: str, store: Path) -> dict:
 
 
 def by_preset(found: dict[str, dict]) -> list[dict]:
-    """Rows of STAGES."""
+    """Rows of stages."""
     rows: dict[str, dict] = {}
     for preset, steps in found.items():
         for row in steps["stages"]:
@@ -327,12 +313,12 @@ def by_preset(found: dict[str, dict]) -> list[dict]:
 
 
 def memory(store: Path) -> list[dict]:
-    """Rows of MEMORY."""
+    """Rows of memory."""
     return read_found(store, *TOOL, "tools.memory_peaks")
 
 
 def demo(store: Path) -> list[dict]:
-    """Rows of DEMO: errors of depth and alpha of the demo's runs."""
+    """Rows of demo: errors of depth and alpha of the demo's runs."""
     rows = []
     short, long = (store / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
@@ -344,7 +330,7 @@ def demo(store: Path) -> list[dict]:
 
 
 def meshes(store: Path) -> list[dict]:
-    """Rows of MESHES."""
+    """Rows of meshes."""
     return [
         {"name": name} | read_found(store, *TOOL, "tools.export_quality", store / run)
         for run, name in MESHED.items()
@@ -352,7 +338,7 @@ def meshes(store: Path) -> list[dict]:
 
 
 def splats(store: Path) -> list[dict]:
-    """Rows of SPLATS: the demo also has one with the best quality."""
+    """Rows of splats: the demo also has one with the best quality."""
     (steps, cell), best = QUALITIES[QUICK], QUALITIES[BEST]
     fits = [(name, (steps,), cell) for name in SPLATTED]
     fits.insert(1, ("demo_1500", best[:1], best[1]))
@@ -366,7 +352,7 @@ def splats(store: Path) -> list[dict]:
 
 
 def stability(store: Path) -> list[dict]:
-    """Rows of STABILITY."""
+    """Rows of stability."""
     rows = []
     for row in read_found(store, *PP_CL, "selftest", "--hard")["cases"]:
         numbers = {name: float(row["hard"][name]) for name in ("naive", "error", "bound")}
@@ -377,7 +363,7 @@ def stability(store: Path) -> list[dict]:
 
 
 def work(store: Path) -> list[dict]:
-    """Rows of WORK."""
+    """Rows of work."""
     rows = []
     for name, label in WORKED.items():
         found = read_found(store, *PP_CL, "info", store / name, "--work")
@@ -409,16 +395,9 @@ def frontier(store: Path) -> list[dict]:
 
 PARTS: dict[str, Callable[[Path], Found]] = {
     **{key_of(training): partial(train, training) for training in (*TRAININGS, *CURVES)},
-    "demo": demo,
-    "rasteriser": rasteriser,
-    "pytorch": pytorch,
+    **{part.__name__: part for part in (demo, rasteriser, pytorch)},
     **{f"stages_{preset}": partial(stages, preset) for preset in STEPS},
-    "memory": memory,
-    "meshes": meshes,
-    "splats": splats,
-    "stability": stability,
-    "work": work,
-    "frontier": frontier,
+    **{part.__name__: part for part in (memory, meshes, splats, stability, work, frontier)},
 }
 
 
@@ -442,13 +421,8 @@ def scene_of(name: str) -> Path | str:
 
 def git(*words: str) -> str:
     """Run git; returns what it prints."""
-    return subprocess.run(
-        [shutil.which("git") or "git", *words],
-        cwd=ROOT,
-        check=True,
-        stdout=subprocess.PIPE,
-        text=True,
-    ).stdout.strip()
+    command = [shutil.which("git") or "git", *words]
+    return subprocess.check_output(command, cwd=ROOT, text=True).strip()
 
 
 def processor() -> str:
@@ -543,38 +517,22 @@ def timed(found: dict[str, Found]) -> list[dict]:
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
     """{name: contents without origin()} of the tables that have rows."""
-    quality = "means over the held-out views; minutes of training alone"
-    blended = "milliseconds, medians of interleaved runs, and the largest error against float64"
-    rows = found | {"trainings": trained(found, TRAININGS), "curves": trained(found, CURVES)}
     runs = {preset: found[f"stages_{preset}"] for preset in STEPS if f"stages_{preset}" in found}
-    rows["stages"] = by_preset(runs)
     steps = "; ".join(
         f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['launches']} launches"
         for preset, run in runs.items()
     )
-    beside = "ours, PyTorch's, theirs over ours; medians of interleaved runs"
-    if "pytorch" in found:
-        beside += f", {found['pytorch'][0]['torch']}"
-    meshed = "meshes as exported; roughness is the mean angle of neighbouring faces, distances are"
-    meshed += " in spacings"
-    fitted = "processor seconds a core; means over five test views, drawn as viewers draw splats"
-    parts = {
-        "trainings": (quality, QUALITY),
-        "curves": (quality, QUALITY),
-        "rasteriser": (blended, RASTERISER),
-        "pytorch": (beside, PYTORCH),
-        "stages": (f"medians of a step on lego ({steps})", STAGES),
-        "memory": ("the most memory that a few steps take", MEMORY),
-        "demo": ("runs of the demo", DEMO),
-        "meshes": (meshed, MESHES),
-        "splats": (fitted, SPLATS),
-        "stability": ("errors against float64", STABILITY),
-        "work": ("what runs compute; means over eight training views", WORK),
-    }
+    torch = found["pytorch"][0]["torch"] if "pytorch" in found else ""
+    rows = found | {"trainings": trained(found, TRAININGS), "curves": trained(found, CURVES)}
+    rows["stages"] = by_preset(runs)
     return {
-        name: {"measured": measured, "columns": columns, "rows": rows[name]}
+        name: {
+            "measured": what.format(steps=steps, torch=torch),
+            "columns": columns(text),
+            "rows": rows[name],
+        }
         | ({"is_plain": True} if name == "stability" else {})
-        for name, (measured, columns) in parts.items()
+        for name, (what, text) in TABLES.items()
         if rows.get(name)
     }
 

@@ -14,7 +14,8 @@ from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 from pp_cl.engine.step import Trainer
 from pp_cl.scene.hull import build_grid, depth_range
-from pp_cl.scene.load import open_scene, scene_box
+from pp_cl.scene.listing import scene_box
+from pp_cl.scene.load import open_scene
 from pp_cl.settings import Config
 
 STEPS = 5  # timed each way, after one that builds the kernels

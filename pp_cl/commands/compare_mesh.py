@@ -14,7 +14,8 @@ from pp_cl.progress import Progress
 from pp_cl.run import check_scene, stored_config
 from pp_cl.scene.demo import demo_mesh
 from pp_cl.scene.hull import CELL_CAP, agreeing, hull_on
-from pp_cl.scene.load import DEMO, open_scene, scene_box
+from pp_cl.scene.listing import DEMO, scene_box
+from pp_cl.scene.load import open_scene
 from pp_cl.settings import Config
 
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side

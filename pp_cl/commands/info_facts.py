@@ -27,7 +27,8 @@ from pp_cl.scene.edits import read_edits
 from pp_cl.scene.gaze import looked_at, up_of
 from pp_cl.scene.hull import Hull, contradicting, spacing_pixels
 from pp_cl.scene.identity import unpacked_views
-from pp_cl.scene.load import DEMO, open_scene, scene_box, scene_format, scene_frames, scene_splits
+from pp_cl.scene.listing import DEMO, scene_box, scene_format, scene_frames, scene_splits
+from pp_cl.scene.load import open_scene
 from pp_cl.scene.outline import SHOWN_VIEWS, outline_sheet
 from pp_cl.scene.verdict import WrongCameras, judged
 from pp_cl.session.start import first_hull

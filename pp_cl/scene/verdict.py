@@ -18,7 +18,7 @@ from pp_cl.scene.edits import EDITS, read_edits
 from pp_cl.scene.gaze import ahead, meeting, upward
 from pp_cl.scene.hull import MOST_LEFT_OUT, Agreement, Beside, agreement_of, shares_beside
 from pp_cl.scene.image_file import ImageFile, shrink
-from pp_cl.scene.load import DEMO, find_reader, list_split, scene_box, scene_splits
+from pp_cl.scene.listing import DEMO, find_reader, list_split, scene_box, scene_splits
 from pp_cl.scene.readings import EXIF, MEANING, SQUARE, STATED, Stated, read_as, readings
 from pp_cl.settings import Config
 

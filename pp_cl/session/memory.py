@@ -37,7 +37,8 @@ from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import target_table
 from pp_cl.errors import UserError
 from pp_cl.scene.image_file import ImageFile, image_bytes, shrink_factor
-from pp_cl.scene.load import DEMO, reading_cost
+from pp_cl.scene.listing import DEMO
+from pp_cl.scene.load import reading_cost
 from pp_cl.settings import Config
 
 MIB, GIB = 2**20, 2**30

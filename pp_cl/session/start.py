@@ -23,7 +23,7 @@ from pp_cl.scene.hull import (
     depth_range,
     spacing_pixels,
 )
-from pp_cl.scene.load import DEMO, scene_box
+from pp_cl.scene.listing import DEMO, scene_box
 from pp_cl.scene.outline import outline_sheet
 from pp_cl.scene.verdict import judged
 from pp_cl.session.memory import MemoryPlan

@@ -32,7 +32,8 @@ from pp_cl.presets import SHORT
 from pp_cl.progress import Progress
 from pp_cl.run import Run, load
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.load import list_split, measured_split, open_scene
+from pp_cl.scene.listing import list_split, measured_split
+from pp_cl.scene.load import open_scene
 from pp_cl.session.budget import Budget
 from pp_cl.session.memory import MemoryPlan
 from pp_cl.session.plan import NEVER, Plan

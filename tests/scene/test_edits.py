@@ -11,7 +11,7 @@ from support.runs import arguments, train_and_interrupt
 from pp_cl.cli import main
 from pp_cl.config import configure, preset
 from pp_cl.scene.edits import Edits, read_edits, write_edits
-from pp_cl.scene.load import scene_box, scene_frames
+from pp_cl.scene.listing import scene_box, scene_frames
 
 BOX = [[-0.5, -1, -1], [1, 1, 0.25]]
 

@@ -9,7 +9,8 @@ from support.scenes import move_scene, write_ball_scene
 
 from pp_cl.scene.identity import difference, identity, unpacked_views
 from pp_cl.scene.image_file import pixel_digest
-from pp_cl.scene.load import load_scene, scene_frames
+from pp_cl.scene.listing import scene_frames
+from pp_cl.scene.load import load_scene
 
 
 @pytest.fixture

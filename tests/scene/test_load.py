@@ -11,14 +11,8 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.image_file import ImageFile
 from pp_cl.scene.lens import BAND_BYTES, LensDistortion
-from pp_cl.scene.load import (
-    BAND_COPIES,
-    list_split,
-    load_scene,
-    reading_cost,
-    scene_frames,
-    scene_splits,
-)
+from pp_cl.scene.listing import list_split, scene_frames, scene_splits
+from pp_cl.scene.load import BAND_COPIES, load_scene, reading_cost
 from pp_cl.settings import SceneConfig
 from tools.scene_formats import nerfstudio
 

@@ -18,7 +18,8 @@ from pp_cl.files.image import read_rgba, write_png
 from pp_cl.run import load
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import agreeing, build_grid
-from pp_cl.scene.load import load_scene, open_scene, scene_box
+from pp_cl.scene.listing import scene_box
+from pp_cl.scene.load import load_scene, open_scene
 from pp_cl.scene.masks import cut_out
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.settings import SceneConfig

@@ -9,7 +9,8 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.image_file import MOST_IMAGE_BYTES, image_bytes, shrink, shrink_factor
-from pp_cl.scene.load import load_scene, open_scene, scene_frames
+from pp_cl.scene.listing import scene_frames
+from pp_cl.scene.load import load_scene, open_scene
 
 PHONE = (4000, 3000)
 

@@ -17,7 +17,7 @@ from support.scenes import ball_image, ring_cameras, write_ball_scene
 from pp_cl.commands.info_facts import describe_scene
 from pp_cl.engine.views import View
 from pp_cl.files.image import ORIENTATION
-from pp_cl.scene.load import list_split
+from pp_cl.scene.listing import list_split
 from pp_cl.scene.readers.frame import GL_FROM_CV
 from tools.convert_scene import convert
 

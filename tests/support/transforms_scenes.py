@@ -8,7 +8,8 @@ from support.refused import refusing
 
 from pp_cl.engine.camera import look_at
 from pp_cl.files.image import write_png
-from pp_cl.scene.load import find_reader, load_scene
+from pp_cl.scene.listing import find_reader
+from pp_cl.scene.load import load_scene
 
 SIZE = (24, 18)  # width, height of the images written here
 

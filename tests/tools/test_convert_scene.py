@@ -3,7 +3,8 @@ import pytest
 from support.same_scene import held_out, same, views
 from support.scenes import write_ball_scene
 
-from pp_cl.scene.load import load_scene, scene_format
+from pp_cl.scene.listing import scene_format
+from pp_cl.scene.load import load_scene
 from tools.convert_scene import FORMATS, convert, main
 
 READER = {"nerf_synthetic": "transforms", "nerfstudio": "transforms"}

@@ -10,7 +10,7 @@ from support.transforms_scenes import left_out, refused
 
 from pp_cl.files.image import write_png
 from pp_cl.scene.lens import LensDistortion
-from pp_cl.scene.load import scene_frames
+from pp_cl.scene.listing import scene_frames
 from pp_cl.scene.readers.colmap import read_model, read_split
 from tools.capture_demo import align, cameras
 from tools.scene_formats import colmap

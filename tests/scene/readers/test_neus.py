@@ -7,7 +7,8 @@ from support.transforms_scenes import left_out, refused
 
 from pp_cl.config import assign, configure, preset
 from pp_cl.files.image import write_png
-from pp_cl.scene.load import load_scene, scene_box, scene_frames
+from pp_cl.scene.listing import scene_box, scene_frames
+from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.neus import box, read_split
 from tools.scene_formats import neus
 

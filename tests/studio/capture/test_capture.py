@@ -17,7 +17,8 @@ from pp_cl.engine.camera import Camera
 from pp_cl.files.image import read_mask, read_rgba, to_8bit, write_png
 from pp_cl.scene.demo import render
 from pp_cl.scene.lens import LensDistortion, undistort
-from pp_cl.scene.load import load_scene, scene_format, scene_frames
+from pp_cl.scene.listing import scene_format, scene_frames
+from pp_cl.scene.load import load_scene
 from pp_studio.capture import poses
 from pp_studio.capture.features import quiet, verification
 from pp_studio.capture.frames import take_images, undistorted_mask

@@ -10,7 +10,7 @@ pytest.importorskip("pycolmap", reason="needs the extra `capture`")
 
 from pp_cl.cli import main
 from pp_cl.files.image import read_mask
-from pp_cl.scene.load import scene_frames
+from pp_cl.scene.listing import scene_frames
 from tools.capture_demo import compare, write_photographs
 
 PAGE = Path(__file__).parents[3] / "docs" / "capture.md"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.viewing import tab, wait
 
-from pp_cl.scene.load import scene_frames
+from pp_cl.scene.listing import scene_frames
 from pp_studio.view.scene_page import DROPPED, ScenePage, hull_points
 
 
