@@ -1,5 +1,5 @@
-// Weights as kernels read them, if not as they are; the sums of the parts of their gradients. Each
-// for all convolutions at once, of which a table has rows.
+// Weights as kernels read them, if not as they are, for all convolutions at once, of which a table
+// has rows.
 #include "lanes.h"
 #include "layers/parts.h"
 
@@ -66,19 +66,4 @@ kernel void lay_out_weights(
     UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
         out[WEIGHT_AT(i, rest, row[4] / 16, channels) + c] = t[i];
 #endif
-}
-
-// One work-item per part of a row of parts.h: writes LANES values of a gradient.
-kernel void sum_parts(
-    const uint n,  // rows of partial, of one part of all weights
-    const uint rows,
-    global const int *table,        // (rows, 8) parts.h
-    global const float16 *partial,  // (...) as there
-    global float16 *grad_weights,   // (...)
-    global float16 *grad_biases)    // (...)
-{
-    const int item = get_global_id(0) / ROW_PARTS;
-    if (item >= n) return;
-    const Sum found = sum_of(table, rows, partial, item);
-    store_part(found.sum, found.is_bias ? grad_biases : grad_weights, found.at);
 }

@@ -27,14 +27,13 @@ from pp_cl.engine.raster.blend import (
     blend_forward,
     shade_forward,
 )
+from pp_cl.engine.raster.highest_weights import list_weights, record_weights
 from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs, pairs_table
 from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid, projection_table
 from pp_cl.engine.raster.weights import (
     ALL,
     BlendWeights,
     blend_weights,
-    list_weights,
-    record_weights,
     weights_table,
 )
 from pp_cl.errors import UserError
@@ -389,7 +388,7 @@ class Renderer:
         *,
         least: float = 0.0,
     ) -> None:
-        """Update max_weight and times_seen from the last forward(), see raster/weights.py."""
+        """Update max_weight and times_seen, see raster/highest_weights.py from the last forward()."""
         pairs, weights = result.pairs, result.weights
         listed = list_weights(self.dev, self._buffers, pairs, weights)
         record_weights(self.dev, pairs, weights, listed, max_weight, times_seen, least)

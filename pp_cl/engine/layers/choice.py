@@ -13,6 +13,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Table
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.layers import conv_direct, conv_local, conv_winograd
 from pp_cl.engine.layers.conv import (
     Blocking,
@@ -21,7 +22,6 @@ from pp_cl.engine.layers.conv import (
     first_float,
     packed_shape,
     parts_shape,
-    weights_program,
 )
 from pp_cl.engine.layers.tiles import VECTOR
 
@@ -149,8 +149,9 @@ def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> 
                 vectors = blocks * k**2 * co
                 n, first, places[1] = n + vectors, first + channels, places[1] + vectors
     if rows:
-        transforms = any(row[1] > 0 for row in rows)
-        weights_program(dev, transforms).launch(
+        # without Winograd's transforms where GPUs do not need them: they spill registers there
+        transforms = int(dev.is_cpu or any(row[1] > 0 for row in rows))
+        dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=transforms).launch(
             "lay_out_weights",
             n,
             VECTOR if dev.is_cpu else None,

@@ -14,7 +14,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import PackedArrays
-from pp_cl.engine.device.device import Device, Program
+from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.layers.tiles import VECTOR
 
@@ -149,13 +149,6 @@ def mask_bits(masks: Sequence[bool]) -> int:
     return sum(1 << i for i, is_masked in enumerate(masks) if is_masked)
 
 
-def weights_program(dev: Device, transforms: bool = False) -> Program:
-    """The kernels of layers/weights.cl. transforms: whether they lay out Winograd's weights, which
-    spills registers on GPUs.
-    """
-    return dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=int(dev.is_cpu or transforms))
-
-
 class GradientParts(NamedTuple):
     """The parts of the gradients of several convolutions' weights and biases, as kernels read them
     (cl/layers/parts.h). n: vectors of 16 in all gradients. table: (convolutions, 8) int32. partial:
@@ -192,7 +185,7 @@ def sum_parts(dev: Device, parts: GradientParts, grad_weights: Array, grad_biase
     grad_weights, grad_biases: (?,) float32; the gradients lie in them as Conv.weight and Conv.bias
     do in their arrays.
     """
-    weights_program(dev).launch(
+    dev.program("layers/sum_parts", LANES=lanes(dev)).launch(
         "sum_parts",
         parts.n * row_parts(dev),
         n=parts.n,

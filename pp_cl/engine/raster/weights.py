@@ -1,5 +1,5 @@
 """Computes the blend weight of each fragment in its pixel, by alpha compositing or by the paper's
-softmax; lists the visible points, and records each point's highest weight for pruning.
+softmax; lists the visible points.
 """
 
 from __future__ import annotations
@@ -198,57 +198,11 @@ def listed_fragments(
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
     """Set pair_gradient, (P, 1 + samples) float32, to 0 at the pairs of visible points."""
     count = weights.total
-    dev.program("raster/weights", SAMPLES=pairs.side**2).launch(
+    dev.program("raster/clear_pairs", SAMPLES=pairs.side**2).launch(
         "clear_pairs",
         count,
         s=count,
         visible=weights.visible_rows,
         point_offset=pairs.point_offset,
         pair_gradient=pair_gradient,
-    )
-
-
-def list_weights(dev: Device, b: Buffers, pairs: Pairs, weights: BlendWeights) -> Array:
-    """(P, 2) float32, valid until the next call: for each pair of a visible point, its blend weight
-    and 0; both are 0 if the pair is dropped or not tracked.
-    """
-    b.require({"pair_gradient": ((pairs.capacity, 2), np.float32)})
-    clear_pairs(dev, pairs, weights, b.pair_gradient)
-    dev.program("raster/weights").launch(
-        "list_weights",
-        pairs.pixels,
-        hw=pairs.pixels,
-        tracked=weights.tracked,
-        pixel_offset=pairs.pixel_offset,
-        pair_key=pairs.pair_key,
-        pixel_weight_point=weights.pixel_weight_point,
-        pair_gradient=b.pair_gradient,
-    )
-    return b.pair_gradient
-
-
-def record_weights(
-    dev: Device,
-    pairs: Pairs,
-    weights: BlendWeights,
-    pair_gradient: Array,
-    max_weight: Array,
-    times_seen: Array,
-    least: float = 0.0,
-) -> None:
-    """Update the inputs of pruning, both (N,) float32. For each point, max_weight is the highest
-    sum of its blend weights over an image's pixels so far, and times_seen counts the images in
-    which it had a fragment, dropped or not, and this sum was at least `least`. pair_gradient: from
-    list_weights().
-    """
-    dev.program("raster/weights").launch(
-        "record_weights",
-        pairs.points,
-        n=pairs.points,
-        least=least,
-        point_offset=pairs.point_offset,
-        point_is_visible=weights.point_is_visible,
-        pair_gradient=pair_gradient,
-        max_weight=max_weight,
-        times_seen=times_seen,
     )

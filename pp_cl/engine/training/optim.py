@@ -196,8 +196,7 @@ def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None
     """
     _same_shape(ema, parameter)
     n = parameter.size
-    program = dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2)
-    program.launch(
+    dev.program("training/ema", LANES=lanes(dev)).launch(
         "ema_update", -(-n // lanes(dev)), n=n, weight=weight, parameter=parameter, ema=ema
     )
 
