@@ -23,7 +23,8 @@
 #define load_lanes load16
 #define store_lanes store16
 #define GPU_UNROLLED_FOR for
-#else
+#endif
+#if LANES < 16
 #include "gpu/lanes.h"
 #endif
 

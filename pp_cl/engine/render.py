@@ -27,9 +27,10 @@ from pp_cl.engine.raster.blend import (
     blend_forward,
     shade_forward,
 )
+from pp_cl.engine.raster.footprint import FOOTPRINTS
 from pp_cl.engine.raster.highest_weights import list_weights, record_weights
 from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs, pairs_table
-from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid, projection_table
+from pp_cl.engine.raster.project import ProjectedPoints, project_grid, projection_table
 from pp_cl.engine.raster.weights import (
     ALL,
     BlendWeights,
@@ -48,7 +49,7 @@ def point_radius(
     settings: RasterConfig, voxel_size: float, depth_range: tuple[float, float]
 ) -> float:
     """The radius in world units of points whose offset is 0. voxel_size: world units."""
-    if settings.footprint in MOVED:
+    if FOOTPRINTS[settings.footprint].moves:
         return settings.radius * voxel_size
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
@@ -341,7 +342,8 @@ class Renderer:
         optimiser multiplies the two when it updates a coefficient, and never stores the products.
         """
         settings = self.settings
-        moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
+        kind = FOOTPRINTS[settings.footprint]
+        moves = with_offsets and settings.blend == "alpha" and kind.moves
         with self.dev.stage("backward"):
             return blend_backward(
                 self.dev,
@@ -388,7 +390,7 @@ class Renderer:
         *,
         least: float = 0.0,
     ) -> None:
-        """Update max_weight and times_seen, see raster/highest_weights.py from the last forward()."""
+        """Update max_weight and times_seen by the last forward(), as highest_weights.py has it."""
         pairs, weights = result.pairs, result.weights
         listed = list_weights(self.dev, self._buffers, pairs, weights)
         record_weights(self.dev, pairs, weights, listed, max_weight, times_seen, least)

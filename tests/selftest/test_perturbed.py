@@ -16,7 +16,7 @@ KERNELS = device_module.kernel_folder()
 FLIPS = [
     ("device/rows", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
     ("device/scan", "sum += total", "sum -= total", "device: scan"),
-    ("device/nonzero", "= listed + before;", "= listed - before;", "device: list of non-zero values"),
+    ("device/nonzero", "before] = i", "before] = n", "device: list of non-zero values"),
     ("scene/demo", "y[lane] = grid[1]", "y[lane] = -grid[1]", "scene: demo"),
     ("scene/lens", "c - out[x]", "c + out[x]", "scene: lens"),
     ("scene/lens", "c - *at", "c + *at", "scene: lens"),

@@ -13,9 +13,10 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import group_items, lanes, launch_groups, replayed, row_parts
+from pp_cl.engine.raster.footprint import FOOTPRINTS, footprint_macros
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.points import four_blocks, offset_width, stored_degree
-from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.points import four_blocks, stored_degree
+from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.engine.raster.softmax import softmax_gradient
 from pp_cl.engine.raster.weights import BlendWeights, clear_pairs, sample_macros
 
@@ -93,7 +94,7 @@ def blend_backward_table(
         return table | {"pixel_blend": ((pixels,), np.float32)}
     return table | {
         "distortion": ((-(-pixels // SPAN),), np.float32),
-        "grad_offset": ((visible, offset_width(footprint)), np.float32),
+        "grad_offset": ((visible, FOOTPRINTS[footprint].offsets), np.float32),
     }
 
 
@@ -146,7 +147,7 @@ def blend_backward(
     is_alpha, moves = weights.blend == "alpha", voxel_size > 0
     if not is_alpha and (grad_alpha is not None or distortion_weight > 0):
         raise ValueError("a softmax has no gradient of alpha and of a distortion loss")
-    if moves and not (is_alpha and points.footprint in MOVED):
+    if moves and not (is_alpha and FOOTPRINTS[points.footprint].moves):
         raise ValueError(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )

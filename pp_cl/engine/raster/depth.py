@@ -5,8 +5,9 @@ from __future__ import annotations
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.raster.footprint import footprint_macros
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.engine.raster.weights import BlendWeights, sample_macros
 
 

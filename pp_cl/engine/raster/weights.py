@@ -14,8 +14,9 @@ from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, replayed
 from pp_cl.engine.device.scan import nonzero, read_total
+from pp_cl.engine.raster.footprint import footprint_macros
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.engine.raster.softmax import softmax_weights
 
 BLENDS = ("softmax", "alpha")

@@ -225,7 +225,7 @@ def rmsprop_update(
     """
     degree = max((d for d in range(stored_degree(cloud.sh) + 1) if rates.sh[d] > 0), default=0)
     root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(cloud.sh)
-    v, parts = state.second_moments, row_parts(dev)
+    v, parts, kind = state.second_moments, row_parts(dev), cloud.kind
     program = dev.program(
         "training/rmsprop",
         LANES=lanes(dev),
@@ -233,9 +233,9 @@ def rmsprop_update(
         DECAY2=DECAY2,
         LOG_BETA2=f"{math.log2(BETA2):.9g}f",
         MOVES_OFFSET=int(grad_offset is not None),
-        MOST_OFFSET=f"{cloud.most_offset}f",
-        OFFSETS=cloud.offset.shape[1],
-        **({"MOST_SH": f"{cloud.most_sh}f"} if cloud.most_sh < math.inf else {}),
+        MOST_OFFSET=f"{kind.most_offset}f",
+        OFFSETS=kind.offsets,
+        **({"MOST_SH": f"{kind.most_sh}f"} if kind.most_sh < math.inf else {}),
     )
     fits = program.kernels["rmsprop_move"].largest_group >= parts
     program.launch(
