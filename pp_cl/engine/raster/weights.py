@@ -17,6 +17,7 @@ from pp_cl.engine.device.scan import nonzero, read_total
 from pp_cl.engine.raster.footprint import footprint_macros
 from pp_cl.engine.raster.pairs import Pairs
 from pp_cl.engine.raster.project import ProjectedPoints
+from pp_cl.engine.raster.samples import sampled_weights
 from pp_cl.engine.raster.softmax import softmax_weights
 
 BLENDS = ("softmax", "alpha")
@@ -120,6 +121,7 @@ def blend_weights(
     b.require(weights_table(pairs.points, pairs.pixels, capacity, side))
     dev.fill(b.point_is_visible, 0)
     defines: dict[str, Any] = {"LANES": lanes(dev), "DERIVATIVES": int(derivatives)}
+    derivative = b.pixel_derivative if derivatives else None
     shared: dict[str, Any] = {
         "hw": pairs.pixels,
         "early_stop": early_stop,
@@ -129,23 +131,10 @@ def blend_weights(
         "pixel_weight_point": b.pair_scratch,
         "point_is_visible": b.point_is_visible,
     }
-    derivative = b.pixel_derivative if derivatives else None
-    transmittances = b.sample_transmittance if derivatives and side > 1 else None
     of_one = {"pair_point_falloff": pairs.pair_point_falloff, "pixel_derivative": derivative}
+    sampled: Array | None = None
     if points and side > 1:
-        program = dev.program("raster/samples", **sample_macros(dev, pairs, derivatives))
-        program.launch(
-            "sampled_weights",
-            pairs.pixels,
-            camera=camera_buffer,
-            point_camera=points.point_camera,
-            point_shape=points.point_shape,
-            pair_point=pairs.pair_point_falloff,
-            sample_derivative=derivative,
-            transmittance=b.transmittance,
-            sample_transmittance=transmittances,
-            **shared,
-        )
+        sampled = sampled_weights(dev, b, points, pairs, derivatives, **shared)
     elif blend == "alpha":
         program = dev.program("raster/alpha", **footprint_macros(pairs.footprint), **defines)
         shared |= {"transmittance": b.transmittance, **of_one}
@@ -166,15 +155,8 @@ def blend_weights(
         b.transmittance if blend == "alpha" else None,
         b.visible,
         b.visible_count,
-        transmittances,
+        sampled,
     )
-
-
-def sample_macros(dev: Device, pairs: Pairs, derivatives: bool = True) -> dict[str, Any]:
-    """The defines of cl/raster/samples.cl, which computes the samples of a pixel in its lanes."""
-    macros: dict[str, Any] = footprint_macros(pairs.footprint, pairs.side)
-    on_cpu = {"ON_CPU": 1} if dev.is_cpu else {}
-    return macros | on_cpu | {"LANES": pairs.side**2, "DERIVATIVES": int(derivatives)}
 
 
 def listed_fragments(
