@@ -265,11 +265,9 @@ def plan_forward(
 def plan_backward(
     layers: list[Layer], size: tuple[int, int], forward: TilePlan, lists: PackedArrays
 ) -> TilePlan:
-    """Plan the backward pass after a forward pass. Also copies tiles of forward outputs that it
-    reads, as inputs of layers and as masks of ReLUs. lists: see plan_forward().
+    """Plan the backward pass after a forward pass that skipped tiles. Also copies tiles of forward
+    outputs that it reads, as inputs of layers and as masks of ReLUs. lists: see plan_forward().
     """
-    if not forward.maps:
-        return forward
     border = _tiles_of(max(LOSS_BORDER, receptive_radius(layers)[layers[-1].name]))
     maps = _map_all(layers, size, forward.active, gradient_radius(layers), border)
     needed = {name: np.zeros_like(of_map.computed) for name, of_map in maps.items()}

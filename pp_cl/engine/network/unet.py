@@ -299,7 +299,8 @@ class Network:
         if self._trained is None:
             raise RuntimeError("Network.backward needs a forward(training=True) before it")
         space, (plan, x), self._trained = self._workspaces[True], self._trained, None
-        plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
+        if plan.maps:  # it skips tiles
+            plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
         parts = self._backward(space, plan, x, grad_y)
         return space.arrays[gradient_of("x")], parts
 
