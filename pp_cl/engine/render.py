@@ -6,7 +6,6 @@ project -> pairs -> blend weights -> shade the visible points -> blend their fea
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -198,7 +197,7 @@ class Renderer:
         depth_range: tuple[float, float] | None = None,
         supersampling: int | None = None,
         training: bool = False,
-        gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
+        gradient_tiles: Pending[np.ndarray] | None = None,
         times_seen: Array | None = None,
     ) -> RenderResult:
         """Render a camera's image, padded by the margin and to multiples of net.multiple pixels.
@@ -208,8 +207,8 @@ class Renderer:
         gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: replaces the
         settings'. depth_range: replaces the model's, for cameras that see beyond it; the softmax
         needs the model's. supersampling: replaces the renderer's.
-        training: keep the arrays that backward() needs. gradient_tiles: returns the argument of
-        that name for Network.plan_tiles(); called after the wait for the device. times_seen: as for
+        training: keep the arrays that backward() needs. gradient_tiles: of
+        Network.gradient_tiles(); got after the wait for the device. times_seen: as for
         find_pairs().
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
@@ -268,7 +267,8 @@ class Renderer:
         with dev.stage("network"):
             plan: Any = None
             if is_planned:
-                plan = net.plan_tiles(size, tile_mask.get(), gradient_tiles())
+                reached = gradient_tiles and gradient_tiles.get()
+                plan = net.plan_tiles(size, tile_mask.get(), reached)
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
             if specular := self.model.specular:

@@ -107,7 +107,7 @@ class Trainer:
                 says_nothing = crop.view.ignored_crop(crop.box, crop.jitter)
             padded, *corner = crop.camera.padded(self.model.net.multiple)
             size = padded.height, padded.width
-            find_gradient_tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
+            gradient_tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
             ignored = None if says_nothing is None else self._sent(says_nothing)
 
         self.renderer.supersampling = supersampling_at(self.step, train)
@@ -115,7 +115,7 @@ class Trainer:
             crop.camera,
             self.gamma,
             training=True,
-            gradient_tiles=find_gradient_tiles,
+            gradient_tiles=gradient_tiles,
             times_seen=self.state.times_seen,
         )
         with self.dev.stage("loss"):

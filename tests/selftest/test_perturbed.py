@@ -23,6 +23,7 @@ FLIPS = [
     ("scene/lens", "2.0f * p2 * xy", "-2.0f * p2 * xy", "scene: lens"),
     ("scene/hull", "counts & ~(in", "counts & (in", "scene: hull"),
     ("training/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
+    ("training/target_between", "a * b / 4", "a - b / 4", "scene: target between pixels"),
     ("raster/project.h", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
     ("raster/footprint/disc.h", "1.0f), f->t", "1.0f), f->z", "raster: pairs, disc"),
     ("raster/footprint/soft.h", "1.0f - sqrt(dis", "1.0f + sqrt(dis", "raster: pairs, soft"),
