@@ -6,7 +6,7 @@ measures a row of that table.
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
@@ -19,6 +19,7 @@ from pp_cl.engine.layers.conv import (
     Blocking,
     Conv,
     ConvShape,
+    column_macros,
     first_float,
     packed_shape,
     parts_shape,
@@ -128,6 +129,21 @@ def work_table(variant: str, shape: ConvShape) -> Table:
     return {name: (of_array, np.float32) for name, of_array in shapes.items()}
 
 
+class WeightsRow(NamedTuple):
+    """A row of the table of lay_out(): cl/layers/weights.cl says what its columns are."""
+
+    item: int
+    kind: int
+    taps: int
+    read: int
+    made: int
+    first: int
+    ci: int
+    weight: int
+    out: int
+    halved: int
+
+
 def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> None:
     """Write the weights in the layout that convolutions read to Conv.work, in one launch.
 
@@ -140,18 +156,20 @@ def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> 
         halved = conv.is_halved and not is_forward
         if conv.variant == "winograd":
             kind, read, made = (1, ci, co) if is_forward else (2, co, ci)
-            rows.append((n, kind, k**2, read, made, 0, ci, *places, halved))
+            rows.append(WeightsRow(n, kind, k**2, read, made, 0, ci, *places, halved=halved))
             n += read * made // VECTOR
         elif not is_forward:
             first = 0
             for channels, blocks in zip(shape.sources, _blocks(shape.sources), strict=True):
-                rows.append((n, 0, k**2, co, channels, first, ci, *places, halved))
+                row = n, 0, k**2, co, channels, first, ci, *places
+                rows.append(WeightsRow(*row, halved=halved))
                 vectors = blocks * k**2 * co
                 n, first, places[1] = n + vectors, first + channels, places[1] + vectors
     if rows:
         # without Winograd's transforms where GPUs do not need them: they spill registers there
-        transforms = int(dev.is_cpu or any(row[1] > 0 for row in rows))
-        dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=transforms).launch(
+        transforms = int(dev.is_cpu or any(row.kind > 0 for row in rows))
+        macros = {"LANES": lanes(dev), "WINOGRAD": transforms} | column_macros("ROW", WeightsRow)
+        dev.program("layers/weights", **macros).launch(
             "lay_out_weights",
             n,
             VECTOR if dev.is_cpu else None,

@@ -149,10 +149,35 @@ def mask_bits(masks: Sequence[bool]) -> int:
     return sum(1 << i for i, is_masked in enumerate(masks) if is_masked)
 
 
+class PartsRow(NamedTuple):
+    """A row of the table of GradientParts, for one convolution: cl/layers/parts.h says what its
+    columns are.
+    """
+
+    item: int
+    sums: int
+    blocks: int
+    count: int
+    partial: int
+    weight: int
+    bias: int
+    halved: int
+
+
+def column_macros(prefix: str, row: Any) -> dict[str, int]:
+    """The defines of kernels that read a table with these rows, a NamedTuple: the number of each
+    column by its name.
+    """
+    return {f"{prefix}_{name.upper()}": number for number, name in enumerate(row._fields)}
+
+
+PARTS_MACROS = column_macros("PARTS", PartsRow)
+
+
 class GradientParts(NamedTuple):
     """The parts of the gradients of several convolutions' weights and biases, as kernels read them
-    (cl/layers/parts.h). n: vectors of 16 in all gradients. table: (convolutions, 8) int32. partial:
-    (?,) float32, the parts.
+    (cl/layers/parts.h). n: vectors of 16 in all gradients. table: (convolutions, 8) int32, a
+    PartsRow for each. partial: (?,) float32, the parts.
     """
 
     n: int
@@ -173,9 +198,10 @@ def gradient_parts(
     for conv, count in parts:
         _, blocks, sums, _ = conv.partial.shape
         places = [first_float(array) // VECTOR for array in (conv.partial, conv.weight, conv.bias)]
-        rows.append((n, sums, blocks, count, *places, conv.is_halved))
+        rows.append(PartsRow(n, sums, blocks, count, *places, halved=conv.is_halved))
         n += sums * blocks
-    (sent,) = table.send([((len(rows), 8), np.int32)], [np.array(rows, np.int32)])
+    values = np.array(rows, np.int32)
+    (sent,) = table.send([(values.shape, np.int32)], [values])
     return GradientParts(n, sent, partial)
 
 
@@ -185,7 +211,7 @@ def sum_parts(dev: Device, parts: GradientParts, grad_weights: Array, grad_biase
     grad_weights, grad_biases: (?,) float32; the gradients lie in them as Conv.weight and Conv.bias
     do in their arrays.
     """
-    dev.program("layers/sum_parts", LANES=lanes(dev)).launch(
+    dev.program("layers/sum_parts", LANES=lanes(dev), **PARTS_MACROS).launch(
         "sum_parts",
         parts.n * row_parts(dev),
         n=parts.n,

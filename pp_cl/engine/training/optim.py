@@ -15,7 +15,7 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import DeviceRows, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
-from pp_cl.engine.layers.conv import GradientParts
+from pp_cl.engine.layers.conv import PARTS_MACROS, GradientParts
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import BlendGradients
 from pp_cl.engine.raster.points import PointCloud, four_blocks, stored_degree
@@ -174,7 +174,8 @@ def adam_update(
     _same_shape(parameter, *moments.values())
     # rate (m / c1) / (sqrt(v / c2) + eps) = (rate root / c1) m / (sqrt(v) + eps root)
     root = math.sqrt(1 - BETA2**step)
-    dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2).launch(
+    decays = {"DECAY1": DECAY1, "DECAY2": DECAY2}
+    dev.program("training/adam", LANES=lanes(dev), **decays, **PARTS_MACROS).launch(
         "adam_update",
         parts.n * row_parts(dev),
         n=parts.n,
