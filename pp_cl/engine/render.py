@@ -55,10 +55,8 @@ def point_radius(
 
 
 def is_supersampled(settings: RasterConfig) -> bool:
-    """Whether a pixel can have several samples: only with discs composited by alpha, where one list
-    of fragments is right for all of them.
-    """
-    return settings.blend == "alpha" and settings.footprint in ("soft", "disc")
+    """Whether a pixel can have several samples: only with discs composited by alpha."""
+    return settings.blend == "alpha" and FOOTPRINTS[settings.footprint].is_flat
 
 
 def view_table(
@@ -301,7 +299,7 @@ class Renderer:
                     derivatives=training,
                     points=points,
                 )
-                weights.read_visible(self.dev)
+                weights.read_count(self.dev)
             tile_mask = None
             if is_planned:
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)

@@ -1,4 +1,4 @@
-"""The kinds of footprints, in place of which points are drawn: what differs between them."""
+"""The kinds of footprints that points have in an image: what differs between them."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,9 @@ class Footprint:
     offsets: numbers in a row of PointCloud.offset, see cl/cloud.h; most_offset: their bound. shape:
     numbers in a row of point_shape, the radius or, of Gaussians, what maps pixels to deviations.
     moves: points learn offsets, if they are composited by alpha, and have radii in voxel sizes.
-    most_sh: the bound of SH coefficients above degree 0; infinity if there is none.
+    most_sh: the bound of SH coefficients above degree 0; infinity if there is none. is_flat: a
+    disc, whose pixels can have several samples, if it is composited by alpha: one list of fragments
+    is right for all of them.
     """
 
     offsets: int = 4
@@ -23,11 +25,12 @@ class Footprint:
     shape: int = 1
     moves: bool = False
     most_sh: float = math.inf
+    is_flat: bool = False
 
 
 FOOTPRINTS = {
-    "disc": Footprint(),
-    "soft": Footprint(moves=True),
+    "disc": Footprint(is_flat=True),
+    "soft": Footprint(is_flat=True, moves=True),
     "sphere": Footprint(),
     "gaussian": Footprint(16, MOST_OF_GAUSSIANS, 4, moves=True, most_sh=MOST_SH_OF_GAUSSIANS),
 }

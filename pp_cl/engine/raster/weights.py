@@ -40,7 +40,7 @@ class BlendWeights:
     visible point in `visible`, undefined for others. transmittance: (HW,) float32 behind all
     fragments, None with the softmax; sample_transmittance: (HW, samples), the same by sample, if a
     pixel has several. visible_rows: (N,) uint32, begins with `visible`; found: (1,) uint32, the
-    number of visible points; count: that number, downloaded by read_visible().
+    number of visible points; count: that number, downloaded by read_count().
     """
 
     blend: str
@@ -57,7 +57,7 @@ class BlendWeights:
     sample_transmittance: Array | None = None
     count: Any = None
 
-    def read_visible(self, dev: Device) -> None:
+    def read_count(self, dev: Device) -> None:
         """Enqueue the download of the number of visible points."""
         self.count = read_total(dev, self.found)
 
@@ -115,7 +115,7 @@ def blend_weights(
     all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
     have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
     pass reads. points: needed if a pixel has several samples (alpha compositing of discs).
-    read_visible() downloads the number of visible points.
+    read_count() downloads the number of visible points.
     """
     side, capacity = pairs.side, pairs.capacity if derivatives else 0
     b.require(weights_table(pairs.points, pairs.pixels, capacity, side))
