@@ -127,37 +127,42 @@ class Loss:
 
         distortion: (...,) float32; the distortion loss is scale * sum(distortion).
         """
-        weight, further, v = self.ssim_weight, dict(self._further), self._window_rows
+        further, downloaded = dict(self._further), None
         if distortion is not None:
             further["distortion"] = distortion_weight, scale
             downloaded = read_later(self.dev, distortion)
-
-        def by_name(rows: np.ndarray) -> dict[str, float]:
-            dissimilarity = rows[:v].sum(0, dtype=np.float64)[0]
-            smooth, l1, mse, mask = rows[v:].sum(0, dtype=np.float64)
-            found = {"mask": mask}
-            if "distortion" in further:
-                found["distortion"] = downloaded.get().sum(dtype=np.float64)
-            more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
-            total = smooth + weight * dissimilarity
-            total += sum(more[name] * weight for name, (weight, _) in further.items())
-            terms = {
-                "loss": float(total),
-                "l1": float(l1),
-                "ssim": float(1 - dissimilarity),
-                "psnr": -10 * math.log10(max(mse, 1e-10)),
-                **more,
-            }
-            broken = [name for name, value in terms.items() if not math.isfinite(value)]
-            if broken:
-                raise Diverged(f"the loss is not finite at step {step} ({', '.join(broken)})")
-            return terms
-
-        return read_later(self.dev, self._buffers.terms, convert=by_name)
+        given = step, self._window_rows, self.ssim_weight, further, downloaded
+        terms = self._buffers.terms
+        return read_later(self.dev, terms, convert=lambda rows: _by_name(rows, *given))
 
     def _launch(self, kernel, rows, **arguments):
         defines = _defines(self.dev)
         launch_groups(self.dev, "training/loss", kernel, rows, defines=defines, **arguments)
+
+
+def _by_name(rows, step, window_rows, ssim_weight, further, distortion):
+    """The terms of Loss.read() from the rows that the kernels wrote. further: {term: (weight,
+    scale)}. distortion: its pending values if it is one of them.
+    """
+    dissimilarity = rows[:window_rows].sum(0, dtype=np.float64)[0]
+    smooth, l1, mse, mask = rows[window_rows:].sum(0, dtype=np.float64)
+    found = {"mask": mask}
+    if "distortion" in further:
+        found["distortion"] = distortion.get().sum(dtype=np.float64)
+    more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
+    total = smooth + ssim_weight * dissimilarity
+    total += sum(more[name] * weight for name, (weight, _) in further.items())
+    terms = {
+        "loss": float(total),
+        "l1": float(l1),
+        "ssim": float(1 - dissimilarity),
+        "psnr": -10 * math.log10(max(mse, 1e-10)),
+        **more,
+    }
+    broken = [name for name, value in terms.items() if not math.isfinite(value)]
+    if broken:
+        raise Diverged(f"the loss is not finite at step {step} ({', '.join(broken)})")
+    return terms
 
 
 def _defines(dev):
