@@ -205,9 +205,9 @@ class Renderer:
         gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: replaces the
         settings'. depth_range: replaces the model's, for cameras that see beyond it; the softmax
         needs the model's. supersampling: replaces the renderer's.
-        training: keep the arrays that backward() needs. gradient_tiles: of
-        Network.gradient_tiles(); got after the wait for the device. times_seen: as for
-        find_pairs().
+        training: keep the arrays that backward() needs. gradient_tiles: what
+        Network.gradient_tiles() returned; its value is taken after the wait for the device.
+        times_seen: as for find_pairs().
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         margin = self.margin if until == "image" and not training else 0
@@ -226,7 +226,8 @@ class Renderer:
             self.release()
         b = self._buffers
         b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
-        dev.send(b.camera_buffer, self.model.packed(padded.enlarged(side), depth_range))
+        of_samples = padded.enlarged(side) if side > 1 else padded
+        dev.send(b.camera_buffer, self.model.packed(of_samples, depth_range))
         with dev.stage("project"):
             points = project_grid(
                 dev,
