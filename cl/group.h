@@ -17,6 +17,7 @@
 #if GROUP > 1
 #include "gpu/group.h"
 #else
+// One work-item: the sum is its own value, and no member is before it.
 #define GROUP_BARRIER
 #define SHARED(T, name, items)
 #define group_sum(value, shared) (value)

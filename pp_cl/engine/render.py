@@ -266,7 +266,7 @@ class Renderer:
         with dev.stage("network"):
             plan: Any = None
             if is_planned:
-                reached = gradient_tiles and gradient_tiles.get()
+                reached = gradient_tiles.get() if gradient_tiles else None
                 plan = net.plan_tiles(size, tile_mask.get(), reached)
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
