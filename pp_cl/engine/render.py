@@ -150,6 +150,16 @@ class RenderResult:
         return array[top : top + self.camera.height, left : left + self.camera.width]
 
 
+@dataclass
+class Capacity:
+    """The numbers of pairs and of visible points that a view's arrays hold; both grow with the
+    views.
+    """
+
+    pairs: int = 1
+    visible: int = 1
+
+
 class Renderer:
     """Renders a model. Its buffers are reused from view to view. supersampling: of images, as in
     RenderResult, 1 or 2. margin: pixels that are rendered around an image and cut off, except in a
@@ -167,11 +177,10 @@ class Renderer:
         self.dev = dev
         self.model = model
         self.settings = settings
-        # Images and a training's steps take turns in memory, as previews are larger than crops. For
-        # each of the two: capacities of the arrays of pairs and of visible points, which grow with
-        # the views.
+        # Images and a training's steps take turns in memory, as previews are larger than crops;
+        # each of the two has its capacity.
         self._by_pair = False
-        self._capacity, self._visible_capacity = [1, 1], [1, 1]
+        self._capacities = {False: Capacity(), True: Capacity()}
         self.supersampling, self.margin = supersampling, margin
         self.release()
 
@@ -251,10 +260,10 @@ class Renderer:
             return result
         with dev.stage("shade"):
             visible, count = weights.visible_rows, weights.total
-            capacity = self._visible_capacity[by_pair] = grown(
-                self._visible_capacity[by_pair], count
-            )
-            b.require({"visible_features": ((min(capacity, cloud.count), 16), np.float32)})
+            capacity = self._capacities[by_pair]
+            capacity.visible = grown(capacity.visible, count)
+            rows = min(capacity.visible, cloud.count)
+            b.require({"visible_features": ((rows, 16), np.float32)})
             shade_forward(
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
@@ -280,11 +289,10 @@ class Renderer:
         enqueued before the number of pairs is known, and run again with more capacity if it was too
         small.
         """
-        settings, by_pair, b = self.settings, self._by_pair, self._buffers
+        settings, capacity, b = self.settings, self._capacities[self._by_pair], self._buffers
         while True:
             with self.dev.stage("pairs"):
-                capacity = self._capacity[by_pair]
-                pairs = find_pairs(self.dev, b, points, size, capacity, times_seen)
+                pairs = find_pairs(self.dev, b, points, size, capacity.pairs, times_seen)
                 pairs.read_count(self.dev)
             with self.dev.stage("weights"):
                 weights = blend_weights(
@@ -305,8 +313,8 @@ class Renderer:
             if is_planned:
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
             (tile_mask or weights.count).get()  # the host's only wait for the device
-            self._capacity[by_pair] = capacity_needed(pairs)
-            if self._capacity[by_pair] == pairs.capacity:
+            capacity.pairs = capacity_needed(pairs)
+            if capacity.pairs == pairs.capacity:
                 return pairs, weights, tile_mask
             del pairs, weights  # frees their arrays before larger ones are allocated
 
