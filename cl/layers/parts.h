@@ -10,7 +10,7 @@
 #define PARTS_ITEM 0     // first row of partial of all weights
 #define PARTS_SUMS 1     // rows of a part and block: K * K * ci + 1, the last one the bias
 #define PARTS_BLOCKS 2   // groups of 16 output channels
-#define PARTS_COUNT 3    // parts
+#define PARTS_PARTS 3    // parts
 #define PARTS_PARTIAL 4  // where the parts begin, in vectors of 16, as the next two
 #define PARTS_WEIGHT 5   // where the gradient of the weights begins
 #define PARTS_BIAS 6     // where that of the biases begins
@@ -37,7 +37,7 @@ typedef struct {
 ALWAYS_INLINE Sum
 sum_of(global const int *table, const uint rows, global const float16 *partial, const int item) {
     global const int *of = row_of(table, 8, rows, item);
-    const int per_block = of[PARTS_SUMS], blocks = of[PARTS_BLOCKS], parts = of[PARTS_COUNT];
+    const int per_block = of[PARTS_SUMS], blocks = of[PARTS_BLOCKS], parts = of[PARTS_PARTS];
     const int row = (item - of[PARTS_ITEM]) % per_block,
               block = (item - of[PARTS_ITEM]) / per_block;
     Sum found;

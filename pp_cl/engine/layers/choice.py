@@ -151,20 +151,20 @@ def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> 
     """
     rows, n = [], 0
     for conv in convs:
-        shape, places = conv.shape, [first_float(conv.weight), first_float(conv.work) // VECTOR]
+        shape = conv.shape
+        weight, out = first_float(conv.weight), first_float(conv.work) // VECTOR
         k, ci, co, is_forward = shape.k, shape.ci, shape.co, shape.direction == "forward"
         halved = conv.is_halved and not is_forward
         if conv.variant == "winograd":
             kind, read, made = (1, ci, co) if is_forward else (2, co, ci)
-            rows.append(WeightsRow(n, kind, k**2, read, made, 0, ci, *places, halved=halved))
+            rows.append(WeightsRow(n, kind, k**2, read, made, 0, ci, weight, out, halved))
             n += read * made // VECTOR
         elif not is_forward:
             first = 0
             for channels, blocks in zip(shape.sources, _blocks(shape.sources), strict=True):
-                row = n, 0, k**2, co, channels, first, ci, *places
-                rows.append(WeightsRow(*row, halved=halved))
+                rows.append(WeightsRow(n, 0, k**2, co, channels, first, ci, weight, out, halved))
                 vectors = blocks * k**2 * co
-                n, first, places[1] = n + vectors, first + channels, places[1] + vectors
+                n, first, out = n + vectors, first + channels, out + vectors
     if rows:
         # without Winograd's transforms where GPUs do not need them: they spill registers there
         transforms = int(dev.is_cpu or any(row.kind > 0 for row in rows))

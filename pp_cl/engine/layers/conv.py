@@ -157,7 +157,7 @@ class PartsRow(NamedTuple):
     item: int
     sums: int
     blocks: int
-    count: int
+    parts: int
     partial: int
     weight: int
     bias: int
@@ -197,8 +197,9 @@ def gradient_parts(
     rows, n = [], 0
     for conv, count in parts:
         _, blocks, sums, _ = conv.partial.shape
-        places = [first_float(array) // VECTOR for array in (conv.partial, conv.weight, conv.bias)]
-        rows.append(PartsRow(n, sums, blocks, count, *places, halved=conv.is_halved))
+        arrays = conv.partial, conv.weight, conv.bias
+        partial_at, weight, bias = (first_float(array) // VECTOR for array in arrays)
+        rows.append(PartsRow(n, sums, blocks, count, partial_at, weight, bias, conv.is_halved))
         n += sums * blocks
     values = np.array(rows, np.int32)
     (sent,) = table.send([(values.shape, np.int32)], [values])
