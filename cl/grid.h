@@ -20,12 +20,4 @@ static inline uint3 grid_vertex(global const float *grid, const uint id) {
     return BRICK * (uint3)(brick - row * nx, row % ny, row / ny) + inside;
 }
 
-// The id of a vertex (i, j, k).
-static inline uint grid_id(global const float *grid, const uint3 vertex) {
-    const uint nx = bricks(grid[4]), ny = bricks(grid[5]);
-    const uint3 brick = vertex / BRICK, inside = vertex % BRICK;
-    return (brick.x + nx * (brick.y + ny * brick.z)) << 3 * BRICK_BITS |
-           (inside.x | inside.y << BRICK_BITS | inside.z << 2 * BRICK_BITS);
-}
-
 #endif

@@ -13,12 +13,19 @@
 #if LANES == 16
 #define LANED(name) name##16
 #define LANE (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
-#elif LANES == 4
-#define LANED(name) name##4
-#define LANE (uint4)(0, 1, 2, 3)
-#else
-#define LANED(name) name
-#define LANE 0u
+#define LANES_FROM(p) vload16(0, p)
+#define LANES_INTO(p, value) vstore16(value, 0, p)
+#define ANY_LANE(v) any(v)
+#define SUM_LANES(v) sum16(v)
+#define MAX_LANES(v) max16(v)
+// load_lanes(p, count): the values at p, of which `count` exist; the others read as 0.
+// store_lanes(value, p, count): writes the first `count` of the values to p.
+#define load_lanes load16
+#define store_lanes store16
+#define GPU_UNROLLED_FOR for
+#endif
+#if LANES < 16
+#include "gpu/lanes.h"
 #endif
 
 // Steps of a walk whose reads do not wait for each other: 4 on GPUs, where a read takes hundreds of
@@ -47,26 +54,6 @@ typedef LANED(float) floats;
 typedef LANED(int) ints;
 typedef LANED(uint) uints;
 
-#if LANES == 16
-#define GPU_UNROLLED_FOR for
-#else
-#define GPU_UNROLLED_FOR UNROLLED_FOR
-#endif
-
-#if LANES == 1
-#define LANES_FROM(p) (*(p))
-#define LANES_INTO(p, value) (*(p) = (value))
-#define ANY_LANE(v) ((v) != 0)
-#define SUM_LANES(v) (v)
-#define MAX_LANES(v) (v)
-#else
-#define LANES_FROM(p) LANED(vload)(0, p)
-#define LANES_INTO(p, value) LANED(vstore)(value, 0, p)
-#define ANY_LANE(v) any(v)
-#define SUM_LANES(v) LANED(sum)(v)
-#define MAX_LANES(v) LANED(max)(v)
-#endif
-
 // A row of 16 channels has ROW_PARTS such vectors. Of a kernel with a work-item for each part of
 // each row, ROW_PART is the item's, get_global_id(0) / ROW_PARTS its row.
 #define ROW_PARTS (CHANNELS / LANES)
@@ -79,18 +66,5 @@ ALWAYS_INLINE floats load_part(global const float16 *rows, const size_t row) {
 ALWAYS_INLINE void store_part(const floats value, global float16 *rows, const size_t row) {
     ((global floats *)rows)[row * ROW_PARTS + ROW_PART] = value;
 }
-
-// load_lanes(p, count): the values at p, of which `count` exist; the others read as 0.
-// store_lanes(value, p, count): writes the first `count` of the values to p.
-#if LANES == 16
-#define load_lanes load16
-#define store_lanes store16
-#elif LANES == 4
-#define load_lanes load4
-#define store_lanes store4
-#else
-#define load_lanes(p, count) (*(p))
-#define store_lanes(value, p, count) (*(p) = (value))
-#endif
 
 #endif

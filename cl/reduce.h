@@ -1,5 +1,5 @@
-// The 16 or 4 lanes of a vector reduced to one value: always lane i with lane i + 8, then i + 4, i
-// + 2 and i + 1, so that the order of a sum is fixed.
+// The 16 lanes of a vector reduced to one value: always lane i with lane i + 8, then i + 4, i + 2 and
+// i + 1, so that the order of a sum is fixed.
 #ifndef PP_REDUCE_H
 #define PP_REDUCE_H
 
@@ -14,14 +14,7 @@
     }
 #define SUM(a, b) ((a) + (b))
 
-#define REDUCE4(name, T, JOIN)                                                                     \
-    static inline T name(const T##4 v) {                                                           \
-        const T##2 v2 = JOIN(v.lo, v.hi);                                                          \
-        return JOIN(v2.x, v2.y);                                                                   \
-    }
-
 REDUCE16(sum16, float, SUM)
-REDUCE4(sum4, float, SUM)
 REDUCE16(max16, float, fmax)
 
 // Sum of the products of two 16-vectors.

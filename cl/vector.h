@@ -1,5 +1,4 @@
-// Loads and stores of 16 or 4 neighbouring values as one vector, of which the last ones may not
-// exist.
+// Loads and stores of 16 neighbouring values as one vector, of which the last ones may not exist.
 #ifndef PP_VECTOR_H
 #define PP_VECTOR_H
 
@@ -30,19 +29,6 @@ static inline void store16(const float16 value, global float *p, const int count
     vstore16(value, 0, x);
     for (int i = 0; i < count; i++)
         p[i] = x[i];
-}
-
-// The same of 4 values.
-static inline float4 load4(global const float *p, const int count) {
-    if (count >= 4) return vload4(0, p);
-    return (float4)(p[0], count > 1 ? p[1] : 0.0f, count > 2 ? p[2] : 0.0f, 0.0f);
-}
-
-static inline void store4(const float4 value, global float *p, const int count) {
-    p[0] = value.x;
-    if (count > 1) p[1] = value.y;
-    if (count > 2) p[2] = value.z;
-    if (count > 3) p[3] = value.w;
 }
 
 #endif

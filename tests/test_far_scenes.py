@@ -10,7 +10,7 @@ from support.runs import arguments
 from support.scenes import move_scene, write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
+from pp_cl.engine.raster.footprint import MOST_OF_GAUSSIANS
 from pp_cl.metrics.shape import read_mesh
 from pp_cl.run import load
 from pp_studio.export.gltf import write_glb

@@ -9,6 +9,7 @@ minute is 40 lines of code, without blank lines, comments and docstrings.
 import ast
 import gc
 import io
+import operator
 import re
 import sys
 import tempfile
@@ -16,6 +17,7 @@ import tokenize
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from pp_cl.config import run_config
 from pp_cl.drivers import open_device
@@ -39,12 +41,15 @@ LEAST_LINES = 5  # of a listed function; shorter ones are explained by their nam
 HEAD = """# The road: one step, in the order to read it
 
 What `Trainer.train_step` calls in a default training on a CPU, once its buffers are there:
-functions of `pp_cl/engine/` from {least} lines of code on and files of `cl/`, where they come
-first, after the minutes of reading up to their end, at {pace} lines a minute. `make docs` traces a
-step and writes this page; [architecture.md](architecture.md#a-training-step) says what the parts
-do.
+functions of `pp_cl/engine/` from {least} lines of code on and files of `cl/`, of headers those that
+the step's kernels are built with. They stand where they come first, after the minutes of reading up
+to their end, at {pace} lines a minute. `make docs` traces a step and writes this page;
+[architecture.md](architecture.md#a-training-step) says what the parts do.
 
 """
+# an #include, and the condition of an #if or #elif right above it
+INCLUDE = r'(?m)^(?:#(?:el)?if (\w+)(?: (==|<|>) (\w+))?\n)?#include "(.+)"'
+RELATIONS = {"": operator.ne, "==": operator.eq, "<": operator.lt, ">": operator.gt}
 Step = tuple[Path, str]  # (a file, a function in it; "" for a file of kernels)
 
 
@@ -76,7 +81,9 @@ def called(function: Callable[[], object]) -> list[Step]:
         if event == "call" and ENGINE in path.parents and not code.co_name.startswith("<"):
             found[path, code.co_name] = None
             if code.co_name == "program":
-                found[kernel_folder() / f"{frame.f_locals['name']}.cl", ""] = None
+                name, macros = frame.f_locals["name"], frame.f_locals["defines"]
+                for file in kernel_files(kernel_folder() / f"{name}.cl", macros):
+                    found[file, ""] = None
 
     gc.disable()  # its callbacks for unrelated arrays would be listed
     sys.setprofile(watch)
@@ -109,11 +116,19 @@ def python_lines(path: Path) -> dict[str, int]:
     return found
 
 
-def kernel_files(path: Path) -> list[Path]:
-    """The headers that a kernel's file includes, then the file."""
-    includes = re.findall(r'(?m)^#include "(.+)"', path.read_text("utf-8"))
-    headers = [file for name in includes for file in kernel_files(kernel_folder() / name)]
-    return [*dict.fromkeys([*headers, path])]
+def kernel_files(path: Path, macros: dict[str, Any]) -> list[Path]:
+    """The headers that a kernel's file includes if it is built with these macros, then the file."""
+    text = path.read_text("utf-8")
+    values = dict(re.findall(r"(?m)^#define (\w+) (\w+)", text)) | macros
+
+    def number(word):
+        return number(values[word]) if word in values else int(word)
+
+    found: dict[Path, None] = {}
+    for left, relation, right, name in re.findall(INCLUDE, text):
+        if not left or RELATIONS[relation](number(left), number(right or "0")):
+            found |= dict.fromkeys(kernel_files(kernel_folder() / name, macros))
+    return [*found, path]
 
 
 def kernel_lines(path: Path) -> int:
@@ -125,7 +140,6 @@ def kernel_lines(path: Path) -> int:
 def page(steps: list[Step]) -> str:
     """The text of docs/road.md."""
     rows: list[tuple[Path, list[str], int]] = []
-    read: set[Path] = set()
     for path, function in steps:
         if function:
             lines = python_lines(path).get(function, 0)
@@ -136,10 +150,7 @@ def page(steps: list[Step]) -> str:
             else:
                 rows.append((path, [function], lines))
             continue
-        for file in kernel_files(path):
-            if file not in read:
-                rows.append((file, [], kernel_lines(file)))
-                read.add(file)
+        rows.append((path, [], kernel_lines(path)))
     text, total = HEAD.format(least=LEAST_LINES, pace=LINES_A_MINUTE), 0
     for path, functions, lines in rows:
         total += lines

@@ -3,8 +3,8 @@
 #ifndef PP_LOCAL_H
 #define PP_LOCAL_H
 
+#include "gpu/vector.h"
 #include "layers/tiles.h"
-#include "vector.h"
 
 #ifndef KERNEL_SIZE
 #define KERNEL_SIZE 3  // side of the kernel: 1 or 3

@@ -1,12 +1,21 @@
 // The gradients of the weights and biases of all convolutions are sums of parts, each of another
-// share of the image. A table has a row for each convolution: first row of partial of all weights;
-// rows of one part and group of 16 output channels (K * K * ci + 1, the last one the bias); such
-// groups; parts; where the parts, the gradient of the weights and that of the biases begin, in
-// vectors of 16; 1 if the sums are halved.
+// share of the image. A table has a row for each convolution, PartsRow of
+// pp_cl/engine/layers/conv.py.
 #ifndef PP_PARTS_H
 #define PP_PARTS_H
 
 #include "lanes.h"
+
+#ifndef PARTS_ITEM
+#define PARTS_ITEM 0     // first row of partial of all weights
+#define PARTS_SUMS 1     // rows of a part and block: K * K * ci + 1, the last one the bias
+#define PARTS_BLOCKS 2   // groups of 16 output channels
+#define PARTS_PARTS 3    // parts
+#define PARTS_PARTIAL 4  // where the parts begin, in vectors of 16, as the next two
+#define PARTS_WEIGHT 5   // where the gradient of the weights begins
+#define PARTS_BIAS 6     // where that of the biases begins
+#define PARTS_HALVED 7   // 1: the sums are halved
+#endif
 
 // The row of the table whose items are from its first number on. length: of a row.
 static inline global const int *
@@ -28,15 +37,18 @@ typedef struct {
 ALWAYS_INLINE Sum
 sum_of(global const int *table, const uint rows, global const float16 *partial, const int item) {
     global const int *of = row_of(table, 8, rows, item);
-    const int per_block = of[1], blocks = of[2], parts = of[3];
-    const int row = (item - of[0]) % per_block, block = (item - of[0]) / per_block;
+    const int per_block = of[PARTS_SUMS], blocks = of[PARTS_BLOCKS], parts = of[PARTS_PARTS];
+    const int row = (item - of[PARTS_ITEM]) % per_block,
+              block = (item - of[PARTS_ITEM]) / per_block;
     Sum found;
     found.sum = 0.0f;
     for (int part = 0; part < parts; part++)
-        found.sum += load_part(partial, of[4] + ((size_t)part * blocks + block) * per_block + row);
-    if (of[7]) found.sum *= 0.5f;
+        found.sum += load_part(
+            partial, of[PARTS_PARTIAL] + ((size_t)part * blocks + block) * per_block + row);
+    if (of[PARTS_HALVED]) found.sum *= 0.5f;
     found.is_bias = row == per_block - 1;
-    found.at = found.is_bias ? of[6] + block : of[5] + block * (per_block - 1) + row;
+    found.at =
+        found.is_bias ? of[PARTS_BIAS] + block : of[PARTS_WEIGHT] + block * (per_block - 1) + row;
     return found;
 }
 

@@ -1,5 +1,5 @@
-// Weights as kernels read them, if not as they are; the sums of the parts of their gradients. Each
-// for all convolutions at once, of which a table has rows.
+// Weights as kernels read them, if not as they are, for all convolutions at once, of which a table
+// has rows.
 #include "lanes.h"
 #include "layers/parts.h"
 
@@ -8,6 +8,22 @@
 #endif
 #if WINOGRAD
 #include "layers/winograd.h"
+#endif
+
+// Columns of a row of the table, WeightsRow of pp_cl/engine/layers/choice.py.
+#ifndef ROW_ITEM
+#define ROW_ITEM 0  // first work-item
+// 0: weights of an input gradient (blocks, K, K, co, 16), 1: the transform G g G^T (winograd.h), 2:
+// that of an input gradient
+#define ROW_KIND 1
+#define ROW_TAPS 2    // K * K
+#define ROW_READ 3    // channels that the result is computed from
+#define ROW_MADE 4    // channels of the result
+#define ROW_FIRST 5   // the first of these among the input channels
+#define ROW_CI 6      // input channels of the weights
+#define ROW_WEIGHT 7  // where the weights begin
+#define ROW_OUT 8     // where the result's vectors begin
+#define ROW_HALVED 9  // 1: the result is halved
 #endif
 
 // `scale` times the weights of `count` input channels from `first` on, at most 16, for a tap and the
@@ -31,10 +47,6 @@ static inline float16 across(
 // One work-item per vector of 16 channels of the result and channel that it is computed from; one
 // for all taps where weights are transformed. For an input gradient kernels are mirrored, input and
 // output channels exchange their roles, and what is halved behind the convolution is halved here.
-// Rows of `table`: first work-item; 0 for weights of an input gradient (blocks, K, K, co, 16), 1 for
-// the transform G g G^T (winograd.h), 2 for that of an input gradient; taps (K * K); channels that
-// the result is computed from, and of the result, the first of these among the input channels; input
-// channels of the weights; where weights and vectors begin; 1 if they are halved.
 kernel void lay_out_weights(
     const uint n,  // work-items
     const uint rows,
@@ -45,15 +57,17 @@ kernel void lay_out_weights(
     const int item = get_global_id(0);
     if (item >= n) return;
     global const int *row = row_of(table, 10, rows, item);
-    const int kind = row[1], taps = row[2], channels = row[3], ci = row[6];
-    const int c = (item - row[0]) % channels, rest = (item - row[0]) / channels;
-    const float scale = row[9] ? 0.5f : 1.0f;
-    global const float *weight = weights + row[7];
-    global float16 *out = laid_out + row[8];
+    const int kind = row[ROW_KIND], taps = row[ROW_TAPS], channels = row[ROW_READ],
+              ci = row[ROW_CI];
+    const int c = (item - row[ROW_ITEM]) % channels, rest = (item - row[ROW_ITEM]) / channels;
+    const float scale = row[ROW_HALVED] ? 0.5f : 1.0f;
+    global const float *weight = weights + row[ROW_WEIGHT];
+    global float16 *out = laid_out + row[ROW_OUT];
     if (kind == 0) {
         const int tap = rest % taps, block = rest / taps;
-        out[(block * taps + taps - 1 - tap) * channels + c] =
-            across(weight, taps, tap, c, ci, row[5] + block * 16, row[4] - block * 16, scale);
+        out[(block * taps + taps - 1 - tap) * channels + c] = across(
+            weight, taps, tap, c, ci, row[ROW_FIRST] + block * 16, row[ROW_MADE] - block * 16,
+            scale);
         return;
     }
 #if WINOGRAD
@@ -64,21 +78,6 @@ kernel void lay_out_weights(
                                         : vload16((rest * 9 + i) * ci + c, weight);
     transform_kernel_tile(t);
     UNROLLED_FOR (int i = 0; i < POSITIONS; i++)
-        out[WEIGHT_AT(i, rest, row[4] / 16, channels) + c] = t[i];
+        out[WEIGHT_AT(i, rest, row[ROW_MADE] / 16, channels) + c] = t[i];
 #endif
-}
-
-// One work-item per part of a row of parts.h: writes LANES values of a gradient.
-kernel void sum_parts(
-    const uint n,  // rows of partial, of one part of all weights
-    const uint rows,
-    global const int *table,        // (rows, 8) parts.h
-    global const float16 *partial,  // (...) as there
-    global float16 *grad_weights,   // (...)
-    global float16 *grad_biases)    // (...)
-{
-    const int item = get_global_id(0) / ROW_PARTS;
-    if (item >= n) return;
-    const Sum found = sum_of(table, rows, partial, item);
-    store_part(found.sum, found.is_bias ? grad_biases : grad_weights, found.at);
 }

@@ -19,6 +19,7 @@
 #include "cloud.h"
 #include "lanes.h"
 
+// the kinds
 #define DISC 0
 #define SOFT 1
 #define SPHERE 2
@@ -30,7 +31,7 @@
 #define SHAPE 1  // numbers in a row of point_shape: the radius; of Gaussians 4
 #endif
 #ifndef MOST_OFFSET
-#define MOST_OFFSET 0.5f  // PointCloud.most_offset of points that are no Gaussians
+#define MOST_OFFSET 0.5f  // of points that are no Gaussians, pp_cl/engine/raster/footprint.py
 #endif
 
 // Samples of a pixel, each way: the camera's pixels are the samples, boxes and lists are of pixels.
@@ -134,7 +135,7 @@ ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
 #include "raster/footprint/soft.h"
 #elif FOOTPRINT == SPHERE
 #include "raster/footprint/sphere.h"
-#else
+#elif FOOTPRINT == GAUSSIAN
 #include "raster/footprint/gaussian.h"
 #endif
 

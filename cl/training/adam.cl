@@ -1,5 +1,5 @@
 // Adam (Kingma & Ba 2015, section 2, with the bias corrections folded into rate and eps on the
-// host) and exponential moving averages (EMA).
+// host).
 #include "common.h"
 #include "lanes.h"
 #include "layers/parts.h"
@@ -36,18 +36,4 @@ kernel void adam_update(
     store_part(v_new, v, found.at);
     store_part(
         load_part(parameter, found.at) - rate * m_new / (sqrt(v_new) + eps), parameter, found.at);
-}
-
-// One work-item per LANES values: moves an EMA towards a parameter.
-kernel void ema_update(
-    const uint n,                   // values
-    const float weight,             // of the parameter
-    global const float *parameter,  // (...) n values
-    global float *ema)              // (...) n values
-{
-    const size_t i = LANES * get_global_id(0);
-    if (i >= n) return;
-    const int count = min(n - (uint)i, (uint)LANES);
-    const floats a = load_lanes(ema + i, count);
-    store_lanes(a + weight * (load_lanes(parameter + i, count) - a), ema + i, count);
 }

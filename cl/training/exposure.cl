@@ -4,37 +4,12 @@
 // the loss compares the rendering with the image that has been multiplied by the inverse. They
 // concern the object's part of a colour over white, c - (1 - a), and a itself, the fourth column's.
 #include "group.h"
+#include "training/exposure.h"
 
 #ifndef MOST
 #define MOST 8.0f  // gain: three stops
 #endif
 #define BLOCK 8  // pixels of the squares that are one half of the image and the other in turn
-// rows of one half: products of rendering and rendering, 4; of image and rendering, 3; squares of
-// the image
-#define SUMS 8
-#define MATRIX (2 * SUMS)  // first row of a view's matrix
-#define ROWS (MATRIX + 3)
-
-// One work-item per target pixel: writes the image as the model's colours have it.
-kernel void exposure_undo(
-    const uint hw,  // pixels of the target
-    const uint view,
-    global const float4 *exposure,  // (VIEWS, ROWS, 4)
-    global const float *image,      // (H, W, 3)
-    global const float *alpha,      // (H, W)
-    global float *target)           // (H, W, 3)
-{
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    global const float4 *m = exposure + ROWS * view + MATRIX;
-    const float white = 1.0f - alpha[q];
-    const float3 shift = (float3)(m[0].w, m[1].w, m[2].w);
-    const float3 c = vload3(q, image) - white - alpha[q] * shift;
-    // Cramer's rule
-    const float3 r = m[0].xyz, g = m[1].xyz, b = m[2].xyz;
-    const float3 gb = cross(g, b), br = cross(b, r), rg = cross(r, g);
-    vstore3((c.x * gb + c.y * br + c.z * rg) / dot(r, gb) + white, q, target);
-}
 
 // GROUP work-items per row: write its sums of products, of both halves.
 kernel void exposure_products(

@@ -5,6 +5,14 @@
 #include "grid.h"
 #include "lanes.h"
 
+// The id of a vertex (i, j, k): the inverse of grid_vertex().
+static inline uint grid_id(global const float *grid, const uint3 vertex) {
+    const uint nx = bricks(grid[4]), ny = bricks(grid[5]);
+    const uint3 brick = vertex / BRICK, inside = vertex % BRICK;
+    return (brick.x + nx * (brick.y + ny * brick.z)) << 3 * BRICK_BITS |
+           (inside.x | inside.y << BRICK_BITS | inside.z << 2 * BRICK_BITS);
+}
+
 // Index of `id` in ids[first, last), ascending; NONE where it is missing.
 static inline uint find(global const uint *ids, const uint id, uint first, uint last) {
     const uint end = last;

@@ -115,7 +115,7 @@ class PulsarScene:
         with dev.stage("weights"):
             opacity = self.point_opacity
             weights = blend_weights(dev, b, pairs, camera, opacity, blend=blend, gamma=GAMMA)
-            weights.read_visible(dev)
+            weights.read_count(dev)
         with dev.stage("blend"):
             features = gather_rows(dev, self.device_features, weights.visible)
             blend_forward(dev, b, pairs, weights, features, self.features)

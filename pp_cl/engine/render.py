@@ -6,7 +6,6 @@ project -> pairs -> blend weights -> shade the visible points -> blend their fea
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -27,14 +26,14 @@ from pp_cl.engine.raster.blend import (
     blend_forward,
     shade_forward,
 )
+from pp_cl.engine.raster.footprint import FOOTPRINTS
+from pp_cl.engine.raster.highest_weights import list_weights, record_weights
 from pp_cl.engine.raster.pairs import Pairs, capacity_needed, find_pairs, pairs_table
-from pp_cl.engine.raster.project import MOVED, ProjectedPoints, project_grid, projection_table
+from pp_cl.engine.raster.project import ProjectedPoints, project_grid, projection_table
 from pp_cl.engine.raster.weights import (
     ALL,
     BlendWeights,
     blend_weights,
-    list_weights,
-    record_weights,
     weights_table,
 )
 from pp_cl.errors import UserError
@@ -49,17 +48,15 @@ def point_radius(
     settings: RasterConfig, voxel_size: float, depth_range: tuple[float, float]
 ) -> float:
     """The radius in world units of points whose offset is 0. voxel_size: world units."""
-    if settings.footprint in MOVED:
+    if FOOTPRINTS[settings.footprint].moves:
         return settings.radius * voxel_size
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
 
 
 def is_supersampled(settings: RasterConfig) -> bool:
-    """Whether a pixel can have several samples: only with discs composited by alpha, where one list
-    of fragments is right for all of them.
-    """
-    return settings.blend == "alpha" and settings.footprint in ("soft", "disc")
+    """Whether a pixel can have several samples: only with discs composited by alpha."""
+    return settings.blend == "alpha" and FOOTPRINTS[settings.footprint].is_flat
 
 
 def view_table(
@@ -153,6 +150,16 @@ class RenderResult:
         return array[top : top + self.camera.height, left : left + self.camera.width]
 
 
+@dataclass
+class Capacity:
+    """The numbers of pairs and of visible points that a view's arrays hold; both grow with the
+    views.
+    """
+
+    pairs: int = 1
+    visible: int = 1
+
+
 class Renderer:
     """Renders a model. Its buffers are reused from view to view. supersampling: of images, as in
     RenderResult, 1 or 2. margin: pixels that are rendered around an image and cut off, except in a
@@ -170,11 +177,10 @@ class Renderer:
         self.dev = dev
         self.model = model
         self.settings = settings
-        # Images and a training's steps take turns in memory, as previews are larger than crops. For
-        # each of the two: capacities of the arrays of pairs and of visible points, which grow with
-        # the views.
+        # Images and a training's steps take turns in memory, as previews are larger than crops;
+        # each of the two has its capacity.
         self._by_pair = False
-        self._capacity, self._visible_capacity = [1, 1], [1, 1]
+        self._capacities = {False: Capacity(), True: Capacity()}
         self.supersampling, self.margin = supersampling, margin
         self.release()
 
@@ -198,7 +204,7 @@ class Renderer:
         depth_range: tuple[float, float] | None = None,
         supersampling: int | None = None,
         training: bool = False,
-        gradient_tiles: Callable[[], np.ndarray | None] = lambda: None,
+        gradient_tiles: Pending[np.ndarray] | None = None,
         times_seen: Array | None = None,
     ) -> RenderResult:
         """Render a camera's image, padded by the margin and to multiples of net.multiple pixels.
@@ -208,9 +214,9 @@ class Renderer:
         gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: replaces the
         settings'. depth_range: replaces the model's, for cameras that see beyond it; the softmax
         needs the model's. supersampling: replaces the renderer's.
-        training: keep the arrays that backward() needs. gradient_tiles: returns the argument of
-        that name for Network.plan_tiles(); called after the wait for the device. times_seen: as for
-        find_pairs().
+        training: keep the arrays that backward() needs. gradient_tiles: what
+        Network.gradient_tiles() returned; its value is taken after the wait for the device.
+        times_seen: as for find_pairs().
         """
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         margin = self.margin if until == "image" and not training else 0
@@ -229,7 +235,8 @@ class Renderer:
             self.release()
         b = self._buffers
         b.require({"camera_buffer": ((21,), np.float32), "features": ((*size, 16), np.float32)})
-        dev.send(b.camera_buffer, self.model.packed(padded.enlarged(side), depth_range))
+        of_samples = padded.enlarged(side) if side > 1 else padded
+        dev.send(b.camera_buffer, self.model.packed(of_samples, depth_range))
         with dev.stage("project"):
             points = project_grid(
                 dev,
@@ -253,10 +260,10 @@ class Renderer:
             return result
         with dev.stage("shade"):
             visible, count = weights.visible_rows, weights.total
-            capacity = self._visible_capacity[by_pair] = grown(
-                self._visible_capacity[by_pair], count
-            )
-            b.require({"visible_features": ((min(capacity, cloud.count), 16), np.float32)})
+            capacity = self._capacities[by_pair]
+            capacity.visible = grown(capacity.visible, count)
+            rows = min(capacity.visible, cloud.count)
+            b.require({"visible_features": ((rows, 16), np.float32)})
             shade_forward(
                 dev, points, visible, count, cloud.sh, visible_features=b.visible_features
             )
@@ -268,7 +275,8 @@ class Renderer:
         with dev.stage("network"):
             plan: Any = None
             if is_planned:
-                plan = net.plan_tiles(size, tile_mask.get(), gradient_tiles())
+                reached = gradient_tiles.get() if gradient_tiles else None
+                plan = net.plan_tiles(size, tile_mask.get(), reached)
                 result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(result.features, training, plan)
             if specular := self.model.specular:
@@ -281,11 +289,10 @@ class Renderer:
         enqueued before the number of pairs is known, and run again with more capacity if it was too
         small.
         """
-        settings, by_pair, b = self.settings, self._by_pair, self._buffers
+        settings, capacity, b = self.settings, self._capacities[self._by_pair], self._buffers
         while True:
             with self.dev.stage("pairs"):
-                capacity = self._capacity[by_pair]
-                pairs = find_pairs(self.dev, b, points, size, capacity, times_seen)
+                pairs = find_pairs(self.dev, b, points, size, capacity.pairs, times_seen)
                 pairs.read_count(self.dev)
             with self.dev.stage("weights"):
                 weights = blend_weights(
@@ -301,13 +308,13 @@ class Renderer:
                     derivatives=training,
                     points=points,
                 )
-                weights.read_visible(self.dev)
+                weights.read_count(self.dev)
             tile_mask = None
             if is_planned:
                 tile_mask = tiles_covered(self.dev, pairs.pixel_offset, size)
             (tile_mask or weights.count).get()  # the host's only wait for the device
-            self._capacity[by_pair] = capacity_needed(pairs)
-            if self._capacity[by_pair] == pairs.capacity:
+            capacity.pairs = capacity_needed(pairs)
+            if capacity.pairs == pairs.capacity:
                 return pairs, weights, tile_mask
             del pairs, weights  # frees their arrays before larger ones are allocated
 
@@ -342,7 +349,8 @@ class Renderer:
         optimiser multiplies the two when it updates a coefficient, and never stores the products.
         """
         settings = self.settings
-        moves = with_offsets and settings.blend == "alpha" and settings.footprint in MOVED
+        kind = FOOTPRINTS[settings.footprint]
+        moves = with_offsets and settings.blend == "alpha" and kind.moves
         with self.dev.stage("backward"):
             return blend_backward(
                 self.dev,
@@ -389,7 +397,7 @@ class Renderer:
         *,
         least: float = 0.0,
     ) -> None:
-        """Update max_weight and times_seen from the last forward(), see raster/weights.py."""
+        """Update max_weight and times_seen by the last forward(), as highest_weights.py has it."""
         pairs, weights = result.pairs, result.weights
         listed = list_weights(self.dev, self._buffers, pairs, weights)
         record_weights(self.dev, pairs, weights, listed, max_weight, times_seen, least)

@@ -102,10 +102,12 @@ class Trainer:
             target = image
             if self.exposure and self.exposure.is_applied:
                 target = self.exposure.target(crop.view_index, image, alpha)
-            says_nothing = crop.view.ignored_crop(crop.box, crop.jitter)
+            says_nothing: np.ndarray | None = None
+            if crop.view.ignored is not None:
+                says_nothing = crop.view.ignored_crop(crop.box, crop.jitter)
             padded, *corner = crop.camera.padded(self.model.net.multiple)
             size = padded.height, padded.width
-            find_gradient_tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
+            gradient_tiles = self.model.net.gradient_tiles(target, says_nothing, size, corner)
             ignored = None if says_nothing is None else self._sent(says_nothing)
 
         self.renderer.supersampling = supersampling_at(self.step, train)
@@ -113,7 +115,7 @@ class Trainer:
             crop.camera,
             self.gamma,
             training=True,
-            gradient_tiles=find_gradient_tiles,
+            gradient_tiles=gradient_tiles,
             times_seen=self.state.times_seen,
         )
         with self.dev.stage("loss"):
@@ -132,8 +134,6 @@ class Trainer:
             with_offsets=rates.offset > 0,
             max_weight=self.state.max_weight,
         )
-        if gradients.distortion is not None:
-            self.loss.add_distortion(gradients.distortion, distortion_weight, 1 / all_depths)
 
         with self.dev.stage("update"):
             self.optimiser.update(
@@ -148,7 +148,8 @@ class Trainer:
             )
         self.step += 1
         self.check()
-        self._terms = self.loss.read(self.step)
+        distortion = gradients.distortion, distortion_weight, 1 / all_depths
+        self._terms = self.loss.read(self.step, *distortion)
         # so that the renderer can release them
         del rendered, gradients
         between.after_update(self, rates)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import SPAN
-from pp_cl.engine.raster.project import FOOTPRINTS
+from pp_cl.engine.raster.footprint import FOOTPRINTS
 from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.reference import dense
 from pp_cl.reference.differences import numeric_gradient

@@ -130,9 +130,8 @@ def _sum_of_terms(dev, rng):
         for _ in range(2):  # the second sum must not contain the first
             loss.forward_backward(dev.upload(prediction), dev.upload(target))
             values = rng.random(12 * n).astype(np.float32)
-            loss.add_distortion(dev.upload(values), 1.5, scale=1 / n)
+            found = loss.read(1, dev.upload(values), 1.5, scale=1 / n).get()
             added = values.sum(dtype=np.float64) / n
-        found = loss.read(1).get()
         expected = [terms[0] + 1.5 * added, added]
         yield each([found["loss"], found["distortion"]], expected, LOSS)
 

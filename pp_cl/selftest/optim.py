@@ -10,7 +10,8 @@ from pp_cl.engine.camera import Camera
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.layers.conv import GradientParts
-from pp_cl.engine.raster.points import SH_DEGREES, PointCloud, offset_width
+from pp_cl.engine.raster.footprint import FOOTPRINTS, Footprint
+from pp_cl.engine.raster.points import SH_DEGREES, PointCloud
 from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.engine.training.optim import POINT_EPS, adam_update, ema_update, rmsprop_update
 from pp_cl.engine.training.schedule import Rates
@@ -29,8 +30,8 @@ CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 
 class Cloud:
-    """n random points on the grid, and their float64 twin. width: numbers of an offset. start,
-    learned(): arrays "sh" (N, count, 16), "offset" (N, width), "opacity" (N, 9).
+    """n random points on the grid, and their float64 twin. kind: of their footprint. start,
+    learned(): arrays "sh" (N, count, 16), "offset" (N, kind.offsets), "opacity" (N, 9).
     """
 
     def __init__(
@@ -39,19 +40,19 @@ class Cloud:
         rng: np.random.Generator,
         n: int,
         degree: int = SH_DEGREES[-1],
-        width: int = 4,
+        kind: Footprint = FOOTPRINTS["soft"],
     ):
         self.dev, self.n, self.steps = dev, n, 0
         ids = some_ids(rng, GRID, n)
         self.cloud = PointCloud.create(dev, ids, degree)
-        self.cloud.offset = dev.zeros((n, width))
-        most, count = self.cloud.most_offset, sum(block.count for block in self.cloud.blocks)
+        self.cloud.offset, self.cloud.kind = dev.zeros((n, kind.offsets)), kind
+        most, count = kind.most_offset, sum(block.count for block in self.cloud.blocks)
         self.start = {
             "sh": rng.standard_normal((n, count, 16)).astype(np.float32),
-            "offset": rng.uniform(-most, most, (n, width)).astype(np.float32),
+            "offset": rng.uniform(-most, most, (n, kind.offsets)).astype(np.float32),
             "opacity": some_opacities(rng, n),
         }
-        most_sh = self.cloud.most_sh
+        most_sh = kind.most_sh
         np.clip(self.start["sh"][:, 1:], -most_sh, most_sh, out=self.start["sh"][:, 1:])
         for block, array in zip(self.cloud.blocks, self.cloud.sh, strict=True):
             array.set(self.start["sh"][:, block.first : block.first + block.count].copy())
@@ -265,12 +266,11 @@ def _rmsprop_nothing(dev, rng):
 
 def _bounded(dev, rng):
     """Huge gradients leave opacities, offsets and Gaussians' SH above degree 0 in their bounds."""
-    for footprint in ("soft", "gaussian"):
-        width = offset_width(footprint)
-        cloud = Cloud(dev, rng, 257, width=width)
+    for kind in (FOOTPRINTS["soft"], FOOTPRINTS["gaussian"]):
+        cloud = Cloud(dev, rng, 257, kind=kind)
         for _ in range(60):
-            cloud.step(gradients(rng, 257, 1e4, width), np.arange(257))
-        most, learned = cloud.cloud.most_offset, cloud.learned()
+            cloud.step(gradients(rng, 257, 1e4, kind.offsets), np.arange(257))
+        most, learned = kind.most_offset, cloud.learned()
         mean, lobes = np.split(learned["opacity"], [1], axis=1)
         for values, bounds in ((learned["offset"], (-most, most)), (mean, (0.0, 1.0))):
             yield exact([values.min(), values.max()], bounds)
@@ -279,7 +279,7 @@ def _bounded(dev, rng):
             yield finite(learned[name])
             yield absolute(learned[name], cloud.twin.values[name], 1e-5)  # sixty moves
     sh = learned["sh"]
-    yield exact([sh[:, 1:].min(), sh[:, 1:].max()], [-cloud.cloud.most_sh, cloud.cloud.most_sh])
+    yield exact([sh[:, 1:].min(), sh[:, 1:].max()], [-kind.most_sh, kind.most_sh])
     yield exact(abs(sh[:, 0]).max() > 1, True)
     yield absolute(sh, cloud.twin.values["sh"], 1e-5)
 

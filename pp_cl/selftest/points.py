@@ -135,7 +135,7 @@ class PairedPoints:
         self.weights = blend_weights(
             self.dev, *view, self.opacity, blend=rule, gamma=gamma, points=self.projected, **drops
         )
-        self.weights.read_visible(self.dev)
+        self.weights.read_count(self.dev)
         visible = self.weights.visible.get()
         rows = np.full((len(visible) + 1, 16), np.nan)  # with room for one more point
         rows[:-1] = np.asarray(point_features)[visible]

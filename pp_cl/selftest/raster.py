@@ -11,9 +11,11 @@ from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import shade_forward
 from pp_cl.engine.raster.depth import depth_forward
+from pp_cl.engine.raster.footprint import FOOTPRINTS
+from pp_cl.engine.raster.highest_weights import list_weights, record_weights
 from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES, sh_blocks
-from pp_cl.engine.raster.project import FOOTPRINTS, project_grid
-from pp_cl.engine.raster.weights import BLENDS, list_weights, record_weights
+from pp_cl.engine.raster.project import project_grid
+from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.reference import dense
 from pp_cl.selftest.case import EPS, SIZES, Case, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import (

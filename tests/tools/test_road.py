@@ -10,6 +10,23 @@ def test_the_page_is_what_a_step_calls(plain):
     assert road.page(road.traced(plain)) == road.FILE.read_text("utf-8")
 
 
+@pytest.mark.parametrize(
+    ("macros", "built", "others"),
+    [
+        ({}, {"soft.h", "round.h"}, {"disc.h", "gaussian.h"}),
+        ({"FOOTPRINT": "GAUSSIAN"}, {"gaussian.h"}, {"soft.h", "round.h"}),
+        ({"LANES": 1}, {"vector.h"}, set()),
+    ],
+)
+def test_headers_are_listed_if_a_kernel_is_built_with_them(macros, built, others):
+    path = road.kernel_folder() / "raster" / "alpha.cl"
+    files = road.kernel_files(path, macros)
+    names = {file.name for file in files}
+    assert built <= names and not others & names
+    assert (road.kernel_folder() / "gpu" / "lanes.h" in files) == ("LANES" in macros)
+    assert files[-1] == path and len(files) == len(set(files))
+
+
 def test_lines_of_code_are_counted(tmp_path):
     (tmp_path / "a.py").write_text(
         'def f(a):\n    """Doc.\n\n    More.\n    """\n\n    # why\n    return a\n'

@@ -139,34 +139,38 @@ class Device:
         """
         key = name, frozenset(defines.items())
         if key not in self._programs:
-            folder = kernel_folder()
-            if " " in str(folder):  # PoCL 3.1 splits its options at spaces, quoted or not
-                raise UserError(
-                    f"{folder}: OpenCL compilers cannot include from a folder with a space in its"
-                    " path; move it"
-                )
-            macros = [f"-D{k}={v}" for k, v in sorted(defines.items())]
-            start = time.perf_counter()
-            self._programs[key] = Program(
-                self,
-                name,
-                (folder / f"{name}.cl").read_text("utf-8"),
-                options=[
-                    *self.build_options,
-                    *vendor_options(self.info, name),
-                    "-I",
-                    folder.as_posix(),
-                    *macros,
-                ],
-                defines=defines,
-            )
-            if self.debug:
-                seconds = time.perf_counter() - start
-                print(
-                    f"cl/{name}.cl {' '.join(macros)} built in {seconds:.2f} s",
-                    file=sys.stderr,
-                )
+            self._programs[key] = self._built(name, defines)
         return self._programs[key]
+
+    def _built(self, name, defines):
+        folder = kernel_folder()
+        if " " in str(folder):  # PoCL 3.1 splits its options at spaces, quoted or not
+            raise UserError(
+                f"{folder}: OpenCL compilers cannot include from a folder with a space in its"
+                " path; move it"
+            )
+        macros = [f"-D{k}={v}" for k, v in sorted(defines.items())]
+        start = time.perf_counter()
+        program = Program(
+            self,
+            name,
+            (folder / f"{name}.cl").read_text("utf-8"),
+            options=[
+                *self.build_options,
+                *vendor_options(self.info, name),
+                "-I",
+                folder.as_posix(),
+                *macros,
+            ],
+            defines=defines,
+        )
+        if self.debug:
+            seconds = time.perf_counter() - start
+            print(
+                f"cl/{name}.cl {' '.join(macros)} built in {seconds:.2f} s",
+                file=sys.stderr,
+            )
+        return program
 
     def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
         """Uninitialised array on the device; zeros under PP_DEBUG=3, so that its scan sees only

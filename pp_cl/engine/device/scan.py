@@ -17,15 +17,16 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
     values: (N) uint32, N >= 1. offsets: (N+1) uint32.
     """
     n = values.size
-    block_sum = _block_sums(dev, "scan_sums", n, values=values)
-    _launch(dev, "scan_offsets", n, values=values, block_sum=block_sum, offsets=offsets)
+    block_sum = _block_sums(dev, "device/scan", "scan_sums", n, values=values)
+    arrays = {"values": values, "block_sum": block_sum, "offsets": offsets}
+    _launch(dev, "device/scan", "scan_offsets", n, **arrays)
 
 
-def _block_sums(dev, kernel, n, **arrays):
+def _block_sums(dev, file, kernel, n, **arrays):
     """(blocks,) or longer: the kernel's sum of each block of n numbers."""
     # rounded up to a power of two, as numbers of pairs differ from step to step
     held = dev.scratch("scan", 1 << (blocks_of(n) - 1).bit_length(), np.uint32)
-    _launch(dev, kernel, n, block_sum=held, **arrays)
+    _launch(dev, file, kernel, n, block_sum=held, **arrays)
     return held
 
 
@@ -34,11 +35,9 @@ def blocks_of(n: int) -> int:
     return -(-n // BLOCK)
 
 
-def _launch(dev, kernel, n, **arguments):
+def _launch(dev, file, kernel, n, **arguments):
     blocks = blocks_of(n)
-    launch_groups(
-        dev, "device/scan", kernel, blocks, defines={"BLOCK": BLOCK}, n=n, b=blocks, **arguments
-    )
+    launch_groups(dev, file, kernel, blocks, defines={"BLOCK": BLOCK}, n=n, b=blocks, **arguments)
 
 
 def read_total(dev: Device, offsets: Array) -> Pending[int]:
@@ -53,9 +52,10 @@ def nonzero(dev: Device, flags: Array, indices: Array, places: Array, found: Arr
     flag in `indices`; the others are left unchanged. found: (1,) uint32.
     """
     n = flags.size
-    block_sum = _block_sums(dev, "count_nonzero", n, flags=flags)
+    block_sum = _block_sums(dev, "device/nonzero", "count_nonzero", n, flags=flags)
     _launch(
         dev,
+        "device/nonzero",
         "scan_nonzero",
         n,
         flags=flags,

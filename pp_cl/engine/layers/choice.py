@@ -6,22 +6,23 @@ measures a row of that table.
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import Table
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.device.launch import lanes
 from pp_cl.engine.layers import conv_direct, conv_local, conv_winograd
 from pp_cl.engine.layers.conv import (
     Blocking,
     Conv,
     ConvShape,
+    column_macros,
     first_float,
     packed_shape,
     parts_shape,
-    weights_program,
 )
 from pp_cl.engine.layers.tiles import VECTOR
 
@@ -128,6 +129,21 @@ def work_table(variant: str, shape: ConvShape) -> Table:
     return {name: (of_array, np.float32) for name, of_array in shapes.items()}
 
 
+class WeightsRow(NamedTuple):
+    """A row of the table of lay_out(): cl/layers/weights.cl says what its columns are."""
+
+    item: int
+    kind: int
+    taps: int
+    read: int
+    made: int
+    first: int
+    ci: int
+    weight: int
+    out: int
+    halved: int
+
+
 def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> None:
     """Write the weights in the layout that convolutions read to Conv.work, in one launch.
 
@@ -135,22 +151,25 @@ def lay_out(dev: Device, convs: Iterable[Conv], weights: Array, work: Array) -> 
     """
     rows, n = [], 0
     for conv in convs:
-        shape, places = conv.shape, [first_float(conv.weight), first_float(conv.work) // VECTOR]
+        shape = conv.shape
+        weight, out = first_float(conv.weight), first_float(conv.work) // VECTOR
         k, ci, co, is_forward = shape.k, shape.ci, shape.co, shape.direction == "forward"
         halved = conv.is_halved and not is_forward
         if conv.variant == "winograd":
             kind, read, made = (1, ci, co) if is_forward else (2, co, ci)
-            rows.append((n, kind, k**2, read, made, 0, ci, *places, halved))
+            rows.append(WeightsRow(n, kind, k**2, read, made, 0, ci, weight, out, halved))
             n += read * made // VECTOR
         elif not is_forward:
             first = 0
             for channels, blocks in zip(shape.sources, _blocks(shape.sources), strict=True):
-                rows.append((n, 0, k**2, co, channels, first, ci, *places, halved))
+                rows.append(WeightsRow(n, 0, k**2, co, channels, first, ci, weight, out, halved))
                 vectors = blocks * k**2 * co
-                n, first, places[1] = n + vectors, first + channels, places[1] + vectors
+                n, first, out = n + vectors, first + channels, out + vectors
     if rows:
-        transforms = any(row[1] > 0 for row in rows)
-        weights_program(dev, transforms).launch(
+        # without Winograd's transforms where GPUs do not need them: they spill registers there
+        transforms = int(dev.is_cpu or any(row.kind > 0 for row in rows))
+        macros = {"LANES": lanes(dev), "WINOGRAD": transforms} | column_macros("ROW", WeightsRow)
+        dev.program("layers/weights", **macros).launch(
             "lay_out_weights",
             n,
             VECTOR if dev.is_cpu else None,

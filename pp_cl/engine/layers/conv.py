@@ -14,7 +14,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import PackedArrays
-from pp_cl.engine.device.device import Device, Program
+from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.layers.tiles import VECTOR
 
@@ -149,17 +149,35 @@ def mask_bits(masks: Sequence[bool]) -> int:
     return sum(1 << i for i, is_masked in enumerate(masks) if is_masked)
 
 
-def weights_program(dev: Device, transforms: bool = False) -> Program:
-    """The kernels of layers/weights.cl. transforms: whether they lay out Winograd's weights, which
-    spills registers on GPUs.
+class PartsRow(NamedTuple):
+    """A row of the table of GradientParts, for one convolution: cl/layers/parts.h says what its
+    columns are.
     """
-    return dev.program("layers/weights", LANES=lanes(dev), WINOGRAD=int(dev.is_cpu or transforms))
+
+    item: int
+    sums: int
+    blocks: int
+    parts: int
+    partial: int
+    weight: int
+    bias: int
+    halved: int
+
+
+def column_macros(prefix: str, row: Any) -> dict[str, int]:
+    """The defines of kernels that read a table with these rows, a NamedTuple: the number of each
+    column by its name.
+    """
+    return {f"{prefix}_{name.upper()}": number for number, name in enumerate(row._fields)}
+
+
+PARTS_MACROS = column_macros("PARTS", PartsRow)
 
 
 class GradientParts(NamedTuple):
     """The parts of the gradients of several convolutions' weights and biases, as kernels read them
-    (cl/layers/parts.h). n: vectors of 16 in all gradients. table: (convolutions, 8) int32. partial:
-    (?,) float32, the parts.
+    (cl/layers/parts.h). n: vectors of 16 in all gradients. table: (convolutions, 8) int32, a
+    PartsRow for each. partial: (?,) float32, the parts.
     """
 
     n: int
@@ -179,10 +197,12 @@ def gradient_parts(
     rows, n = [], 0
     for conv, count in parts:
         _, blocks, sums, _ = conv.partial.shape
-        places = [first_float(array) // VECTOR for array in (conv.partial, conv.weight, conv.bias)]
-        rows.append((n, sums, blocks, count, *places, conv.is_halved))
+        arrays = conv.partial, conv.weight, conv.bias
+        partial_at, weight, bias = (first_float(array) // VECTOR for array in arrays)
+        rows.append(PartsRow(n, sums, blocks, count, partial_at, weight, bias, conv.is_halved))
         n += sums * blocks
-    (sent,) = table.send([((len(rows), 8), np.int32)], [np.array(rows, np.int32)])
+    values = np.array(rows, np.int32)
+    (sent,) = table.send([(values.shape, np.int32)], [values])
     return GradientParts(n, sent, partial)
 
 
@@ -192,7 +212,7 @@ def sum_parts(dev: Device, parts: GradientParts, grad_weights: Array, grad_biase
     grad_weights, grad_biases: (?,) float32; the gradients lie in them as Conv.weight and Conv.bias
     do in their arrays.
     """
-    weights_program(dev).launch(
+    dev.program("layers/sum_parts", LANES=lanes(dev), **PARTS_MACROS).launch(
         "sum_parts",
         parts.n * row_parts(dev),
         n=parts.n,

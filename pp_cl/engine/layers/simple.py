@@ -14,6 +14,7 @@ from pp_cl.engine.device.launch import channel_ranges, lanes, launch_groups
 from pp_cl.engine.layers.tiles import Tiles, all_tiles
 
 GATE, RESAMPLE = "layers/gate", "layers/resample"
+OUTPUT, FIRST_FEATURES = "layers/output", "layers/first_features"
 PIXELS_TOGETHER = 64  # pixels of a work-group of the specular layer on GPUs
 SHARE = 0.25  # of a feature in its colour: features vary about four times as much as colours
 
@@ -65,7 +66,7 @@ def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
         raise ValueError(f"max pooling of {x.shape} to {out.shape}")
     size, work_group = channel_ranges(dev, h, w, c)
     sizes = {"h": h, "w": w, "c": c, "x_width": x.shape[1]}
-    dev.program(RESAMPLE, LANES=lanes(dev)).launch(
+    dev.program("layers/maxpool", LANES=lanes(dev)).launch(
         "maxpool2_forward", size, work_group, x=x, out=out, **sizes
     )
 
@@ -102,7 +103,7 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
     """
     named = {"residual": features is not None, "share": SHARE, "features": features}
     shape = image.shape if features is None else features.shape
-    _per_pixel(dev, "output_forward", shape, image=image, **named)
+    _per_pixel(dev, OUTPUT, "output_forward", shape, image=image, **named)
 
 
 def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
@@ -110,7 +111,7 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
     (H, W, 3).
     """
     grads = {"grad_image": grad_image, "grad_features": grad_features}
-    _per_pixel(dev, "residual_backward", grad_features.shape, share=SHARE, **grads)
+    _per_pixel(dev, OUTPUT, "residual_backward", grad_features.shape, share=SHARE, **grads)
 
 
 def specular_forward(
@@ -144,16 +145,17 @@ def specular_forward(
 
 def first_features_forward(dev: Device, features: Array, image: Array) -> None:
     """image (H, W, 3) = the first three of the features (H, W, C)."""
-    _per_pixel(dev, "first_features_forward", features.shape, features=features, image=image)
+    arrays = {"features": features, "image": image}
+    _per_pixel(dev, FIRST_FEATURES, "first_features_forward", features.shape, **arrays)
 
 
 def first_features_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
     """Write grad_features (H, W, C), 0 beyond the first three, from grad_image (H, W, 3)."""
     grads = {"grad_image": grad_image, "grad_features": grad_features}
-    _per_pixel(dev, "first_features_backward", grad_features.shape, **grads)
+    _per_pixel(dev, FIRST_FEATURES, "first_features_backward", grad_features.shape, **grads)
 
 
-def _per_pixel(dev, kernel, shape, **arguments):
-    """Launch a kernel of output.cl. shape: the features' shape."""
+def _per_pixel(dev, file, kernel, shape, **arguments):
+    """Launch a kernel with a work-item for each pixel. shape: the features' shape."""
     n = shape[0] * shape[1]
-    dev.program("layers/output").launch(kernel, n, n=n, channels=shape[2], **arguments)
+    dev.program(file).launch(kernel, n, n=n, channels=shape[2], **arguments)

@@ -5,6 +5,7 @@ A feature map of (height, width) pixels has ceil(height / 4) x ceil(width / 4) t
 by row; the border may cut off the last ones.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,10 +69,17 @@ def all_tiles(dev: Device, height: int, width: int) -> Tiles:
     return some_tiles(dev, (height, width), np.ones(grid_shape(height, width)))
 
 
-def tiles_find(dev: Device, x: Array, background: float) -> Pending[np.ndarray]:
-    """(rows, columns) bool: the tiles of x (H, W, C) float32 that are not all `background`."""
+def tiles_find(
+    dev: Device,
+    x: Array,
+    background: float,
+    convert: Callable[[np.ndarray], np.ndarray] = lambda tiles: tiles,
+) -> Pending[np.ndarray]:
+    """(rows, columns) bool: the tiles of x (H, W, C) float32 that are not all `background`;
+    convert() of them.
+    """
     h, w, c = x.shape
-    return _flags(dev, "tiles_find", (h, w), c=c, background=background, x=x)
+    return _flags(dev, "tiles_find", (h, w), convert, c=c, background=background, x=x)
 
 
 def tiles_covered(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Pending[np.ndarray]:
@@ -111,11 +119,11 @@ def _program(dev):
     return dev.program("layers/tiles", LANES=lanes(dev))
 
 
-def _flags(dev, kernel, size, **arguments):
+def _flags(dev, kernel, size, convert=lambda tiles: tiles, **arguments):
     shape = grid_shape(*size)
     tiles = shape[0] * shape[1]
     flags = dev.scratch("tile flags", tiles, np.int32)[:tiles]
     _program(dev).launch(
         kernel, tiles, h=size[0], w=size[1], flags=flags.reshape(shape), **arguments
     )
-    return read_later(dev, flags, convert=lambda values: values.reshape(shape) != 0)
+    return read_later(dev, flags, convert=lambda values: convert(values.reshape(shape) != 0))

@@ -2,8 +2,6 @@
 the first three of them.
 """
 
-from collections.abc import Callable
-
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
@@ -41,9 +39,8 @@ class FirstFeatures:
         """None: there is no background to leave out."""
 
     @staticmethod
-    def gradient_tiles(*_: object) -> Callable[[], None]:
-        """A function that returns None: there is no background to leave out."""
-        return lambda: None
+    def gradient_tiles(*_: object) -> None:
+        """None: there is no background to leave out."""
 
     def forward(self, x: Array, training: bool = True, plan: None = None) -> Array:
         """(H, W, 3) float32 image of the features x (H, W, C)."""

@@ -77,7 +77,7 @@ def double(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return tiles.repeat(2, 0).repeat(2, 1)[: shape[0], : shape[1]]
 
 
-def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
+def tiles_in_reach(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
     """The tiles of an image of `size` = (height, width) where the gradient of the loss may differ
     from that of background over a white target: those within the loss's reach of a tile of the
     target that is not white. plan_backward() adds the borders.
@@ -240,7 +240,7 @@ def plan_forward(
     """Plan the forward pass over an image of `size` = (height, width), where x differs from the
     background in the tiles `active`; None if more than `most` of the multiplications remain.
 
-    gradient_tiles: from gradient_tiles(); None: all tiles. lists: holds the lists of tiles on the
+    gradient_tiles: from tiles_in_reach(); None: all tiles. lists: holds the lists of tiles on the
     device, until it is given others.
     """
     radius, last = receptive_radius(layers), layers[-1].name
@@ -265,11 +265,9 @@ def plan_forward(
 def plan_backward(
     layers: list[Layer], size: tuple[int, int], forward: TilePlan, lists: PackedArrays
 ) -> TilePlan:
-    """Plan the backward pass after a forward pass. Also copies tiles of forward outputs that it
-    reads, as inputs of layers and as masks of ReLUs. lists: see plan_forward().
+    """Plan the backward pass after a forward pass that skipped tiles. Also copies tiles of forward
+    outputs that it reads, as inputs of layers and as masks of ReLUs. lists: see plan_forward().
     """
-    if not forward.maps:
-        return forward
     border = _tiles_of(max(LOSS_BORDER, receptive_radius(layers)[layers[-1].name]))
     maps = _map_all(layers, size, forward.active, gradient_radius(layers), border)
     needed = {name: np.zeros_like(of_map.computed) for name, of_map in maps.items()}

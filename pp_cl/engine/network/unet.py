@@ -1,13 +1,13 @@
 """Networks on a device, mainly the U-Net: parameters, and the forward and the backward pass."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import PackedArrays, Table, packed_arrays, table_bytes
+from pp_cl.engine.device.buffers import PackedArrays, Pending, Table, packed_arrays, table_bytes
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import replayed
 from pp_cl.engine.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out, work_table
@@ -46,10 +46,10 @@ from pp_cl.engine.network.layers import (
 )
 from pp_cl.engine.network.tile_plan import (
     TilePlan,
-    gradient_tiles,
     plan_all,
     plan_backward,
     plan_forward,
+    tiles_in_reach,
 )
 from pp_cl.settings import NetworkConfig
 
@@ -226,19 +226,23 @@ class Network:
         ignored: np.ndarray | None,
         size: tuple[int, int],
         corner: Sequence[int],
-    ) -> Callable[[], np.ndarray | None]:
-        """A function that returns gradient_tiles of plan_tiles() for a step with this target, (h,
-        w, 3) float32, whose corner lies at (left, top) of the image of `size`. Call it after
-        waiting for the device anyway, so that looking at the target costs no extra wait.
+    ) -> Pending[np.ndarray] | None:
+        """The argument of that name of plan_tiles() for a step with this target, (h, w, 3) float32,
+        whose corner lies at (left, top) of the image of `size`; None if none is needed. Get it
+        after waiting for the device anyway, so that looking at the target costs no extra wait.
 
         ignored: (h, w) bool, the pixels that the loss ignores, if any. They are white in the
         target, but their gradient differs from the background's.
         """
         if not self.is_planned(size):
-            return lambda: None
-        found = tiles_find(self.dev, target, WHITE)
+            return None
+        left, top = corner
         beside = False if ignored is None else tiles_with(ignored)
-        return lambda: gradient_tiles(found.get() | beside, size, (corner[0], corner[1]))
+
+        def in_reach(found):
+            return tiles_in_reach(found | beside, size, (left, top))
+
+        return tiles_find(self.dev, target, WHITE, in_reach)
 
     def forward(self, x: Array, training: bool = True, plan: TilePlan | None = None) -> Array:
         """(H, W, 3) image of the features x (H, W, 16); H and W are multiples of 4.
@@ -299,7 +303,8 @@ class Network:
         if self._trained is None:
             raise RuntimeError("Network.backward needs a forward(training=True) before it")
         space, (plan, x), self._trained = self._workspaces[True], self._trained, None
-        plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
+        if plan.maps:  # it skips tiles
+            plan = plan_backward(self.layers, space.size, plan, self._tile_lists["backward"])
         parts = self._backward(space, plan, x, grad_y)
         return space.arrays[gradient_of("x")], parts
 

@@ -13,11 +13,13 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import group_items, lanes, launch_groups, replayed, row_parts
+from pp_cl.engine.raster.footprint import FOOTPRINTS, footprint_macros
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.points import four_blocks, offset_width, stored_degree
-from pp_cl.engine.raster.project import MOVED, ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.points import four_blocks, stored_degree
+from pp_cl.engine.raster.project import ProjectedPoints
+from pp_cl.engine.raster.samples import sampled_gradient, sampled_offsets
 from pp_cl.engine.raster.softmax import softmax_gradient
-from pp_cl.engine.raster.weights import BlendWeights, clear_pairs, sample_macros
+from pp_cl.engine.raster.weights import BlendWeights, clear_pairs
 
 ON_GPU = 4  # lanes on GPUs: each work-item reads vectors
 SPAN = 64  # pixels that share a sum of the distortion loss
@@ -93,7 +95,7 @@ def blend_backward_table(
         return table | {"pixel_blend": ((pixels,), np.float32)}
     return table | {
         "distortion": ((-(-pixels // SPAN),), np.float32),
-        "grad_offset": ((visible, offset_width(footprint)), np.float32),
+        "grad_offset": ((visible, FOOTPRINTS[footprint].offsets), np.float32),
     }
 
 
@@ -146,7 +148,7 @@ def blend_backward(
     is_alpha, moves = weights.blend == "alpha", voxel_size > 0
     if not is_alpha and (grad_alpha is not None or distortion_weight > 0):
         raise ValueError("a softmax has no gradient of alpha and of a distortion loss")
-    if moves and not (is_alpha and points.footprint in MOVED):
+    if moves and not (is_alpha and FOOTPRINTS[points.footprint].moves):
         raise ValueError(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
         )
@@ -165,36 +167,40 @@ def blend_backward(
     }
     options = {"DL_DB": int(not is_alpha), "MOVES": int(moves and pairs.side == 1)}
     defines = _defines(dev, **options, **footprint_macros(points.footprint, pairs.side))
-    program, file, kernel = dev.program("raster/blend", **defines), "raster/blend", "alpha_gradient"
-    if pairs.side > 1:
-        file, kernel, defines = "raster/samples", "sampled_gradient", sample_macros(dev, pairs)
-        of_fragments["sample_derivative"] = weights.pixel_derivative
-        of_fragments["sample_transmittance"] = weights.sample_transmittance
-        of_fragments["opacity"] = opacity
-    else:
-        of_fragments["pixel_derivative"] = weights.pixel_derivative
     if is_alpha:
-        if pairs.side == 1:
-            of_fragments["transmittance"] = weights.transmittance
+        of_fragments |= {
+            "has_grad_alpha": int(grad_alpha is not None),
+            "distortion_weight": distortion_weight,
+            "point_slot": weights.point_slot,
+            "visible_features": visible_features,
+            "grad_alpha": grad_alpha,
+            "distortion": b.distortion,
+        }
+    if pairs.side > 1:
+        of_samples = weights.pixel_derivative, weights.sample_transmittance
+        sampled_gradient(dev, pairs, opacity, *of_samples, span=SPAN, **of_fragments)
+    elif is_alpha:
         launch_groups(
             dev,
-            file,
-            kernel,
+            "raster/blend",
+            "alpha_gradient",
             -(-pairs.pixels // SPAN),
             most=SPAN,
-            defines=defines | {"SPAN": SPAN},
-            has_grad_alpha=int(grad_alpha is not None),
-            distortion_weight=distortion_weight,
-            point_slot=weights.point_slot,
-            visible_features=visible_features,
-            grad_alpha=grad_alpha,
-            distortion=b.distortion,
+            defines=defines,
+            pixel_derivative=weights.pixel_derivative,
+            transmittance=weights.transmittance,
             **of_fragments,
         )
     else:
-        blended = {"features": features, "pixel_blend": b.pixel_blend}
-        softmax_gradient(dev, pairs.pixels, **blended, **of_fragments)
-    program.launch(
+        softmax_gradient(
+            dev,
+            pairs.pixels,
+            features=features,
+            pixel_derivative=weights.pixel_derivative,
+            pixel_blend=b.pixel_blend,
+            **of_fragments,
+        )
+    dev.program("raster/blend", **defines).launch(
         "blend_backward",
         count * row_parts(dev, ON_GPU),
         s=count,
@@ -220,21 +226,8 @@ def blend_backward(
         max_weight=max_weight,
     )
     if moves and pairs.side > 1:
-        dev.program("raster/sampled_offsets", **sample_macros(dev, pairs)).launch(
-            "sampled_offsets",
-            count,
-            s=count,
-            voxel_size=voxel_size,
-            visible=weights.visible_rows,
-            camera=points.camera_buffer,
-            point_camera=points.point_camera,
-            point_shape=points.point_shape,
-            opacity=opacity,
-            point_offset=pairs.point_offset,
-            pair_pixel=pairs.pair_pixel,
-            pair_gradient=b.pair_gradient,
-            grad_offset=b.grad_offset,
-        )
+        visible = weights.visible_rows, count
+        sampled_offsets(dev, points, pairs, *visible, opacity, voxel_size, b)
     return BlendGradients(
         b.grad_visible_features,
         b.grad_opacity,

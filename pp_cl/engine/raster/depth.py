@@ -5,9 +5,11 @@ from __future__ import annotations
 from pyopencl.array import Array
 
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.raster.footprint import footprint_macros
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
-from pp_cl.engine.raster.weights import BlendWeights, sample_macros
+from pp_cl.engine.raster.project import ProjectedPoints
+from pp_cl.engine.raster.samples import sample_macros
+from pp_cl.engine.raster.weights import BlendWeights
 
 
 def depth_forward(

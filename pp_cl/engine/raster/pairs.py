@@ -14,7 +14,8 @@ from pp_cl.engine.device.buffers import Buffers, Table, grown
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, launch_groups, replayed
 from pp_cl.engine.device.scan import BLOCK, blocks_of, exclusive_scan, read_total
-from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.footprint import footprint_macros
+from pp_cl.engine.raster.project import ProjectedPoints
 from pp_cl.errors import UserError
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32

@@ -13,6 +13,7 @@ from pyopencl.array import Array
 
 from pp_cl.engine.device.buffers import DeviceRows, Table, compact_rows, gather_rows
 from pp_cl.engine.device.device import Device
+from pp_cl.engine.raster.footprint import FOOTPRINTS, Footprint
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,6 @@ SH_BLOCKS = (
 )
 SH_DEGREES = (0, 1, 2)
 OPACITIES = 9  # numbers in a row of PointCloud.opacity
-MOST_OFFSET = 0.5  # voxel sizes each way: keeps points in their cells, scales radii by 0.61 to 1.65
-MOST_OF_GAUSSIANS = 2.0  # in voxel sizes, logarithms or deviations
-MOST_SH_OF_GAUSSIANS = 127 / 128  # above degree 0: the largest that a .spz can hold
-
-
-def offset_width(footprint: str) -> int:
-    """How many numbers a row of PointCloud.offset has, see cl/cloud.h."""
-    return 16 if footprint == "gaussian" else 4
 
 
 def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
@@ -77,33 +70,25 @@ class PointCloud:
 
     ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, the vector from the
     vertex to the point in its cell, in voxel sizes, and the logarithm of its radius over
-    point_radius() of the settings; all within +-MOST_OFFSET. For Gaussians (N, 16), of which 9 are
-    used, within +-MOST_OF_GAUSSIANS: see cl/cloud.h. opacity: (N, 9) float32, o in [0, 1] and
+    point_radius() of the settings; all within +-kind.most_offset. For Gaussians (N, 16), of which 9
+    are used: see cl/cloud.h. opacity: (N, 9) float32, o in [0, 1] and
     coefficients w_k in [-1, 1] of the harmonics Y_k of degrees 1 and 2 in cl/sh.h: seen in a
     direction d, a unit vector from the eye, the point has the opacity o + sum_k w_k Y_k(d), clamped
     to [0, 1]. sh: the SH coefficients, (N, count, 16) for each block: float32, or float16 once they
-    are no longer trained.
+    are no longer trained. kind: the kind of footprint whose offsets and bounds they have, which are
+    those of soft points for all but Gaussians.
     """
 
     ids: Array
     offset: Array
     opacity: Array
     sh: list[Array]
+    kind: Footprint = FOOTPRINTS["soft"]
 
     @property
     def count(self) -> int:
         """Number of points."""
         return len(self.ids)
-
-    @property
-    def most_offset(self) -> float:
-        """The bound of `offset`."""
-        return MOST_OFFSET if self.offset.shape[1] == 4 else MOST_OF_GAUSSIANS
-
-    @property
-    def most_sh(self) -> float:
-        """The bound of SH coefficients above degree 0; infinity if there is none."""
-        return math.inf if self.offset.shape[1] == 4 else MOST_SH_OF_GAUSSIANS
 
     @property
     def blocks(self) -> tuple[ShBlock, ...]:
@@ -140,17 +125,18 @@ class PointCloud:
         """Gaussians for the footprint "gaussian". ids: (N,), ascending. offset: (N, 9) float32, as
         in cl/cloud.h: place in the cell, logarithms of the deviations, entries below the diagonal.
         opacity: (N,). sh: (N, 9, 16), degrees 0 to 2; coefficients above degree 0 are clipped to
-        +-MOST_SH_OF_GAUSSIANS.
+        +-kind.most_sh.
         """
-        padded = np.zeros((len(ids), offset_width("gaussian")), np.float32)
+        kind = FOOTPRINTS["gaussian"]
+        padded = np.zeros((len(ids), kind.offsets), np.float32)
         padded[:, : offset.shape[1]] = offset
-        most = np.full((9, 1), MOST_SH_OF_GAUSSIANS)
+        most = np.full((9, 1), kind.most_sh)
         most[0] = np.inf
         begins = [block.first for block in sh_blocks(2)[1:]]
         blocks = np.split(sh.clip(-most, most).astype(np.float32), begins, axis=1)
         opacities = dev.upload(_from_all_sides(opacity))
         sh_arrays = [dev.upload(block) for block in blocks]
-        return cls(dev.upload(ids, np.uint32), dev.upload(padded), opacities, sh_arrays)
+        return cls(dev.upload(ids, np.uint32), dev.upload(padded), opacities, sh_arrays, kind)
 
     def learned(self) -> dict[str, Array]:
         """{name: array that training changes}: "offset", "opacity", and the SH by block."""
@@ -170,7 +156,7 @@ class PointCloud:
         """A copy of the rows `keep`, (M) uint32, ascending."""
         arrays = self.ids, self.offset, self.opacity, *self.sh
         ids, offset, opacity, *sh = (gather_rows(dev, array, keep) for array in arrays)
-        return PointCloud(ids, offset, opacity, sh)
+        return PointCloud(ids, offset, opacity, sh, self.kind)
 
     def replace_by(self, dev: Device, ids: np.ndarray, rows: Array) -> None:
         """Become the points `ids`, (M) ascending; each takes what point rows[i] of the present ones

@@ -15,11 +15,8 @@ from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, launch_groups, replayed
 from pp_cl.engine.device.scan import BLOCK, blocks_of
-from pp_cl.engine.raster.points import MOST_OFFSET, offset_width
+from pp_cl.engine.raster.footprint import FOOTPRINTS, MOST_OFFSET, footprint_macros
 
-# numbered as in cl/raster/footprint.h; each has a header in cl/raster/footprint/
-FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
-MOVED = ("soft", "gaussian")  # their points learn offsets and have radii in voxel sizes
 LEAST_RADIUS = 0.75  # pixels, as in cl/raster/footprint.h
 
 
@@ -68,21 +65,8 @@ def projection_table(n: int, footprint: str = "soft") -> Table:
         "point_box": ((n, 4), np.uint16),
         "point_count": ((n,), np.uint32),
         "block_sum": ((blocks_of(n),), np.uint32),
-        "point_shape": ((n, footprint_macros(footprint)["SHAPE"]), np.float32),
+        "point_shape": ((n, FOOTPRINTS[footprint].shape), np.float32),
         "point_opacity": ((n,), np.float32),
-    }
-
-
-def footprint_macros(footprint: str, side: int = 1) -> dict[str, int]:
-    """The defines of a program that includes cl/raster/footprint.h, for one of FOOTPRINTS and side
-    x side samples in a pixel.
-    """
-    return {
-        "SIDE": side,
-        "SAMPLES": side**2,
-        "FOOTPRINT": FOOTPRINTS.index(footprint),
-        "OFFSETS": offset_width(footprint),
-        "SHAPE": 4 if footprint == "gaussian" else 1,
     }
 
 

@@ -1,5 +1,5 @@
 """Computes the blend weight of each fragment in its pixel, by alpha compositing or by the paper's
-softmax; lists the visible points, and records each point's highest weight for pruning.
+softmax; lists the visible points.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from pp_cl.engine.device.buffers import Buffers, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, replayed
 from pp_cl.engine.device.scan import nonzero, read_total
+from pp_cl.engine.raster.footprint import footprint_macros
 from pp_cl.engine.raster.pairs import Pairs
-from pp_cl.engine.raster.project import ProjectedPoints, footprint_macros
+from pp_cl.engine.raster.project import ProjectedPoints
+from pp_cl.engine.raster.samples import sampled_weights
 from pp_cl.engine.raster.softmax import softmax_weights
 
 BLENDS = ("softmax", "alpha")
@@ -38,7 +40,7 @@ class BlendWeights:
     visible point in `visible`, undefined for others. transmittance: (HW,) float32 behind all
     fragments, None with the softmax; sample_transmittance: (HW, samples), the same by sample, if a
     pixel has several. visible_rows: (N,) uint32, begins with `visible`; found: (1,) uint32, the
-    number of visible points; count: that number, downloaded by read_visible().
+    number of visible points; count: that number, downloaded by read_count().
     """
 
     blend: str
@@ -55,7 +57,7 @@ class BlendWeights:
     sample_transmittance: Array | None = None
     count: Any = None
 
-    def read_visible(self, dev: Device) -> None:
+    def read_count(self, dev: Device) -> None:
         """Enqueue the download of the number of visible points."""
         self.count = read_total(dev, self.found)
 
@@ -113,12 +115,13 @@ def blend_weights(
     all. early_stop: in [0, 1): a pixel drops all fragments behind the depth where no fragment can
     have this share any more (0.001 in the paper); 0: none. derivatives: write what the backward
     pass reads. points: needed if a pixel has several samples (alpha compositing of discs).
-    read_visible() downloads the number of visible points.
+    read_count() downloads the number of visible points.
     """
     side, capacity = pairs.side, pairs.capacity if derivatives else 0
     b.require(weights_table(pairs.points, pairs.pixels, capacity, side))
     dev.fill(b.point_is_visible, 0)
     defines: dict[str, Any] = {"LANES": lanes(dev), "DERIVATIVES": int(derivatives)}
+    derivative = b.pixel_derivative if derivatives else None
     shared: dict[str, Any] = {
         "hw": pairs.pixels,
         "early_stop": early_stop,
@@ -128,23 +131,10 @@ def blend_weights(
         "pixel_weight_point": b.pair_scratch,
         "point_is_visible": b.point_is_visible,
     }
-    derivative = b.pixel_derivative if derivatives else None
-    transmittances = b.sample_transmittance if derivatives and side > 1 else None
     of_one = {"pair_point_falloff": pairs.pair_point_falloff, "pixel_derivative": derivative}
+    sampled: Array | None = None
     if points and side > 1:
-        program = dev.program("raster/samples", **sample_macros(dev, pairs, derivatives))
-        program.launch(
-            "sampled_weights",
-            pairs.pixels,
-            camera=camera_buffer,
-            point_camera=points.point_camera,
-            point_shape=points.point_shape,
-            pair_point=pairs.pair_point_falloff,
-            sample_derivative=derivative,
-            transmittance=b.transmittance,
-            sample_transmittance=transmittances,
-            **shared,
-        )
+        sampled = sampled_weights(dev, b, points, pairs, derivatives, **shared)
     elif blend == "alpha":
         program = dev.program("raster/alpha", **footprint_macros(pairs.footprint), **defines)
         shared |= {"transmittance": b.transmittance, **of_one}
@@ -165,15 +155,8 @@ def blend_weights(
         b.transmittance if blend == "alpha" else None,
         b.visible,
         b.visible_count,
-        transmittances,
+        sampled,
     )
-
-
-def sample_macros(dev: Device, pairs: Pairs, derivatives: bool = True) -> dict[str, Any]:
-    """The defines of cl/raster/samples.cl, which computes the samples of a pixel in its lanes."""
-    macros: dict[str, Any] = footprint_macros(pairs.footprint, pairs.side)
-    on_cpu = {"ON_CPU": 1} if dev.is_cpu else {}
-    return macros | on_cpu | {"LANES": pairs.side**2, "DERIVATIVES": int(derivatives)}
 
 
 def listed_fragments(
@@ -198,57 +181,11 @@ def listed_fragments(
 def clear_pairs(dev: Device, pairs: Pairs, weights: BlendWeights, pair_gradient: Array) -> None:
     """Set pair_gradient, (P, 1 + samples) float32, to 0 at the pairs of visible points."""
     count = weights.total
-    dev.program("raster/weights", SAMPLES=pairs.side**2).launch(
+    dev.program("raster/clear_pairs", SAMPLES=pairs.side**2).launch(
         "clear_pairs",
         count,
         s=count,
         visible=weights.visible_rows,
         point_offset=pairs.point_offset,
         pair_gradient=pair_gradient,
-    )
-
-
-def list_weights(dev: Device, b: Buffers, pairs: Pairs, weights: BlendWeights) -> Array:
-    """(P, 2) float32, valid until the next call: for each pair of a visible point, its blend weight
-    and 0; both are 0 if the pair is dropped or not tracked.
-    """
-    b.require({"pair_gradient": ((pairs.capacity, 2), np.float32)})
-    clear_pairs(dev, pairs, weights, b.pair_gradient)
-    dev.program("raster/weights").launch(
-        "list_weights",
-        pairs.pixels,
-        hw=pairs.pixels,
-        tracked=weights.tracked,
-        pixel_offset=pairs.pixel_offset,
-        pair_key=pairs.pair_key,
-        pixel_weight_point=weights.pixel_weight_point,
-        pair_gradient=b.pair_gradient,
-    )
-    return b.pair_gradient
-
-
-def record_weights(
-    dev: Device,
-    pairs: Pairs,
-    weights: BlendWeights,
-    pair_gradient: Array,
-    max_weight: Array,
-    times_seen: Array,
-    least: float = 0.0,
-) -> None:
-    """Update the inputs of pruning, both (N,) float32. For each point, max_weight is the highest
-    sum of its blend weights over an image's pixels so far, and times_seen counts the images in
-    which it had a fragment, dropped or not, and this sum was at least `least`. pair_gradient: from
-    list_weights().
-    """
-    dev.program("raster/weights").launch(
-        "record_weights",
-        pairs.points,
-        n=pairs.points,
-        least=least,
-        point_offset=pairs.point_offset,
-        point_is_visible=weights.point_is_visible,
-        pair_gradient=pair_gradient,
-        max_weight=max_weight,
-        times_seen=times_seen,
     )

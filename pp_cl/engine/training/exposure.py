@@ -49,7 +49,7 @@ class Exposure:
         """
         height, width = alpha.shape
         self._buffers.require({"target": ((height, width, 3), np.float32)})
-        self.dev.program("training/exposure").launch(
+        self.dev.program("training/exposure_undo").launch(
             "exposure_undo",
             height * width,
             hw=height * width,

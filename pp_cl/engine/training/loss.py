@@ -37,7 +37,7 @@ def loss_table(
 
 class Loss:
     """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image + mask_weight * mean (alpha
-    - mask)^2, plus the term of add_distortion(); holds its scratch buffers.
+    - mask)^2, plus the distortion loss that read() is given; holds its scratch buffers.
 
     D is smooth L1 (Girshick 2015): d^2 / (2 beta) below beta, |d| - beta/2 from there on; L1 where
     beta is 0.
@@ -54,7 +54,6 @@ class Loss:
         self.ssim_weight = ssim_weight
         self.mask_weight = mask_weight
         self._window_rows = 0
-        self._distortion: Any = None  # its download
         self._further: dict[str, tuple[float, float]] = {}  # {further term: (weight, scale)}
         self._buffers = Buffers(dev)
 
@@ -112,48 +111,58 @@ class Loss:
             grad_alpha=b.grad_alpha,
             **shared,
         )
-        self._window_rows, self._distortion = window_rows, None
+        self._window_rows = window_rows
         self._further = {"mask": (self.mask_weight, 1 / (height * width))} if alphas else {}
         return b.grad_prediction, b.grad_alpha if alphas else None
 
-    def add_distortion(self, distortion: Array, weight: float, scale: float = 1.0) -> None:
-        """Add weight times the distortion loss: scale * sum(distortion), (...,) float32."""
-        self._further["distortion"] = weight, scale
-        self._distortion = read_later(self.dev, distortion)
+    def read(
+        self,
+        step: int,
+        distortion: Array | None = None,
+        distortion_weight: float = 0.0,
+        scale: float = 1.0,
+    ) -> Pending[dict[str, float]]:
+        """{"loss", "l1", "ssim", "psnr" and, if they count, "mask" and "distortion": value} of a
+        step's crop; steps count from 1. Its get() raises Diverged if a value is not finite.
 
-    def read(self, step: int) -> Pending[dict[str, float]]:
-        """{"loss", "l1", "ssim", "psnr" and further terms: value} of a step's crop; steps count
-        from 1. Its get() raises Diverged if a value is not finite.
+        distortion: (...,) float32; the distortion loss is scale * sum(distortion).
         """
-        weight, further, v = self.ssim_weight, self._further, self._window_rows
-        distortion = self._distortion
-
-        def by_name(rows: np.ndarray) -> dict[str, float]:
-            dissimilarity = rows[:v].sum(0, dtype=np.float64)[0]
-            smooth, l1, mse, mask = rows[v:].sum(0, dtype=np.float64)
-            found = {"mask": mask}
-            if distortion:
-                found["distortion"] = distortion.get().sum(dtype=np.float64)
-            more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
-            total = smooth + weight * dissimilarity
-            total += sum(more[name] * weight for name, (weight, _) in further.items())
-            terms = {
-                "loss": float(total),
-                "l1": float(l1),
-                "ssim": float(1 - dissimilarity),
-                "psnr": -10 * math.log10(max(mse, 1e-10)),
-                **more,
-            }
-            broken = [name for name, value in terms.items() if not math.isfinite(value)]
-            if broken:
-                raise Diverged(f"the loss is not finite at step {step} ({', '.join(broken)})")
-            return terms
-
-        return read_later(self.dev, self._buffers.terms, convert=by_name)
+        further, downloaded = dict(self._further), None
+        if distortion is not None:
+            further["distortion"] = distortion_weight, scale
+            downloaded = read_later(self.dev, distortion)
+        given = step, self._window_rows, self.ssim_weight, further, downloaded
+        terms = self._buffers.terms
+        return read_later(self.dev, terms, convert=lambda rows: _by_name(rows, *given))
 
     def _launch(self, kernel, rows, **arguments):
         defines = _defines(self.dev)
         launch_groups(self.dev, "training/loss", kernel, rows, defines=defines, **arguments)
+
+
+def _by_name(rows, step, window_rows, ssim_weight, further, distortion):
+    """The terms of Loss.read() from the rows that the kernels wrote. further: {term: (weight,
+    scale)}. distortion: its pending values if it is one of them.
+    """
+    dissimilarity = rows[:window_rows].sum(0, dtype=np.float64)[0]
+    smooth, l1, mse, mask = rows[window_rows:].sum(0, dtype=np.float64)
+    found = {"mask": mask}
+    if "distortion" in further:
+        found["distortion"] = distortion.get().sum(dtype=np.float64)
+    more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
+    total = smooth + ssim_weight * dissimilarity
+    total += sum(more[name] * weight for name, (weight, _) in further.items())
+    terms = {
+        "loss": float(total),
+        "l1": float(l1),
+        "ssim": float(1 - dissimilarity),
+        "psnr": -10 * math.log10(max(mse, 1e-10)),
+        **more,
+    }
+    broken = [name for name, value in terms.items() if not math.isfinite(value)]
+    if broken:
+        raise Diverged(f"the loss is not finite at step {step} ({', '.join(broken)})")
+    return terms
 
 
 def _defines(dev):

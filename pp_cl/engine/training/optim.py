@@ -15,7 +15,7 @@ from pyopencl.array import Array
 from pp_cl.engine.device.buffers import DeviceRows, Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
-from pp_cl.engine.layers.conv import GradientParts
+from pp_cl.engine.layers.conv import PARTS_MACROS, GradientParts
 from pp_cl.engine.model import Model
 from pp_cl.engine.raster.blend import BlendGradients
 from pp_cl.engine.raster.points import PointCloud, four_blocks, stored_degree
@@ -174,7 +174,8 @@ def adam_update(
     _same_shape(parameter, *moments.values())
     # rate (m / c1) / (sqrt(v / c2) + eps) = (rate root / c1) m / (sqrt(v) + eps root)
     root = math.sqrt(1 - BETA2**step)
-    dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2).launch(
+    decays = {"DECAY1": DECAY1, "DECAY2": DECAY2}
+    dev.program("training/adam", LANES=lanes(dev), **decays, **PARTS_MACROS).launch(
         "adam_update",
         parts.n * row_parts(dev),
         n=parts.n,
@@ -196,8 +197,7 @@ def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None
     """
     _same_shape(ema, parameter)
     n = parameter.size
-    program = dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2)
-    program.launch(
+    dev.program("training/ema", LANES=lanes(dev)).launch(
         "ema_update", -(-n // lanes(dev)), n=n, weight=weight, parameter=parameter, ema=ema
     )
 
@@ -226,7 +226,7 @@ def rmsprop_update(
     """
     degree = max((d for d in range(stored_degree(cloud.sh) + 1) if rates.sh[d] > 0), default=0)
     root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(cloud.sh)
-    v, parts = state.second_moments, row_parts(dev)
+    v, parts, kind = state.second_moments, row_parts(dev), cloud.kind
     program = dev.program(
         "training/rmsprop",
         LANES=lanes(dev),
@@ -234,9 +234,9 @@ def rmsprop_update(
         DECAY2=DECAY2,
         LOG_BETA2=f"{math.log2(BETA2):.9g}f",
         MOVES_OFFSET=int(grad_offset is not None),
-        MOST_OFFSET=f"{cloud.most_offset}f",
-        OFFSETS=cloud.offset.shape[1],
-        **({"MOST_SH": f"{cloud.most_sh}f"} if cloud.most_sh < math.inf else {}),
+        MOST_OFFSET=f"{kind.most_offset}f",
+        OFFSETS=kind.offsets,
+        **({"MOST_SH": f"{kind.most_sh}f"} if kind.most_sh < math.inf else {}),
     )
     fits = program.kernels["rmsprop_move"].largest_group >= parts
     program.launch(

@@ -54,11 +54,13 @@ class Target:
         image = self.dev.scratch("stored image", most, np.uint8)[: rows.size].reshape(rows.shape)
         self.dev.send(image, rows)
         across, down = (stored - d for stored, d in zip(jitter, whole, strict=True))
-        name, own = "target_forward", dict[str, Any](downscale=view.downscale)
+        file, kernel = "training/target", "target_forward"
+        own: dict[str, Any] = {"downscale": view.downscale}
         if across or down:
-            name, own = "target_between", {"across": across, "down": down}
-        self.dev.program("training/target").launch(
-            name,
+            file, kernel = "training/target_between", "target_between"
+            own = {"across": across, "down": down}
+        self.dev.program(file).launch(
+            kernel,
             (width, height),
             width=width,
             height=height,

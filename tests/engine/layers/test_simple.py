@@ -11,7 +11,7 @@ from pp_cl.engine.network.unet import UNet
 from pp_cl.reference import network
 from pp_cl.selftest.layers import gated
 
-pytestmark = pytest.mark.kernels  # they test gate.cl, output.cl and resample.cl
+pytestmark = pytest.mark.kernels  # they test gate.cl, output.cl, maxpool.cl and resample.cl
 
 
 @pytest.mark.exact

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.engine.raster.weights import BLENDS, list_weights, record_weights
+from pp_cl.engine.raster.highest_weights import list_weights, record_weights
+from pp_cl.engine.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.points import (

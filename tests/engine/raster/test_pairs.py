@@ -7,8 +7,8 @@ from support.guarded import large
 
 from pp_cl.bench.spheres import find_all_pairs
 from pp_cl.engine.device.buffers import Buffers
+from pp_cl.engine.raster.footprint import FOOTPRINTS
 from pp_cl.engine.raster.pairs import MOST_PAIRS, capacity_needed, find_pairs
-from pp_cl.engine.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 

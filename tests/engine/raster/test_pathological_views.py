@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.engine.raster.project import FOOTPRINTS
+from pp_cl.engine.raster.footprint import FOOTPRINTS
 from pp_cl.errors import UserError
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera

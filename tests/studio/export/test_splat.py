@@ -11,7 +11,7 @@ from support.gltf import glb
 from support.splats import colours, draw_splats, read_splats
 
 from pp_cl.engine import FirstFeatures, Model, Renderer
-from pp_cl.engine.raster.points import MOST_OF_GAUSSIANS
+from pp_cl.engine.raster.footprint import MOST_OF_GAUSSIANS
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.scene.gaze import up_of
