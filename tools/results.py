@@ -2,8 +2,8 @@
 
 Every part is a process: a training with its evaluation, a bench, a tool. Its result is stored in
 runs/results/, so that the same command goes on where it was stopped; if the code changes, all parts
-are measured anew. A table is written to docs/results/ once all its parts are measured, the plots
-once all parts are; `make docs` puts them into the pages. Scenes are looked for in PP_DATA
+are measured anew. A table is written to docs/results/ once all its parts are measured, a plot
+likewise; `make docs` puts them into the pages. Scenes are looked for in PP_DATA
 (../shared/data). It takes hours in which nothing else should run.
 
 `--kind NAME` measures for another processor, driver (PP_DEVICE) or GPU. Results are stored in
@@ -130,9 +130,8 @@ WORTH = {"demo_1500": 1.0, "lego_8000": 1.5, "lego_22000": 4.4}
 WORTH |= {"rasteriser": 1.0, "pytorch": 1.0, "stages_tiny": 0.5, "stages_full": 1.0}
 # {part whose run is examined: its name in the rows} by splats(), work() and meshes(); TRADED: by
 # frontier()
-SPLATTED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_6000": "lego 400x400"}
-SPLATTED |= {"ethiopian_head": "ethiopian_head"}
-WORKED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_22000": "lego 800x800"}
+EXAMINED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_6000": "lego 400x400"}
+EXAMINED |= {"ethiopian_head": "ethiopian_head"}
 MESHED = {"demo_1500": "demo, 1,500 steps", "ethiopian_head": "ethiopian_head, 8,000 steps"}
 TRADED = "lego_8000"
 
@@ -340,14 +339,14 @@ def meshes(store: Path) -> list[dict]:
 def splats(store: Path) -> list[dict]:
     """Rows of splats: the demo also has one with the best quality."""
     (steps, cell), best = QUALITIES[QUICK], QUALITIES[BEST]
-    fits = [(name, (steps,), cell) for name in SPLATTED]
+    fits = [(name, (steps,), cell) for name in EXAMINED]
     fits.insert(1, ("demo_1500", best[:1], best[1]))
     rows = []
     for name, numbers, size in fits:
         words = (store / name, "--steps", *numbers, "--cell", size)
         for row in read_found(store, *TOOL, "tools.splat_quality", *words):
             psnr = {"psnr_same": row["psnr"]["1"], "psnr_larger": row["psnr"]["3"]}
-            rows.append(row | psnr | {"name": SPLATTED[name]})
+            rows.append(row | psnr | {"name": EXAMINED[name]})
     return rows
 
 
@@ -365,7 +364,7 @@ def stability(store: Path) -> list[dict]:
 def work(store: Path) -> list[dict]:
     """Rows of work."""
     rows = []
-    for name, label in WORKED.items():
+    for name, label in EXAMINED.items():
         found = read_found(store, *PP_CL, "info", store / name, "--work")
         cells, counted = found["cells"], found["work"]
         fragments, network = counted["fragments"], counted["network"]
@@ -538,21 +537,26 @@ def tables(found: dict[str, Found]) -> dict[str, dict]:
 
 
 def draw(found: dict[str, Found], machine: str, folder: Path) -> None:
-    """Draw quality.png, speed.png and frontier.png, and the same for dark pages."""
+    """Draw quality.png, speed.png and frontier.png, and the same for dark pages, each if its parts
+    were measured.
+    """
     from matplotlib import style
     from matplotlib.figure import Figure
 
     for suffix, look in (("", "default"), ("_dark", "dark_background")):
         with style.context(look):
-            figure = Figure(figsize=(11, 4), layout="constrained")
-            plot_quality(figure, trained(found, CURVES))
-            figure.supxlabel(f"minutes of training on {machine}", fontsize=9)
-            figure.savefig(folder / f"quality{suffix}.png", dpi=120)
-            figure = Figure(figsize=(13, 4), layout="constrained")
-            plot_speed(figure, timed(found))
-            figure.savefig(folder / f"speed{suffix}.png", dpi=120)
-            title = f"{WORKED[TRADED]}, on {machine}"
-            plot_frontier(found["frontier"], str(folder / f"frontier{suffix}.png"), title)
+            if found.keys() >= OF_TABLE["curves"]:
+                figure = Figure(figsize=(11, 4), layout="constrained")
+                plot_quality(figure, trained(found, CURVES))
+                figure.supxlabel(f"minutes of training on {machine}", fontsize=9)
+                figure.savefig(folder / f"quality{suffix}.png", dpi=120)
+            if found.keys() >= {"rasteriser", "pytorch"}:
+                figure = Figure(figsize=(13, 4), layout="constrained")
+                plot_speed(figure, timed(found))
+                figure.savefig(folder / f"speed{suffix}.png", dpi=120)
+            if "frontier" in found:
+                title = f"{EXAMINED[TRADED]}, on {machine}"
+                plot_frontier(found["frontier"], str(folder / f"frontier{suffix}.png"), title)
 
 
 def plot_quality(figure: "Figure", rows: list[dict]) -> None:
@@ -650,7 +654,7 @@ def main() -> int:
     for name, contents in tables(found).items():
         if options.kind or found.keys() >= OF_TABLE.get(name, {name}):
             write_json(folder / f"{name}.json", about | contents)
-    if found.keys() == PARTS.keys() and not options.kind:
+    if not options.kind:
         draw(found, about["machine"], ROOT / "docs")
     return 0
 
