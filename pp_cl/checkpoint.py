@@ -14,12 +14,8 @@ import numpy as np
 
 from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.grid import MOST_IDS, Grid
-from pp_cl.engine.network.layers import parameter_table, unet_layers
-from pp_cl.engine.network.specular import specular_layers
-from pp_cl.engine.raster.points import OPACITIES, SH_DEGREES
-from pp_cl.engine.training.exposure import MATRIX, decided_at
-from pp_cl.engine.training.schedule import ema_start
-from pp_cl.engine.training.state import PointState
+from pp_cl.engine.stored import stored_table
+from pp_cl.engine.training.exposure import decided_at
 from pp_cl.errors import Diverged, UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.run_folder import RunFolder
@@ -230,7 +226,8 @@ def _problem_of_forms(stored, config):
         # gains are stored until the training decides that it needs none
         if "exposed" in header or step < decided_at(header.get("extended_from", 0), views):
             gains = views
-    expected = stored_forms(config, n, step, gains, has_specular="specular" in header)
+    table = stored_table(config, n, step, gains, has_specular="specular" in header)
+    expected = {name: Form(tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in table.items()}
     for name in sorted(expected.keys() | forms.keys()):
         form, wanted = forms.get(name), expected.get(name)
         if wanted is None:
@@ -238,36 +235,3 @@ def _problem_of_forms(stored, config):
         if form != wanted:
             return f"{name} is {form or 'missing'}, expected {wanted}"
     return ""
-
-
-def stored_forms(
-    config: Config,
-    n: int,
-    step: int | None,
-    gains: int = 0,
-    *,
-    has_specular: bool = False,
-) -> dict[str, Form]:
-    """{name: Form} of the arrays in a checkpoint with n points after `step` steps; None: finished.
-    gains: number of views with gains. has_specular: whether the model has the specular layer.
-    """
-    degrees = SH_DEGREES[: config.points.sh_degree + 1]
-    sh_dtype = np.float16 if step is None else np.float32
-    network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
-    table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.offset": ((n, 4), np.float32)}
-    table["points.opacity"] = (n, OPACITIES), np.float32
-    table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), sh_dtype) for d in degrees}
-    table |= {f"net.{name}": row for name, row in network.items()}
-    if has_specular:
-        layer = parameter_table(specular_layers())
-        table |= {f"specular.{name}": row for name, row in layer.items()}
-    if step is not None:
-        table |= {f"moment.{kind}.{name}": row for name, row in network.items() for kind in "mv"}
-        state = PointState.table(n)
-        if config.train.ema and step >= ema_start(config.train.iterations):
-            state |= {f"a.{name}": row for name, row in PointState.ema_table(n).items()}
-            table |= {f"average.{name}": row for name, row in network.items()}
-        table |= {f"state.{name}": row for name, row in state.items()}
-    if gains:
-        table["exposure"] = (gains, MATRIX + 3, 4), np.float32
-    return {name: Form(tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in table.items()}

@@ -19,6 +19,7 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.depth import depth_forward
 from pp_cl.engine.render import Renderer, RenderResult
+from pp_cl.engine.stored import load_model
 from pp_cl.engine.training.schedule import gamma_at, supersampling_at
 from pp_cl.engine.views import View
 from pp_cl.errors import UserError, few_names
@@ -305,7 +306,7 @@ def load(
     config = stored_config(place, scene)
     header, arrays = load_run_state(place, config)
     net = UNet.of_settings(dev, config.network)
-    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+    model = load_model(dev, header, arrays, net, degree=config.points.sh_degree)
     others = []
     for number in range(2, config.train.members + 1):
         if (member := place.member(number)).checkpoint.exists():

@@ -27,10 +27,10 @@ from pp_cl.checkpoint import (
     load_run_state,
     opened_run,
     save_checkpoint,
-    stored_forms,
 )
 from pp_cl.config import load_config
 from pp_cl.engine.device.buffers import DeviceRows
+from pp_cl.engine.stored import stored_table
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.errors import Diverged, UserError
 from pp_cl.files.run_folder import RunFolder
@@ -148,7 +148,7 @@ def test_a_training_writes_what_is_expected(scene, tmp_path, monkeypatch, every,
     assert header["step"] == {10: 50, 53: 53, 30: 30}[every]
     config, n = load_config(folder.config), len(arrays["points.ids"])
     undecided = config.train.exposure == "auto" and header["step"] < decided_at(0, 8)
-    expected = stored_forms(config, n, header["step"], gains=8 if undecided else 0)
+    expected = stored_table(config, n, header["step"], gains=8 if undecided else 0)
     assert {name: (a.shape, a.dtype) for name, a in arrays.items()} == expected
     load_run_state(folder, load_config(folder.config))
 

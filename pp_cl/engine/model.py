@@ -8,7 +8,6 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.engine.camera import Camera
-from pp_cl.engine.device.buffers import DeviceRows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.network.first_features import FirstFeatures
@@ -75,44 +74,3 @@ class Model:
         self.grid = self.grid.refined()
         self.grid_buffer = self.dev.upload(self.grid.packed(self.grid.centre))
         return rows
-
-    def header(self) -> dict:
-        """JSON-able description that load() needs in addition to the arrays."""
-        header = {
-            "grid": self.grid.header(),
-            "depth_range": [float(x) for x in self.depth_range],
-        }
-        return header | ({"specular": True} if self.specular else {})
-
-    def arrays(self) -> dict[str, DeviceRows]:
-        """{name: array} of everything learned, as a checkpoint stores it."""
-        parameters = self.network_parameters().items()
-        networks = {name: DeviceRows(self.dev, array) for name, array in parameters}
-        return self.cloud.arrays(self.dev) | networks
-
-    def network_parameters(self) -> dict[str, Array]:
-        """{name in a checkpoint: array} of the networks."""
-        found = {f"net.{name}": array for name, array in self.net.parameters.items()}
-        layer = self.specular.parameters if self.specular else {}
-        return found | {f"specular.{name}": array for name, array in layer.items()}
-
-    @classmethod
-    def load(
-        cls,
-        dev: Device,
-        header: dict,
-        arrays: dict[str, np.ndarray],
-        net: UNet,
-        *,
-        degree: int,
-    ) -> Model:
-        """Make a Model from a checkpoint's header and arrays, which pp_cl/checkpoint.py has
-        checked. Removes the arrays from `arrays` and writes the stored parameters to net.
-        """
-        grid = Grid.of_header(header["grid"])
-        cloud = PointCloud.load(dev, arrays, degree)
-        specular = Specular(dev) if header.get("specular") else None
-        model = cls(dev, grid, tuple(header["depth_range"]), cloud, net=net, specular=specular)
-        for name, array in model.network_parameters().items():
-            dev.write(array, arrays.pop(name))
-        return model

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import Buffers, DeviceRows, Pending
+from pp_cl.engine.device.buffers import Buffers, Pending
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.model import Model
 from pp_cl.engine.render import Renderer, RenderResult
@@ -19,7 +19,6 @@ from pp_cl.engine.training.loss import Loss
 from pp_cl.engine.training.optim import Optimiser
 from pp_cl.engine.training.schedule import (
     Rates,
-    ema_start,
     gamma_at,
     refine_steps,
     rising_weight,
@@ -201,7 +200,7 @@ class Trainer:
         """
         between.finish(self)
 
-    # ---- what the session shows and stores -------------------------------------------------------
+    # ---- what the session shows and resumes ------------------------------------------------------
 
     def rates(self) -> dict:
         """The learning rates of the last step, for the log."""
@@ -215,28 +214,7 @@ class Trainer:
         """(H, W, 3) float32 in [0, 1]: the image that render(view) should match."""
         return self.targets.whole(view)
 
-    def arrays(self) -> dict[str, DeviceRows]:
-        """{name in a checkpoint: array} of the model and of the training's state. Raises UserError
-        as check() does.
-        """
-        self.check()
-        exposure = {"exposure": DeviceRows(self.dev, self.exposure.state)} if self.exposure else {}
-        return self.model.arrays() | self.optimiser.arrays() | exposure
-
-    def restore(
-        self, step: int, arrays: dict[str, np.ndarray], begun: int, exposed: str = ""
-    ) -> None:
-        """Resume after `step` steps with a checkpoint's training state, which is removed from
-        `arrays`; the model must be loaded already. A finished training stores no such state: its
-        moments start anew, and so does its EMA if it is due.
-        """
+    def start_at(self, step: int, begun: int) -> None:
+        """Go on as after `step` steps; the optimiser's moments started at the step `begun`."""
         self.step, self.begun = step, begun
         self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
-        if arrays:
-            self.optimiser.restore(arrays)
-            if "exposure" not in arrays:
-                self.exposure = None
-            elif self.exposure:
-                self.exposure.restore(arrays.pop("exposure"), exposed)
-        elif self.config.train.ema and step >= ema_start(self.config.train.iterations):
-            self.optimiser.update_ema(1.0)

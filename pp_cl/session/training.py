@@ -19,6 +19,13 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.network.unet import UNet
 from pp_cl.engine.raster.points import PointCloud
 from pp_cl.engine.step import Trainer
+from pp_cl.engine.stored import (
+    load_model,
+    model_arrays,
+    model_header,
+    restore_training,
+    training_arrays,
+)
 from pp_cl.engine.training.between import keep_most_visible
 from pp_cl.engine.training.schedule import supersampling_at
 from pp_cl.engine.views import View
@@ -106,7 +113,7 @@ class Training:
             if self.hull and self.hull.sheet is not None:
                 write_png(self.folder.path / MASKS_SHEET, self.hull.sheet)
             self._saved = self.trainer.step
-            size = sum(array.nbytes for array in self.trainer.arrays().values())
+            size = sum(array.nbytes for array in training_arrays(self.trainer).values())
             check_room(self.folder.checkpoint, size)
             try:
                 return self._run(on_step, is_stopped)
@@ -157,7 +164,7 @@ class Training:
                 if is_stopped() and trainer.step < self.config.train.iterations:
                     self._save(finished=False)
                     return seconds
-            check_finite(trainer.arrays())  # before the EMA replaces the parameters
+            check_finite(training_arrays(trainer))  # before the EMA replaces the parameters
             start = time.perf_counter()
             trainer.finish()
             seconds += time.perf_counter() - start
@@ -241,9 +248,11 @@ class Training:
 
     def _save(self, finished):
         trainer = self.trainer
-        header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
+        header = (
+            model_header(trainer.model) | self.info | {"step": trainer.step, "finished": finished}
+        )
         header |= {"exposed": trainer.exposed} if trainer.exposed else {}
-        arrays = trainer.model.arrays() if finished else trainer.arrays()
+        arrays = model_arrays(trainer.model) if finished else training_arrays(trainer)
         save_checkpoint(self.folder.checkpoint, header, arrays)
         self._expect_save()
         self._saved = trainer.step
@@ -309,7 +318,7 @@ def open_training(
     info = identity(views) | ({"notes": scene.notes} if scene.notes else {})
     if stored:
         _check_scene(folder, config, header, views)
-        model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+        model = load_model(dev, header, arrays, net, degree=config.points.sh_degree)
         left_out = header.get("left_out", [])
         views = [view for view in views if view.name not in left_out]
         info["initial_points"] = header["initial_points"]
@@ -328,7 +337,7 @@ def open_training(
         info["initial_points"] = model.cloud.count
     trainer = Trainer(dev, followed, model, views)
     if stored:
-        trainer.restore(header["step"], arrays, begun, header.get("exposed", ""))
+        restore_training(trainer, header["step"], arrays, begun, header.get("exposed", ""))
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
     measured = []

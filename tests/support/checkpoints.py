@@ -7,9 +7,10 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from pp_cl.checkpoint import load_run_state, save_checkpoint, stored_forms
+from pp_cl.checkpoint import load_run_state, save_checkpoint
 from pp_cl.config import preset
 from pp_cl.engine.grid import Grid
+from pp_cl.engine.stored import stored_table
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.errors import UserError
 from pp_cl.scene.demo import demo_frames
@@ -47,12 +48,12 @@ def settings(**changes):
 
 def contents(config, step=STEP, n=POINTS):
     """(header, {name: array}) that a run could have after `step` steps."""
-    rng, arrays = np.random.default_rng(5), {}
+    rng = np.random.default_rng(5)
     finished = step == config.train.iterations
     views = len(HEADER["views"])
     gains = 0 if finished or step >= decided_at(0, views) else views
-    for name, form in stored_forms(config, n, None if finished else step, gains=gains).items():
-        arrays[name] = rng.random(form.shape).astype(form.dtype)
+    table = stored_table(config, n, None if finished else step, gains=gains)
+    arrays = {name: rng.random(shape).astype(dtype) for name, (shape, dtype) in table.items()}
     arrays["points.ids"] = some_ids(rng, Grid.of_header(HEADER["grid"]), n)
     for name in {"points.offset", "state.a.offset"} & arrays.keys():
         arrays[name] -= np.float32(0.5)

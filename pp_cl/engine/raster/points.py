@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import DeviceRows, Table, compact_rows, gather_rows
+from pp_cl.engine.device.buffers import Table, compact_rows, gather_rows
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.raster.footprint import FOOTPRINTS, Footprint
 
@@ -167,30 +167,6 @@ class PointCloud:
         self.opacity = gather_rows(dev, self.opacity, rows)
         for i in range(len(self.sh)):
             self.sh[i] = gather_rows(dev, self.sh[i], rows)
-
-    def arrays(self, dev: Device) -> dict[str, DeviceRows]:
-        """The arrays by their names in a checkpoint; the SH by degree, (N, 1, 16), (N, 3, 16), (N,
-        5, 16).
-        """
-        learned = {"ids": self.ids, "offset": self.offset, "opacity": self.opacity}
-        stored = {name: DeviceRows(dev, array) for name, array in learned.items()}
-        blocks = list(zip(self.blocks, self.sh, strict=True))
-        for degree in range(stored_degree(self.sh) + 1):
-            parts = [array for block, array in blocks if block.degree == degree]
-            stored[f"sh{degree}"] = DeviceRows(dev, *parts)
-        return {f"points.{name}": rows for name, rows in stored.items()}
-
-    @classmethod
-    def load(cls, dev: Device, arrays: dict[str, np.ndarray], degree: int) -> PointCloud:
-        """The points of a checkpoint's arrays, which are removed from `arrays`."""
-        names = "ids", "offset", "opacity"
-        ids, offset, opacity = (dev.upload(arrays.pop(f"points.{name}")) for name in names)
-        by_degree = [arrays.pop(f"points.sh{d}") for d in SH_DEGREES[: degree + 1]]
-        sh = []
-        for block in sh_blocks(degree):
-            start = block.first - block.degree**2  # within its degree
-            sh.append(dev.upload(by_degree[block.degree][:, start : start + block.count]))
-        return cls(ids, offset, opacity, sh)
 
 
 def _from_all_sides(opacity):

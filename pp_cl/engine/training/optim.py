@@ -12,7 +12,7 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.engine.device.buffers import DeviceRows, Table
+from pp_cl.engine.device.buffers import Table
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.device.launch import lanes, row_parts
 from pp_cl.engine.layers.conv import PARTS_MACROS, GradientParts
@@ -122,38 +122,6 @@ class Optimiser:
             (self.state.averages, {name: learned[name] for name in PointState.ema_table(0)}),
             (self.averages, {"network": self.model.net.all_parameters}),
         ]
-
-    def arrays(self) -> dict[str, DeviceRows]:
-        """{name in a checkpoint: array} of all but the model's own arrays."""
-        split = self.model.net.split
-        network: dict[str, Array] = {}
-        moments = {kind: split(array) for kind, array in self.moments.items()}
-        for name in self.model.net.parameters:
-            network |= {f"moment.{kind}.{name}": parts[name] for kind, parts in moments.items()}
-        for array in self.averages.values():
-            network |= {f"average.{name}": part for name, part in split(array).items()}
-        return {
-            name: DeviceRows(self.dev, array)
-            for name, array in (self.state.arrays() | network).items()
-        }
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take the state, as written by arrays(), out of the arrays of a checkpoint."""
-        net, averages = self.model.net, self.state.averages
-        for name, parameter in self.model.cloud.learned().items():
-            if f"state.a.{name}" in arrays:
-                stored = arrays.pop(f"state.a.{name}")
-                averages[name] = self.dev.upload(stored.reshape(parameter.shape))
-        whole = {f"moment.{kind}": array for kind, array in self.moments.items()}
-        if any(name.startswith("average.") for name in arrays):
-            self.averages = {"network": self.dev.zeros(net.all_parameters.shape)}
-            whole["average"] = self.averages["network"]
-        for kind, array in whole.items():
-            for name, part in net.split(array).items():
-                self.dev.write(part, arrays.pop(f"{kind}.{name}"))
-        for name, array in self.state.arrays().items():
-            if not name.startswith("state.a."):
-                self.dev.write(array, arrays.pop(name))
 
 
 def adam_update(

@@ -13,12 +13,13 @@ from pp_cl.engine.raster.points import PointCloud, sh_blocks
 class PointState:
     """Arrays with one row per point of the cloud, in its order; they start as zeros.
 
-    averages: {name as in PointCloud.learned(): EMA}, empty until Optimiser.update_ema().
+    arrays: {name as in table(): array}. averages: {name as in PointCloud.learned(): EMA}, empty
+    until Optimiser.update_ema().
     """
 
     def __init__(self, dev: Device, cloud: PointCloud):
         table = self.table(cloud.count, cloud.offset.shape[1])
-        self._arrays = {name: dev.zeros(*row) for name, row in table.items()}
+        self.arrays = {name: dev.zeros(*row) for name, row in table.items()}
         self.averages: dict[str, Array] = {}
 
     @staticmethod
@@ -47,30 +48,30 @@ class PointState:
         """(N) float32: the sum of the point's blend weights over an image's pixels, its highest
         value in all images since pruning last judged the point.
         """
-        return self._arrays["max_weight"]
+        return self.arrays["max_weight"]
 
     @property
     def times_seen(self) -> Array:
         """(N) float32: number of images, since pruning last judged the point, with a fragment of
         it, occluded or not.
         """
-        return self._arrays["times_seen"]
+        return self.arrays["times_seen"]
 
     @property
     def second_moments(self) -> dict[str, Array]:
         """RMSprop's second moments, float32: "offset" (N, 4), "opacity" (N,) and "sh" (N, 16), one
         for each feature.
         """
-        return {name: self._arrays[f"v.{name}"] for name in ("offset", "opacity", "sh")}
+        return {name: self.arrays[f"v.{name}"] for name in ("offset", "opacity", "sh")}
 
     @property
     def last_step(self) -> Array:
         """(N,) uint32: the last step in which the point had a gradient; 0: none yet."""
-        return self._arrays["last_step"]
+        return self.arrays["last_step"]
 
     def compact(self, dev: Device, keep: Array) -> None:
         """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
-        for arrays in (self._arrays, self.averages):
+        for arrays in (self.arrays, self.averages):
             for name in arrays:
                 arrays[name] = compact_rows(dev, arrays[name], keep)
 
@@ -78,16 +79,11 @@ class PointState:
         """Become the state of a refined cloud: point i takes over the state of parents[i], (M,)
         uint32, but max_weight and times_seen start anew.
         """
-        for arrays in (self._arrays, self.averages):
+        for arrays in (self.arrays, self.averages):
             for name in arrays:
                 arrays[name] = gather_rows(dev, arrays[name], parents)
         for array in (self.max_weight, self.times_seen):
             dev.fill(array, 0)
-
-    def arrays(self) -> dict[str, Array]:
-        """{name in a checkpoint: array}."""
-        averages = {f"a.{name}": array for name, array in self.averages.items()}
-        return {f"state.{name}": array for name, array in (self._arrays | averages).items()}
 
 
 def split_opacity(dev: Device, opacity: Array) -> None:

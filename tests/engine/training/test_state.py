@@ -5,6 +5,7 @@ from support.models import fetched, make_model
 from pp_cl.config import configure, preset
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.points import PointCloud
+from pp_cl.engine.stored import cloud_arrays, state_arrays
 from pp_cl.engine.training.between import refine
 from pp_cl.engine.training.prune import final_points_to_keep, most_visible, points_to_keep
 from pp_cl.engine.training.state import PointState
@@ -102,13 +103,13 @@ def test_the_state_follows(dev, rng):
     state = PointState(dev, model.cloud)
     averages = PointState.ema_table(model.cloud.count)
     state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
-    for array in state.arrays().values():
+    for array in state_arrays(state).values():
         array.set((1e3 * rng.random(array.shape)).astype(array.dtype))
-    grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
+    grid, before = model.grid, fetched(cloud_arrays(dev, model.cloud) | state_arrays(state))
     ids, parents = grid.children(before["points.ids"])
     state.refine(dev, model.refine())
 
-    after = fetched(model.cloud.arrays(dev) | state.arrays())
+    after = fetched(cloud_arrays(dev, model.cloud) | state_arrays(state))
     assert model.grid == grid.refined() and after.keys() == before.keys()
     np.testing.assert_array_equal(model.grid_buffer.get(), grid.refined().packed(grid.centre))
     np.testing.assert_array_equal(after.pop("points.ids"), ids)
