@@ -27,7 +27,7 @@ CLOSER = 8.0  # degrees between the two images with which the mapping of a turne
 STRONG, WEAK = 0.4, 0.15
 # Two images that match each other about as well as any contradict a model in which fewer of these
 # matches are the same point: of neighbours, half are in sound models, a sixth beside a wrong place.
-SAME_BEST, SAME_POINT = 0.75, 0.3
+SAME_BEST, SAME_POINT = 0.75, 0.25
 # One round of cameras hardly tells lens distortion from distance. Distortion must lower the error
 # by this share: of the demo, whose lens is straight, it does by 0.005, of a museum's head by 0.017.
 DISTORTS = 0.01
@@ -44,8 +44,9 @@ def place(
 
     taken: take_images()'s facts about the images. turns: the object turns before a fixed camera,
     and all matches are on the object; if few images fit in this way, they are placed as usual.
-    Returns the numbers of images and points, the reprojection error in pixels, and {image: reason}
-    for images without a place. Raises UserError if these are more than half, and if the cameras
+    Returns the numbers of images and points, the reprojection error in pixels, {image: reason} for
+    images without a place, and the images of a turned object that have a place by weak pairs alone.
+    Raises UserError if these are more than half, and if the cameras
     around a turned object contradict the matches.
     """
     least = max(3, LEAST_SHARE * len(taken))
@@ -96,6 +97,7 @@ def place(
             "points": best.num_points3D(),
             "error": round(error, 3),
             "unplaced": reasons,
+            "weak": _weak(database, placed) if turns else [],
         }
 
 
@@ -221,6 +223,15 @@ def _reasons(database, taken, placed):
         else:
             reasons[name] = f"fits no others that are placed (at most {matches} matches)"
     return reasons
+
+
+def _weak(database, placed):
+    """The names of the images among `placed` that have no strong pair."""
+    best = _most_matches(database)
+    with needed("pycolmap").Database.open(database) as db:
+        names = {image.image_id: image.name for image in db.read_all_images()}
+    least = STRONG * np.median(list(best.values()))
+    return sorted(names[i] for i, most in best.items() if most < least and names[i] in placed)
 
 
 def _most_matches(database):

@@ -276,6 +276,7 @@ class Capture:
         line = (
             f"{found['placed']} of {len(taken)} images, {found['points']} points, reprojection"
             f" error {found['error']:.2f} pixels{_but(unplaced, 'without a place')}"
+            f"{_but(found['weak'], 'may be a little off, by few matches')}"
         )
         return {"line": line, **found}
 
