@@ -40,7 +40,7 @@ def test_averages_start_as_copies_and_are_applied_and_released(dev, rng):
     for array in parameters.values():
         dev.fill(array, 0)
     optimiser.update_ema(0.25)
-    stored = optimiser_arrays(optimiser).keys()
+    stored = {*optimiser_arrays(optimiser)}
     assert {name.split(".", 1)[0] for name in stored} == {"state", "moment", "average"}
     assert {f"state.a.{name}" for name in learned} < stored and "state.a.sh_1" not in stored
     optimiser.apply_ema()

@@ -2,6 +2,7 @@ import numpy as np
 import plyfile
 import pytest
 
+from pp_cl.engine.stored import cloud_arrays
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.files.srgb import linear_to_srgb
@@ -48,7 +49,7 @@ def test_the_ply_reads_back_by_plyfile(run, tmp_path):
     offset = run.model.cloud.offset.get()[points.rows, 3]
     spacings = vertex["radius"] / run.model.grid.voxel_size / run.config.raster.radius
     assert np.log(spacings) == pytest.approx(offset, abs=1e-5)
-    stored = run.model.cloud.arrays(run.dev)
+    stored = cloud_arrays(run.dev, run.model.cloud)
     by_degree = [stored[f"points.sh{degree}"].get()[points.rows] for degree in range(3)]
     for c in range(16):
         for degree in (0, 1, 2):
