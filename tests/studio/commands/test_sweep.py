@@ -23,6 +23,7 @@ from pp_cl.run import load
 from pp_cl.session.training import open_training
 
 ROOT = Path(__file__).parents[3]
+STEPS = specular.STEPS  # before a fixture lowers it
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +109,7 @@ def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkey
     assert len(begun) == 5  # one run began twice
     rows = json.loads((out / "sweep.json").read_text())["runs"]
     plan, dev = jobs_of(scenes, tmp_path / "alone", [1, 2]), open_device()
-    monkeypatch.setattr(specular, "STEPS", 500)  # as in the workers, which fixtures do not reach
+    monkeypatch.setattr(specular, "STEPS", STEPS)  # as in the workers, which fixtures do not reach
     for row, job in zip(rows, plan, strict=True):
         expected = undisturbed(dev, job)
         assert (row["scene"], row["seed"]) == (job.name, job.seed)
