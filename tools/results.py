@@ -128,10 +128,10 @@ STEPS = {"tiny": "lego_8000", "full": "lego_22000"}
 # {part: the most minutes it takes on an H200} that --minutes measures, the most telling first
 WORTH = {"demo_1500": 1.0, "lego_8000": 1.5, "lego_22000": 4.4}
 WORTH |= {"rasteriser": 1.0, "pytorch": 1.0, "stages_tiny": 0.5, "stages_full": 1.0}
-# {part whose run is examined: its name in the rows} by splats(), work() and meshes(); TRADED: by
+# {part whose run is examined: its name in the rows} by work(), splats() and meshes(); TRADED: by
 # frontier()
-EXAMINED = {"demo_1500": "demo", "lego_8000": "lego 200x200", "lego_6000": "lego 400x400"}
-EXAMINED |= {"ethiopian_head": "ethiopian_head"}
+WORKED = {"demo_1500": "demo", "lego_8000": "lego 200x200"}
+SPLATTED = WORKED | {"lego_6000": "lego 400x400", "ethiopian_head": "ethiopian_head"}
 MESHED = {"demo_1500": "demo, 1,500 steps", "ethiopian_head": "ethiopian_head, 8,000 steps"}
 TRADED = "lego_8000"
 
@@ -339,14 +339,14 @@ def meshes(store: Path) -> list[dict]:
 def splats(store: Path) -> list[dict]:
     """Rows of splats: the demo also has one with the best quality."""
     (steps, cell), best = QUALITIES[QUICK], QUALITIES[BEST]
-    fits = [(name, (steps,), cell) for name in EXAMINED]
+    fits = [(name, (steps,), cell) for name in SPLATTED]
     fits.insert(1, ("demo_1500", best[:1], best[1]))
     rows = []
     for name, numbers, size in fits:
         words = (store / name, "--steps", *numbers, "--cell", size)
         for row in read_found(store, *TOOL, "tools.splat_quality", *words):
             psnr = {"psnr_same": row["psnr"]["1"], "psnr_larger": row["psnr"]["3"]}
-            rows.append(row | psnr | {"name": EXAMINED[name]})
+            rows.append(row | psnr | {"name": SPLATTED[name]})
     return rows
 
 
@@ -364,7 +364,7 @@ def stability(store: Path) -> list[dict]:
 def work(store: Path) -> list[dict]:
     """Rows of work."""
     rows = []
-    for name, label in EXAMINED.items():
+    for name, label in WORKED.items():
         found = read_found(store, *PP_CL, "info", store / name, "--work")
         cells, counted = found["cells"], found["work"]
         fragments, network = counted["fragments"], counted["network"]
@@ -555,7 +555,7 @@ def draw(found: dict[str, Found], machine: str, folder: Path) -> None:
                 plot_speed(figure, timed(found))
                 figure.savefig(folder / f"speed{suffix}.png", dpi=120)
             if "frontier" in found:
-                title = f"{EXAMINED[TRADED]}, on {machine}"
+                title = f"{WORKED[TRADED]}, on {machine}"
                 plot_frontier(found["frontier"], str(folder / f"frontier{suffix}.png"), title)
 
 

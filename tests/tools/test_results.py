@@ -65,7 +65,7 @@ def test_work_is_told_in_shares(tmp_path, monkeypatch):
     monkeypatch.setattr(TOOL, "read_found", lambda *words: {"cells": cells, "work": counted})
     row = {"box": 1000, "hull": 0.2, "left": 0.1, "stored": 2, "whole": 20, "fragments": 800}
     row |= {"blended": 0.75, "computed": 0.25, "drawn": 0.5, "touched": 0.3}
-    assert TOOL.work(tmp_path) == [{"name": name} | row for name in TOOL.EXAMINED.values()]
+    assert TOOL.work(tmp_path) == [{"name": name} | row for name in TOOL.WORKED.values()]
 
 
 def test_each_point_of_speed_has_its_name():
