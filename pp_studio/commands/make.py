@@ -32,7 +32,7 @@ Its parts are capture, train, eval, export and render. The same command goes on 
 MINUTES, MOST_MINUTES = 20.0, field_of("train.minutes").metadata["most"]
 # least minutes of each preset: on two cores with AVX-512 `small` takes 7 for its steps, `full` 25
 PRESET_FROM = {"full": 30.0, "small": 8.0, "tiny": 0.0}
-LARGER = [*PRESET_FROM][::-1]
+PRESETS = [*PRESET_FROM][::-1]
 # Evaluation, splat and video, after the training, take this share of the minutes that the capture
 # leaves, within these bounds in minutes.
 AFTER, LEAST_AFTER, MOST_AFTER = 0.25, 1.0, 5.0
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--preset",
-        choices=LARGER,
+        choices=PRESETS,
         help="of the training (by its minutes: tiny below 8, small below 30, then full)",
     )
     add("--title", metavar="TEXT", help="of the page (the name of FOLDER)")
@@ -152,13 +152,14 @@ def run(options: argparse.Namespace) -> None:
         else:  # keep the run's preset; train refuses another
             train(*preset, *clock.iterations())
         if minutes := clock.more(folder):
-            before = read_json(folder.config)["preset"]
-            trained = max(0.0, folder.rows()[-1]["seconds"] / 60 + minutes)
-            wanted = options.preset or _preset(trained, share)
-            if LARGER.index(wanted) > LARGER.index(before):
+            end, config = folder.rows()[-1], read_json(folder.config)
+            in_all = max(0.0, end["seconds"] / 60 + minutes)
+            wanted = options.preset or _preset(in_all, share)
+            if config["scene"]["downscale"] > 1 and wanted in _larger(config["preset"]):
                 # in more steps on images as small, it would only learn its photographs by heart
-                kept = folder.path.rename(out / f"run-{before}")
+                kept = folder.path.rename(out / f"run-of-{end['step']}-steps")
                 print(f"the preset is {wanted} now; {kept} is the model so far", flush=True)
+                # an open page keeps that model, which is better than the new one's first previews
                 train("--preset", wanted, "--minutes", f"{minutes:.3g}", follow=None)
             else:
                 train(*clock.extended(folder, minutes))
@@ -274,6 +275,7 @@ class _Clock:
         if self._planned >= self.minutes or left < LEAST_MORE or len(folder.rows()) < 2:
             return 0.0
         self._planned, self._until = self.minutes, self.minutes
+        self.keep()
         return self._divided(left)
 
     def extended(self, folder: "RunFolder", minutes: float) -> list[str]:
@@ -322,6 +324,11 @@ def _preset(minutes, share):
             flush=True,
         )
     return chosen
+
+
+def _larger(preset):
+    """The presets for larger images than a run's."""
+    return PRESETS[PRESETS.index(preset) + 1 :] if preset in PRESETS else []
 
 
 def _share():

@@ -79,20 +79,31 @@ def test_with_more_minutes_a_finished_model_is_trained_on(made, capsys, monkeypa
     assert "A &lt;ball&gt;" in (folder / "index.html").read_text("utf-8")
 
 
-def test_minutes_that_allow_for_larger_images_train_anew(made, capsys, monkeypatch):
-    """In more steps on small images, held-out views of a head got worse by 0.3 dB."""
+@pytest.mark.parametrize("downscale", [2, 1])
+def test_minutes_that_allow_for_larger_images_train_anew(made, capsys, monkeypatch, downscale):
+    """In more steps on small images, held-out views of a head got worse by 0.3 dB. Images that were
+    not reduced cannot get larger.
+    """
     scene, folder = made
     monkeypatch.setattr(render, "LEAST_HEIGHT", 32)
     monkeypatch.setattr(make, "LEAST_MORE", -100)
     monkeypatch.setitem(make.PRESET_FROM, "small", 0.1)
     monkeypatch.setattr(make, "_share", lambda: 1.0)
-    folder = shutil.copytree(folder, folder.with_name("larger"))
+    folder = shutil.copytree(folder, folder.with_name(f"larger_{downscale}"))
+    config = json.loads((folder / "run/config.json").read_text())
+    config["scene"]["downscale"] = downscale
+    write_json(folder / "run/config.json", config)
+    step = load_header(folder / "run")["step"]
     before = (folder / "run/checkpoint.npz").read_bytes()
     passed = json.loads((folder / "make.json").read_text())["passed"]
     words = ["make", scene, "--out", str(folder), "--minutes", f"{passed + 0.4:.3f}"]
     assert main(words) == 0
+    if downscale == 1:
+        assert "extends a finished training" in capsys.readouterr().out
+        assert load_header(folder / "run")["step"] > step
+        return
     assert "the preset is small now; " in capsys.readouterr().out
-    assert (folder / "run-tiny/checkpoint.npz").read_bytes() == before
+    assert (folder / f"run-of-{step}-steps/checkpoint.npz").read_bytes() == before
     assert json.loads((folder / "run/config.json").read_text())["preset"] == "small"
     after = (folder / "run/checkpoint.npz").read_bytes()
     assert main(words) == 0  # nothing is left to do
