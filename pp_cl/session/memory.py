@@ -217,13 +217,14 @@ class MemoryPlan:
         crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
         image = self._padded_size(0, 0)
         side, pixels = stretch.supersampling if is_supersampled(raster) else 1, math.prod(image)
-        pairs = grown(0, round(n * min(footprint_pixels(radius, side), pixels)))
+        pairs, plain = (
+            grown(0, round(n * min(footprint_pixels(radius, k), pixels))) for k in (side, 1)
+        )
         visible = n if raster.early_stop == 0 else round(SHOWN * n)
         share = min(1.0, CROP_SHARE * math.prod(crop) / pixels)
         of_crop = math.prod(crop), round(share * pairs), round(share * visible)
         of_step = view_table(raster, n, *of_crop, training=True, supersampling=side)
         of_preview = view_table(raster, n, pixels, pairs, visible, supersampling=side)
-        of_pruning = view_table(raster, n, pixels, pairs, 0, until="weights")
 
         held = [
             PointCloud.table(n, sh_blocks(self._points.sh_degree)),
@@ -235,12 +236,11 @@ class MemoryPlan:
             loss_table(self.dev, crop, crop, train.ssim_weight),
             {"image": ((self._image,), np.uint8)},
         ]
-        of_views = [of_preview, target_table(image)]
-        if stretch.refinements == 0 and self._specular:
-            of_views.append(self._specular)
+        is_last = stretch.refinements == 0
+        of_views = [of_preview, target_table(image), self._specular if is_last else {}]
         taking_turns = [[of_step, target_table(crop)], of_views]
-        if stretch.refinements == 0 and train.prune_weight > 0:
-            taking_turns.append([of_pruning])
+        if is_last and train.prune_weight > 0:  # its views have one sample a pixel
+            taking_turns.append([view_table(raster, n, pixels, plain, 0, until="weights")])
         device = _bytes(held) + max(map(_bytes, taking_turns))
         tables = [*held, *(table for turn in taking_turns for table in turn)]
         largest = max(table_bytes({"": row}) for table in tables for row in table.values())
