@@ -44,13 +44,14 @@ def begin_network(dev: Device, config: Config) -> UNet:
     this shape, else a random one. Raises UserError for a run whose network has another shape.
     """
     net = UNet.of_settings(dev, config.network, seed=config.train.seed)
-    settings, folder = config.network, RunFolder(config.network.start)
+    settings = config.network
     if settings.start == DEMO:
         if config.scene.path != DEMO and not _unlike(settings, NetworkConfig()):
             with np.load(DEMO_NETWORK) as stored:
                 for name, parameter in net.parameters.items():
                     dev.write(parameter, stored[f"net.{name}"].astype(np.float32))
     elif settings.start != RANDOM:
+        folder = RunFolder(settings.start)
         other = load_config(folder.config)
         for key, ours, theirs in _unlike(settings, other.network):
             raise UserError(

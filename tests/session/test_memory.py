@@ -106,7 +106,7 @@ def test_what_was_to_be_supersampled_is_given_up_before_points(
     tmp_path, monkeypatch, capsys, steps, at
 ):
     def fault_of(self, grid, points, depth_range, step=0, share=1.0):
-        return ("little", "") if self._train.supersampled and step > 10 else None
+        return ("little", "") if self._config.train.supersampled and step > 10 else None
 
     monkeypatch.setattr(MemoryPlan, "fault_of", fault_of)
     folder, scene = RunFolder(tmp_path / "run"), write_ball_scene(tmp_path / "ball")
