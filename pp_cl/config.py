@@ -28,6 +28,8 @@ ADDED: dict[str, Any] = {"train.specular": "off", "train.members": 1}
 AUTOMATIC = ("train.refine_at", "raster.radius", "train.view_opacity")  # chosen by the hull
 MEND_SETTINGS = "restore it or start a new run"
 
+Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
+
 
 def preset(name: str) -> Config:
     """The Config of a preset. Raises UserError for an unknown name."""
@@ -133,7 +135,7 @@ def _check(value, where, *, least, most, choices, **_):
         raise UserError(f"{where} = {text_of(value)}; {which} must lie in [{least}, {most}]")
 
 
-def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
+def configure(config: Config, scene: str, given: Iterable[Given] = ()) -> Config:
     """The config with another scene and the given settings: (key, value or its text, origin). Paths
     of masks inside the old scene's folder move with it. Raises UserError naming the first setting
     that makes no sense, and for scene.path among them.
@@ -168,9 +170,7 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
     return config
 
 
-def begin_with(
-    path: Path | str, given: list[tuple[str, Any, str]]
-) -> tuple[str, list[tuple[str, Any, str]]]:
+def begin_with(path: Path | str, given: list[Given]) -> tuple[str, list[Given]]:
     """(preset, settings) of another run's config.json without its scene's settings, overridden by
     the given ones. Raises UserError as load_config() does.
     """
@@ -284,7 +284,7 @@ def run_config(
     folder: RunFolder,
     scene: str,
     preset_name: str | None = None,
-    given: Iterable[tuple[str, Any, str]] = (),
+    given: Iterable[Given] = (),
 ) -> Config:
     """The Config of a training in `folder`: the run's there, or else the preset's, with the given
     settings: (key, value or its text, origin). They must not change a run that has a checkpoint,
@@ -310,9 +310,7 @@ def run_config(
     return configure(stored, scene, given)
 
 
-def scene_config(
-    scene: str, preset_name: str, given: Iterable[tuple[str, Any, str]] = ()
-) -> Config:
+def scene_config(scene: str, preset_name: str, given: Iterable[Given] = ()) -> Config:
     """The Config of a preset for a scene, with the given settings. Unless these set
     scene.downscale, images are reduced to about the preset's size. Raises UserError as configure()
     and scene_frames() do.

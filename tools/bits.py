@@ -182,6 +182,8 @@ def main() -> int:
 
     works = [device.platform.name for _, device, problem in list_devices() if not problem]
     drivers = [name for name in works if (options.driver or "").lower() in name.lower()]
+    if not drivers:  # else nothing would be compared, and nothing would differ
+        parser.error(f"--driver {options.driver}: none of {', '.join(works)}")
     forms = [options.form] if options.form else ["cpu", "gpu"]
     if Path(options.base).is_dir():
         return min(1, compare(Path(options.base).resolve(), drivers, forms, options.settings))

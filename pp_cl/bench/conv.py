@@ -133,7 +133,7 @@ class UploadedLayer:
         conv = Conv(dev, blocking, variant, shape, self.weight, self.bias)
         for name, (needed, _) in choice.work_table(variant, shape).items():
             n = math.prod(needed)
-            setattr(conv, name, dev.scratch(f"bench: {name}", n)[:n].reshape(needed))
+            conv.take(name, dev.scratch(f"bench: {name}", n)[:n].reshape(needed))
         choice.lay_out(dev, [conv], self.weight.reshape(-1), conv.work)
         if direction == "forward":
             kernels.forward(conv, parts, self.out, relu=self.relu, tiles=tiles)

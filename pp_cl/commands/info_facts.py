@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.checkpoint import opened_run
-from pp_cl.config import scene_config
+from pp_cl.config import Given, scene_config
 from pp_cl.engine.device.device import Device
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.layers.tiles import tiles_with
@@ -36,7 +36,6 @@ from pp_cl.session.start import first_hull
 WORK_VIEWS = 8  # number of views in which run_work() counts
 
 Facts = dict[str, Any]
-Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
 
 
 def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:

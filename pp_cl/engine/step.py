@@ -37,10 +37,18 @@ class Trainer:
     start at any step.
 
     step: number of steps done. begun: the step at which the optimiser's moments started; above 0 if
-    a finished training is extended. state: the training state of each point.
+    a finished training is extended. state: the training state of each point. crops: an
+    instance of the class given as `crops`, which draws them.
     """
 
-    def __init__(self, dev: Device, config: Config, model: Model, views: list[View]):
+    def __init__(
+        self,
+        dev: Device,
+        config: Config,
+        model: Model,
+        views: list[View],
+        crops: type[Crops] = Crops,
+    ):
         train = config.train
         self.dev = dev
         self.config = config
@@ -61,7 +69,8 @@ class Trainer:
         self._terms: Pending[dict[str, float]] | None = None  # of the last step's loss
         self.smoother: Smoother | None = None  # made when due, and again after points change
         self.refine_steps = refine_steps(train)
-        self.crops = Crops(views, train, self.refinements_to_come)
+        self._crops_class = crops
+        self.renew_crops()
         self.fitted: Fitted | None = None  # set by finish()
 
     def follow(self, config: Config) -> None:
@@ -70,7 +79,11 @@ class Trainer:
         self.renderer.settings = config.raster
         self.refine_steps = refine_steps(config.train)
         if self.refinements_to_come != self.crops.halvings:
-            self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
+            self.renew_crops()
+
+    def renew_crops(self) -> None:
+        """Draw crops from now on of images halved as often as the grid will still be refined."""
+        self.crops = self._crops_class(self.views, self.config.train, self.refinements_to_come)
 
     @property
     def refinements_to_come(self) -> int:
@@ -217,4 +230,4 @@ class Trainer:
     def start_at(self, step: int, begun: int) -> None:
         """Go on as after `step` steps; the optimiser's moments started at the step `begun`."""
         self.step, self.begun = step, begun
-        self.crops = Crops(self.views, self.config.train, self.refinements_to_come)
+        self.renew_crops()

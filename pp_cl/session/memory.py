@@ -1,5 +1,5 @@
-"""Predicts a training's memory, within 15 %, from the engine's tables for the expected numbers of
-points, fragments and pixels. A training that does not fit is refused before it allocates.
+"""Refuses a training that does not fit into the memory before it allocates;
+engine/training/needs.py predicts what it needs.
 """
 
 import math
@@ -8,33 +8,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
 from itertools import islice
-from typing import NamedTuple
 
-import numpy as np
-
-from pp_cl.engine.device.buffers import PIECE_BYTES, Table, grown, table_bytes
+from pp_cl.engine.device.buffers import PIECE_BYTES
 from pp_cl.engine.device.host import available_bytes, resident_bytes
 from pp_cl.engine.device.quirks import compiler_bytes
 from pp_cl.engine.grid import MOST_IDS, Grid
-from pp_cl.engine.model import REFINING_BYTES
-from pp_cl.engine.network.specular import Specular
 from pp_cl.engine.network.unet import UNet
-from pp_cl.engine.raster.points import PointCloud, sh_blocks
-from pp_cl.engine.raster.project import footprint_pixels
-from pp_cl.engine.render import is_supersampled, point_radius, view_table
-from pp_cl.engine.training.crops import crop_side
-from pp_cl.engine.training.loss import loss_table
-from pp_cl.engine.training.optim import network_state_table
-from pp_cl.engine.training.schedule import (
-    averages_from,
-    expected_stretches,
-    refine_steps,
-    supersampled_from,
-)
-from pp_cl.engine.training.smooth import smoothing_table
-from pp_cl.engine.training.specular import SIDE, fit_table
-from pp_cl.engine.training.state import PointState
-from pp_cl.engine.training.target import target_table
+from pp_cl.engine.training.needs import Need, Needs
+from pp_cl.engine.training.schedule import averages_from, refine_steps, supersampled_from
 from pp_cl.errors import UserError
 from pp_cl.scene.image_file import ImageFile, image_bytes, shrink_factor
 from pp_cl.scene.listing import DEMO
@@ -42,12 +23,6 @@ from pp_cl.scene.load import reading_cost
 from pp_cl.settings import Config
 
 MIB, GIB = 2**20, 2**30
-# A crop's share of the points is this many times its share of an image's pixels: up to 4 times on
-# lego, where an image shows the object on a third of its pixels.
-CROP_SHARE = 4
-# The share of the points that an image shows at first, when they are fog; it shows all if no
-# fragments are dropped.
-SHOWN = 0.8
 # If memory is too small for all points, a training goes on only with at least this share of them:
 # about enough if pruning leaves the most beyond LEFT_BY_PRUNING, in two refinements.
 LEAST_KEPT = 0.5
@@ -56,48 +31,31 @@ LEAST_KEPT = 0.5
 FILLED = 0.9
 
 
-class Need(NamedTuple):
-    """Bytes that a training needs. device: the device's peak, which it reaches with `points`
-    points. largest: the largest buffer. host: host memory besides the program's own, including a
-    CPU's buffers.
-    """
-
-    device: int
-    points: int
-    largest: int
-    host: int
-
-
 class MemoryPlan:
     """Checks, before a training allocates anything, that it fits the available memory. need: result
     of the last check. budget: --memory, GiB. image_files: of the training views.
     """
 
     def __init__(self, config: Config, net: UNet, image_files: Sequence[ImageFile]):
-        self.dev, self._net = net.dev, net
+        self.dev = net.dev
         self.need: Need
         self.follow(config)
         self.budget = config.train.memory_gib
-        self._downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
+        downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
         cameras = [one.camera for one in image_files]
-        self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
         sizes = [(camera.width, camera.height) for camera in cameras]
-        factor = 1 if is_demo else shrink_factor(sizes, self._downscale)
-        self._specular: Table = {}
-        if config.train.specular == "auto" and config.raster.blend == "alpha":
-            batch = SIDE, SIDE
-            pixels = sum(one.width * one.height for one in cameras) // self._downscale**2
-            self._specular = Specular(self.dev).table(batch, batch)
-            self._specular |= fit_table(self.dev, pixels)
+        factor = 1 if is_demo else shrink_factor(sizes, downscale)
         self._images = image_bytes(sizes, factor)
-        self._image = image_bytes([(self._largest.width, self._largest.height)], factor)
+        largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
+        image = image_bytes([(largest.width, largest.height)], factor)
+        self._needs = Needs(net, largest, sum(map(math.prod, sizes)), image)
         self._reading_bytes = 0 if is_demo else reading_cost(image_files, config.scene, factor)[1]
         held = self.dev.bytes if self.dev.is_cpu else 0  # `need` counts these
         self._program = resident_bytes() - held + compiler_bytes(self.dev.info)
 
     def follow(self, config: Config) -> None:
         """Check a training of the same scene with these settings from now on."""
-        self._raster, self._train, self._points = config.raster, config.train, config.points
+        self._config = config
 
     @property
     def host_bytes(self) -> int:
@@ -108,8 +66,8 @@ class MemoryPlan:
         """Raise UserError if even the least memory that the training can take does not fit; called
         before the images are read and the hull is known.
         """
-        least = replace(self._train, supersampled=0.0)
-        self.need = self._need([*expected_stretches(least, self._points.count, 0)], 0.0)
+        least = replace(self._config, train=replace(self._config.train, supersampled=0.0))
+        self.need = self._need(self._needs.expected(least, least.points.count, 0, 0.0))
         if fault := self._fault(self.need):
             raise UserError(": ".join(fault))
 
@@ -161,7 +119,7 @@ class MemoryPlan:
         """(why a training with these points of a grid does not fit into a share of the memory from
         this step on, what to do), or None if it fits.
         """
-        to_come = sum(step < at for at in refine_steps(self._train))
+        to_come = sum(step < at for at in refine_steps(self._config.train))
         last = reduce(lambda finer, _: finer.refined(), range(to_come), grid)
         if last.id_count > MOST_IDS:
             return (
@@ -172,8 +130,8 @@ class MemoryPlan:
 
     def grows_after(self, step: int) -> bool:
         """Whether the next step takes more memory: it refines, begins the EMA or supersampling."""
-        begins = averages_from(self._train), supersampled_from(self._train)
-        return step + 1 in (*refine_steps(self._train), *begins)
+        begins = averages_from(self._config.train), supersampled_from(self._config.train)
+        return step + 1 in (*refine_steps(self._config.train), *begins)
 
     def need_of(
         self,
@@ -186,71 +144,18 @@ class MemoryPlan:
         """The Need of a training with these points of a grid from this step on. stretches: how many
         stretches to look ahead, each of which ends where more memory is taken; None: all.
         """
-        middle = sum(depth_range) / 2
-        # footprints grow by 1 / (z^2 cos) nearer by and off the axis: this is the mean over a cube,
-        # to second order
-        growth = 1 + (grid.diagonal / middle) ** 2 / 9
-        radius = point_radius(self._raster, grid.voxel_size, depth_range)
-        radius *= self._largest.fx / middle * math.sqrt(growth)
+        radius = self._needs.radius(self._config.raster, grid, depth_range)
         return self._need(
-            [*islice(expected_stretches(self._train, points, step), stretches)], radius
+            islice(self._needs.expected(self._config, points, step, radius), stretches)
         )
 
-    def _need(self, ahead, radius):
-        """The Need of these stretches. radius: radius of footprints in the first, in pixels of the
-        stored image.
-        """
-        found = []
-        for stretch in ahead:
-            # soft points are as wide as the spacing of points, and refining halves it
-            halved = ahead[0].refinements - stretch.refinements
-            width = radius / 2**halved if self._raster.footprint == "soft" else radius
-            found.append(self._need_of_stretch(stretch, width / self._downscale))
+    def _need(self, of_stretches):
+        """The Need of a training with these of its stretches."""
+        found = [*of_stretches]
         peak, largest = max(found), max(need.largest for need in found)
         host = 2 * PIECE_BYTES + max(need.host for need in found) + self.dev.is_cpu * peak.device
         host = self._images + max(host, self._reading_bytes)
         return peak._replace(largest=largest, host=host)
-
-    def _need_of_stretch(self, stretch, radius):
-        """The Need of one stretch; its `host` is what refining after it takes."""
-        raster, train, n = self._raster, self._train, stretch.points
-        crop = self._padded_size(stretch.refinements, crop_side(train.crop, stretch.refinements))
-        image = self._padded_size(0, 0)
-        side, pixels = stretch.supersampling if is_supersampled(raster) else 1, math.prod(image)
-        pairs = grown(0, round(n * min(footprint_pixels(radius, side), pixels)))
-        visible = n if raster.early_stop == 0 else round(SHOWN * n)
-        share = min(1.0, CROP_SHARE * math.prod(crop) / pixels)
-        of_crop = math.prod(crop), round(share * pairs), round(share * visible)
-        of_step = view_table(raster, n, *of_crop, training=True, supersampling=side)
-        of_preview = view_table(raster, n, pixels, pairs, visible, supersampling=side)
-        of_pruning = view_table(raster, n, pixels, pairs, 0, until="weights")
-
-        held = [
-            PointCloud.table(n, sh_blocks(self._points.sh_degree)),
-            PointState.table(n),
-            PointState.ema_table(n if stretch.is_averaged else 0),
-            smoothing_table(n if train.sh_smoothing > 0 else 0),
-            self._net.table(crop, image),
-            network_state_table(self._net.all_parameters.size, stretch.is_averaged),
-            loss_table(self.dev, crop, crop, train.ssim_weight),
-            {"image": ((self._image,), np.uint8)},
-        ]
-        of_views = [of_preview, target_table(image)]
-        if stretch.refinements == 0 and self._specular:
-            of_views.append(self._specular)
-        taking_turns = [[of_step, target_table(crop)], of_views]
-        if stretch.refinements == 0 and train.prune_weight > 0:
-            taking_turns.append([of_pruning])
-        device = _bytes(held) + max(map(_bytes, taking_turns))
-        tables = [*held, *(table for turn in taking_turns for table in turn)]
-        largest = max(table_bytes({"": row}) for table in tables for row in table.values())
-        return Need(device, n, largest, n * REFINING_BYTES if stretch.refinements else 0)
-
-    def _padded_size(self, halvings, side):
-        """(height, width) of a crop of the largest image, or of it all, padded for the network."""
-        camera = self._largest.downscaled(self._downscale << halvings)
-        height, width = (min(side or size, size) for size in (camera.height, camera.width))
-        return height + -height % UNet.multiple, width + -width % UNet.multiple
 
     def _fault(self, need, share=1.0):
         info, name = self.dev.info, self.dev.name
@@ -277,10 +182,6 @@ class MemoryPlan:
 def _most(points, fault):
     """The largest n up to `points` without a fault(n), as smaller n have none; or 0."""
     return bisect_right(range(1, points + 1), False, key=lambda n: fault(n) is not None)
-
-
-def _bytes(tables):
-    return sum(map(table_bytes, tables))
 
 
 def _size(size):

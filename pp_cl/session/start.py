@@ -3,6 +3,7 @@
 import math
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,13 +45,14 @@ def begin_network(dev: Device, config: Config) -> UNet:
     this shape, else a random one. Raises UserError for a run whose network has another shape.
     """
     net = UNet.of_settings(dev, config.network, seed=config.train.seed)
-    settings, folder = config.network, RunFolder(config.network.start)
+    settings = config.network
     if settings.start == DEMO:
         if config.scene.path != DEMO and not _unlike(settings, NetworkConfig()):
             with np.load(DEMO_NETWORK) as stored:
                 for name, parameter in net.parameters.items():
                     dev.write(parameter, stored[f"net.{name}"].astype(np.float32))
     elif settings.start != RANDOM:
+        folder = RunFolder(settings.start)
         other = load_config(folder.config)
         for key, ours, theirs in _unlike(settings, other.network):
             raise UserError(
@@ -91,14 +93,25 @@ def first_hull(
     return hull, REFINE_AT[times]
 
 
+class FittingHull(NamedTuple):
+    """The hull that a training starts from. agreement: of the views' masks. depth_range: (near,
+    far) of the hull. plan: the training's. given_up: lines on what lack of memory prevents, or "".
+    """
+
+    agreement: Agreement
+    hull: Hull
+    depth_range: tuple[float, float]
+    plan: Plan
+    given_up: str
+
+
 def fitting_hull(
     dev: Device, config: Config, views: list[View], memory_plan: MemoryPlan
-) -> tuple[Agreement, Hull, tuple[float, float], str, Plan]:
-    """Return (which views' masks agree, their first_hull(), its (near, far), lines on what is given
-    up, the training's plan). If memory is too small, supersampling is given up; if that does not
-    suffice and refine_at is automatic, points are only as close as memory allows, with as many
-    refinements. Raises UserError as MemoryPlan.check_points() does, and if raster.radius is
-    automatic but footprints are not soft.
+) -> FittingHull:
+    """Return the first_hull() that fits into memory. If memory is too small, supersampling is given
+    up; if that does not suffice and refine_at is automatic, points are only as close as memory
+    allows, with as many refinements. Raises UserError as MemoryPlan.check_points() does, and if
+    raster.radius is automatic but footprints are not soft.
     """
     given_up: list[str] = []
     if config.raster.radius == 0 and config.raster.footprint != "soft":
@@ -126,7 +139,7 @@ def fitting_hull(
         fewer = memory_plan.coarser_points(*found) if fault and can_be_fewer else 0
         if not (fault and fewer):
             memory_plan.check_points(*found)
-            return agreement, hull, found[-1], "\n".join(given_up), plan
+            return FittingHull(agreement, hull, found[-1], plan, "\n".join(given_up))
         if last == math.inf:
             spacing = spacing_pixels(hull.grid, cameras) / 2**to_come
             given_up.append(

@@ -326,13 +326,13 @@ def open_training(
         start = time.perf_counter()
         with Progress("carving the visual hull"):
             fitting = fitting_hull(dev, config, views, memory_plan)
-            agreement, hull, depth_range, given_up, plan = fitting
-            config = followed = plan.settings(config)
+            agreement, hull = fitting.agreement, fitting.hull
+            config = followed = fitting.plan.settings(config)
             seconds = time.perf_counter() - start
             sheet = sheet_of_masks(dev, views, hull, agreement)
-            facts = HullFacts(hull.capped, seconds, agreement.forgiven, given_up, sheet)
+            facts = HullFacts(hull.capped, seconds, agreement.forgiven, fitting.given_up, sheet)
         cloud = PointCloud.create(dev, hull.ids, config.points.sh_degree, config.points.opacity)
-        model = Model(dev, hull.grid, depth_range, cloud, net=net)
+        model = Model(dev, hull.grid, fitting.depth_range, cloud, net=net)
         views, left_out = agreement.views, list(agreement.left_out)
         info["initial_points"] = model.cloud.count
     trainer = Trainer(dev, followed, model, views)

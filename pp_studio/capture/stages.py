@@ -130,9 +130,19 @@ class Capture:
             option = "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
             redone = OPTIONS[name][0]
             self.tell(f"{option} has changed: {redone} and all after it are repeated")
+        made_by = {
+            "frames": self._frames,
+            "features": self._features,
+            "matches": self._matches,
+            "poses": self._poses,
+            "images": self._images,
+            "box": self._box,
+            "masks": self._masks,
+            "scene": self._scene,
+        }
         for stage in left:
             start = time.monotonic()
-            found = getattr(self, f"_{stage}")()
+            found = made_by[stage]()
             seconds = time.monotonic() - start
             write_json(self._file(stage), found | {"seconds": round(seconds, 1)})
             self.tell(f"{stage}: {found['line']} ({seconds:.0f} s)")

@@ -13,7 +13,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,7 +28,6 @@ from pp_cl.engine import (
     PointCloud,
     Renderer,
     Trainer,
-    View,
 )
 from pp_cl.errors import UserError
 from pp_cl.files import atomic_file
@@ -108,9 +107,9 @@ class Gaussians(NamedTuple):
 class WindowCrops(Crops):
     """Crops as windows of any size show them: each pixel is the mean of several window pixels."""
 
-    def __init__(self, views: list[View], config: Config):
-        super().__init__(views, config.train, 0)
-        longest = max(max(view.camera.width, view.camera.height) for view in views)
+    def __init__(self, *arguments: Any):
+        super().__init__(*arguments)
+        longest = max(max(view.camera.width, view.camera.height) for view in self.views)
         self._least, self._most = windows(longest)
 
     def draw(self, step: int) -> Crop:
@@ -145,8 +144,8 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
     sides = [side for view in views for side in (view.camera.width, view.camera.height)]
     factor = max(1, min(round(max(sides) / LARGEST), min(sides) // MIN_SIDE))
     config = config_of(run, steps)
-    trainer = Trainer(dev, config, model, [one.reduced(factor * one.downscale) for one in views])
-    trainer.crops = WindowCrops(trainer.views, config)
+    reduced = [one.reduced(factor * one.downscale) for one in views]
+    trainer = Trainer(dev, config, model, reduced, crops=WindowCrops)
     with Progress("fitting Gaussians", steps, "step") as progress:
         while trainer.step < config.train.iterations:
             trainer.train_step()

@@ -106,7 +106,7 @@ def test_what_was_to_be_supersampled_is_given_up_before_points(
     tmp_path, monkeypatch, capsys, steps, at
 ):
     def fault_of(self, grid, points, depth_range, step=0, share=1.0):
-        return ("little", "") if self._train.supersampled and step > 10 else None
+        return ("little", "") if self._config.train.supersampled and step > 10 else None
 
     monkeypatch.setattr(MemoryPlan, "fault_of", fault_of)
     folder, scene = RunFolder(tmp_path / "run"), write_ball_scene(tmp_path / "ball")
@@ -157,6 +157,13 @@ def test_a_training_that_goes_on_counts_no_pruning_twice(dev):
     assert halfway.points < needed(dev, "small", **once).points  # it still fits
     last = needed(dev, "small", points=600_000, step=4000, **once)
     assert last.points == 600_000
+
+
+def test_views_that_decide_on_pruning_have_one_sample_a_pixel(dev):
+    """They take the most memory where images are much larger than crops."""
+    few = {"train__iterations": "24", "size": (1600, 1200)}
+    one, four = (needed(dev, train__supersampled=share, **few) for share in ("0", "0.25"))
+    assert four.device == one.device
 
 
 def test_a_refined_grid_is_expected_to_take_what_was_planned_before(dev):

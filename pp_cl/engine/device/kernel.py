@@ -8,7 +8,8 @@ import operator
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import CodeType
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyopencl as cl
@@ -24,6 +25,31 @@ DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 # How many shapes and sizes of launches a kernel remembers, to check and round them only once: more
 # than a network's layers have. The numbers of visible points, new each step, would fill memory.
 REMEMBERED = 64
+
+
+class Slot(NamedTuple):
+    """A parameter in the order of the kernel's. dtype: None for a scalar. least, largest: integers
+    that a scalar may be. letter: the letter whose size a scalar gives, or None.
+    """
+
+    parameter: Parameter
+    name: str
+    dtype: np.dtype | None
+    least: int
+    largest: int
+    letter: str | None
+
+
+class Dimension(NamedTuple):
+    """A dimension of a buffer. text: as its comment has it. letter: the text in lower case if it is
+    a letter that no macro defines, otherwise "".
+    """
+
+    parameter: Parameter
+    axis: int
+    text: str
+    letter: str
+    formula: CodeType
 
 
 class Kernel:
@@ -54,10 +80,8 @@ class Kernel:
         names = {name for word in words for name in compile_formula(word).co_names}
         self._macros = {name: int(defines[name]) for name in names & defines.keys()}
         letters = {name.lower() for name in names}
-        # in order: (parameter, its name, dtype if it is a buffer, least and largest integer, the
-        # letter whose size it gives if it is a scalar)
         self._slots = [
-            (
+            Slot(
                 p,
                 p.name,
                 np.dtype(p.dtype) if p.is_buffer else None,
@@ -66,15 +90,16 @@ class Kernel:
             )
             for p in parameters
         ]
-        # (parameter, axis, dimension as text, its letter if it is one alone, its formula), letters
-        # first: the others are computed from them
+        # letters first: the others are computed from them
         dimensions = [
-            (p, axis, word, word.lower() if word in names - defines.keys() else "", formula)
+            Dimension(
+                p, axis, word, word.lower() if word in names - defines.keys() else "", formula
+            )
             for p in parameters
             for axis, word in enumerate(p.shape or ())
             if word != "?" and (formula := compile_formula(word))
         ]
-        self._dimensions = sorted(dimensions, key=lambda d: not d[3])
+        self._dimensions = sorted(dimensions, key=lambda dimension: not dimension.letter)
         self._checked: set[Any] = set()  # shapes and sizes already found valid
         self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 

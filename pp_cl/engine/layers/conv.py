@@ -101,6 +101,13 @@ class Conv:
     def __post_init__(self) -> None:
         self.work = self.weight
 
+    def take(self, name: str, array: Array) -> None:
+        """Use an array of choice.work_table(): "work" or "partial"."""
+        if name == "work":
+            self.work = array
+        else:
+            self.partial = array
+
 
 def pack_weights(weight: np.ndarray, dtype: type = np.float32) -> np.ndarray:
     """(CO, CI, K, K) -> (ceil(CO / 16), K, K, CI, 16); output channels beyond CO are zero."""

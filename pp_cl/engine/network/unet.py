@@ -110,7 +110,7 @@ class Workspace:
         whole, arrays = packed_arrays(net.dev, [*needed.values()])
         self.work = whole.view(np.float32)
         for (key, name), array in zip(needed, arrays, strict=True):
-            setattr(self.convs[key], name, array)
+            self.convs[key].take(name, array)
         reserve_scratch(self.convs.values())
         self.all_tiles = plan_all(net.dev, net.layers, size)
         self.size = size

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from pyopencl.array import Array
 
-from pp_cl.engine.training.crops import Crops
 from pp_cl.engine.training.exposure import decided_at
 from pp_cl.engine.training.prune import (
     most_visible,
@@ -95,7 +94,7 @@ def refine(trainer: Trainer) -> None:
         split_opacity(trainer.dev, trainer.model.cloud.opacity)
         if "opacity" in trainer.state.averages:
             split_opacity(trainer.dev, trainer.state.averages["opacity"])
-    trainer.crops = Crops(trainer.views, trainer.config.train, trainer.refinements_to_come)
+    trainer.renew_crops()
 
 
 def finish(trainer: Trainer) -> None:

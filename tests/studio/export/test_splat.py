@@ -151,7 +151,9 @@ def test_points_of_a_cell_begin_as_one_that_looks_like_them(run):
 def test_windows_are_as_large_as_people_have_them(run, size, least, most):
     (view, *_) = run.rendered(run.image_files("train")[:1], opaque=True)
     large = replace(view, stored_camera=view.stored_camera.resized(size, size))
-    crops = WindowCrops([replace(large, image=np.zeros((size, size, 4), np.uint8))], run.config)
+    crops = WindowCrops(
+        [replace(large, image=np.zeros((size, size, 4), np.uint8))], run.config.train, 0
+    )
     drawn = [crops.draw(step).camera.samples for step in range(200)]
     assert least <= min(drawn) < 1.1 * least and 0.9 * most < max(drawn) <= most
 
