@@ -9,6 +9,8 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import psutil
+
 from pp_cl.commands import COMMANDS
 from pp_cl.commands import options as shared
 from pp_cl.config import field_of
@@ -44,6 +46,7 @@ LEAST_MORE = 0.1  # minutes that must be left for a finished training to go on
 LATE = 0.8  # the time per step is measured after this share of a training
 PER_PHOTOGRAPH = 0.05  # minutes that a capture takes for each, about, on two cores without AVX-512
 OF_SPLAT = 0.6  # share of the minutes left after the evaluation
+LOOKED, FULL = 0.5, 0.9  # seconds in which the processor's use is measured; share of it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -334,8 +337,11 @@ def _larger(preset):
 
 def _share():
     """The share of the processor left by running programs, which are expected to run on."""
-    cores = os.cpu_count() or 1
-    return cores / (cores + (os.getloadavg()[0] if hasattr(os, "getloadavg") else 0))
+    cores, busy = os.cpu_count() or 1, psutil.cpu_percent(interval=LOOKED) / 100
+    load = cores * busy
+    if busy > FULL:  # programs that wait count, too; else the mean has some that ended since
+        load = max(load, psutil.getloadavg()[0])
+    return cores / (cores + load)
 
 
 def _is_scene(source):

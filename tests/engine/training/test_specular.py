@@ -87,7 +87,7 @@ def test_what_other_views_contradict_is_left_out(dev, rng, enough):
     noise = rng.normal(size=(9, 3)) * 0.1
     noise -= noise.mean(axis=0)
     fitted = Shown(dev, rng, 9, lambda index, _: noise[index]).fitted()
-    assert fitted.layer is None and fitted.scale < 0.1
+    assert fitted.layer is None and fitted.scale < specular.LEAST_SCALE
     assert fitted.after == fitted.before
 
 

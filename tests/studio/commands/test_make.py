@@ -290,3 +290,15 @@ def test_hints_of_photographs_are_refused_for_a_scene(made, tmp_path):
     assert status == 2 and "--turntable" in lines[-1] and not (tmp_path / "new").exists()
     status, lines = spoken(["make", tmp_path / "none", "--out", tmp_path / "new"])
     assert status == 2 and "give photographs, a video or a scene" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    "busy, load, share",
+    [(0, 4, 1), (50, 4, 2 / 3), (100, 4, 1 / 3), (100, 0, 1 / 2)],
+    ids=["ended", "one of two cores", "four programs", "no mean yet"],
+)
+def test_programs_that_run_take_their_share(monkeypatch, busy, load, share):
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr("psutil.cpu_percent", lambda interval: busy)
+    monkeypatch.setattr("psutil.getloadavg", lambda: (load, load, load))
+    assert make._share() == pytest.approx(share)
