@@ -67,7 +67,7 @@ class MemoryPlan:
         before the images are read and the hull is known.
         """
         least = replace(self._config, train=replace(self._config.train, supersampled=0.0))
-        self.need = self._need(self._needs.expected(least, least.points.count, 0, 0.0))
+        self.need = self._need(self._needs.expected(least, least.points.count))
         if fault := self._fault(self.need):
             raise UserError(": ".join(fault))
 
@@ -144,10 +144,8 @@ class MemoryPlan:
         """The Need of a training with these points of a grid from this step on. stretches: how many
         stretches to look ahead, each of which ends where more memory is taken; None: all.
         """
-        radius = self._needs.radius(self._config.raster, grid, depth_range)
-        return self._need(
-            islice(self._needs.expected(self._config, points, step, radius), stretches)
-        )
+        needs = self._needs.expected(self._config, points, step, grid, depth_range)
+        return self._need(islice(needs, stretches))
 
     def _need(self, of_stretches):
         """The Need of a training with these of its stretches."""

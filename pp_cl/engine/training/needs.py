@@ -27,7 +27,7 @@ from pp_cl.engine.training.smooth import smoothing_table
 from pp_cl.engine.training.specular import SIDE, fit_table
 from pp_cl.engine.training.state import PointState
 from pp_cl.engine.training.target import target_table
-from pp_cl.settings import Config, RasterConfig
+from pp_cl.settings import Config
 
 # A crop's share of the points is this many times its share of an image's pixels: up to 4 times on
 # lego, where an image shows the object on a third of its pixels.
@@ -60,7 +60,27 @@ class Needs:
         self._pixels, self._image_bytes = pixels, image_bytes
         self._layer: Table = Specular(net.dev).table((SIDE, SIDE), (SIDE, SIDE))
 
-    def radius(self, settings: RasterConfig, grid: Grid, depth_range: tuple[float, float]) -> float:
+    def expected(
+        self,
+        config: Config,
+        points: int,
+        step: int = 0,
+        grid: Grid | None = None,
+        depth_range: tuple[float, float] = (0.0, 0.0),
+    ) -> Iterator[Need]:
+        """Yield the Need of each stretch that a training has from this step on, when it has
+        `points` points of the grid; without a grid, of the least width. Its `host` is what refining
+        after the stretch takes.
+        """
+        radius = self._radius(config.raster, grid, depth_range) if grid else 0.0
+        stretches = [*expected_stretches(config.train, points, step)]
+        for stretch in stretches:
+            # soft points are as wide as the spacing of points, and refining halves it
+            halved = stretches[0].refinements - stretch.refinements
+            width = radius / 2**halved if config.raster.footprint == "soft" else radius
+            yield self._need_of(config, stretch, width / config.scene.downscale)
+
+    def _radius(self, settings, grid, depth_range):
         """The mean radius of the footprints of a grid's points in the largest image, in pixels of
         the stored image.
         """
@@ -70,17 +90,6 @@ class Needs:
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
         radius = point_radius(settings, grid.voxel_size, depth_range)
         return radius * (self._largest.fx / middle * math.sqrt(growth))
-
-    def expected(self, config: Config, points: int, step: int, radius: float) -> Iterator[Need]:
-        """Yield the Need of each stretch that a training has from this step on, when it has
-        `points` points of this radius(). Its `host` is what refining after the stretch takes.
-        """
-        stretches = [*expected_stretches(config.train, points, step)]
-        for stretch in stretches:
-            # soft points are as wide as the spacing of points, and refining halves it
-            halved = stretches[0].refinements - stretch.refinements
-            width = radius / 2**halved if config.raster.footprint == "soft" else radius
-            yield self._need_of(config, stretch, width / config.scene.downscale)
 
     def _need_of(self, config: Config, stretch: Stretch, radius: float) -> Need:
         """The Need of one stretch. radius: of footprints in it, in pixels of the reduced image."""
