@@ -137,7 +137,9 @@ class Trainer:
                 offset = rendered.offset
                 self.exposure.fit(crop.view_index, rendered.image, image, alpha, offset)
             grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
-            depth = self._depth_gradient(rendered)
+            depth_weight = late_weight(self.step, train.iterations, train.depth_weight)
+            has_depth = self.composited and depth_weight > 0
+            depth = self._depth_gradient(rendered, depth_weight) if has_depth else None
         # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * rendered.supersampling**2 * self.model.grid.diagonal
         distortion_weight = self._rising(train.distortion_weight if self.composited else 0.0)
@@ -196,12 +198,8 @@ class Trainer:
             ignore_gradient(self.dev, ignored, grad_image, offset)
         return grad_image, grad_alpha
 
-    def _depth_gradient(self, rendered):
-        """The gradient of the depth loss for Renderer.backward(); None where it has no weight."""
-        train = self.config.train
-        weight = late_weight(self.step, train.iterations, train.depth_weight)
-        if weight == 0 or not self.composited:
-            return None
+    def _depth_gradient(self, rendered, weight):
+        """The gradient of weight times the depth loss, for Renderer.backward()."""
         view = rendered.points, rendered.pairs, rendered.weights, rendered.size
         of_loss = {"voxel_size": self.model.grid.voxel_size, "weight": weight}
         return depth_gradient(self.dev, self._depth_buffers, *view, **of_loss)
