@@ -169,8 +169,8 @@ class TrainConfig:
     )
     depth_weight: float = setting(
         0.001,
-        "weight of the depth loss: how much the surface bends from pixel to pixel, in spacings of"
-        " points; in the last quarter of the steps; needs raster.blend=alpha (0: off)",
+        "weight of the depth loss: how much surfaces bend between pixels, in point spacings; in the"
+        " last quarter of the steps; needs raster.blend=alpha (0: off)",
         0,
         1e3,
     )
