@@ -24,7 +24,7 @@ RANDOM = "random"  # a value of network.start; others are demo and folders
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 LENGTH = ("train.minutes", "train.iterations")  # a run has one of them
 # settings that runs of 0.3.0 lack, with the values with which they were trained
-ADDED: dict[str, Any] = {"train.specular": "off", "train.members": 1}
+ADDED: dict[str, Any] = {"train.specular": "off", "train.members": 1, "train.depth_weight": 0.0}
 AUTOMATIC = ("train.refine_at", "raster.radius", "train.view_opacity")  # chosen by the hull
 MEND_SETTINGS = "restore it or start a new run"
 

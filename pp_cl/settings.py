@@ -167,6 +167,13 @@ class TrainConfig:
         0,
         1e3,
     )
+    depth_weight: float = setting(
+        0.001,
+        "weight of the depth loss: how much surfaces bend between pixels, in point spacings; in the"
+        " last quarter of the steps; needs raster.blend=alpha (0: off)",
+        0,
+        1e3,
+    )
     sh_rate: tuple = setting(
         (0.5, 0.25, 0.125), "first learning rate of SH degrees 0, 1, 2, ten times the last", 0, 100
     )

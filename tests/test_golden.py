@@ -26,6 +26,7 @@ SETTINGS = {
     "train.crop": 40,
     "train.sh_smoothing": 0.25,
     "train.prune_every": 20,
+    "train.depth_weight": 0.1,
     "train.prune_weight": 0.2,
     "train.log_every": 10,
     "train.specular": "off",

@@ -15,7 +15,7 @@
 // never divides by 1 - alpha. A gradient g of the pixel's alpha, 1 - T, acts as one more feature
 // that is 1 at all points and 0 at the background: G.f becomes G.f + g. The distortion loss of the
 // pixel, w sum_ij b_i b_j |z_i - z_j| (Mip-NeRF 360, Eq. 15), adds its derivative with respect to
-// b_i to G.f_i in the same way.
+// b_i to G.f_i in the same way, and so does the depth loss (training/depth_loss.cl).
 //
 // Offsets of points composited by alpha learn by the falloff d of their fragments, of which each
 // kind of point that has them has the derivatives in its header: dL/dd = o/d dL/do. How the order of
@@ -91,8 +91,10 @@ kernel void alpha_gradient(
     global const float16 *visible_features,  // (?, 16) of the visible points
     global const float16 *grad_features,     // (H, W, 16) G
     global const float *grad_alpha,          // (HW) g, NULL without has_grad_alpha
-    global float2 *pair_gradient,            // (P, 2) b, s dL/db; cleared before
-    global float *distortion)                // ((HW+SPAN-1)/SPAN) of each run, without its weight
+    const int has_depth,
+    global const float2 *depth_gradient,  // (HW, 2) depth_loss.cl, NULL without has_depth
+    global float2 *pair_gradient,         // (P, 2) b, s dL/db; cleared before
+    global float *distortion)             // ((HW+SPAN-1)/SPAN) of each run, without its weight
 {
     SHARED(float, shared, GROUP);
     const uint last = min(hw, (GROUP_ID + 1) * SPAN);
@@ -101,6 +103,7 @@ kernel void alpha_gradient(
     for (uint q = GROUP_ID * SPAN + MEMBER; q < last; q += GROUP) {
         const float16 G = grad_features[q];
         const float g = has_grad_alpha ? grad_alpha[q] : 0.0f;
+        const float2 bend = has_depth ? depth_gradient[q] : 0.0f;
         const uint begin = pixel_offset[q];
         // depths count from here, so that sums of them keep their digits
         const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
@@ -138,6 +141,7 @@ kernel void alpha_gradient(
                     sum += b * distances;
                     behind += b * (float2)(1.0f, z);
                 }
+                if (has_depth) own += bend.x * (upper_float(key[j]) - bend.y);
                 const float dL_db = own + g - B;
                 if (i - begin < tracked)
                     pair_gradient[(uint)key[j]] = (float2)(b, derivative[j] * dL_db);

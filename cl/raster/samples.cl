@@ -76,8 +76,10 @@ kernel void sampled_gradient(
     global const float16 *visible_features,    // (?, 16) of the visible points
     global const float16 *grad_features,       // (H, W, 16) G
     global const float *grad_alpha,            // (HW) g, NULL without has_grad_alpha
-    global float *pair_gradient,               // (P, 1+SAMPLES) b, s dL/db of each; cleared before
-    global float *distortion)                  // ((HW+SPAN-1)/SPAN) of each run, without its weight
+    const int has_depth,
+    global const float2 *depth_gradient,  // (HW, 2) depth_loss.cl, NULL without has_depth
+    global float *pair_gradient,          // (P, 1+SAMPLES) b, s dL/db of each; cleared before
+    global float *distortion)             // ((HW+SPAN-1)/SPAN) of each run, without its weight
 {
     SHARED(float, shared, GROUP);
     const uint last = min(hw, (GROUP_ID + 1) * SPAN);
@@ -86,6 +88,7 @@ kernel void sampled_gradient(
     for (uint q = GROUP_ID * SPAN + MEMBER; q < last; q += GROUP) {
         const float16 G = grad_features[q] / SAMPLES;
         const float g = has_grad_alpha ? grad_alpha[q] / SAMPLES : 0.0f;
+        const float2 bend = has_depth ? depth_gradient[q] : 0.0f;
         const uint begin = pixel_offset[q];
         // depths count from here, so that sums of them keep their digits
         const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
@@ -117,6 +120,7 @@ kernel void sampled_gradient(
                 behind += b;
                 behind_z += b * z;
             }
+            if (has_depth) own += bend.x / SAMPLES * (upper_float(key) - bend.y);
             const floats dL_db = own + g - B;
             if (i - begin < tracked) {
                 global float *row = pair_gradient + (size_t)(1 + SAMPLES) * (uint)key;

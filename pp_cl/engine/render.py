@@ -335,12 +335,14 @@ class Renderer:
         *,
         grad_alpha: Array | None = None,
         distortion_weight: float = 0.0,
+        depth_gradient: Array | None = None,
         with_offsets: bool = False,
         max_weight: Array | None = None,
     ) -> BlendGradients:
         """The gradients of the visible points from dL/dfeatures (H, W, 16) of result.features; with
         alpha compositing also from dL/dalpha (H * W,), and from the distortion loss of each sample
-        times distortion_weight (cl/raster/blend.cl). with_offsets: also compute gradients of
+        times distortion_weight (cl/raster/blend.cl). depth_gradient: as for blend_backward().
+        with_offsets: also compute gradients of
         offsets, if soft points or Gaussians are composited by alpha. max_weight: as for
         blend_backward().
 
@@ -364,6 +366,7 @@ class Renderer:
                 grad_features=grad_features,
                 grad_alpha=grad_alpha,
                 distortion_weight=distortion_weight,
+                depth_gradient=depth_gradient,
                 voxel_size=self.model.grid.voxel_size if moves else 0.0,
                 max_weight=max_weight,
             )

@@ -13,6 +13,7 @@ from pp_cl.engine.model import Model
 from pp_cl.engine.render import Renderer, RenderResult
 from pp_cl.engine.training import between
 from pp_cl.engine.training.crops import Crop, Crops
+from pp_cl.engine.training.depth_loss import depth_gradient
 from pp_cl.engine.training.exposure import Exposure
 from pp_cl.engine.training.ignored import ignore_gradient, ignore_target
 from pp_cl.engine.training.loss import Loss
@@ -20,6 +21,7 @@ from pp_cl.engine.training.optim import Optimiser
 from pp_cl.engine.training.schedule import (
     Rates,
     gamma_at,
+    late_weight,
     refine_steps,
     rising_weight,
     supersampling_at,
@@ -65,7 +67,7 @@ class Trainer:
         self.optimiser = Optimiser(dev, model, self.state)
         self.composited = config.raster.blend == "alpha"
         self.targets = Target(dev)
-        self._buffers = Buffers(dev)
+        self._buffers, self._depth_buffers = Buffers(dev), Buffers(dev)
         self._terms: Pending[dict[str, float]] | None = None  # of the last step's loss
         self.smoother: Smoother | None = None  # made when due, and again after points change
         self.refine_steps = refine_steps(train)
@@ -135,6 +137,9 @@ class Trainer:
                 offset = rendered.offset
                 self.exposure.fit(crop.view_index, rendered.image, image, alpha, offset)
             grad_image, grad_alpha = self._losses(crop, rendered, target, alpha, ignored)
+            depth_weight = late_weight(self.step, train.iterations, train.depth_weight)
+            has_depth = self.composited and depth_weight > 0
+            depth = self._depth_gradient(rendered, depth_weight) if has_depth else None
         # the distortion loss is a mean over the pixels, as a share of the grid's diagonal
         all_depths = alpha.size * rendered.supersampling**2 * self.model.grid.diagonal
         distortion_weight = self._rising(train.distortion_weight if self.composited else 0.0)
@@ -143,6 +148,7 @@ class Trainer:
             grad_image,
             grad_alpha=grad_alpha,
             distortion_weight=distortion_weight / all_depths,
+            depth_gradient=depth,
             with_offsets=rates.offset > 0,
             max_weight=self.state.max_weight,
         )
@@ -175,8 +181,8 @@ class Trainer:
         alpha: Array,
         ignored: Array | None,
     ) -> tuple[Array, Array | None]:
-        """(dL/dimage, dL/dalpha or None) of all terms but the distortion loss; self.loss keeps
-        their values on the device. ignored: (H, W) uint8, 1 for ignored pixels of the crop.
+        """(dL/dimage, dL/dalpha or None) of all terms but those of depths; self.loss keeps their
+        values on the device. ignored: (H, W) uint8, 1 for ignored pixels of the crop.
         """
         image, offset = rendered.image, rendered.offset
         if ignored is not None:
@@ -191,6 +197,12 @@ class Trainer:
         if ignored is not None:
             ignore_gradient(self.dev, ignored, grad_image, offset)
         return grad_image, grad_alpha
+
+    def _depth_gradient(self, rendered, weight):
+        """The gradient of weight times the depth loss, for Renderer.backward()."""
+        view = rendered.points, rendered.pairs, rendered.weights, rendered.size
+        of_loss = {"voxel_size": self.model.grid.voxel_size, "weight": weight}
+        return depth_gradient(self.dev, self._depth_buffers, *view, **of_loss)
 
     def _sent(self, says_nothing):
         """The crop's ignored pixels on the device."""

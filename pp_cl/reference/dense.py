@@ -284,15 +284,20 @@ def gradients(
     *,
     max_tracked: int = 0,
     distortion_weight: float = 0.0,
+    depth_gradient: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(dL/df (N, C), dL/do (N,)) through the tracked() fragments, given grad_features (HW, C).
-    With alpha(), distortion_weight times the distortion loss is added.
+    With alpha(), distortion_weight times the distortion loss is added, and a loss with
+    depth_gradient (HW, 2): dL/db of a fragment over the difference of its depth and the second.
     """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
     if "through" in blend_:
         if distortion_weight:
             own += 2 * distortion_weight * distances(geometry_, blend_)
+        if depth_gradient is not None:
+            slope, mean = depth_gradient.T
+            own += np.where(blend_["fragment"], slope * (geometry_["depth"] - mean), 0)
         derivative = _alpha_derivative(blend_, own, G.sum(axis=1), ranks) * geometry_["falloff"]
     else:
         derivative = blend_["by_opacity"] * (own - (G * features(blend_, f)).sum(axis=1))

@@ -1,5 +1,5 @@
 """Float64 twin of cl/training/loss.cl: the textbook SSIM with 2-D windows, and gradients derived
-from that form.
+from that form; and of cl/training/depth_loss.cl.
 """
 
 import numpy as np
@@ -75,3 +75,20 @@ def loss(
         gradient = gradient - weight * d_x
     terms = smooth + weight * dissimilarity, error.mean(), dissimilarity, (error**2).mean()
     return np.array(terms, dtype), gradient
+
+
+def bending(depth: np.ndarray, has_surface: np.ndarray) -> tuple[float, np.ndarray]:
+    """(depth loss, its gradient (H, W)) of depths (H, W) in voxels. has_surface: (H, W) bool."""
+    gradient, total = np.zeros(depth.shape), 0.0
+    for axis in (0, 1):
+        z, where, sums = (np.moveaxis(a, axis, 0) for a in (depth, has_surface, gradient))
+        for s in (1, 2, 4):
+            if len(z) <= 2 * s:
+                continue
+            ends = np.s_[: -2 * s], np.s_[s:-s], np.s_[2 * s :]
+            counts = where[ends[0]] & where[ends[1]] & where[ends[2]]
+            c = np.where(counts, z[ends[0]] - 2 * z[ends[1]] + z[ends[2]], 0)
+            total += (c**2 / (1 + c**2 / 4)).sum()
+            for part, times in zip(ends, (1, -2, 1), strict=True):
+                sums[part] += times * 2 * c / (1 + c**2 / 4) ** 2
+    return total / depth.size, gradient / depth.size

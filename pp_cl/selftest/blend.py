@@ -8,12 +8,15 @@ from itertools import product
 
 import numpy as np
 
+from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.grid import Grid
 from pp_cl.engine.raster.blend import SPAN
 from pp_cl.engine.raster.footprint import FOOTPRINTS
 from pp_cl.engine.raster.weights import BLENDS
+from pp_cl.engine.training.depth_loss import depth_gradient
 from pp_cl.reference import dense
 from pp_cl.reference.differences import numeric_gradient
+from pp_cl.reference.loss import bending
 from pp_cl.selftest.case import (
     SIZES,
     Case,
@@ -41,6 +44,7 @@ WEIGHT = {"alpha": 1e-5, "softmax": 2e-5}
 GRADIENT = 2e-5  # alpha: T and the colour behind both have errors of WEIGHT
 # softmax: dL/do = share (1 + o z / gamma) s, in which two factors have errors of WEIGHT
 OPACITY = {"alpha": GRADIENT, "softmax": 5e-5}
+DEPTH = 5e-5  # depths of 40 voxels round by 2e-6, in second differences four times
 MANY = 1e-4  # a sum of 20000 terms, added one by one: each addition rounds the sum
 UNIT = 2.0**-24  # rounding error of a float
 ROUNDINGS = 4  # roundings of an exponent, and in a product of 16 terms
@@ -421,6 +425,32 @@ def _distortion(dev, rng):
         yield relative(blended.scene.backward.distortion.get(), runs, GRADIENT)
 
 
+def _depth_loss(dev, rng):
+    """The depth loss of one and of 2 x 2 samples, before an early stop, too; some images are
+    narrower than its strides.
+    """
+    sizes = (31, 33), (1, 20), (9, 1), (24, 20)
+    for (size, n), stop in product(zip(sizes, (257, 31, 33, 600), strict=True), (0.0, 0.05)):
+        for side in (1, 2):
+            large = tuple(side * pixels for pixels in size)
+            shared = {"rule": "alpha", "early_stop": stop}
+            fine = Blended(dev, rng, n, radius=0.6, size=large, **shared)
+            scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, side=side)
+            scene.blend(fine.opacity, 0.1, fine.point_features, **shared)
+            view = scene.buffers, scene.projected, scene.pairs, scene.weights, scene.shape
+            found = depth_gradient(dev, Buffers(dev), *view[1:], voxel_size=0.1, weight=3.0)
+            expected = _bent(fine, side, 0.1)
+            yield relative(found.get()[:, 0], 3.0 * expected[:, 0], DEPTH)
+            yield relative(found.get()[:, 1], expected[:, 1], DEPTH)
+            expected[:, 0] *= 3.0 / side**2
+            of_each = expected.reshape(*scene.shape, 2).repeat(side, 0).repeat(side, 1)
+            fine.grad[:] = 0
+            wanted = fine.reference_gradients(depth_gradient=of_each.reshape(-1, 2))[1]
+            grad = np.zeros((*scene.shape, 16))
+            gradients = scene.gradients(grad, depth_gradient=found)
+            yield relative(gradients["opacity"], wanted, DEPTH)
+
+
 def _samples(dev, rng):
     """2 x 2 samples give the mean of as many pixels; points cover all, some or none of them."""
     shapes = (257, None, 0.0), (257, None, 0.3), (33, 1e-3, 0.0), (31, 0.4, 0.05), (1, 0.4, 0.0)
@@ -454,6 +484,21 @@ def _samples(dev, rng):
         of_each = (alpha / 4).repeat(2, 0).repeat(2, 1).ravel()
         expected = fine.scene.gradients(0 * fine.grad, of_each)["opacity"]
         yield relative(scene.gradients(0 * grad, alpha.ravel())["opacity"], expected, GRADIENT)
+
+
+def _bent(fine, side, voxel_size):
+    """(HW, 2): depth_gradient() of a weight of 1; a pixel is side x side pixels of `fine`."""
+    camera, weight = fine.camera, fine.blend["weight"]
+    shape = camera.height // side, side, camera.width // side, side
+    ranges = np.where(weight > 0, weight * fine.geometry["depth"], 0)
+    alpha, sums = (array.sum(0).reshape(shape).mean((1, 3)) for array in (weight, ranges))
+    has_surface = alpha >= 0.9
+    alpha = np.where(has_surface, alpha, 1)
+    mean = np.where(has_surface, sums / alpha, 0)
+    y, x = side * (np.indices(mean.shape) + 0.5)
+    axis = 1 / np.hypot(np.hypot((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy), 1)
+    _, slope = bending(axis * mean / voxel_size, has_surface)
+    return np.stack([(slope * axis / voxel_size / alpha).ravel(), mean.ravel()], 1)
 
 
 def _means(samples, shape):
@@ -502,6 +547,7 @@ CASES = (
     ),
     Case("alpha: gradient of alpha", _gradient_of_alpha),
     Case("alpha: distortion loss", _distortion),
+    Case("alpha: depth loss", _depth_loss),
     Case("alpha: distortion far away", _far_distortion, hard="sums of b z from the eye cancel"),
     Case("alpha: a point on the ray", _on_the_ray, hard="e / length(e) is 0 / 0"),
     Case("alpha: offsets of points", _offsets),

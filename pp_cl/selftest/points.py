@@ -163,12 +163,13 @@ class PairedPoints:
         grad_features: np.ndarray,
         grad_alpha: np.ndarray | None = None,
         distortion_weight: float = 0.0,
+        depth_gradient: Array | None = None,
         voxel_size: float = 0.0,
         max_weight: Array | None = None,
     ) -> Gradients:
         """{"features": (N, 16), "opacity": (N,), and if a voxel size is given "offset": (N, 4)}:
-        gradients of sum(features * grad_features), sum(alpha * grad_alpha) and the weighted
-        distortion loss.
+        gradients of sum(features * grad_features), sum(alpha * grad_alpha), the weighted
+        distortion loss and the loss of depth_gradient.
         """
         grad_features = np.reshape(grad_features, (*self.shape, 16))
         view = self.projected, self.pairs, self.weights
@@ -182,6 +183,7 @@ class PairedPoints:
             grad_features=self.dev.upload(grad_features, np.float32),
             grad_alpha=None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32),
             distortion_weight=distortion_weight,
+            depth_gradient=depth_gradient,
             voxel_size=voxel_size,
             max_weight=max_weight,
         )

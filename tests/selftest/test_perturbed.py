@@ -54,6 +54,8 @@ FLIPS = [
     ("raster/samples", "1.0f - opacity", "1.0f + opacity", "alpha: samples of a pixel"),
     ("raster/samples", "front - behind", "front + behind", "alpha: samples of a pixel"),
     ("raster/blend", "front.x - behind.x", "front.x + behind.x", "alpha: distortion loss"),
+    ("training/depth_loss", "here - after", "here + after", "alpha: depth loss"),
+    ("raster/samples", "(key) - bend.y", "(key) + bend.y", "alpha: depth loss"),
     ("raster/blend", "d, opacity[i]", "d, -opacity[i]", "alpha: offsets of points"),
     ("bench/project_spheres", "j] = positions[3 * i]", "j] = -positions[3 * i]", "raster: project"),
     ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),

@@ -131,6 +131,7 @@ def blend_backward(
     grad_features: Array,
     grad_alpha: Array | None = None,
     distortion_weight: float = 0.0,
+    depth_gradient: Array | None = None,
     voxel_size: float = 0.0,
     max_weight: Array | None = None,
 ) -> BlendGradients:
@@ -139,15 +140,17 @@ def blend_backward(
     opacity: (N,). visible_features, features: from blend_forward(). grad_features: dL/dfeatures (H,
     W, 16). grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. distortion_weight: adds this times
     sum_ij b_i b_j |z_i - z_j| of every sample to the loss, where b and z are the weights and depths
-    (world units) of its fragments; depths get no gradient. voxel_size: the unit of offsets, in
-    world units; 0: offsets get no gradients. max_weight: (N,) float32, becomes for each point the
-    highest sum of its blend weights over an image's pixels so far. Raises ValueError if grad_alpha
-    or a distortion loss is given with a softmax, which has no transmittance, and if offsets need
-    gradients without soft points or Gaussians composited by alpha.
+    (world units) of its fragments; depths get no gradient. depth_gradient: (HW, 2), as
+    engine/training/depth_loss.py writes it. voxel_size: the unit of offsets, in world units; 0:
+    offsets get no gradients. max_weight: (N,) float32, becomes for each point the
+    highest sum of its blend weights over an image's pixels so far. Raises ValueError if grad_alpha,
+    a distortion loss or depth_gradient is given with a softmax, and if offsets need gradients
+    without soft points or Gaussians composited by alpha.
     """
     is_alpha, moves = weights.blend == "alpha", voxel_size > 0
-    if not is_alpha and (grad_alpha is not None or distortion_weight > 0):
-        raise ValueError("a softmax has no gradient of alpha and of a distortion loss")
+    has_depth = depth_gradient is not None
+    if not is_alpha and (grad_alpha is not None or distortion_weight > 0 or has_depth):
+        raise ValueError("a softmax has no gradient of alpha and of losses of depths")
     if moves and not (is_alpha and FOOTPRINTS[points.footprint].moves):
         raise ValueError(
             "only soft points and Gaussians composited by alpha have gradients of offsets"
@@ -174,6 +177,8 @@ def blend_backward(
             "point_slot": weights.point_slot,
             "visible_features": visible_features,
             "grad_alpha": grad_alpha,
+            "has_depth": int(has_depth),
+            "depth_gradient": depth_gradient,
             "distortion": b.distortion,
         }
     if pairs.side > 1:

@@ -20,6 +20,7 @@ from pp_cl.engine.raster.points import PointCloud, sh_blocks
 from pp_cl.engine.raster.project import footprint_pixels
 from pp_cl.engine.render import is_supersampled, point_radius, view_table
 from pp_cl.engine.training.crops import crop_side
+from pp_cl.engine.training.depth_loss import depth_loss_table
 from pp_cl.engine.training.loss import loss_table
 from pp_cl.engine.training.optim import network_state_table
 from pp_cl.engine.training.schedule import Stretch, expected_stretches
@@ -115,6 +116,7 @@ class Needs:
             self._net.table(crop, image),
             network_state_table(self._net.all_parameters.size, stretch.is_averaged),
             loss_table(self._net.dev, crop, crop, train.ssim_weight),
+            depth_loss_table(math.prod(crop) if train.depth_weight > 0 else 0),
             {"image": ((self._image_bytes,), np.uint8)},
         ]
         is_last, of_views = stretch.refinements == 0, [of_preview, target_table(image)]

@@ -156,6 +156,13 @@ def rising_weight(step: int, steps: int, last: float = 1.0) -> float:
     return last * step / steps
 
 
+def late_weight(step: int, steps: int, last: float) -> float:
+    """A loss weight that is 0 in the first three quarters of the steps and rises to `last` within a
+    twentieth, for the depth loss: a surface must be found before it can be smoothed.
+    """
+    return last * min(1.0, max(0.0, (step / steps - 0.75) / 0.05))
+
+
 def ema_start(steps: int) -> int:
     """The step after which the EMA begins."""
     return 17 * steps // 20

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 
+from pp_cl.engine.device.buffers import Buffers
 from pp_cl.engine.raster.highest_weights import list_weights, record_weights
 from pp_cl.engine.raster.weights import BLENDS
+from pp_cl.engine.training.depth_loss import depth_gradient
 from pp_cl.reference import dense as oracle
 from pp_cl.reference.differences import numeric_gradient
+from pp_cl.reference.loss import bending
 from pp_cl.selftest.points import (
     AXIS,
     Blended,
@@ -57,6 +60,34 @@ def test_gradients_of_the_distortion_loss_against_finite_differences(dev, rng):
     assert relative_error(blended.gradients(distortion_weight=1.0)["opacity"], numeric) < 1e-5
 
 
+def test_gradients_of_the_depth_loss_against_finite_differences(dev, rng):
+    blended = Blended(dev, rng, n=90, radius=0.6, rule="alpha")
+    blended.grad[:] = 0
+    scene, geometry, camera = blended.scene, blended.geometry, blended.camera
+    axis = oracle.rays(camera)[:, 2] / 0.1
+
+    def surface(opacity):
+        weight = oracle.alpha(geometry, opacity)["weight"]
+        alpha = weight.sum(axis=0)
+        depth = (weight * np.where(weight > 0, geometry["depth"], 0)).sum(axis=0)
+        return alpha, axis * depth / np.where(alpha > 0, alpha, 1)
+
+    opacity = blended.opacity.astype(np.float64)
+    has_surface = (surface(opacity)[0] >= 0.9).reshape(scene.shape)
+    assert has_surface.sum() > 50
+
+    def loss(opacity):
+        return bending(surface(opacity)[1].reshape(scene.shape), has_surface)[0]
+
+    view = scene.projected, scene.pairs, scene.weights, scene.shape
+    found = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=1.0)
+    gradients = scene.gradients(blended.grad, depth_gradient=found)["opacity"]
+    inside = np.flatnonzero((opacity > 0) & (opacity < 1))
+    numeric = numeric_gradient(loss, opacity, 1e-6, inside)
+    assert np.abs(numeric).max() > 1e-3
+    assert relative_error(gradients[inside], numeric) < 1e-4
+
+
 def test_fragments_at_one_depth_and_single_fragments_have_no_distortion_loss(dev):
     for z in ([0.5], [0.5] * 7):
         scene, _ = blend_on_axis(dev, z, [0.5] * len(z), 0.1, rule="alpha")
@@ -80,9 +111,11 @@ def test_an_opacity_that_is_nan_comes_through(dev, rng, kind):
     assert np.isnan(highest.get()[point])
 
 
-def test_a_softmax_has_no_distortion_loss(dev, rng):
-    with pytest.raises(ValueError, match="distortion"):
-        Blended(dev, rng).gradients(distortion_weight=1.0)
+def test_a_softmax_has_no_losses_of_depths(dev, rng):
+    blended = Blended(dev, rng)
+    for term in ({"distortion_weight": 1.0}, {"depth_gradient": dev.zeros((480, 2))}):
+        with pytest.raises(ValueError, match="losses of depths"):
+            blended.scene.gradients(blended.grad, **term)
 
 
 def test_the_softmax_by_hand(dev):

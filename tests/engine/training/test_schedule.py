@@ -9,6 +9,7 @@ from pp_cl.engine.training.schedule import (
     Rates,
     ema_weight,
     gamma_at,
+    late_weight,
     learning_rate,
     refine_steps,
     rising_weight,
@@ -39,6 +40,11 @@ def test_the_distortion_weight_rises_from_nothing():
     weights = [rising_weight(step, 200, 3.0) for step in range(200)]
     assert weights[0] == 0 and weights[100] == pytest.approx(1.5) and max(weights) < 3
     np.testing.assert_allclose(np.diff(weights), 3 / 200)
+
+
+def test_the_depth_weight_rises_in_the_last_quarter():
+    weights = [late_weight(step, 200, 3.0) for step in (0, 150, 155, 160, 199)]
+    assert weights == pytest.approx([0, 0, 1.5, 3, 3])
 
 
 @pytest.mark.parametrize(
