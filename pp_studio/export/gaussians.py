@@ -366,6 +366,7 @@ def config_of(run: Run, steps: int) -> Config:
         ssim_weight=0.0,
         mask_weight=MASK_WEIGHT,
         distortion_weight=0.0,
+        depth_weight=0.0,
         exposure="off",
         sh_smoothing=0.0,
         prune_weight=0.0,  # images judge points, but larger windows show more
