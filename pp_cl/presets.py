@@ -52,7 +52,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.specular": "off",
         "train.mask_weight": 0.0,
         "train.distortion_weight": 0.0,
-        "train.depth_weight": 0.0,
         "train.prune_every": 500,
         "train.refine_at": (1.0, 1.0),
         "train.checkpoint_every": 5000,

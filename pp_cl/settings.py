@@ -168,9 +168,10 @@ class TrainConfig:
         1e3,
     )
     depth_weight: float = setting(
-        0.001,
+        0.0,
         "weight of the depth loss: how much surfaces bend between pixels, in point spacings; in the"
-        " last quarter of the steps; needs raster.blend=alpha (0: off)",
+        " last quarter of the steps; needs raster.blend=alpha (0: off; 0.001 for smoother meshes of"
+        " photographs)",
         0,
         1e3,
     )

@@ -298,7 +298,7 @@ def test_a_needle_beside_the_hull_is_measured(run):
     before = beside()
     assert before < 0.05
     offset, opacity = cloud.offset.get(), cloud.opacity.get()
-    highest = run.model.positions()[:, 2].argmax()
+    highest = run.model.grid.positions(cloud.ids.get())[:, 2].argmax()
     unit = DEVIATION * run.config.raster.radius * run.model.grid.voxel_size
     offset[highest, 3:9] = [0, 0, np.log(0.5 / unit), 0, 0, 0]  # a needle upwards, half a unit long
     opacity[highest] = 0
