@@ -170,7 +170,7 @@ class TrainConfig:
     depth_weight: float = setting(
         0.0,
         "weight of the depth loss: how much surfaces bend between pixels, in point spacings; in the"
-        " last quarter of the steps; needs raster.blend=alpha (0: off; 0.001 for smoother meshes of"
+        " last quarter of the steps; needs raster.blend=alpha (0: off; make takes 0.001 for"
         " photographs)",
         0,
         1e3,

@@ -46,6 +46,8 @@ LEAST_MORE = 0.1  # minutes that must be left for a finished training to go on
 LATE = 0.8  # the time per step is measured after this share of a training
 PER_PHOTOGRAPH = 0.05  # minutes that a capture takes for each, about, on two cores without AVX-512
 OF_SPLAT = 0.6  # share of the minutes left after the evaluation
+# of a training on photographs: poses are not exact, and surfaces would have pits
+SMOOTH = ["--set", "train.depth_weight=0.001"]
 LOOKED, FULL = 0.5, 0.9  # seconds in which the processor's use is measured; share of it
 
 
@@ -144,6 +146,7 @@ def run(options: argparse.Namespace) -> None:
             found = {name: read_json(out / f"scene/capture/{name}.json") for name in stages}
             told = [f"{name}: {one['line']}" for name, one in found.items()]
         preset = ["--preset", options.preset] if options.preset else []
+        smooth = [] if is_scene else SMOOTH
         if not folder.checkpoint.exists():
             show("Cameras and masks are found.")
             print(f"wrote {page}: open it in a browser; it grows by itself", flush=True)
@@ -152,7 +155,7 @@ def run(options: argparse.Namespace) -> None:
         if not folder.config.exists():
             minutes = clock.training()
             preset = ["--preset", options.preset or _preset(minutes, share)]
-            train(*preset, "--minutes", f"{minutes:.3g}")
+            train(*preset, *smooth, "--minutes", f"{minutes:.3g}")
         else:  # keep the run's preset; train refuses another
             train(*preset, *clock.iterations())
         if minutes := clock.more(folder):
@@ -164,7 +167,8 @@ def run(options: argparse.Namespace) -> None:
                 kept = folder.path.rename(out / f"run-of-{end['step']}-steps")
                 print(f"the preset is {wanted} now; {kept} is the model so far", flush=True)
                 # an open page keeps that model, which is better than the new one's first previews
-                train("--preset", wanted, "--minutes", f"{minutes:.3g}", follow=None)
+                words = ["--preset", wanted, *smooth, "--minutes", f"{minutes:.3g}"]
+                train(*words, follow=None)
             else:
                 train(*clock.extended(folder, minutes))
         split = "test" if "test" in scene_splits(scene) else "train"

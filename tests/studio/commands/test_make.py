@@ -273,13 +273,14 @@ def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
     hints = ["--turntable", "--masks", "M", "--box=-1,-1,-1,1,1,2"]
     with pytest.raises(Enough):
         spoken(["make", photographs, "--out", tmp_path / "out", *hints, *words])
-    scene, box = str(tmp_path / "out/scene"), "--box=-1.0,-1.0,-1.0,1.0,1.0,2.0"
+    scene, out = (str(tmp_path / "out" / name) for name in ("scene", "run"))
+    box = "--box=-1.0,-1.0,-1.0,1.0,1.0,2.0"
     minutes = {"3": "2", "60": "55"}.get(words[-1] if words else "", "15")
     assert steps == [
         ("capture", (str(photographs), "--out", scene, "--turntable", "--masks", "M", box)),
         (
             "train",
-            (scene, "--out", str(tmp_path / "out/run"), "--preset", preset, "--minutes", minutes),
+            (scene, "--out", out, "--preset", preset, *make.SMOOTH, "--minutes", minutes),
         ),
     ]
 
