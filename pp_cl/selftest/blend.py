@@ -437,8 +437,8 @@ def _depth_loss(dev, rng):
             fine = Blended(dev, rng, n, radius=0.6, size=large, **shared)
             scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, side=side)
             scene.blend(fine.opacity, 0.1, fine.point_features, **shared)
-            view = scene.buffers, scene.projected, scene.pairs, scene.weights, scene.shape
-            found = depth_gradient(dev, Buffers(dev), *view[1:], voxel_size=0.1, weight=3.0)
+            view = scene.projected, scene.pairs, scene.weights, scene.shape
+            found = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=3.0)
             expected = _bent(fine, side, 0.1)
             yield relative(found.get()[:, 0], 3.0 * expected[:, 0], DEPTH)
             yield relative(found.get()[:, 1], expected[:, 1], DEPTH)

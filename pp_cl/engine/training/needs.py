@@ -70,8 +70,8 @@ class Needs:
         depth_range: tuple[float, float] = (0.0, 0.0),
     ) -> Iterator[Need]:
         """Yield the Need of each stretch that a training has from this step on, when it has
-        `points` points of the grid; without a grid, of the least width. Its `host` is what refining
-        after the stretch takes.
+        `points` points of the grid; without a grid, points with the smallest footprints. Its `host`
+        is what refining after the stretch takes.
         """
         radius = self._radius(config.raster, grid, depth_range) if grid else 0.0
         stretches = [*expected_stretches(config.train, points, step)]
