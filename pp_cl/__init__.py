@@ -6,6 +6,6 @@ scene, config, errors and commands. Those of __init__.pyi are imported when they
 
 import lazy_loader
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
