@@ -1,10 +1,11 @@
 """Measure what README.md and docs/ state as results of this code: `make results`.
 
 Every part is a process: a training with its evaluation, a bench, a tool. Its result is stored in
-runs/results/, so that the same command goes on where it was stopped; if the code changes, all parts
-are measured anew. A table is written to docs/results/ once all its parts are measured, a plot
-likewise; `make docs` puts them into the pages. Scenes are looked for in PP_DATA
-(../shared/data). It takes hours in which nothing else should run.
+runs/results/, so that the same command goes on where it was stopped; if the code that decides the
+numbers (tools/provenance.py) changes, all parts are measured anew. A table is written to
+docs/results/ once all its parts are measured, a plot likewise; `make docs` puts them into the
+pages. Scenes are looked for in PP_DATA (../shared/data). It takes hours in which nothing else
+should run.
 
 `--kind NAME` measures for another processor, driver (PP_DEVICE) or GPU. Results are stored in
 runs/results-NAME/, and the tables of the parts measured so far go to docs/results/NAME/, for the
@@ -37,7 +38,7 @@ from pp_cl.files.atomic import write_json
 from pp_cl.metrics.published import tables as published
 from pp_cl.selftest.run import Hard
 from pp_studio.export import BEST, QUALITIES, QUICK
-from tools.provenance import digest
+from tools.provenance import DECIDES, digest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 DATA = Path(os.environ.get("PP_DATA", ROOT.parent / "shared" / "data"))
-CODE = ("pp_cl", "cl")  # the code that decides the numbers
 WIDTHS = {16: "AVX-512", 8: "AVX2", 4: "vectors of 128 bits"}  # floats in a vector of the device
 
 LEGO, ALL_VIEWS = "nerf_synthetic/lego", "nerf_synthetic/lego_all"
@@ -437,8 +437,8 @@ def processor() -> str:
 
 def origin() -> dict[str, str]:
     """Code, date and machine of the results. Raises UserError if code is not committed."""
-    if git("status", "--porcelain", "--", *CODE):
-        raise UserError("pp_cl/ or cl/ differ from the last commit: commit first")
+    if changed := git("status", "--porcelain", "--", *DECIDES):
+        raise UserError(f"commit first what decides the numbers: {changed}")
     dev = open_device()
     # not PoCL's longer name: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
     name = processor().replace("(R)", "")
@@ -448,7 +448,7 @@ def origin() -> dict[str, str]:
         name += f", {vectors}"
     gpu = "" if dev.is_cpu else f"{dev.name} beside "
     return {
-        "commit": git("log", "-1", "--format=%h", "--", *CODE),
+        "commit": git("log", "-1", "--format=%h", "--", *DECIDES),
         "date": date.today().isoformat(),
         "machine": f"{gpu}{os.cpu_count()} cores ({name}), {driver}",
         "decides": digest(),

@@ -1,5 +1,6 @@
 """Draws the plots of the benches; matplotlib is an extra."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ LEAST_ERROR = 1e-9  # an error of 0 has no logarithm: it is drawn here, far belo
 # For a run's renderings: mean errors below LEAST_SEEN, a thousandth of a step of 8 bits, are drawn
 # there; PSNR is drawn from BELOW dB below the default's to ABOVE dB above it.
 LEAST_SEEN, BELOW, ABOVE = 4e-6, 4.0, 0.3
+NEAR = 20  # pixels from a label within which another one would be written over it
 # {knob of a row: its name, and how its values are written}
 KNOBS = {
     "early_stop": ("early stop", "{:g}"),
@@ -78,17 +80,30 @@ def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
         def draw(some, *style, axes=axes, value=value, **options):
             axes.plot([row["ms"] for row in some], [*map(value, some)], *style, **options)
 
-        for knob, (name, form) in KNOBS.items():
+        for knob, (name, _) in KNOBS.items():
             some = [row for row in rows if row["knob"] == knob]
-            for row in some if form else ():
-                words, place = form.format(row["setting"][knob]), (row["ms"], value(row))
-                axes.annotate(words, place, fontsize="x-small", clip_on=True)
             if some and knob in CURVES:
                 some = sorted([*some, default], key=lambda row: row["setting"][knob])
             draw(some, "o-" if knob in CURVES else "D", label=name if some else None)
         draw([default], "*", color=ink, markersize=14, label="default", zorder=3)
+        axes.autoscale_view()
+        _label(axes, default, rows, value)
     draw(front, "--", color=ink, alpha=0.5, label="frontier")  # in the plot on the right
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())
     return figure
+
+
+def _label(axes, default, rows, value):
+    """Write the values of the knobs to their marks, but none near the default or another one."""
+    taken = [axes.transData.transform((default["ms"], value(default)))]
+    for row in rows:
+        form = KNOBS[row["knob"]][1] if row["knob"] in KNOBS else ""
+        place = row["ms"], value(row)
+        at = axes.transData.transform(place)
+        if form and min(math.dist(at, other) for other in taken) > NEAR:
+            words = form.format(row["setting"][row["knob"]])
+            offset = {"xytext": (4, 3), "textcoords": "offset points"}
+            axes.annotate(words, place, fontsize="small", clip_on=True, **offset)
+            taken.append(at)

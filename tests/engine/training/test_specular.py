@@ -60,6 +60,7 @@ def enough(monkeypatch):
     monkeypatch.setattr(specular, "STEPS", 200)
 
 
+@pytest.mark.large
 def test_a_lobe_is_found_and_shown(dev, rng, enough):
     shown = Shown(dev, rng, 9, lobe)
     fitted = shown.fitted()
@@ -77,12 +78,14 @@ def test_a_lobe_is_found_and_shown(dev, rng, enough):
     assert (after[alpha < 0.02] == before[alpha < 0.02]).all()
 
 
+@pytest.mark.large
 def test_the_same_seed_gives_the_same_layer(dev, rng, enough):
     shown = Shown(dev, rng, 9, lobe)
     layers = [shown.fitted(seed).layer.all_parameters.get() for seed in (0, 0, 1)]
     assert (layers[0] == layers[1]).all() and (layers[0] != layers[2]).any()
 
 
+@pytest.mark.large
 def test_what_other_views_contradict_is_left_out(dev, rng, enough):
     noise = rng.normal(size=(9, 3)) * 0.1
     noise -= noise.mean(axis=0)
@@ -99,6 +102,7 @@ def test_without_anything_to_tell_there_is_none(dev, rng, enough, views, lacking
     assert fitted.layer is None and fitted.scale == 0 and np.isfinite(fitted.before)
 
 
+@pytest.mark.large
 def test_views_that_lack_the_same_get_it(dev, rng, enough):
     fitted = Shown(dev, rng, 4, lambda *_: np.full(3, 0.1)).fitted()
     assert fitted.scale > 0.95 and fitted.after < 0.01 * fitted.before
