@@ -47,9 +47,12 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     ahead = level(eyes[0] - centre, up)
     rotation = np.stack([ahead, np.cross(up, ahead), up])  # the first camera is towards x
     upright = (points - centre) @ rotation.T / reach
-    seen = np.mean([camera.pixels(points)[2] for camera in cameras], axis=0)
-    on_object = _on_object(upright, seen)
-    angles = [np.arctan(min(one.width / one.fx, one.height / one.fy) / 2) for one in cameras]
+    seen_share = np.mean([camera.pixels(points)[2] for camera in cameras], axis=0)
+    on_object = _on_object(upright, seen_share)
+    angles = [
+        np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
+        for camera in cameras
+    ]
     away = [np.linalg.norm(eye - centre) for eye in eyes]
     # radius of the largest ball around the centre that every camera sees as a whole
     ball = min(far * np.sin(angle) for far, angle in zip(away, angles, strict=True)) / reach
@@ -68,12 +71,12 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     return World(scale, rotation, shift, np.stack([low - middle, high - middle]) / size)
 
 
-def _on_object(points, seen):
+def _on_object(points, seen_share):
     """(M, 3) the points that nearly all cameras see and that are not alone, without a table's."""
     near = np.linalg.norm(points, axis=1) < 1
     if not near.any():
         return points[near]
-    on_object = points[near & (seen >= SEEN * np.quantile(seen[near], 0.95))]
+    on_object = points[near & (seen_share >= SEEN * np.quantile(seen_share[near], 0.95))]
     if len(on_object) <= NEIGHBOURS:
         return on_object
     away = cKDTree(on_object).query(on_object, NEIGHBOURS + 1)[0][:, -1]
@@ -84,7 +87,7 @@ def _on_object(points, seen):
 
 def _table(points):
     """(4,) normal and height of the nearly level plane on which the points stand, or None."""
-    best, found = TABLE * len(points), None
+    best, plane = TABLE * len(points), None
     for x, y in product(SLOPES, SLOPES):
         normal = np.array([x, y, 1]) / np.sqrt(x * x + y * y + 1)
         height = points @ normal
@@ -98,10 +101,10 @@ def _table(points):
         if not above.any():
             continue
         # widths in x and y, without some points at the ends
-        ends = [np.quantile(points[some, :2], [0.05, 0.95], axis=0) for some in (on, above)]
+        ends = [np.quantile(points[part, :2], [0.05, 0.95], axis=0) for part in (on, above)]
         if (np.ptp(ends[0], axis=0) > LEAST_SPREAD * np.ptp(ends[1], axis=0)).all():
-            best, found = inside.max(), np.append(normal, middle)
-    return found
+            best, plane = inside.max(), np.append(normal, middle)
+    return plane
 
 
 def corners_of(box: np.ndarray) -> np.ndarray:

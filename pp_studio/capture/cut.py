@@ -132,8 +132,8 @@ def window(image: np.ndarray, image_file: ImageFile, box: np.ndarray) -> Window:
     camera = replace(
         camera, fx=sx * camera.fx, fy=sy * camera.fy, cx=sx * camera.cx, cy=sy * camera.cy
     )
-    found = Window(image_file.name, image, camera, place)
-    return replace(found, image=found.reduced(image))
+    unreduced = Window(image_file.name, image, camera, place)
+    return replace(unreduced, image=unreduced.reduced(image))
 
 
 def _grown(places, size):
@@ -164,10 +164,12 @@ def cut_out_all(
     inside: (N,) bool, the points in the box. Raises UserError for a box without an object.
     """
     cv2.setNumThreads(1)
-    left = [i for i, one in enumerate(windows) if one.mask is None]
+    unmasked = [i for i, window in enumerate(windows) if window.mask is None]
     labels = [
-        _seeds(one, box, points, inside, some) if one.mask is None else one.mask.astype(np.uint8)
-        for one, some in zip(track(windows, "finding the object", "image"), seen, strict=True)
+        _seeds(window, box, points, inside, visible)
+        if window.mask is None
+        else window.mask.astype(np.uint8)
+        for window, visible in zip(track(windows, "finding the object", "image"), seen, strict=True)
     ]
     seeds = list(labels)
     if not any((label & 1).any() for label in labels):  # the lowest bit marks the object
@@ -179,29 +181,31 @@ def cut_out_all(
         text = f"cutting out, {number} of {2 + ROUNDS}"
         with Progress(text):
             colours = _colours(windows, labels)
-        for i in track(left, text, "image"):
-            label, (background, front) = labels[i].copy(), (some.copy() for some in colours)
+        for i in track(unmasked, text, "image"):
+            label, (background, front) = labels[i].copy(), (mixture.copy() for mixture in colours)
             how = cv2.GC_EVAL_FREEZE_MODEL  # keeps the colours
             cv2.grabCut(windows[i].image, label, None, background, front, 1, how)
             windows[i].mask = label & 1 == 1
 
     cut(1)
-    around = [some == cv2.GC_BGD for some in labels]
+    around = [label == cv2.GC_BGD for label in labels]
 
     def beside():
-        return [some & ~one.mask for some, one in zip(around, windows, strict=True)]
+        return [
+            background & ~window.mask for background, window in zip(around, windows, strict=True)
+        ]
 
-    found = differences(windows, points[~inside], beside() if turns else None)
+    levels = differences(windows, points[~inside], beside() if turns else None)
     agreed = [np.zeros(label.shape, bool) for label in labels]  # object, say nearly all views
     for number in range(1 + ROUNDS):
         if number:
             hull = forgiving_hull(windows, box)
-            for i in track(left, f"voting, {number} of {ROUNDS}", "image"):
+            for i in track(unmasked, f"voting, {number} of {ROUNDS}", "image"):
                 labels[i], agreed[i] = _relabelled(windows[i], seeds[i], *hull)
-        surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
+        surely = [_eroded(label == cv2.GC_FGD, ROUGH) for label in labels]
         with Progress("what stands out"):
-            standing_out = evidence(found, beside(), surely)
-        for i in left:  # pixels that clearly stand out, or do not, are no longer open
+            standing_out = evidence(levels, beside(), surely)
+        for i in unmasked:  # pixels that clearly stand out, or do not, are no longer open
             label, wall = labels[i].copy(), standing_out[i] < IS_WALL
             crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
             label[(standing_out[i] > STANDS_OUT) & (label != cv2.GC_BGD)] = cv2.GC_FGD
@@ -209,7 +213,7 @@ def cut_out_all(
             label[wall & crowded & (label != cv2.GC_FGD)] = cv2.GC_BGD
             labels[i] = label
         cut(2 + number)
-    for i in left:
+    for i in unmasked:
         windows[i].mask = without_islands(windows[i].mask)
 
 
@@ -219,9 +223,9 @@ def grown_box(windows: Sequence[Window], box: np.ndarray) -> np.ndarray | None:
     mask bounds the rest.
     """
     hull, *_, voxel_size = forgiving_hull(windows, box)
-    inside = [one.inside(hull)[0] for one in track(windows, "where the object ends", "image")]
-    seen = np.bincount(np.concatenate(inside), None, len(hull))
-    hull = hull[seen >= MOSTLY_SEEN * len(windows)]
+    inside = [window.inside(hull)[0] for window in track(windows, "where the object ends", "image")]
+    seeing = np.bincount(np.concatenate(inside), None, len(hull))
+    hull = hull[seeing >= MOSTLY_SEEN * len(windows)]
     if not len(hull):
         return None
     grown, by = box.copy(), GROWTH * np.linalg.norm(box[1] - box[0])
@@ -245,10 +249,10 @@ def without_islands(mask: np.ndarray) -> np.ndarray:
     return (areas >= max(1, ISLAND * areas.max()))[regions]
 
 
-def _seeds(one, box, points, inside, seen):
+def _seeds(window, box, points, inside, visible):
     """(H, W) uint8 GrabCut labels from the box and the sparse points in a photograph."""
-    labels = np.full(one.image.shape[:2], cv2.GC_BGD, np.uint8)
-    outline = one.pixels(corners_of(box))
+    labels = np.full(window.image.shape[:2], cv2.GC_BGD, np.uint8)
+    outline = window.pixels(corners_of(box))
     if np.isnan(outline).any():
         labels[:] = cv2.GC_PR_BGD
     else:
@@ -256,12 +260,12 @@ def _seeds(one, box, points, inside, seen):
         cv2.fillConvexPoly(labels, outline, cv2.GC_PR_BGD)
     radius = max(1, round(SEED * CUT_SIDE))
     foot = box[0, 2] + FOOT * np.linalg.norm(box[1] - box[0])
-    near = dilated(one.marked(points[inside & (points[:, 2] > foot)]), radius)
+    near = dilated(window.marked(points[inside & (points[:, 2] > foot)]), radius)
     near = _closed(near, round(NEAR * CUT_SIDE))
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
-    sure = seen[inside[seen] & (points[seen, 2] > foot)]
-    labels[dilated(one.marked(points[seen[~inside[seen]]]), radius)] = cv2.GC_BGD
-    labels[dilated(one.marked(points[sure]), radius)] = cv2.GC_FGD
+    sure = visible[inside[visible] & (points[visible, 2] > foot)]
+    labels[dilated(window.marked(points[visible[~inside[visible]]]), radius)] = cv2.GC_BGD
+    labels[dilated(window.marked(points[sure]), radius)] = cv2.GC_FGD
     return labels
 
 
@@ -281,9 +285,11 @@ def _colours(windows, labels):
     rng, drawn = np.random.default_rng(0), []
     each = -(-(SAMPLES**2) // len(windows))
     for wanted in (0, 1):  # the lowest bit of a label
-        of = [one.image[label & 1 == wanted] for one, label in zip(windows, labels, strict=True)]
-        found = np.concatenate([f[rng.integers(0, len(f), each)] for f in of if len(f)])
-        drawn.append(found[rng.integers(0, len(found), SAMPLES**2)])
+        of = [
+            window.image[label & 1 == wanted] for window, label in zip(windows, labels, strict=True)
+        ]
+        colours = np.concatenate([f[rng.integers(0, len(f), each)] for f in of if len(f)])
+        drawn.append(colours[rng.integers(0, len(colours), SAMPLES**2)])
     image = np.concatenate(drawn).reshape(2 * SAMPLES, SAMPLES, 3)
     sure = np.zeros(image.shape[:2], np.uint8)
     sure[:SAMPLES], sure[SAMPLES:] = cv2.GC_BGD, cv2.GC_FGD
@@ -301,41 +307,41 @@ def forgiving_hull(
     """
     grid = Grid.centred_in(box, smallest_voxel_size(box, CELLS))
     positions = grid.lattice()
-    seen, rejected = np.zeros((2, len(positions)), np.int32)
-    most, left = int(FORGIVEN * len(windows)), np.arange(len(positions))
-    for one in track(windows, "what the masks agree on", "image"):
-        found, rows, columns = one.inside(positions[left])
-        seen[left[found]] += 1
-        rejected[left[found]] += ~one.mask[rows, columns]
-        left = left[rejected[left] <= most]
-    seen, rejected = seen[left], rejected[left]
-    in_hull = (seen >= min(LEAST_SEEING, len(windows))) & (rejected <= FORGIVEN * seen)
+    seeing, rejected = np.zeros((2, len(positions)), np.int32)
+    most, candidates = int(FORGIVEN * len(windows)), np.arange(len(positions))
+    for window in track(windows, "what the masks agree on", "image"):
+        shown, rows, columns = window.inside(positions[candidates])
+        seeing[candidates[shown]] += 1
+        rejected[candidates[shown]] += ~window.mask[rows, columns]
+        candidates = candidates[rejected[candidates] <= most]
+    seeing, rejected = seeing[candidates], rejected[candidates]
+    in_hull = (seeing >= min(LEAST_SEEING, len(windows))) & (rejected <= FORGIVEN * seeing)
     if not in_hull.any():
         raise UserError(
             "the photographs have no part of the box in common that stands out from what is behind"
             " it; give masks with --masks, or another box with --box"
         )
-    return positions[left[in_hull]], rejected[in_hull], seen[in_hull], grid.voxel_size
+    return positions[candidates[in_hull]], rejected[in_hull], seeing[in_hull], grid.voxel_size
 
 
-def _relabelled(one, seeds, hull, rejections, seen, voxel_size):
+def _relabelled(window, seeds, hull, rejections, seeing, voxel_size):
     """((H, W) uint8 GrabCut labels from the hull and its part that no other view rejects, (H, W)
     bool: the part that hardly any other view rejects).
     """
-    gap = gap_of(one, hull, voxel_size)
-    found, rows, columns = one.inside(hull)
-    others = rejections[found] - ~one.mask[rows, columns]
+    gap = gap_of(window, hull, voxel_size)
+    shown, rows, columns = window.inside(hull)
+    others = rejections[shown] - ~window.mask[rows, columns]
 
     def core(most):
-        return _eroded(silhouette(one, hull[found[others <= most]], gap), 2 * gap + 1)
+        return _eroded(silhouette(window, hull[shown[others <= most]], gap), 2 * gap + 1)
 
-    held = silhouette(one, hull, gap)
-    labels = np.where(held & one.mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    held = silhouette(window, hull, gap)
+    labels = np.where(held & window.mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[_eroded(held, gap) & (seeds == cv2.GC_FGD)] = cv2.GC_FGD
     labels[seeds == cv2.GC_BGD] = cv2.GC_BGD
     labels[~dilated(held, 2 * gap)] = cv2.GC_BGD
     labels[core(0)] = cv2.GC_FGD
-    return labels, core(SLIPS * seen[found])
+    return labels, core(SLIPS * seeing[shown])
 
 
 def gap_of(one: Window, hull: np.ndarray, voxel_size: float) -> int:
@@ -386,84 +392,84 @@ def differences(
     background, which others show at the same pixels: (H, W) bool for each window, the pixels that
     surely show it.
     """
-    eyes = np.stack([one.camera.eye for one in windows])
-    found = []
-    for i, one in enumerate(track(windows, "backgrounds", "image")):
-        order = np.argsort(np.linalg.norm(eyes - one.camera.eye, axis=1), kind="stable")
+    eyes = np.stack([window.camera.eye for window in windows])
+    levels = []
+    for i, window in enumerate(track(windows, "backgrounds", "image")):
+        order = np.argsort(np.linalg.norm(eyes - window.camera.eye, axis=1), kind="stable")
         others = [windows[k] for k in order[1:]]
         if beside is not None:
-            found.append(_difference_of_still(one, evenly(others, COMPARED), beside[i]))
+            levels.append(_difference_of_still(window, evenly(others, COMPARED), beside[i]))
         else:
-            found.append(_difference(one, others[:NEAREST], background))
-    return found
+            levels.append(_difference(window, others[:NEAREST], background))
+    return levels
 
 
-def _difference(one, others, background):
+def _difference(window, others, background):
     """The median difference from the background that others show beside their masks."""
-    places = _places_behind(one, background)
+    places = _places_behind(window, background)
     if places is None:
-        return np.full(one.mask.shape, UNSEEN, np.uint8)
-    found = []
+        return np.full(window.mask.shape, UNSEEN, np.uint8)
+    levels = []
     for other in others:
         at = other.pixels(places.reshape(-1, 3)).reshape(*places.shape[:2], 2)
         at = np.nan_to_num(at.astype(np.float32) - 0.5, nan=-1e6)
-        at = cv2.resize(at, one.mask.shape[::-1])
-        found.append(_levels(one, other, at, ~dilated(other.mask, HIDING)))
-    return _smallest(found, [0.5])[0]
+        at = cv2.resize(at, window.mask.shape[::-1])
+        levels.append(_levels(window, other, at, ~dilated(other.mask, HIDING)))
+    return _smallest(levels, [0.5])[0]
 
 
-def _difference_of_still(one, others, beside):
+def _difference_of_still(window, others, beside):
     """The difference that some of the others with the same still background do not exceed; their
     masks do not matter.
     """
-    found, off = [], []
+    of_others, off = [], []
     for other in others:
         at = []  # x and y of this window's pixels in the other window, at the same pixels
         for axis in (0, 1):
-            (begin, end), (first, last) = one.place[axis::2], other.place[axis::2]
-            size, there = one.image.shape[1 - axis], other.image.shape[1 - axis]
+            (begin, end), (first, last) = window.place[axis::2], other.place[axis::2]
+            size, there = window.image.shape[1 - axis], other.image.shape[1 - axis]
             places = begin + (np.arange(size) + 0.5) * (end - begin) / size
             at.append((places - first) * there / (last - first) - 0.5)
         same = np.stack(np.meshgrid(*at), axis=-1).astype(np.float32)
-        levels = _levels(one, other, same, np.ones(other.mask.shape, bool))
-        seen = beside & (levels < UNSEEN)
-        found.append(levels)
-        off.append(np.median(levels[seen]) if seen.any() else UNSEEN)
+        levels = _levels(window, other, same, np.ones(other.mask.shape, bool))
+        visible = beside & (levels < UNSEEN)
+        of_others.append(levels)
+        off.append(np.median(levels[visible]) if visible.any() else UNSEEN)
     least = np.sort(off)[:LEAST_ALIKE].mean()
     alike = min(max(SLIGHT, ALIKE * least), UNSEEN - 1)
-    found = [levels for levels, by in zip(found, off, strict=True) if by <= alike]
-    if len(found) < LEAST_ALIKE:
+    of_others = [levels for levels, by in zip(of_others, off, strict=True) if by <= alike]
+    if len(of_others) < LEAST_ALIKE:
         return np.full(beside.shape, UNSEEN, np.uint8)
-    few, some, nearly_all = _smallest(found, SHOWN)
-    usual, most = (ALIKE * np.median(one[beside]) + SLIGHT for one in (some, nearly_all))
+    few, some, nearly_all = _smallest(of_others, SHOWN)
+    usual, most = (ALIKE * np.median(levels[beside]) + SLIGHT for levels in (some, nearly_all))
     # few others show a mostly hidden wall; nearly all show a part of the object without a pattern
     rarely, always = (few <= usual) & (some > usual), nearly_all <= most
     some[rarely | (always & ~beside)] = UNSEEN
     return some
 
 
-def _levels(one, other, at, usable):
+def _levels(window, other, at, usable):
     """(H, W) uint8 differences from another window's pixels at (H, W, 2); UNSEEN if not usable."""
     usable = cv2.remap(255 * usable.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=0)
     behind = cv2.remap(other.image, at, None, cv2.INTER_LINEAR)
-    levels = np.maximum.reduce(cv2.split(cv2.absdiff(one.image, behind)))
+    levels = np.maximum.reduce(cv2.split(cv2.absdiff(window.image, behind)))
     return np.where(usable == 255, np.minimum(levels, UNSEEN - 1), np.uint8(UNSEEN))
 
 
-def _smallest(found, shares):
+def _smallest(levels, shares):
     """(H, W) uint8 for each share: the level that this share of seen differences do not exceed."""
-    found = np.sort(np.stack(found, axis=-1), axis=-1)
-    seen = (found < UNSEEN).sum(-1, keepdims=True)
-    places = (np.maximum(np.ceil(share * seen).astype(int) - 1, 0) for share in shares)
-    return [np.take_along_axis(found, at, axis=-1)[..., 0] for at in places]
+    levels = np.sort(np.stack(levels, axis=-1), axis=-1)
+    count = (levels < UNSEEN).sum(-1, keepdims=True)
+    places = (np.maximum(np.ceil(share * count).astype(int) - 1, 0) for share in shares)
+    return [np.take_along_axis(levels, at, axis=-1)[..., 0] for at in places]
 
 
-def _places_behind(one, background):
+def _places_behind(window, background):
     """(rows, columns, 3) positions interpolated between background points; None if they are few."""
-    camera = one.camera
+    camera = window.camera
     size = np.array([camera.width, camera.height])
     depth = (background - camera.eye) @ camera.pose[:, 2]
-    pixels = one.pixels(background)
+    pixels = window.pixels(background)
     near = (depth > 0) & (abs(pixels / size - 0.5) < 0.5 + MARGIN).all(1)
     if near.sum() < LEAST:
         return None

@@ -78,27 +78,27 @@ def find_features(
                 options.camera_params = f"{focal},{width / 2},{height / 2},0"
             # This numbers the images by name. Otherwise COLMAP would number them in the order in
             # which their features are found, and matches and poses depend on the numbers.
-            names = [one["name"] for one in of_camera]
+            names = [image["name"] for image in of_camera]
             with Progress("reading what EXIF tells of lenses"):
                 colmap.import_images(database, images, colmap.CameraMode.SINGLE, names, options)
-        found = db.read_all_images()
-        left = [image for image in found if not db.exists_descriptors(image.image_id)]
+        stored = db.read_all_images()
+        missing = [image for image in stored if not db.exists_descriptors(image.image_id)]
         needed("cv2").setNumThreads(1)
         with ThreadPoolExecutor(cores()) as pool:
-            made = pool.map(lambda image: _features(images / image.name, masks), left)
-            made = track(made, "features", "image", len(found), done=len(found) - len(left))
-            for image, (keypoints, descriptors) in zip(left, made, strict=True):
+            made = pool.map(lambda image: _features(images / image.name, masks), missing)
+            made = track(made, "features", "image", len(stored), done=len(stored) - len(missing))
+            for image, (keypoints, descriptors) in zip(missing, made, strict=True):
                 kind = colmap.FeatureExtractorType.SIFT
                 with colmap.DatabaseTransaction(db):  # a stopped run leaves both or neither
                     db.write_keypoints(image.image_id, keypoints)
                     db.write_descriptors(
                         image.image_id, colmap.FeatureDescriptors(kind, descriptors)
                     )
-        return {image.name: db.num_keypoints_for_image(image.image_id) for image in found}
+        return {image.name: db.num_keypoints_for_image(image.image_id) for image in stored}
 
 
-def _camera(one):
-    return one["lens"], tuple(one["size"])
+def _camera(image):
+    return image["lens"], tuple(image["size"])
 
 
 def _features(file, masks):
@@ -114,10 +114,12 @@ def _features(file, masks):
         with Image.open(masks / f"{file.name}.png") as image:
             mask = np.array(image.convert("L").resize(reduced, Image.Resampling.NEAREST))
     sift = cv2.SIFT_create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
-    found, descriptors = sift.detectAndCompute(gray, mask)
-    if not found:
+    features, descriptors = sift.detectAndCompute(gray, mask)
+    if not features:
         return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
-    keypoints = np.array([(*one.pt, one.size / 2, np.radians(one.angle)) for one in found])
+    keypoints = np.array(
+        [(*feature.pt, feature.size / 2, np.radians(feature.angle)) for feature in features]
+    )
     # in photographs of a shiny head, twice as many of the largest features match as of the
     # strongest
     best = np.argsort(-keypoints[:, 2], kind="stable")[:FEATURES]
@@ -147,22 +149,22 @@ def match(database: Path) -> int:
         places = [db.read_keypoints(i.image_id)[:, :2] / lenses[i.camera_id] for i in images]
         descriptors = [np.array(db.read_descriptors(i).data) for i in ids]
         pairs = pairs_of(places, descriptors)
-        left = [(i, j) for i, j in pairs if not db.exists_two_view_geometry(ids[i], ids[j])]
+        pairs_left = [(i, j) for i, j in pairs if not db.exists_two_view_geometry(ids[i], ids[j])]
         with (
             ThreadPoolExecutor(cores()) as pool,
             tempfile.TemporaryDirectory(prefix="pp-cl-") as folder,
-            Progress("matches", len(pairs), "pair", done=len(pairs) - len(left)) as progress,
+            Progress("matches", len(pairs), "pair", done=len(pairs) - len(pairs_left)) as progress,
         ):
             listed = Path(folder) / "pairs.txt"
-            for first in range(0, len(left), PAIRS_AT_ONCE):
-                some = left[first : first + PAIRS_AT_ONCE]
-                new = [(i, j) for i, j in some if not db.exists_matches(ids[i], ids[j])]
+            for first in range(0, len(pairs_left), PAIRS_AT_ONCE):
+                batch = pairs_left[first : first + PAIRS_AT_ONCE]
+                new = [(i, j) for i, j in batch if not db.exists_matches(ids[i], ids[j])]
                 made = pool.map(lambda two: matches_of(*(descriptors[i] for i in two)), new)
-                for (i, j), found in zip(new, made, strict=True):
-                    db.write_matches(ids[i], ids[j], found)
+                for (i, j), matches in zip(new, made, strict=True):
+                    db.write_matches(ids[i], ids[j], matches)
                     progress.update()
-                progress.update(len(some) - len(new))
-                lines = [f"{images[i].name} {images[j].name}\n" for i, j in some]
+                progress.update(len(batch) - len(new))
+                lines = [f"{images[i].name} {images[j].name}\n" for i, j in batch]
                 listed.write_text("".join(lines), "utf-8")
                 colmap.verify_matches(database, listed, verification(colmap))
         return len(db.read_two_view_geometry_num_inliers()[0])
@@ -195,8 +197,8 @@ def _best(products):
     largest = np.take_along_axis(products, best, -1)
     np.put_along_axis(products, best, -1, -1)
     angle, second = (
-        np.arccos(np.minimum(one[..., 0] / UNIT**2, 1))
-        for one in (largest, products.max(-1, keepdims=True))
+        np.arccos(np.minimum(product[..., 0] / UNIT**2, 1))
+        for product in (largest, products.max(-1, keepdims=True))
     )
     return best[..., 0], (angle < FARTHEST) & (angle < RATIO * second)
 
@@ -214,15 +216,17 @@ def forget_focal_lengths(database: Path) -> bool:
     """
     with quiet(database) as colmap, colmap.Database.open(database) as db:
         factor = colmap.ImageReaderOptions().default_focal_length_factor
-        told = [camera for camera in db.read_all_cameras() if camera.has_prior_focal_length]
-        for one in told:
-            size = one.width, one.height
+        cameras = [camera for camera in db.read_all_cameras() if camera.has_prior_focal_length]
+        for camera in cameras:
+            size = camera.width, camera.height
             db.update_camera(
-                colmap.Camera.create_from_model_name(one.camera_id, LENS, factor * max(size), *size)
+                colmap.Camera.create_from_model_name(
+                    camera.camera_id, LENS, factor * max(size), *size
+                )
             )
-        if told:
+        if cameras:
             _verify_anew(colmap, database, db)
-    return bool(told)
+    return bool(cameras)
 
 
 def verification(colmap: Any) -> Any:
@@ -268,8 +272,8 @@ def _alikeness(places, descriptors):
     count = len(places)
     large = np.zeros((count, LARGE, 128), np.float32)  # zeros match no feature
     at = np.zeros((count, LARGE, 2), np.float32)
-    for i, (place, some) in enumerate(zip(places, descriptors, strict=True)):
-        large[i, : len(some)], at[i, : len(some)] = some[:LARGE], place[:LARGE]
+    for i, (place, vectors) in enumerate(zip(places, descriptors, strict=True)):
+        large[i, : len(vectors)], at[i, : len(vectors)] = vectors[:LARGE], place[:LARGE]
     alike = np.zeros((count, count), int)
     for i in track(range(count - 1), "choosing pairs", "image"):
         products = (large[i + 1 :].reshape(-1, 128) @ large[i].T).reshape(-1, LARGE, LARGE)
@@ -308,21 +312,23 @@ def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
         scales, shifts = _aligned(places, pairs)
         moved = [s * place + t for s, t, place in zip(scales, shifts, places, strict=True)]
         still = [abs(moved[i][m[:, 0]] - moved[j][m[:, 1]]) < STILL for _, i, j, m in pairs]
-        counted = [one for one in still if len(one) >= LEAST_MATCHES]
-        shared = sum(one.sum() >= max(LEAST_MATCHES, len(one) / 2) for one in counted)
+        counted = [is_still for is_still in still if len(is_still) >= LEAST_MATCHES]
+        shared = sum(
+            is_still.sum() >= max(LEAST_MATCHES, len(is_still) / 2) for is_still in counted
+        )
         if not is_turntable and shared < LEAST_PAIRS * len(counted):
             return False
         votes = [np.zeros((len(place), 2), int) for place in places]
-        for (_, i, j, m), one in zip(pairs, still, strict=True):
-            np.add.at(votes[i], (m[:, 0], one.astype(int)), 1)
-            np.add.at(votes[j], (m[:, 1], one.astype(int)), 1)
+        for (_, i, j, m), is_still in zip(pairs, still, strict=True):
+            np.add.at(votes[i], (m[:, 0], is_still.astype(int)), 1)
+            np.add.at(votes[j], (m[:, 1], is_still.astype(int)), 1)
         stays = [(v[:, 1] > 1) & (v[:, 1] > v[:, 0]) for v in votes]
         begun.touch()
         with colmap.DatabaseTransaction(db):
-            for (ids, i, j, m), one in zip(pairs, still, strict=True):
-                left = m[~(one | stays[i][m[:, 0]] | stays[j][m[:, 1]])]
+            for (ids, i, j, m), is_still in zip(pairs, still, strict=True):
+                matches_left = m[~(is_still | stays[i][m[:, 0]] | stays[j][m[:, 1]])]
                 db.delete_matches(*ids)
-                db.write_matches(*ids, left)
+                db.write_matches(*ids, matches_left)
         _verify_anew(colmap, database, db)
     return True
 
@@ -332,21 +338,23 @@ def _aligned(places: list[np.ndarray], pairs: list[Any]) -> tuple[np.ndarray, np
     rng, count = np.random.default_rng(0), len(places)
     drawn = []
     for _, i, j, matches in pairs:
-        some = matches[rng.permutation(len(matches))[:SAMPLED]]
-        ends = np.full(len(some), i), np.full(len(some), j)
-        drawn.append((*ends, places[i][some[:, 0]], places[j][some[:, 1]]))
-    first, second, one, other = map(np.concatenate, zip(*drawn, strict=True))
-    rows = np.tile(np.arange(len(one)), 4)
+        sample = matches[rng.permutation(len(matches))[:SAMPLED]]
+        ends = np.full(len(sample), i), np.full(len(sample), j)
+        drawn.append((*ends, places[i][sample[:, 0]], places[j][sample[:, 1]]))
+    first, second, at_first, at_second = map(np.concatenate, zip(*drawn, strict=True))
+    rows = np.tile(np.arange(len(at_first)), 4)
     columns = np.concatenate([first, first + count, second, second + count])
     scales, shifts = np.ones(count, complex), np.zeros(count, complex)
-    hold = HELD * len(one) / count * np.eye(2 * count)
+    hold = HELD * len(at_first) / count * np.eye(2 * count)
     for number in range(ROUNDS):
-        off = abs(scales[first] * one + shifts[first] - scales[second] * other - shifts[second])
+        off = abs(
+            scales[first] * at_first + shifts[first] - scales[second] * at_second - shifts[second]
+        )
         weight = 1 / (1 + (off / max(STILL, WIDEST * NARROWER**number)) ** 2)
-        values = np.concatenate([one * weight, weight, -other * weight, -weight])
-        system = coo_matrix((values, (rows, columns)), shape=(len(one), 2 * count)).tocsr()
+        values = np.concatenate([at_first * weight, weight, -at_second * weight, -weight])
+        system = coo_matrix((values, (rows, columns)), shape=(len(at_first), 2 * count)).tocsr()
         normal = (system.conj().T @ system).toarray() + hold
-        found = np.linalg.solve(normal, hold @ np.repeat([1.0, 0.0], count))
-        scales, shifts = found[:count], found[count:]
+        solution = np.linalg.solve(normal, hold @ np.repeat([1.0, 0.0], count))
+        scales, shifts = solution[:count], solution[count:]
         shifts, scales = (shifts - shifts.mean()) / scales.mean(), scales / scales.mean()
     return scales, shifts

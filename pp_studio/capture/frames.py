@@ -85,23 +85,23 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
     """
     with atomic_folder(images) as unfinished:
         take = _photographs if source.is_dir() else _frames
-        found = list(take(source, unfinished))
-        _leave_out(found)
-        usable = [one for one in found if "reason" not in one]
-        left_out = [one for one in found if "reason" in one]
-        for one in left_out:
-            if "name" in one:
-                (unfinished / one["name"]).unlink()
+        taken = list(take(source, unfinished))
+        _leave_out(taken)
+        usable = [image for image in taken if "reason" not in image]
+        left_out = [image for image in taken if "reason" in image]
+        for image in left_out:
+            if "name" in image:
+                (unfinished / image["name"]).unlink()
         if len(usable) < LEAST:
-            why = [f"{one['source']} {one['reason']}" for one in left_out[:3]]
+            why = [f"{image['source']} {image['reason']}" for image in left_out[:3]]
             others = f", {len(left_out)} cannot be used ({'; '.join(why)})" if why else ""
             raise UserError(
                 f"{source}: {len(usable)} images{others}; at least {LEAST} are needed: take 30 or"
                 " more all around the object"
             )
-    for one in usable:
-        del one["small"]
-    reasons = [{key: one[key] for key in ("source", "reason")} for one in left_out]
+    for image in usable:
+        del image["small"]
+    reasons = [{key: image[key] for key in ("source", "reason")} for image in left_out]
     return {"images": usable, "left_out": reasons}
 
 
@@ -138,21 +138,21 @@ def listed(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
     """The photographs in a folder and its subfolders, in the order of their names, 10 after 9.
     Hidden files are left out, and so are folders of masks and folders that pp-cl fills.
     """
-    found = []
+    paths = []
     for place, folders, files in os.walk(folder):
         here = Path(place)
         if here != folder and is_owned(here):
             folders.clear()
             continue
         folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]
-        found += [here / f for f in files if f.lower().endswith(tuple(endings)) and f[0] != "."]
+        paths += [here / f for f in files if f.lower().endswith(tuple(endings)) and f[0] != "."]
 
     def natural(file):
         name = file.relative_to(folder).as_posix()
         parts = re.split(r"(\d+)", name)
         return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
 
-    return sorted(found, key=natural)
+    return sorted(paths, key=natural)
 
 
 def _take(folder, file, target):
@@ -163,20 +163,20 @@ def _take(folder, file, target):
         with opened_regular(file) as opened:
             image = Image.open(opened, formats=FORMATS)
             image.load()
-            turned, told = ImageOps.exif_transpose(image), image.getexif()
+            turned, tags = ImageOps.exif_transpose(image), image.getexif()
             upright = in_srgb(file, turned)
             is_copied = (
                 image.format in COPIED
                 and upright is turned
                 and image.mode in ("RGB", "RGBA", "L")
-                and told.get(ExifTags.Base.Orientation, 1) == 1
+                and tags.get(ExifTags.Base.Orientation, 1) == 1
                 and not is_deep_png(file)
             )
             content = opened.seek(0) or opened.read() if is_copied else None
-            lens, exif = _lens(told)
+            lens, exif = _lens(tags)
             # each folder has the photographs of one round, or of one camera
             facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
-            facts["focal"] = _focal_of_larger(told.get_ifd(EXIF), image.size)
+            facts["focal"] = _focal_of_larger(tags.get_ifd(EXIF), image.size)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
     except UnidentifiedImageError:
@@ -225,8 +225,8 @@ def _frames(video, images):
     chosen, is_hdr = _sharpest(video)
     equal = [f"eq(n,{number})" for number in chosen]
     # in groups, since ffmpeg adds at most a hundred terms
-    some = [f"({'+'.join(equal[i : i + GROUP])})" for i in range(0, len(equal), GROUP)]
-    frames = _decoded(video, f"select='{'+'.join(some)}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
+    groups = [f"({'+'.join(equal[i : i + GROUP])})" for i in range(0, len(equal), GROUP)]
+    frames = _decoded(video, f"select='{'+'.join(groups)}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
     next(frames)  # the video's metadata
     for number, frame in zip(track(chosen, "frames", "image"), frames, strict=False):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
@@ -276,9 +276,9 @@ def _decoded(video: Path, filters: str, pixels: str, channels: int) -> Iterator[
     except (OSError, RuntimeError, ValueError, IndexError, KeyError, StopIteration) as error:
         # ffmpeg's last line that names an error, without its banner
         lines = [line for line in str(error).splitlines() if "rror" in line or "nvalid" in line]
-        said = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
+        reason = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
         raise UserError(
-            f"{video}: cannot be read as a video ({shown(said, 100)}); give an MP4, MOV or WebM,"
+            f"{video}: cannot be read as a video ({shown(reason, 100)}); give an MP4, MOV or WebM,"
             " or a folder of photographs"
         ) from None
 
@@ -300,33 +300,35 @@ def _is_uniform(image):
     return is_uniform(np.array(small))
 
 
-def _leave_out(found):
+def _leave_out(taken):
     """Add a reason to each image that is empty, blurred or like the one before."""
 
     def near(values, i):
         return np.median(values[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
 
-    good = [one for one in found if "reason" not in one]
-    sharpness = [one["sharpness"] for one in good]
-    for i, one in enumerate(good):
+    good = [image for image in taken if "reason" not in image]
+    sharpness = [image["sharpness"] for image in good]
+    for i, image in enumerate(good):
         usual = near(sharpness, i)
-        if one["sharpness"] < EMPTY:
-            one["reason"] = "shows nothing sharp"
-        elif one["sharpness"] < BLURRED * usual:
-            one["reason"] = f"is blurred (sharpness {one['sharpness'] / usual:.0%} of the usual)"
-    good = [one for one in good if "reason" not in one]
+        if image["sharpness"] < EMPTY:
+            image["reason"] = "shows nothing sharp"
+        elif image["sharpness"] < BLURRED * usual:
+            image["reason"] = (
+                f"is blurred (sharpness {image['sharpness'] / usual:.0%} of the usual)"
+            )
+    good = [image for image in good if "reason" not in image]
     steps = [_difference(*two) for two in pairwise(good)]
     last = good[0] if good else None
-    for i, one in enumerate(good[1:]):
-        if _difference(last, one) < max(SAME, ALIKE * near(steps, i)):
-            one["reason"] = f"shows the same as {last['source']}"
+    for i, image in enumerate(good[1:]):
+        if _difference(last, image) < max(SAME, ALIKE * near(steps, i)):
+            image["reason"] = f"shows the same as {last['source']}"
         else:
-            last = one
+            last = image
 
 
-def _difference(one, other):
+def _difference(look, other):
     """Mean difference of two images' small copies, in levels, apart from their brightness."""
-    a, b = (image["small"] - image["small"].mean() for image in (one, other))
+    a, b = (image["small"] - image["small"].mean() for image in (look, other))
     return float(np.abs(a - b).mean())
 
 
@@ -337,22 +339,26 @@ def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[
     frames: the folder of the distorted photographs. Raises UserError if the distortion folds one
     over, and as read_rgba() and write_png() do.
     """
-    for one in image_files:
-        if one.lens.folds(one.camera):
+    for image_file in image_files:
+        if image_file.lens.folds(image_file.camera):
             raise UserError(
-                f"{frames / Path(one.name).name}: the lens that was found folds the image over;"
-                " take more photographs with more overlap, and do not zoom"
+                f"{frames / Path(image_file.name).name}: the lens that was found folds the image"
+                " over; take more photographs with more overlap, and do not zoom"
             )
     images.mkdir(exist_ok=True)
-    left = [one for one in image_files if not (images / Path(one.name).name).is_file()]
+    unwritten = [
+        image_file
+        for image_file in image_files
+        if not (images / Path(image_file.name).name).is_file()
+    ]
     lock = Lock()  # only one thread at a time uses the device
 
-    def write(one):
-        name = Path(one.name).name
+    def write(image_file):
+        name = Path(image_file.name).name
         image = read_rgba(frames / name)
-        if one.lens:
+        if image_file.lens:
             with lock:
-                image = undistort(dev, image, one.camera, one.lens)
+                image = undistort(dev, image, image_file.camera, image_file.lens)
         if name.endswith(".png"):
             is_opaque = (image[..., 3] == 255).all()
             write_png(images / name, image[..., :3] if is_opaque else image)
@@ -360,12 +366,12 @@ def write_images(dev: Device, frames: Path, images: Path, image_files: Sequence[
             with atomic_file(images / name) as file:
                 Image.fromarray(image[..., :3]).save(file, "JPEG", **QUALITY)
 
-    most = max(one.camera.width * one.camera.height for one in image_files)
+    most = max(image_file.camera.width * image_file.camera.height for image_file in image_files)
     threads = min(os.cpu_count() or 1, MOST_DECODED // (DECODED * most))
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        made = pool.map(write, left)
-        list(track(made, "images", "image", len(left)))
-    return len(left)
+        made = pool.map(write, unwritten)
+        list(track(made, "images", "image", len(unwritten)))
+    return len(unwritten)
 
 
 def undistorted_mask(dev: Device, mask: np.ndarray, image_file: ImageFile) -> np.ndarray:

@@ -77,28 +77,28 @@ def write_masks(
     """
     words = None if command is None else program_words(command)
     (scene / "masks").mkdir(exist_ok=True)
-    left = _without_mask(scene, image_files)
-    how = {"kept": len(image_files) - len(left)}
-    shown = [i for i, one in enumerate(image_files) if cut.place_of(one, box)]
+    unmasked = _without_mask(scene, image_files)
+    how = {"kept": len(image_files) - len(unmasked)}
+    shown = [i for i, image_file in enumerate(image_files) if cut.place_of(image_file, box)]
     shown = shown or list(range(len(image_files)))  # window() then raises the error
-    beside = {one.name for one in image_files} - {image_files[i].name for i in shown}
-    for one in track(left, "masks", "image"):
-        source, mask = _found(scene, one, given, sources or {}, fitted, words)
-        if mask is None and one.name in beside:  # such as at the beginning or end of a video
+    beside = {image_file.name for image_file in image_files} - {image_files[i].name for i in shown}
+    for image_file in track(unmasked, "masks", "image"):
+        source, mask = _found(scene, image_file, given, sources or {}, fitted, words)
+        if mask is None and image_file.name in beside:  # such as at the beginning or end of a video
             source = "empty, as the object is outside"
-            mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
+            mask = np.zeros((image_file.camera.height, image_file.camera.width), np.uint8)
         if mask is not None:
-            write_png(mask_file(scene, one.name), mask)
+            write_png(mask_file(scene, image_file.name), mask)
             how[source] = how.get(source, 0) + 1
     if _without_mask(scene, image_files):
         inside = ((points > box[0]) & (points < box[1])).all(1)
         in_view, seen = [image_files[i] for i in shown], [seen[i] for i in shown]
         reading = track(in_view, "reading images", "image")
-        windows = [_window(scene, one, box) for one in reading]
-        of_object = [points[some[inside[some]]] for some in seen]
+        windows = [_window(scene, image_file, box) for image_file in reading]
+        of_object = [points[indices[inside[indices]]] for indices in seen]
         how["before a uniform background"] = _uniform(scene, in_view, windows, box, of_object)
-        if left := _without_mask(scene, in_view):
-            how["cut out"] = len(left)
+        if unmasked := _without_mask(scene, in_view):
+            how["cut out"] = len(unmasked)
             for growth in range(1 + cut.GROWTHS):
                 cut.cut_out_all(windows, box, points, inside, seen, turns)
                 larger = cut.grown_box(windows, box) if grows and growth < cut.GROWTHS else None
@@ -106,16 +106,20 @@ def write_masks(
                     break
                 box = larger
                 reading = track(in_view, "reading images", "image")
-                windows = [_window(scene, one, box) for one in reading]
-            of_name = dict(zip([one.name for one in in_view], windows, strict=True))
-            for one in track(left, "masks", "image"):
-                mask = cut.whole_mask(of_name[one.name], read_rgba(scene / one.name)[..., :3])
-                write_png(mask_file(scene, one.name), mask)
+                windows = [_window(scene, image_file, box) for image_file in reading]
+            of_name = dict(zip([image_file.name for image_file in in_view], windows, strict=True))
+            for image_file in track(unmasked, "masks", "image"):
+                mask = cut.whole_mask(
+                    of_name[image_file.name], read_rgba(scene / image_file.name)[..., :3]
+                )
+                write_png(mask_file(scene, image_file.name), mask)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     checking = track(image_files, "checking masks", "image")
-    views = [_reduced(scene, one, CHECKED_SIDE)[0] for one in checking]
+    views = [_reduced(scene, image_file, CHECKED_SIDE)[0] for image_file in checking]
     with Progress("comparing masks"):
-        wrong = {one.view.name: one.share for one in disagreements(views, box)}
+        wrong = {
+            disagreement.view.name: disagreement.share for disagreement in disagreements(views, box)
+        }
     if wrong:
         shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
         counts += f"; {len(wrong)} contradict the others: {few_names(shares)}"
@@ -123,14 +127,16 @@ def write_masks(
 
 
 def _without_mask(scene, image_files):
-    return [one for one in image_files if not mask_file(scene, one.name).is_file()]
+    return [
+        image_file for image_file in image_files if not mask_file(scene, image_file.name).is_file()
+    ]
 
 
-def _found(scene, image_file, given, sources, fitted, words):
+def _found(scene, image_file, given_masks, sources, fitted, words):
     """(its source, (H, W) uint8 mask or None) of a photograph, without looking at the others."""
     file, size = scene / image_file.name, (image_file.camera.width, image_file.camera.height)
-    if given is not None:
-        mask = named_mask(given, sources.get(file.name, file.name), file.name)
+    if given_masks is not None:
+        mask = named_mask(given_masks, sources.get(file.name, file.name), file.name)
         return "given", fitted(image_file.name, read_mask_of_size(mask, size))
     if words is not None:
         return "by the program", _of_program(words, file, size[::-1])
@@ -153,13 +159,13 @@ def _of_program(words, image, shape):
         except (OSError, subprocess.TimeoutExpired) as error:
             raise UserError(f"{who}: {error}; fix the command") from None
         if done.returncode or not mask.is_file():
-            said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word of it"]
+            lines = done.stderr.decode(errors="replace").strip().splitlines() or ["no word of it"]
             what = f"status {done.returncode}" if done.returncode else "no mask written"
-            raise UserError(f"{who}: {what}: {shown(said[-1])}; fix the command")
-        found = read_mask(mask)
-    if found.shape != shape:
+            raise UserError(f"{who}: {what}: {shown(lines[-1])}; fix the command")
+        pixels = read_mask(mask)
+    if pixels.shape != shape:
         raise UserError(f"{who}: its mask has another size than the photograph; fix the command")
-    return found
+    return pixels
 
 
 def program_words(command: str) -> list[str]:
@@ -185,19 +191,19 @@ def _written_mask(scene, image_file):
 
 def _window(scene, image_file, box):
     """The Window of a photograph, with its mask if that exists."""
-    found = cut.window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
+    window = cut.window(read_rgba(scene / image_file.name)[..., :3], image_file, box)
     if mask_file(scene, image_file.name).is_file():
-        found.mask = found.reduced(_written_mask(scene, image_file)) > 127
-    return found
+        window.mask = window.reduced(_written_mask(scene, image_file)) > 127
+    return window
 
 
 def _uniform(scene, image_files, windows, box, points):
     """If nearly all photographs have a uniform background, write their masks; returns how many."""
-    left = [i for i, one in enumerate(windows) if one.mask is None]
+    unmasked = [i for i, window in enumerate(windows) if window.mask is None]
     held = {}  # for each mask, whether it covers the object's points that its view shows
     with_holes = len(windows) * cut.FORGIVEN >= 1  # since one view votes against a hole in a spot
-    found = {}
-    for i in track(left, "looking for a uniform background", "image"):
+    masks = {}
+    for i in track(unmasked, "looking for a uniform background", "image"):
         mask = uniform_mask(windows[i].image, windows[i].name, with_holes)
         if mask is not None:
             mask, (_, rows, columns) = mask > 127, windows[i].inside(points[i])
@@ -205,47 +211,52 @@ def _uniform(scene, image_files, windows, box, points):
             held[i] = (
                 binary_fill_holes(mask)[rows, columns] if len(rows) else np.array([mask.any()])
             )
-            found |= {i: mask} if held[i].mean() >= ON_MASK else {}
-    if len(found) < UNIFORM * len(left):
-        if len(held) >= UNIFORM * len(left) and np.concatenate([*held.values()]).mean() < ON_MASK:
+            masks |= {i: mask} if held[i].mean() >= ON_MASK else {}
+    if len(masks) < UNIFORM * len(unmasked):
+        if (
+            len(held) >= UNIFORM * len(unmasked)
+            and np.concatenate([*held.values()]).mean() < ON_MASK
+        ):
             raise UserError(
                 f"{scene}: what is behind the object has one colour, and so have parts of"
                 " it; take the photographs before another colour, or give masks with --masks"
             )
         return 0
-    for i, mask in found.items():
+    for i, mask in masks.items():
         windows[i].mask = mask
-    spots = _spots(windows, found, box) if with_holes and found else {}
-    for i in track(found, "masks", "image", len(found)):
-        name, one = image_files[i].name, windows[i]
-        mask, one.mask = uniform_mask(read_rgba(scene / name), name, with_holes), None
+    spots = _spots(windows, masks, box) if with_holes and masks else {}
+    for i in track(masks, "masks", "image", len(masks)):
+        name, window = image_files[i].name, windows[i]
+        mask, window.mask = uniform_mask(read_rgba(scene / name), name, with_holes), None
         if mask is None:
             continue
         if i in spots:
-            x0, y0, x1, y1 = one.place
+            x0, y0, x1, y1 = window.place
             closed = cv2.resize(spots[i].astype(np.uint8), (x1 - x0, y1 - y0)) > 0
             mask[y0:y1, x0:x1][closed] = 255
         write_png(mask_file(scene, name), mask)
-        one.mask = one.reduced(mask) > 127
-    return sum(windows[i].mask is not None for i in found)
+        window.mask = window.reduced(mask) > 127
+    return sum(windows[i].mask is not None for i in masks)
 
 
 def _spots(windows, numbers, box):
     """{index of a window: (H, W) bool, holes of its mask in which other views see the object}."""
-    masked = [one for one in windows if one.mask is not None]
+    masked = [window for window in windows if window.mask is not None]
     hull, rejections, _, voxel_size = cut.forgiving_hull(masked, box)
-    found = {}
+    spots = {}
     for i in numbers:
-        one = windows[i]
-        regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
+        window = windows[i]
+        regions = label(binary_fill_holes(window.mask) & ~window.mask, connectivity=1)
         # neighbouring views, too, reject all places behind a gap
-        shown, rows, columns = one.inside(hull)
-        others = rejections[shown] - ~one.mask[rows, columns]
-        held = cut.silhouette(one, hull[shown[others == 0]], cut.gap_of(one, hull, voxel_size))
+        shown, rows, columns = window.inside(hull)
+        others = rejections[shown] - ~window.mask[rows, columns]
+        held = cut.silhouette(
+            window, hull[shown[others == 0]], cut.gap_of(window, hull, voxel_size)
+        )
         is_spot = np.bincount(regions.ravel(), held.ravel()) > SPOT * np.bincount(regions.ravel())
         is_spot[0] = False
-        found[i] = cut.dilated(is_spot[regions], 1)
-    return found
+        spots[i] = cut.dilated(is_spot[regions], 1)
+    return spots
 
 
 def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: bool) -> None:
@@ -254,15 +265,15 @@ def write_inside(frames: Path, names: Sequence[str], folder: Path, is_uniform: b
     otherwise all white. If no photograph has either, write nothing.
     """
     with atomic_folder(folder) as unfinished:
-        left, may_have = list(names), [n for n in names if not n.lower().endswith(OPAQUE)]
+        names_left, may_have = list(names), [n for n in names if not n.lower().endswith(OPAQUE)]
         for name in track(may_have, "alpha", "image"):
             alpha = read_rgba(frames / name)[..., 3]
             if (alpha < 255).any():
                 write_png(unfinished / f"{name}.png", np.where(alpha > 127, np.uint8(255), 0))
-                left.remove(name)
-        if len(left) == len(names) and not is_uniform:
+                names_left.remove(name)
+        if len(names_left) == len(names) and not is_uniform:
             return
-        for name in track(left, "backgrounds", "image"):
+        for name in track(names_left, "backgrounds", "image"):
             image = read_rgba(frames / name)
             image = shrink(image, fitting_downscale(image.shape[:2], GLANCED_SIDE))
             mask = uniform_mask(image, name) if is_uniform else None
@@ -276,22 +287,25 @@ def outline_sheet(
     """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks.
     first: names of the photographs that come first; the others are spread evenly.
     """
-    wrong = [one for one in image_files if one.name in first][:SHOWN_VIEWS]
-    others = [one for one in image_files if one.name not in first]
+    wrong = [image_file for image_file in image_files if image_file.name in first][:SHOWN_VIEWS]
+    others = [image_file for image_file in image_files if image_file.name not in first]
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
-    for one in chosen:
-        view, factor = _reduced(scene, one, SHOWN_SIZE)
-        image, held = shrink(read_rgba(scene / one.name), factor)[..., :3], view.image[..., 3] > 127
+    for image_file in chosen:
+        view, factor = _reduced(scene, image_file, SHOWN_SIZE)
+        image, held = (
+            shrink(read_rgba(scene / image_file.name), factor)[..., :3],
+            view.image[..., 3] > 127,
+        )
         image[~held] //= 2
         image[find_boundaries(held, mode="thick")] = OUTLINE
         images.append(image)
-    return contact_sheet(images, [Path(one.name).name for one in chosen])
+    return contact_sheet(images, [Path(image_file.name).name for image_file in chosen])
 
 
-def _reduced(scene, one, side):
+def _reduced(scene, image_file, side):
     """(a View of a photograph's mask, reduced to a longer side of about `side`, the factor)."""
-    mask = _written_mask(scene, one)
+    mask = _written_mask(scene, image_file)
     factor = fitting_downscale(mask.shape, side)
     image = shrink(np.dstack([mask] * 4), factor)
-    return View(one.name, one.camera.downscaled(factor), image), factor
+    return View(image_file.name, image_file.camera.downscaled(factor), image), factor

@@ -54,11 +54,11 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
     with ProcessPoolExecutor(1, get_context("spawn"), _begin) as pool:
         try:
             with deferred():
-                found = pool.submit(function, *arguments)
-            return found.result()
+                future = pool.submit(function, *arguments)
+            return future.result()
         except KeyboardInterrupt:  # the pool would wait until the function ends
-            for one in {*active_children()} - {*before}:
-                one.kill()
+            for process in {*active_children()} - {*before}:
+                process.kill()
             raise
         except BrokenProcessPool:
             raise UserError(

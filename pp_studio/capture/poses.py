@@ -51,37 +51,48 @@ def place(
     """
     least = max(3, LEAST_SHARE * len(taken))
 
-    def is_sound(one, least):
-        return one.num_reg_images() >= least and not (turns and contradictions(database, one))
+    def is_sound(candidate, least):
+        return candidate.num_reg_images() >= least and not (
+            turns and contradictions(database, candidate)
+        )
 
     with atomic_folder(model) as unfinished:
         map_all = _mapped_turned if turns else _mapped
-        found = map_all(database, images, unfinished, len(taken))
-        if turns and not any(is_sound(one, MANY * len(taken)) for one in found):
+        candidates = map_all(database, images, unfinished, len(taken))
+        if turns and not any(is_sound(candidate, MANY * len(taken)) for candidate in candidates):
             (usual := unfinished / "usual").mkdir()
-            found += _mapped(database, images, usual, len(taken))
-        if all(one.num_reg_images() < least for one in found):  # EXIF may be for another size
+            candidates += _mapped(database, images, usual, len(taken))
+        # the focal lengths of EXIF may be for another size
+        if all(candidate.num_reg_images() < least for candidate in candidates):
             (again := unfinished / "again").mkdir()
             copy = Path(shutil.copy(database, again))  # a stopped run must find its own unchanged
             if forget_focal_lengths(copy):
-                found += map_all(copy, images, again, len(taken))
+                candidates += map_all(copy, images, again, len(taken))
         for folder in list(unfinished.iterdir()):
             shutil.rmtree(folder)
-        found.sort(key=lambda one: (is_sound(one, least), one.num_reg_images(), one.num_points3D()))
-        while found:
-            best = found[-1]
+        candidates.sort(
+            key=lambda candidate: (
+                is_sound(candidate, least),
+                candidate.num_reg_images(),
+                candidate.num_points3D(),
+            )
+        )
+        while candidates:
+            best = candidates[-1]
             with Progress("refining all poses"):
                 best = _refined_turned(best) if turns else refine(best)
             if (error := best.compute_mean_reprojection_error()) < MOST_ERROR:
                 best.write(unfinished)
                 break
-            found.pop()  # its optimisation failed
-        placed = {image.name for image in best.images.values() if image.has_pose} if found else ()
+            candidates.pop()  # its optimisation failed
+        placed = (
+            {image.name for image in best.images.values() if image.has_pose} if candidates else ()
+        )
         reasons = _reasons(database, taken, placed)
         if len(placed) < least:
-            some = "; ".join(f"{name} {why}" for name, why in list(reasons.items())[:3])
+            examples = "; ".join(f"{name} {why}" for name, why in list(reasons.items())[:3])
             raise UserError(
-                f"{images}: only {len(placed)} of {len(taken)} images could be placed ({some});"
+                f"{images}: only {len(placed)} of {len(taken)} images could be placed ({examples});"
                 " take more of them with more overlap (10 degrees apart or less), sharp and of an"
                 " object that has some texture"
             )
@@ -106,14 +117,14 @@ def _mapped_turned(database, images, folder, count):
     images, one to which weaker pairs add the others.
     """
     (strong := folder / "strong").mkdir()
-    found = _mapped(database, images, strong, count, STRONG)
-    best = max(found, key=lambda one: one.num_reg_images(), default=None)
+    models = _mapped(database, images, strong, count, STRONG)
+    best = max(models, key=lambda model: model.num_reg_images(), default=None)
     if best is not None and contradictions(database, best):
         best = None  # weaker pairs begin anew
     elif best is not None and best.num_reg_images() == count:
-        return found
+        return models
     (weak := folder / "weak").mkdir()
-    return found + _mapped(database, images, weak, count, WEAK, best)
+    return models + _mapped(database, images, weak, count, WEAK, best)
 
 
 def _mapped(database, images, folder, count, share=None, begun=None):
@@ -152,24 +163,24 @@ def contradictions(database: Path, model: Any) -> list[tuple[str, str]]:
     names, shown = {}, {}
     for image in _placed(model):
         names[image.image_id] = image.name
-        of_point = [one.point3D_id if one.has_point3D() else -1 for one in image.points2D]
+        of_point = [point.point3D_id if point.has_point3D() else -1 for point in image.points2D]
         shown[image.image_id] = np.array(of_point, np.int64)
     colmap = needed("pycolmap")
     with colmap.Database.open(database) as db:
         numbers, checked = db.read_two_view_geometries()
     pairs, best = [], dict.fromkeys(names, FEW_MATCHES)
     for number, geometry in zip(numbers, checked, strict=True):
-        one, other = colmap.pair_id_to_image_pair(number)
+        first, second = colmap.pair_id_to_image_pair(number)
         matches = np.array(geometry.inlier_matches)
-        if one in names and other in names and len(matches):
-            points = shown[one][matches[:, 0]], shown[other][matches[:, 1]]
+        if first in names and second in names and len(matches):
+            points = shown[first][matches[:, 0]], shown[second][matches[:, 1]]
             same = ((points[0] == points[1]) & (points[0] >= 0)).mean()
-            pairs.append((same, len(matches), one, other))
-            best |= {i: max(best[i], len(matches)) for i in (one, other)}
+            pairs.append((same, len(matches), first, second))
+            best |= {i: max(best[i], len(matches)) for i in (first, second)}
     return [
-        (names[one], names[other])
-        for same, count, one, other in sorted(pairs)
-        if same < SAME_POINT and count >= SAME_BEST * max(best[one], best[other])
+        (names[first], names[second])
+        for same, count, first, second in sorted(pairs)
+        if same < SAME_POINT and count >= SAME_BEST * max(best[first], best[second])
     ]
 
 
@@ -198,7 +209,8 @@ def _refined_turned(model):
     for lens in straight.cameras.values():
         lens.params = [*lens.params[:3], 0]
     errors = [
-        refine(one, one is model).compute_mean_reprojection_error() for one in (straight, model)
+        refine(candidate, candidate is model).compute_mean_reprojection_error()
+        for candidate in (straight, model)
     ]
     return model if errors[1] < (1 - DISTORTS) * errors[0] else straight
 
@@ -209,15 +221,15 @@ def _reasons(database, taken, placed):
     with needed("pycolmap").Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(i) for name, i in ids.items()}
-    usual = np.median([one["sharpness"] for one in taken])
+    usual = np.median([image["sharpness"] for image in taken])
     reasons = {}
-    for one in (one for one in taken if one["name"] not in placed):
-        name, sharpness = one["name"], one["sharpness"] / usual
-        found, matches = features.get(name, 0), best.get(ids.get(name), 0)
+    for image in (image for image in taken if image["name"] not in placed):
+        name, sharpness = image["name"], image["sharpness"] / usual
+        count, matches = features.get(name, 0), best.get(ids.get(name), 0)
         if sharpness < BLURRED:
             reasons[name] = f"is blurred (sharpness {sharpness:.0%} of the usual)"
-        elif found < FEW_FEATURES:
-            reasons[name] = f"has few features ({found}): blurred, dark or plain"
+        elif count < FEW_FEATURES:
+            reasons[name] = f"has few features ({count}): blurred, dark or plain"
         elif matches < FEW_MATCHES:
             reasons[name] = f"has few matches with any other ({matches}): too little overlap"
         else:
@@ -240,8 +252,8 @@ def _most_matches(database):
     with colmap.Database.open(database) as db:
         best = {image.image_id: 0 for image in db.read_all_images()}
         for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
-            for one in colmap.pair_id_to_image_pair(pair):
-                best[one] = max(best[one], matches)
+            for image_id in colmap.pair_id_to_image_pair(pair):
+                best[image_id] = max(best[image_id], matches)
     return best
 
 
@@ -249,21 +261,21 @@ def image_files(model: Any) -> list[ImageFile]:
     """The images of pycolmap's model that have a place, in the order of their names, as ImageFiles
     of a scene with a folder `images`.
     """
-    found = []
+    files = []
     for image in _placed(model):
         lens = model.cameras[image.camera_id]
         focal, cx, cy, k1 = lens.params  # of features.LENS
         world = image.cam_from_world().inverse().matrix()
         camera = Camera(np.array(world), focal, focal, cx, cy, lens.width, lens.height)
-        found.append(ImageFile(f"images/{image.name}", camera, lens=LensDistortion(k1)))
-    return found
+        files.append(ImageFile(f"images/{image.name}", camera, lens=LensDistortion(k1)))
+    return files
 
 
 def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
     """((N, 3) points of pycolmap's model that at least `least` images show, for each of
     image_files() the indices of the points in it).
     """
-    chosen = [number for number, one in model.points3D.items() if one.track.length() >= least]
+    chosen = [number for number, point in model.points3D.items() if point.track.length() >= least]
     index = {number: k for k, number in enumerate(chosen)}
     shown = [
         np.array([index[p.point3D_id] for p in image.points2D if p.point3D_id in index], int)

@@ -96,22 +96,22 @@ class Capture:
         changed = self._take_options(begin)
         anew = {begin, *(OPTIONS[name][0] for name in changed)}
         anew |= {"masks"} if replace_masks else set()
-        done = list(takewhile(lambda one: one not in anew and self._is_done(one), STAGES))
-        left = list(STAGES)[len(done) :]
-        mended = self._mended() if "masks" in left else []
-        self._check_options(left, [] if replace_masks else mended)
-        if mended and "images" in left and not replace_masks:
+        done = list(takewhile(lambda stage: stage not in anew and self._is_done(stage), STAGES))
+        stages_left = list(STAGES)[len(done) :]
+        mended = self._mended() if "masks" in stages_left else []
+        self._check_options(stages_left, [] if replace_masks else mended)
+        if mended and "images" in stages_left and not replace_masks:
             raise UserError(
                 f"{mended[0]}: was made or changed by hand, for images that are made again;"
                 " move it away, or add --replace-masks"
             )
-        files = {stage: self._files(stage) for stage in left}
-        for stage in left:
+        files = {stage: self._files(stage) for stage in stages_left}
+        for stage in stages_left:
             check_ours(files[stage])
         for path in mended if replace_masks else ():
             path.unlink()
-        for stage in reversed(left):
-            if stage != left[0] or stage in anew or stage not in RESUMED:
+        for stage in reversed(stages_left):
+            if stage != stages_left[0] or stage in anew or stage not in RESUMED:
                 if stage == "matches" and self.database.exists():
                     features.forget_matches(self.database)
                 remove_ours(files[stage])
@@ -120,12 +120,12 @@ class Capture:
         if changed or not self._file("options").exists():
             write_json(self._file("options"), self.options)
         for stage in done:
-            found, came = self._found(stage), ""
+            facts, came = self._found(stage), ""
             if stage == "frames":
-                known = {one["source"] for one in (*found["images"], *found["left_out"])}
+                known = {image["source"] for image in (*facts["images"], *facts["left_out"])}
                 if new := [name for name in self._names() if name not in known]:
                     came = f"; {few_names(new)} came later: --from frames takes all of them anew"
-            self.tell(f"{stage}: {found['line']} (done before{came})")
+            self.tell(f"{stage}: {facts['line']} (done before{came})")
         for name in changed:
             option = "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
             redone = OPTIONS[name][0]
@@ -140,12 +140,12 @@ class Capture:
             "masks": self._masks,
             "scene": self._scene,
         }
-        for stage in left:
+        for stage in stages_left:
             start = time.monotonic()
-            found = made_by[stage]()
+            facts = made_by[stage]()
             seconds = time.monotonic() - start
-            write_json(self._file(stage), found | {"seconds": round(seconds, 1)})
-            self.tell(f"{stage}: {found['line']} ({seconds:.0f} s)")
+            write_json(self._file(stage), facts | {"seconds": round(seconds, 1)})
+            self.tell(f"{stage}: {facts['line']} ({seconds:.0f} s)")
 
     def _file(self, stage, suffix=".json"):
         return self.work / f"{stage}{suffix}"
@@ -177,7 +177,7 @@ class Capture:
         if "source" in changed and begin != "frames" and self._is_done("frames"):
             # a missing source may have moved: its photographs or video have the same names
             if self.source.is_dir():
-                taken = {one["source"] for one in self._found("frames")["images"]}
+                taken = {image["source"] for image in self._found("frames")["images"]}
                 is_same = taken <= {*self._names()}
             else:
                 is_same = self.source.name == Path(before["source"]).name
@@ -190,41 +190,41 @@ class Capture:
             changed.remove("source")
         return changed
 
-    def _check_options(self, left, mended):
+    def _check_options(self, stages_left, mended):
         """Raise UserError if a file or program in an option of the remaining stages is missing."""
-        count, is_new = len(self._names()), "frames" in left and self._is_done("frames")
+        count, is_new = len(self._names()), "frames" in stages_left and self._is_done("frames")
         if is_new and self.source.is_dir() and count < frames.LEAST:
             raise UserError(
                 f"{self.source}: {count} photographs in it, at least {frames.LEAST} are needed"
             )
-        command, given = self.options["mask_command"], self.options["masks"]
-        if "masks" not in left:
+        command, folder = self.options["mask_command"], self.options["masks"]
+        if "masks" not in stages_left:
             return
         if command is not None and shutil.which(masks.program_words(command)[0]) is None:
             raise UserError(f"--mask-command {command}: no such program; install it, or fix it")
-        if given is not None and not Path(given).is_dir():
-            raise UserError(f"--masks {given}: no such folder; auto makes them")
-        if given is not None and self.source.is_dir() and not {"frames", "poses"} & {*left}:
+        if folder is not None and not Path(folder).is_dir():
+            raise UserError(f"--masks {folder}: no such folder; auto makes them")
+        if folder is not None and self.source.is_dir() and not {"frames", "poses"} & {*stages_left}:
             unplaced = self._found("poses")["unplaced"]
-            for one in self._found("frames")["images"]:
-                is_mended = masks.mask_file(self.scene, one["name"]) in mended
-                if one["name"] not in unplaced and not is_mended:
-                    named_mask(Path(given), one["source"], one["name"])
+            for image in self._found("frames")["images"]:
+                is_mended = masks.mask_file(self.scene, image["name"]) in mended
+                if image["name"] not in unplaced and not is_mended:
+                    named_mask(Path(folder), image["source"], image["name"])
 
     def _files(self, stage):
         """The files of a stage, without masks by others and files that change in place."""
         # its JSON is removed first: without it the stage is not done
-        found = [self._file(stage), self._file(stage, ".png")]
+        files = [self._file(stage), self._file(stage, ".png")]
         for path in (self.scene / name for name in LEFT[stage] if name not in CHANGING):
             inside = path.rglob("*") if path.is_dir() else [path]
-            inside = [one for one in inside if one.is_symlink() or not one.is_dir()]
-            found += ours(inside) if stage == "masks" else inside
-        return found
+            inside = [file for file in inside if file.is_symlink() or not file.is_dir()]
+            files += ours(inside) if stage == "masks" else inside
+        return files
 
     def _mended(self):
         """The images' masks that the user has made or changed, which are kept."""
         taken = self._found("frames")["images"] if self._is_done("frames") else []
-        named = [masks.mask_file(self.scene, one["name"]) for one in taken]
+        named = [masks.mask_file(self.scene, image["name"]) for image in taken]
         there = [path for path in named if path.is_file()]
         return sorted(set(there) - set(ours(there)))
 
@@ -240,21 +240,23 @@ class Capture:
     # ---- the stages
 
     def _frames(self):
-        found = frames.take_images(self.source, self.frames)
-        names = [one["name"] for one in evenly(found["images"], masks.SHOWN_VIEWS)]
+        facts = frames.take_images(self.source, self.frames)
+        names = [image["name"] for image in evenly(facts["images"], masks.SHOWN_VIEWS)]
         shown = [read_rgba(self.frames / name) for name in names]
-        shown = [shrink(one, fitting_downscale(one.shape[:2], masks.SHOWN_SIZE)) for one in shown]
+        shown = [
+            shrink(image, fitting_downscale(image.shape[:2], masks.SHOWN_SIZE)) for image in shown
+        ]
         write_png(self._file("frames", ".png"), contact_sheet(shown, names))
-        left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
-        line = f"{len(found['images'])} images{_but(left_out, 'left out')}"
-        if _is_uniform(found["images"]):
+        left_out = [f"{image['source']} {image['reason']}" for image in facts["left_out"]]
+        line = f"{len(facts['images'])} images{_but(left_out, 'left out')}"
+        if _is_uniform(facts["images"]):
             line += "; the background is uniform: colour tells the object from it"
-        return {"line": line, **found}
+        return {"line": line, **facts}
 
     def _features(self):
         taken, folder = self._found("frames")["images"], self.work / "inside"
         if not (folder.is_dir() and any(folder.iterdir())):  # else it was stopped, and goes on
-            names = [one["name"] for one in taken]
+            names = [image["name"] for image in taken]
             masks.write_inside(self.frames, names, folder, _is_uniform(taken))
         inside = folder if folder.is_dir() and any(folder.iterdir()) else None
         counts = isolated(
@@ -278,17 +280,17 @@ class Capture:
     def _poses(self):
         taken = self._found("frames")["images"]
         turns = self._found("matches")["turns"]
-        found = isolated(
+        facts = isolated(
             self.work, poses.place, self.database, self.frames, self.model, taken, turns
         )
         self._show("poses", self._model(), None)
-        unplaced = [f"{name} {why}" for name, why in found["unplaced"].items()]
+        unplaced = [f"{name} {why}" for name, why in facts["unplaced"].items()]
         line = (
-            f"{found['placed']} of {len(taken)} images, {found['points']} points, reprojection"
-            f" error {found['error']:.2f} pixels{_but(unplaced, 'without a place')}"
-            f"{_but(found['weak'], 'may be a little off, by few matches')}"
+            f"{facts['placed']} of {len(taken)} images, {facts['points']} points, reprojection"
+            f" error {facts['error']:.2f} pixels{_but(unplaced, 'without a place')}"
+            f"{_but(facts['weak'], 'may be a little off, by few matches')}"
         )
-        return {"line": line, **found}
+        return {"line": line, **facts}
 
     def _images(self):
         taken = poses.image_files(self._model())
@@ -298,12 +300,12 @@ class Capture:
 
     def _box(self):
         model = self._model()
-        cameras = [one.camera for one in poses.image_files(model)]
+        cameras = [image_file.camera for image_file in poses.image_files(model)]
         world = box.find_world(cameras, poses.points(model)[0])
-        given = self.options["box"]
-        chosen = world.box if given is None else np.sort(np.reshape(given, (2, 3)), axis=0)
+        given_box = self.options["box"]
+        chosen = world.box if given_box is None else np.sort(np.reshape(given_box, (2, 3)), axis=0)
         _move(model, world.scale, world.rotation, world.shift)
-        eyes = [one.camera.eye for one in poses.image_files(model)]
+        eyes = [image_file.camera.eye for image_file in poses.image_files(model)]
         distance = np.median(np.linalg.norm(eyes, axis=1))
         self._show("box", model, chosen)
         return {
@@ -317,9 +319,9 @@ class Capture:
     def _masks(self):
         model, before = self._world()
         corners, edits = before, read_edits(self.scene)
-        taken = {one.name: one for one in poses.image_files(model)}
-        image_files = [replace(one, lens=LensDistortion()) for one in taken.values()]
-        points, seen = poses.points(model, FOLLOWED)
+        taken = {image_file.name: image_file for image_file in poses.image_files(model)}
+        image_files = [replace(image_file, lens=LensDistortion()) for image_file in taken.values()]
+        points, seen_points = poses.points(model, FOLLOWED)
         files = self._found("frames")["images"] if self.source.is_dir() else []
 
         def write(chosen):
@@ -328,16 +330,18 @@ class Capture:
                 [image_files[i] for i in chosen],
                 corners,
                 points,
-                [seen[i] for i in chosen],
+                [seen_points[i] for i in chosen],
                 given=self.options["masks"] and Path(self.options["masks"]),
-                sources={one["name"]: one["source"] for one in files},
+                sources={image["name"]: image["source"] for image in files},
                 fitted=lambda name, mask: frames.undistorted_mask(self._dev, mask, taken[name]),
                 command=self.options["mask_command"],
                 turns=self._found("matches")["turns"],
                 grows=self.options["box"] is None and edits.box is None,
             )
 
-        used = [i for i, one in enumerate(image_files) if one.name not in edits.dropped]
+        used = [
+            i for i, image_file in enumerate(image_files) if image_file.name not in edits.dropped
+        ]
         line, wrong, corners = write(used)
         if edits.dropped:  # dropped images have no vote in the masks of the others
             write(range(len(image_files)))
@@ -352,12 +356,12 @@ class Capture:
 
     def _scene(self):
         model, corners = self._world()
-        found = poses.image_files(model)
+        image_files = poses.image_files(model)
         places = []
-        for one in found:
-            mask = masks.mask_file(Path(), one.name).as_posix()
-            keys = {key: _rounded(value) for key, value in frame_keys(one.camera).items()}
-            places.append({"file_path": one.name, "mask_path": mask, **keys})
+        for image_file in image_files:
+            mask = masks.mask_file(Path(), image_file.name).as_posix()
+            keys = {key: _rounded(value) for key, value in frame_keys(image_file.camera).items()}
+            places.append({"file_path": image_file.name, "mask_path": mask, **keys})
         poses.undistort_model(model)
         with atomic_folder(self.scene / "sparse") as unfinished:
             (unfinished / "0").mkdir()
@@ -366,11 +370,11 @@ class Capture:
             model.export_PLY(unfinished)
         stated = {"camera_model": "OPENCV", "ply_file_path": "points.ply"}
         write_json(self.scene / SCENE_FILE, stated | {"aabb": _rounded(corners), "frames": places})
-        return {"line": f"wrote {self.scene / SCENE_FILE} with {len(found)} photographs"}
+        return {"line": f"wrote {self.scene / SCENE_FILE} with {len(image_files)} photographs"}
 
     def _show(self, stage, model, corners):
         """Write a stage's image, which shows a model's points and cameras, and a box (2, 3)."""
-        cameras = [one.camera for one in poses.image_files(model)]
+        cameras = [image_file.camera for image_file in poses.image_files(model)]
         colours = np.array([point.color for point in model.points3D.values()])
         drawn = overview(cameras, corners, poses.points(model)[0], colours, SHOWN_WIDTH)
         write_png(self._file(stage, ".png"), drawn)
@@ -379,18 +383,18 @@ class Capture:
         """(pycolmap's model in the scene's world, (2, 3) box from the user, the masks or the
         stage).
         """
-        model, found = self._model(), self._found("box")
-        _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
+        model, facts = self._model(), self._found("box")
+        _move(model, facts["scale"], np.array(facts["rotation"]), np.array(facts["shift"]))
         edited = read_edits(self.scene).box
         if edited is not None:
             return model, edited
         grown = self._found("masks").get("box") if self._is_done("masks") else None
-        return model, np.array(grown or found["box"])
+        return model, np.array(grown or facts["box"])
 
 
 def _is_uniform(taken):
     """Whether nearly all images have a uniform background, according to take_images()."""
-    return float(np.mean([one.get("uniform", False) for one in taken])) >= masks.UNIFORM
+    return float(np.mean([image.get("uniform", False) for image in taken])) >= masks.UNIFORM
 
 
 def _size(corners):

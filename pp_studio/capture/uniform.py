@@ -77,7 +77,7 @@ def _border(image):
     return marked
 
 
-def _distances(one, other):
+def _distances(colours, other):
     """CIELAB distances between colours from 0 to 255."""
-    a, b = (rgb2lab(np.clip(some, 0, 255) / 255) for some in (one, other))
+    a, b = (rgb2lab(np.clip(rgb, 0, 255) / 255) for rgb in (colours, other))
     return np.linalg.norm(a - b, axis=-1)
