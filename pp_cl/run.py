@@ -90,14 +90,14 @@ class Run:
         )
         members = self.others if others is None else [*others]
         config = replace(self.config, raster=raster)
-        found = replace(self, model=shown, config=config, others=members)
+        run = replace(self, model=shown, config=config, others=members)
         # what a member shows of a view does not depend on which points are left out
-        found.ball = self.ball
+        run.ball = self.ball
         samples = supersampling or self.renderer.supersampling
-        found.renderer = Renderer(dev, shown, raster, samples, self.renderer.margin)
+        run.renderer = Renderer(dev, shown, raster, samples, self.renderer.margin)
         if net:
             net.freeze()
-        return found
+        return run
 
     @property
     def _last_step(self):

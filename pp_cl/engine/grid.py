@@ -78,9 +78,9 @@ class Grid:
         if refined.id_count > MOST_IDS:
             raise ValueError(f"a grid of {self.dims} vertices cannot be refined")
         corners = product((0, 1), repeat=3)
-        found = np.concatenate([refined.ids(first + corner) for corner in corners])
-        order = np.argsort(found)
-        return found[order].astype(np.uint32), (order % len(ids)).astype(np.uint32)
+        child_ids = np.concatenate([refined.ids(first + corner) for corner in corners])
+        order = np.argsort(child_ids)
+        return child_ids[order].astype(np.uint32), (order % len(ids)).astype(np.uint32)
 
     @property
     def centre(self) -> np.ndarray:
@@ -167,12 +167,12 @@ class Grid:
             there = place + step
             inside = np.flatnonzero(((there >= 0) & (there < self.dims)).all(1))
             wanted = self.ids(there[inside])
-            found = np.searchsorted(ids, wanted)
-            found[found == len(ids)] = 0
-            known = ids[found] == wanted
-            found_pairs.append(np.stack([inside[known], found[known]]).astype(np.int32))
-        one, other = np.concatenate(found_pairs, 1)
-        graph = coo_array((np.ones(len(one), bool), (one, other)), (len(ids), len(ids)))
+            places = np.searchsorted(ids, wanted)
+            places[places == len(ids)] = 0
+            known = ids[places] == wanted
+            found_pairs.append(np.stack([inside[known], places[known]]).astype(np.int32))
+        vertex, neighbour = np.concatenate(found_pairs, 1)
+        graph = coo_array((np.ones(len(vertex), bool), (vertex, neighbour)), (len(ids), len(ids)))
         part = connected_components(graph, directed=False)[1]
         size = np.bincount(part)
         return size[part] >= min(least, size.max())

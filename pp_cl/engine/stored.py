@@ -127,9 +127,9 @@ def load_cloud(dev: Device, arrays: dict[str, np.ndarray], degree: int) -> Point
 
 def _network_parameters(model):
     """{name: array} of the networks."""
-    found = {f"net.{name}": array for name, array in model.net.parameters.items()}
+    parameters = {f"net.{name}": array for name, array in model.net.parameters.items()}
     layer = model.specular.parameters if model.specular else {}
-    return found | {f"specular.{name}": array for name, array in layer.items()}
+    return parameters | {f"specular.{name}": array for name, array in layer.items()}
 
 
 # ---- the training's state
@@ -167,13 +167,13 @@ def restore_training(
 def optimiser_arrays(optimiser: Optimiser) -> dict[str, DeviceRows]:
     """{name: array} of the moments, the averages and the state of the points."""
     net, split = optimiser.model.net, optimiser.model.net.split
-    found: dict[str, Array] = {}
+    of_network: dict[str, Array] = {}
     moments = {kind: split(array) for kind, array in optimiser.moments.items()}
     for name in net.parameters:
-        found |= {f"moment.{kind}.{name}": parts[name] for kind, parts in moments.items()}
+        of_network |= {f"moment.{kind}.{name}": parts[name] for kind, parts in moments.items()}
     for array in optimiser.averages.values():
-        found |= {f"average.{name}": part for name, part in split(array).items()}
-    arrays = state_arrays(optimiser.state) | found
+        of_network |= {f"average.{name}": part for name, part in split(array).items()}
+    arrays = state_arrays(optimiser.state) | of_network
     return {name: DeviceRows(optimiser.dev, array) for name, array in arrays.items()}
 
 

@@ -90,8 +90,8 @@ class View:
         before = max(-top, 0), max(-left, 0)
         after = np.subtract((height * k, width * k), np.add(before, there.shape))
         blocks = np.pad(there, list(zip(before, after, strict=True)))
-        found = np.logical_or.reduce(blocks.reshape(height, k, width, k), (1, 3))
-        return found if found.any() else None
+        ignored = np.logical_or.reduce(blocks.reshape(height, k, width, k), (1, 3))
+        return ignored if ignored.any() else None
 
     def ignoring(self, truth: np.ndarray, image: np.ndarray) -> np.ndarray:
         """(height, width, 3): the truth for an image of this view, with the image's own values at
@@ -177,10 +177,10 @@ def _extent(occupied, downscale, margin):
     """(first, last + 1) reduced pixel of the occupied stored columns or rows (N,) bool, grown by
     the margin; the whole length if none is occupied.
     """
-    size, found = len(occupied) // downscale, np.flatnonzero(occupied) // downscale
-    if found.size == 0:
+    size, pixels = len(occupied) // downscale, np.flatnonzero(occupied) // downscale
+    if pixels.size == 0:
         return 0, size
-    return max(int(found[0]) - margin, 0), min(int(found[-1]) + 1 + margin, size)
+    return max(int(pixels[0]) - margin, 0), min(int(pixels[-1]) + 1 + margin, size)
 
 
 def border(image: np.ndarray) -> np.ndarray:

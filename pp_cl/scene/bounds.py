@@ -88,7 +88,7 @@ def looking_elsewhere(views: Sequence[View]) -> list[View]:
 
     unit = 2.0 ** math.frexp(reach_of(views))[1]
     planes = [_silhouette_planes(view, None) for view in views]
-    owner = np.repeat(np.arange(len(views)), [len(some) for some in planes])
+    owner = np.repeat(np.arange(len(views)), [len(of_view) for of_view in planes])
     stacked = np.concatenate(planes)
     outside = (owner[:, None] == np.arange(len(views))).astype(float)  # each view's distance
     solution = linprog(

@@ -198,19 +198,19 @@ def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -
     return grid.ids_of(carver.carve(grid.moved(-corner), forgiven))
 
 
-def _box(views, given, forgiven):
+def _box(views, given_box, forgiven):
     """The part of the given box within the bounding box of the masks, which is doubled if some
     masks are forgiven.
     """
-    if given is not None and not any(view.has_mask for view in views):
-        return given
+    if given_box is not None and not any(view.has_mask for view in views):
+        return given_box
     box = bounding_box(views)
     if forgiven:
         box = box.mean(0) + np.array([[-1], [1]]) * np.ptp(box, axis=0)
-    if given is None:
+    if given_box is None:
         return box
-    shared = np.stack([np.maximum(box[0], given[0]), np.minimum(box[1], given[1])])
-    return shared if (shared[0] < shared[1]).all() else given
+    shared = np.stack([np.maximum(box[0], given_box[0]), np.minimum(box[1], given_box[1])])
+    return shared if (shared[0] < shared[1]).all() else given_box
 
 
 def _corner(views, reach):

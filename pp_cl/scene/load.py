@@ -129,9 +129,9 @@ def load_scene(
     file and the key for missing, broken or contradictory data, and for distortion without a device.
     """
     folder, lines = Path(path), []
-    for option, given in (("--masks", masks.masks), ("--ignore", masks.ignore)):
-        if given and not os.path.isdir(given):
-            raise UserError(f"{given}: no such folder; {option} takes a folder of masks")
+    for option, mask_folder in (("--masks", masks.masks), ("--ignore", masks.ignore)):
+        if mask_folder and not os.path.isdir(mask_folder):
+            raise UserError(f"{mask_folder}: no such folder; {option} takes a folder of masks")
     chosen: dict[str, list[ImageFile]] = {}
     left_out: dict[str, LeftOut] = {}
     for split in splits:
@@ -149,15 +149,15 @@ def load_scene(
             except UserError as error:
                 left_out[split].append((image.name, error))
         check_left(chosen[split], left_out[split], 1)
-    image_files = [image for some in chosen.values() for image in some]
+    image_files = [image for files in chosen.values() for image in files]
     if dev is None and any(image.lens for image in image_files):
         raise UserError(f"{folder}: its images have distortion, which only a device removes")
     factor = shrink_factor([(p.camera.width, p.camera.height) for p in image_files], downscale or 1)
     views = {
-        split: _read_views(folder, some, masks, dev, factor, left_out[split])
-        for split, some in chosen.items()
+        split: _read_views(folder, files, masks, dev, factor, left_out[split])
+        for split, files in chosen.items()
     }
-    has_masks = any(v.is_masked or v.has_mask for some in views.values() for v in some)
+    has_masks = any(v.is_masked or v.has_mask for of_split in views.values() for v in of_split)
     for split, gone in left_out.items():
         is_whole, done = split == "train" and most is None, []
         if has_masks:

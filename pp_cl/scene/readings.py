@@ -63,7 +63,7 @@ def readings(stated: Stated) -> list[str]:
     other = "opengl" if stated[1] == "opencv" else "opencv"
     odd = ["left-handed", "mirrored", "upside-down"]
     axes = ["", other, *odd, *(f"{name} {other}" for name in odd)]
-    several = (" ".join(filter(None, some)) for some in product(["", *QUATERNIONS], axes, kinds))
+    several = (" ".join(filter(None, words)) for words in product(["", *QUATERNIONS], axes, kinds))
     every = [*filter(None, several), SQUARE, *ORDERS, EXIF]
     return sorted(every, key=lambda reading: reading.count(" "))
 

@@ -177,7 +177,7 @@ def _small(views):
 
 
 def _alike(views, others):
-    cameras = ([view.camera.packed((0, 1)) for view in some] for some in (views, others))
+    cameras = ([view.camera.packed((0, 1)) for view in group] for group in (views, others))
     return np.array_equal(*cameras)
 
 

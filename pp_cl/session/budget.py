@@ -50,17 +50,17 @@ class Budget:
             self._times.clear()
         if len(self._times) < FEWEST or seconds < self._next:
             return None
-        given = 60 * train.minutes / train.members
-        self._next = seconds + given / PLANS
-        left = given - seconds - self._fitting
+        time_given = 60 * train.minutes / train.members
+        self._next = seconds + time_given / PLANS
+        time_left = time_given - seconds - self._fitting
         clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
-        left /= clearing * statistics.median(self._times)
-        plan = Plan.given(config).for_minutes(train, step, left, self._ending)
+        time_left /= clearing * statistics.median(self._times)
+        plan = Plan.given(config).for_minutes(train, step, time_left, self._ending)
         to_come = refine_steps(plan.train(train))
         is_coarse = self._may_stay_coarse and all(at > step for at in to_come)
         if is_coarse and plan.iterations < LEAST_REFINED * len(to_come):
             self._times.clear()  # these were of images of another size
             coarse = replace(plan, refine_at=NEVER)
-            plan = coarse.for_minutes(train, step, left / WHOLE, self._ending)
+            plan = coarse.for_minutes(train, step, time_left / WHOLE, self._ending)
         self._may_stay_coarse = False
         return plan

@@ -42,7 +42,7 @@ class MemoryPlan:
         self.follow(config)
         self.budget = config.train.memory_gib
         downscale, is_demo = config.scene.downscale, config.scene.path == DEMO
-        cameras = [one.camera for one in image_files]
+        cameras = [image_file.camera for image_file in image_files]
         sizes = [(camera.width, camera.height) for camera in cameras]
         factor = 1 if is_demo else shrink_factor(sizes, downscale)
         self._images = image_bytes(sizes, factor)
@@ -149,9 +149,9 @@ class MemoryPlan:
 
     def _need(self, of_stretches):
         """The Need of a training with these of its stretches."""
-        found = [*of_stretches]
-        peak, largest = max(found), max(need.largest for need in found)
-        host = 2 * PIECE_BYTES + max(need.host for need in found) + self.dev.is_cpu * peak.device
+        needs = [*of_stretches]
+        peak, largest = max(needs), max(need.largest for need in needs)
+        host = 2 * PIECE_BYTES + max(need.host for need in needs) + self.dev.is_cpu * peak.device
         host = self._images + max(host, self._reading_bytes)
         return peak._replace(largest=largest, host=host)
 

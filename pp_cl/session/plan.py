@@ -52,7 +52,7 @@ class Plan:
         """
         given = cls.given(config)
         is_open = given.refine_at == UNSET, given.radius == 0, given.view_opacity == "auto"
-        automatic = tuple(key for key, one in zip(AUTOMATIC, is_open, strict=True) if one)
+        automatic = tuple(key for key, is_auto in zip(AUTOMATIC, is_open, strict=True) if is_auto)
         plan = replace(given, refine_at=refine_at, automatic=automatic)
         if "train.view_opacity" in automatic:
             plan = replace(plan, view_opacity="off" if agreement.forgiven else "on")

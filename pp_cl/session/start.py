@@ -128,18 +128,18 @@ def fitting_hull(
     last = math.inf  # points of the previous try
     while True:
         memory_plan.follow(plan.settings(config))
-        found = hull.grid, len(hull.ids), depth_range(views, hull)
-        fault = memory_plan.fault_of(*found)
+        of_hull = hull.grid, len(hull.ids), depth_range(views, hull)
+        fault = memory_plan.fault_of(*of_hull)
         if fault and plan.supersampled > 0:
             plan = plan.for_memory()
             memory_plan.follow(plan.settings(config))
             given_up.append(f"features: of one sample a pixel in the end ({fault[0]})")
-            fault = memory_plan.fault_of(*found)
+            fault = memory_plan.fault_of(*of_hull)
         can_be_fewer = config.train.refine_at == UNSET and len(hull.ids) < last
-        fewer = memory_plan.coarser_points(*found) if fault and can_be_fewer else 0
+        fewer = memory_plan.coarser_points(*of_hull) if fault and can_be_fewer else 0
         if not (fault and fewer):
-            memory_plan.check_points(*found)
-            return FittingHull(agreement, hull, found[-1], plan, "\n".join(given_up))
+            memory_plan.check_points(*of_hull)
+            return FittingHull(agreement, hull, of_hull[-1], plan, "\n".join(given_up))
         if last == math.inf:
             spacing = spacing_pixels(hull.grid, cameras) / 2**to_come
             given_up.append(
@@ -155,8 +155,12 @@ def sheet_of_masks(
     dev: Device, views: list[View], hull: Hull, agreement: Agreement
 ) -> np.ndarray | None:
     """Warn of masks that disagree with the others; return an image of them, None if all agree."""
-    found, left_out = contradicting(views, hull, agreement), agreement.left_out
-    rejecting = {one.view.name: one.share for one in found if one.view.name not in left_out}
+    wrong, left_out = contradicting(views, hull, agreement), agreement.left_out
+    rejecting = {
+        disagreement.view.name: disagreement.share
+        for disagreement in wrong
+        if disagreement.view.name not in left_out
+    }
     for what, shares in (
         ("lie beside what the other views agree on, and are left out of the training", left_out),
         ("reject what the other views agree on", rejecting),
@@ -166,4 +170,4 @@ def sheet_of_masks(
             warnings.warn(
                 f"masks {what}: {worst}; see {MASKS_SHEET} in the run's folder", stacklevel=2
             )
-    return outline_sheet(dev, views, hull, found) if found or left_out else None
+    return outline_sheet(dev, views, hull, wrong) if wrong or left_out else None

@@ -118,9 +118,9 @@ class Training:
             try:
                 return self._run(on_step, is_stopped)
             except Diverged as error:
-                told = f"{self.folder.checkpoint} of step {self._saved} is kept"
+                kept = f"{self.folder.checkpoint} of step {self._saved} is kept"
                 raise UserError(
-                    f"{error}; {told if self._saved else 'nothing was kept'}: train into another"
+                    f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
                     " --out with a lower network.rate or train.sh_rate"
                 ) from None
 
@@ -191,8 +191,8 @@ class Training:
         may_stop = train.supersampled > 0 and supersampling_at(step, train) == 1
         if may_stop and self.memory_plan.fault_of(model.grid, count, model.depth_range, step):
             self._follow(Plan.given(self.config).for_memory())
-            told = f"step {step}: for lack of memory, features are of one sample a pixel"
-            warnings.warn(told, stacklevel=2)
+            message = f"step {step}: for lack of memory, features are of one sample a pixel"
+            warnings.warn(message, stacklevel=2)
         try:
             most = self.memory_plan.points_that_fit(model.grid, count, model.depth_range, step)
         except UserError as error:
@@ -234,12 +234,12 @@ class Training:
 
     def _measure(self):
         """{"test_psnr": mean PSNR of the present model's 8-bit images of the measured views}."""
-        found = []
+        psnrs = []
         for view in self.measured:
             image = self._rendered(view)
             truth = view.ignoring(self.trainer.target(view), image)
-            found.append(psnr(to_8bit(image), to_8bit(truth)))
-        return {"test_psnr": float(np.mean(found))}
+            psnrs.append(psnr(to_8bit(image), to_8bit(truth)))
+        return {"test_psnr": float(np.mean(psnrs))}
 
     def _expect_save(self):
         """Set the time of the next checkpoint; the clock influences nothing else."""
@@ -384,10 +384,10 @@ def train_scene(
     given = [(*s, "settings") for s in settings.items()]
     config = run_config(folder, str(scene), preset, given)
     dev, is_stopped = open_device(device), is_stopped or (lambda: False)
-    for one, of_one in members(folder, config):
-        stored = stored_state(one, of_one)
-        if not is_finished(stored, of_one):
-            open_training(dev, one, of_one, stored).run(on_step, is_stopped)
+    for member, member_config in members(folder, config):
+        stored = stored_state(member, member_config)
+        if not is_finished(stored, member_config):
+            open_training(dev, member, member_config, stored).run(on_step, is_stopped)
         if is_stopped():
             break
     return load(out, dev)

@@ -107,15 +107,15 @@ def replayed(function: Callable[P, R]) -> Callable[P, R]:
     def replaying(*args: P.args, **named: P.kwargs) -> R:
         place: Any = args[1]
         # without args[0], the place's device or network, which the call would keep alive
-        dev, given = place.dev, (*args[2:], *named, *named.values())
+        dev, arguments = place.dev, (*args[2:], *named, *named.values())
         call = place.calls.get(function)
         version = dev.scratch_version
-        if call is None or call.scratch != version or not _are_same(given, call.given):
+        if call is None or call.scratch != version or not _are_same(arguments, call.given):
             call = None
             place.calls.pop(function, None)  # frees its arrays
             with dev.recording() as launches:
                 result = function(*args, **named)
-            place.calls[function] = Call(dev.scratch_version, given, launches, result)
+            place.calls[function] = Call(dev.scratch_version, arguments, launches, result)
             return result
         if dev.doubts:
             dev.compare(call.launches, lambda: function(*args, **named))
@@ -125,9 +125,9 @@ def replayed(function: Callable[P, R]) -> Callable[P, R]:
     return replaying
 
 
-def _are_same(given, before):
+def _are_same(values, before):
     """Whether each value is the same object as before, or an equal number, string or tuple."""
-    return len(given) == len(before) and all(map(_is_same, given, before))
+    return len(values) == len(before) and all(map(_is_same, values, before))
 
 
 def _is_same(a, b):

@@ -74,10 +74,10 @@ def parse_signatures(source: str, file: str) -> dict[str, list[Parameter]]:
 
 
 def _parse_parameter(code, comment, where):
-    found = _PARAMETER.match(code)
-    if not found or found.group(3) not in SCALARS:
+    match = _PARAMETER.match(code)
+    if not match or match.group(3) not in SCALARS:
         raise ValueError(f"{where}: cannot read parameter {code!r}; one parameter per line")
-    space, qualifiers, base, width, star, name = found.groups()
+    space, qualifiers, base, width, star, name = match.groups()
     if bool(space) != bool(star) or (width and not star):
         raise ValueError(f"{where}: {code!r} is neither a global pointer nor a scalar")
     shape = None

@@ -166,15 +166,15 @@ def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]
             read = layer.inputs if layer.reads_input_backward else ()
             written = [gradient_of(name) for name in layer.inputs]
             schedule.append((*read, gradient_of(layer.name), *written))
-    found: dict[str, Any] = {}
+    spans: dict[str, Any] = {}
     for time, names in enumerate(schedule):
         for name in names:
-            found[name] = (found.get(name, (time,))[0], time)
-    del found["x"]
+            spans[name] = (spans.get(name, (time,))[0], time)
+    del spans["x"]
     last = layers[-1].name
-    found.pop(gradient_of(last), None)
-    found[last] = (found[last][0], len(schedule))  # the caller may read it after backward
-    return [(name, *lifetime) for name, lifetime in found.items()]
+    spans.pop(gradient_of(last), None)
+    spans[last] = (spans[last][0], len(schedule))  # the caller may read it after backward
+    return [(name, *lifetime) for name, lifetime in spans.items()]
 
 
 @dataclass

@@ -239,8 +239,8 @@ class Network:
         left, top = corner
         beside = False if ignored is None else tiles_with(ignored)
 
-        def in_reach(found):
-            return tiles_in_reach(found | beside, size, (left, top))
+        def in_reach(tiles):
+            return tiles_in_reach(tiles | beside, size, (left, top))
 
         return tiles_find(self.dev, target, WHITE, in_reach)
 
@@ -369,7 +369,7 @@ class Network:
         """The Conv of each convolution for images of a size, and in training also those of the
         backward pass; their own arrays are not yet allocated.
         """
-        found: Convs = {}
+        convs: Convs = {}
         for layer in convolutions(self.layers):
             here = size[0] >> layer.level, size[1] >> layer.level
             for direction in DIRECTIONS if training else ("forward",):
@@ -379,8 +379,8 @@ class Network:
                 weight, bias = (self.parameters[f"{layer.name}.{n}"] for n in ("weight", "bias"))
                 is_last = layer is self.layers[-1]  # output_forward() halves its output
                 conv = Conv(self.dev, self.blocking, variant, shape, weight, bias, is_last)
-                found[layer.name, direction] = conv
-        return found
+                convs[layer.name, direction] = conv
+        return convs
 
     def table(self, crop: Size, image: Size) -> Table:
         """The arrays of a network that is trained on crops of one size and renders images of

@@ -131,9 +131,9 @@ class Loss:
         if distortion is not None:
             further["distortion"] = distortion_weight, scale
             downloaded = read_later(self.dev, distortion)
-        given = step, self._window_rows, self.ssim_weight, further, downloaded
+        arguments = step, self._window_rows, self.ssim_weight, further, downloaded
         terms = self._buffers.terms
-        return read_later(self.dev, terms, convert=lambda rows: _by_name(rows, *given))
+        return read_later(self.dev, terms, convert=lambda rows: _by_name(rows, *arguments))
 
     def _launch(self, kernel, rows, **arguments):
         defines = _defines(self.dev)
@@ -146,10 +146,10 @@ def _by_name(rows, step, window_rows, ssim_weight, further, distortion):
     """
     dissimilarity = rows[:window_rows].sum(0, dtype=np.float64)[0]
     smooth, l1, mse, mask = rows[window_rows:].sum(0, dtype=np.float64)
-    found = {"mask": mask}
+    further_sums = {"mask": mask}
     if "distortion" in further:
-        found["distortion"] = distortion.get().sum(dtype=np.float64)
-    more = {name: float(found[name] * scale) for name, (_, scale) in further.items()}
+        further_sums["distortion"] = distortion.get().sum(dtype=np.float64)
+    more = {name: float(further_sums[name] * scale) for name, (_, scale) in further.items()}
     total = smooth + ssim_weight * dissimilarity
     total += sum(more[name] * weight for name, (weight, _) in further.items())
     terms = {

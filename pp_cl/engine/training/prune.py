@@ -31,11 +31,11 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainC
     Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
     weight, opacities = _weights_and_opacities(dev, state, opacity)
-    seen = dev.download(state.times_seen)
-    judged = seen >= schedule.PRUNE_LOOKS
+    times_seen = dev.download(state.times_seen)
+    judged = times_seen >= schedule.PRUNE_LOOKS
     passes = (weight >= train.prune_weight) & (opacities >= LEAST_OPACITY)
     dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
-    dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
+    dev.write(state.times_seen, np.where(judged, np.float32(0), times_seen))
     return _listed(dev, ~judged | passes, weight)
 
 
@@ -69,8 +69,8 @@ def final_points_to_keep(
     max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
     many it is train.prune_weight.
     """
-    weight, seen = dev.download(max_weight), dev.download(times_seen)
-    keep = (weight >= train.prune_weight) & (seen >= least)
+    weight, counts = dev.download(max_weight), dev.download(times_seen)
+    keep = (weight >= train.prune_weight) & (counts >= least)
     return _listed(dev, keep & (dev.download(opacity)[:, 0] >= LEAST_OPACITY), weight)
 
 
@@ -79,13 +79,13 @@ def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Co
     that only one shows is mostly a floater. (M,) uint32, as final_points_to_keep().
     """
     dev, cloud, train = renderer.dev, renderer.model.cloud, config.train
-    max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
+    max_weight, times_seen = (dev.zeros((cloud.count,)) for _ in range(2))
     for view in views:
         drawn = renderer.forward(view.camera, schedule.GAMMA[1], until="weights")
-        renderer.record_weights(drawn, max_weight, seen, least=train.prune_weight)
+        renderer.record_weights(drawn, max_weight, times_seen, least=train.prune_weight)
         del drawn  # frees its arrays before the next view allocates
     least = 2 if len(views) >= MANY_VIEWS else 1
-    return final_points_to_keep(dev, max_weight, seen, cloud.opacity, train, least)
+    return final_points_to_keep(dev, max_weight, times_seen, cloud.opacity, train, least)
 
 
 def points_of_large_parts(model: Model) -> Array:

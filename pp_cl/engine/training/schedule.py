@@ -102,11 +102,11 @@ def refine_steps(train: TrainConfig) -> list[int]:
     """
     shares = (share for share in train.refine_at if 0 < share < 1)
     steps = sorted({max(1, round(share * train.iterations)) for share in shares})
-    found = steps[:1]
+    kept = steps[:1]
     for step in steps[1:]:
-        if prunings(train, found[-1], step) or train.prune_weight == 0:
-            found.append(step)
-    return found
+        if prunings(train, kept[-1], step) or train.prune_weight == 0:
+            kept.append(step)
+    return kept
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,11 @@ def expected_stretches(train: TrainConfig, points: int, step: int) -> Iterator[S
     for end in sorted(ends | {train.iterations}):
         if step < end:
             now = max(start, step)
-            left, supersampling = sum(now < at for at in refined), supersampling_at(now, train)
-            yield Stretch(points, left, averaged <= now, supersampling)
+            refinements, supersampling = (
+                sum(now < at for at in refined),
+                supersampling_at(now, train),
+            )
+            yield Stretch(points, refinements, averaged <= now, supersampling)
             stage = max(at for at in stages if at <= start), min(at for at in stages if at >= end)
             to_come = prunings(train, now, end) / max(1, prunings(train, *stage))
             points = round(points * LEFT_BY_PRUNING**to_come) * (8 if end in refined else 1)

@@ -85,11 +85,11 @@ def _splatting_camera(frame, size):
     return Camera(pose, fx, fx if fy is None else fy, width / 2, height / 2, width, height)
 
 
-def _size(frame, keys, given):
+def _size(frame, keys, size):
     """(width, height) in whole pixels that the frame states, or else the given one."""
     stated = [frame.number(key, above=0, below=MOST_PIXELS) for key in keys]
     if None in stated:
-        if given is None:
+        if size is None:
             raise frame.error(keys[stated.index(None)], "is missing; add it, or give --size WxH")
-        return given
+        return size
     return tuple(max(1, round(side)) for side in stated)

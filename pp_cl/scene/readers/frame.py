@@ -83,13 +83,13 @@ class Frame:
 
     def image(self, key: str, folder: Path) -> str | None:
         """find_image() for the path that a key holds; None if it is absent. Raises UserError."""
-        given = self.get(key)
+        path = self.get(key)
         kind = "mask" if key == "mask_path" else "image"
-        if given is None:
+        if path is None:
             return None
-        if not isinstance(given, str) or not given:
+        if not isinstance(path, str) or not path:
             raise Unusable(self.error(key, "must be the path of an image"), f"no {kind}")
-        return find_image(folder, given, partial(self.error, key), kind)
+        return find_image(folder, path, partial(self.error, key), kind)
 
 
 def frame_keys(camera: Camera) -> dict[str, Any]:

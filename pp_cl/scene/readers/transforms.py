@@ -199,7 +199,7 @@ def _image_file(folder, frame):
     mask = frame.image("mask_path", folder)
     stated = frame.number("w", above=0), frame.number("h", above=0)
     size = image_size(folder / name, None if None in stated else stated)
-    whole = [given or side for given, side in zip(stated, size, strict=True)]
+    whole = [stated_side or side for stated_side, side in zip(stated, size, strict=True)]
     camera = fitted(pinhole(frame, *whole), size, partial(frame.error, "w"))
     near_far = frame.number("near", above=0), frame.number("far", above=0)
     is_stated = near_far != (None, None)
