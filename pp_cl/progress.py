@@ -123,8 +123,8 @@ class Progress:
         return f"{self._what}: {', '.join(parts + [self.note] * bool(self.note))}"
 
     def _left(self):
-        left = max(self._given - self._done / 60, 0.0)
-        return f"{left:.1f} of {self._given:.1f} minutes left"
+        minutes_left = max(self._given - self._done / 60, 0.0)
+        return f"{minutes_left:.1f} of {self._given:.1f} minutes left"
 
 
 def track(

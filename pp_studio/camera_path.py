@@ -32,7 +32,7 @@ def around(
     """
     up, centre = up_of(cameras), (points.min(axis=0) + points.max(axis=0)) / 2
     points = points[:: max(1, len(points) // SAMPLED_POINTS)] - centre
-    offsets = np.array([one.eye - centre for one in cameras])
+    offsets = np.array([view_camera.eye - centre for view_camera in cameras])
     distances = np.linalg.norm(offsets, axis=1)
     elevations = np.arcsin(np.clip(offsets @ up / distances, -1, 1)).clip(-HIGHEST, HIGHEST)
     ahead = level(offsets[0], up)
@@ -88,20 +88,20 @@ def between(cameras: Sequence[Camera]) -> list[Camera]:
     offsets = np.stack([camera.eye - centre for camera in cameras])
     distances = np.linalg.norm(offsets, axis=1)
     directions = offsets / np.maximum(distances, np.finfo(float).tiny)[:, None]
-    found = []
+    halfway = []
     for i, camera in enumerate(cameras):
         cosines = directions @ directions[i]
         nearest = [j for j in np.argsort(-cosines, kind="stable") if j != i and cosines[j] > 0]
         if not nearest:
-            found.append(camera)
+            halfway.append(camera)
             continue
         j = nearest[i % min(len(nearest), NEIGHBOURS)]
         turn, _ = Rotation.align_vectors([directions[i] + directions[j]], [directions[i]])
         scale = (1 + distances[j] / distances[i]) / 2
         pose = np.column_stack([camera.pose[:, :3], scale * offsets[i]])
         pose = turn.as_matrix() @ pose + np.pad(centre[:, None], ((0, 0), (3, 0)))
-        found.append(replace(camera, pose=pose))
-    return found
+        halfway.append(replace(camera, pose=pose))
+    return halfway
 
 
 def level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -31,10 +31,10 @@ def fineness(run: Run, camera: Camera) -> float:
     """
     centre = run.ball[0]
 
-    def scale(one):
-        return min(one.fx, one.fy) / max(float(np.linalg.norm(one.eye - centre)), 1e-30)
+    def scale(viewer):
+        return min(viewer.fx, viewer.fy) / max(float(np.linalg.norm(viewer.eye - centre)), 1e-30)
 
-    return float(scale(camera) / np.median([scale(one) for one in run.cameras("train")]))
+    return float(scale(camera) / np.median([scale(viewer) for viewer in run.cameras("train")]))
 
 
 def parts(run: Run, camera: Camera, most: int = MOST_PARTS) -> int:
@@ -63,10 +63,10 @@ def render_large(
         on_part()
         return run.render(camera, samples=samples, **options)
     shifts = (np.arange(side) + 0.5) / side - 0.5
-    seen = (
+    shifted_views = (
         woven(run, camera.shifted(dx, dy), n, on_part, **options) for dy in shifts for dx in shifts
     )
-    return smooth_outlines(mean_rendered_view(seen), n)
+    return smooth_outlines(mean_rendered_view(shifted_views), n)
 
 
 def woven(

@@ -81,12 +81,12 @@ def write_scenes(folder: Path) -> None:
 
 def digest(*arrays) -> str:
     """Hex digest of bytes, or of arrays with their shapes and dtypes."""
-    found = hashlib.sha256()
-    for one in arrays:
-        if isinstance(one, np.ndarray):
-            found.update(f"{one.dtype}{one.shape}".encode())
-        found.update(one if isinstance(one, bytes) else np.ascontiguousarray(one).tobytes())
-    return found.hexdigest()[:16]
+    hasher = hashlib.sha256()
+    for array in arrays:
+        if isinstance(array, np.ndarray):
+            hasher.update(f"{array.dtype}{array.shape}".encode())
+        hasher.update(array if isinstance(array, bytes) else np.ascontiguousarray(array).tobytes())
+    return hasher.hexdigest()[:16]
 
 
 def log_rows(file: Path) -> bytes:
@@ -110,21 +110,21 @@ def digests(name: str, scenes: Path, out: Path) -> dict[str, str]:
         step = at
 
     train_scene(scene, out, settings=settings, on_step=on_step, is_stopped=lambda: step == STOP)
-    found = {"half": digest((out / "checkpoint.npz").read_bytes())}
+    hashes = {"half": digest((out / "checkpoint.npz").read_bytes())}
     run = train_scene(scene, out, settings=settings)
-    found["checkpoint"] = digest((out / "checkpoint.npz").read_bytes())
-    found["log"] = digest(log_rows(out / "log.jsonl"))
-    found["config"] = digest((out / "config.json").read_bytes())
+    hashes["checkpoint"] = digest((out / "checkpoint.npz").read_bytes())
+    hashes["log"] = digest(log_rows(out / "log.jsonl"))
+    hashes["config"] = digest((out / "config.json").read_bytes())
     view = run.render(run.cameras("test")[0], features=True)
     shown = view.colour, view.alpha, view.depth, view.median_depth, view.features
-    found["rendering"] = digest(*shown)
+    hashes["rendering"] = digest(*shown)
     if name == "gaussians":
         from pp_studio.export.gaussians import fit_gaussians
 
         cloud = fit_gaussians(run, STEPS, cell=0)
         arrays = [array.get() for array in (cloud.ids, cloud.offset, cloud.opacity, *cloud.sh)]
-        found["fitted"] = digest(*arrays)
-    return found
+        hashes["fitted"] = digest(*arrays)
+    return hashes
 
 
 def of_tree(tree: Path, scenes: Path, names: list[str], driver: str, form: str) -> dict:
@@ -153,8 +153,8 @@ def compare(base: Path, drivers: list[str], forms: list[str], names: list[str]) 
                     both = ours[name], theirs[name]
                     differs = [what for what in both[0] if both[0][what] != both[1].get(what)]
                     differing += len(differs)
-                    told = f"differs: {', '.join(differs)}" if differs else "same bits"
-                    print(f"{driver}, {form}: {name:14s}{told}", flush=True)
+                    verdict = f"differs: {', '.join(differs)}" if differs else "same bits"
+                    print(f"{driver}, {form}: {name:14s}{verdict}", flush=True)
     return differing
 
 
@@ -173,8 +173,8 @@ def main() -> int:
 
         if options.tree not in Path(pp_cl.__file__).parents:
             raise SystemExit(f"{pp_cl.__file__} is imported, which is not in {options.tree}")
-        found = {n: digests(n, options.scenes, options.out / n) for n in options.settings}
-        print(json.dumps(found))
+        hashes = {n: digests(n, options.scenes, options.out / n) for n in options.settings}
+        print(json.dumps(hashes))
         return 0
     if not options.base:
         parser.error("say what to compare with: a commit, or a folder")

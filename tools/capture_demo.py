@@ -52,9 +52,9 @@ def cameras(size: int, kind: str = "photographs") -> list[Camera]:
     if kind == "video":
         shares = np.arange(VIDEO_FRAMES) / VIDEO_FRAMES
         return [_around(ROUNDS * s, 0.9 * s, size, size * 9 // 32 * 2) for s in shares]
-    found = [frame.camera for frame in demo_frames("train", size)]
-    angle = 2 * np.arctan(0.5 * size / found[0].fx)
-    return [camera.with_angle(WIDER * angle) for camera in found]
+    demo_cameras = [frame.camera for frame in demo_frames("train", size)]
+    angle = 2 * np.arctan(0.5 * size / demo_cameras[0].fx)
+    return [camera.with_angle(WIDER * angle) for camera in demo_cameras]
 
 
 def _around(turn, elevation, width, height, angle=WIDER * ANGLE):
@@ -79,7 +79,7 @@ def room(camera: Camera, octaves: Sequence[float] = OCTAVES) -> np.ndarray:
     for cells in octaves:
         noise = rng.uniform(0, 1, (3, NOISE_CELLS, NOISE_CELLS, NOISE_CELLS))
         at = np.moveaxis(places * cells, -1, 0)
-        layers.append([map_coordinates(one, at, order=1, mode="grid-wrap") for one in noise])
+        layers.append([map_coordinates(volume, at, order=1, mode="grid-wrap") for volume in noise])
     return np.moveaxis(np.mean(layers, axis=0), 0, -1)
 
 
@@ -106,7 +106,7 @@ def write_photographs(dev: Device, folder: Path, size: int, kind: str = "photogr
 
 def align(found: list[Camera], true: list[Camera]) -> Alignment:
     """Move the found cameras onto the true ones by a similarity (Umeyama 1991)."""
-    eyes, targets = (np.stack([camera.eye for camera in some]) for some in (found, true))
+    eyes, targets = (np.stack([camera.eye for camera in group]) for group in (found, true))
     a, b = eyes - eyes.mean(0), targets - targets.mean(0)
     u, sizes, vt = np.linalg.svd(b.T @ a)
     signs = np.array([1, 1, np.linalg.det(u @ vt)])
@@ -123,10 +123,10 @@ def align(found: list[Camera], true: list[Camera]) -> Alignment:
 
 def compare(folder: Path, kind: str) -> tuple[int, Alignment]:
     """(number of images with a camera, Alignment of these). Raises UserError as readers do."""
-    placed = [one for split in ("train", "test") for one in scene_frames(folder, split)]
+    placed = [frame for split in ("train", "test") for frame in scene_frames(folder, split)]
     true = cameras(placed[0].camera.width, kind)
-    places = [int(Path(one.name).stem) for one in placed]
-    return len(places), align([one.camera for one in placed], [true[i] for i in places])
+    places = [int(Path(frame.name).stem) for frame in placed]
+    return len(places), align([frame.camera for frame in placed], [true[i] for i in places])
 
 
 def main() -> int:
@@ -140,9 +140,9 @@ def main() -> int:
     options = parser.parse_args()
     try:
         if options.task == "compare":
-            count, found = compare(options.path, options.kind)
-            print(f"{count} images; positions off by {found.position:.5f} world units (RMS),")
-            print(f"directions by at most {found.degrees:.3f} degrees")
+            count, alignment = compare(options.path, options.kind)
+            print(f"{count} images; positions off by {alignment.position:.5f} world units (RMS),")
+            print(f"directions by at most {alignment.degrees:.3f} degrees")
         elif options.task == "video":
             taken = photographs(open_device(), options.size, "video")
             write_video(options.path, (to_8bit(colours) for colours, _ in taken), FPS)

@@ -90,9 +90,9 @@ def depth_error(run: Run) -> DepthError:
         stored = view.image[..., 3].reshape(view.camera.height, k, view.camera.width, k)
         mask = stored.mean(axis=(1, 3)) > 127.5
         exact = surface.depth(view.camera)
-        seen, most = mask & np.isfinite(exact), NEAR * run.model.grid.voxel_size
+        on_object, most = mask & np.isfinite(exact), NEAR * run.model.grid.voxel_size
         depths = rendered.depth, rendered.median_depth
-        shares = [near_share(depth, exact, seen, most) for depth in depths]
+        shares = [near_share(depth, exact, on_object, most) for depth in depths]
         rows.append((*shares, overlap(rendered.alpha > 0.5, mask)))
     return DepthError(*np.mean(rows, axis=0).tolist())
 

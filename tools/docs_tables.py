@@ -92,9 +92,9 @@ def readme(results: dict) -> dict[str, str]:
     """
     first, *others = results["rows"]
     beside = "".join(
-        f" With {one['driver']} it is {one['points']} points, and {one['psnr']}, {one['ssim']},"
-        f" {one['lpips']}."
-        for one in others
+        f" With {row['driver']} it is {row['points']} points, and {row['psnr']}, {row['ssim']},"
+        f" {row['lpips']}."
+        for row in others
     )
     about = f"These lines are what the driver {first['driver']} gives with {first['kind']}.{beside}"
     lines = ["    " + line for line in first["table"]]
@@ -151,10 +151,10 @@ def api() -> str:
     for name in TOLD:
         module = importlib.import_module(name)
         lines += [f"## {name}", "", _first_sentence(module.__doc__), ""]
-        for one in public_names(module):
-            thing = getattr(module, one)
-            lines += _described(one, thing) if id(thing) not in seen else [f"- `{one}`: above"]
-            seen.add(id(thing))
+        for symbol in public_names(module):
+            obj = getattr(module, symbol)
+            lines += _described(symbol, obj) if id(obj) not in seen else [f"- `{symbol}`: above"]
+            seen.add(id(obj))
         lines += [""]
     others = [importlib.import_module(name) for name in PUBLIC if name not in TOLD]
     lines += [
@@ -181,44 +181,44 @@ def _first_sentence(text: str | None) -> str:
     return re.split(r"(?<=\.)\s", paragraph)[0]
 
 
-def _described(name: str, thing: Any) -> list[str]:
+def _described(name: str, obj: Any) -> list[str]:
     """The lines of a name: a constant, a type, a function, or a class with its public methods."""
-    if not (inspect.isroutine(thing) or inspect.isclass(thing)):
-        if isinstance(thing, (int, str)):
-            return [f"- `{name} = {thing!r}`"]
-        is_type = get_origin(thing) is not None
-        value = re.sub(r"(collections\.abc|typing)\.", "", str(thing)) if is_type else ""
-        return [f"- `{name} = {value}`" if is_type else f"- `{name}: {type(thing).__name__}`"]
-    lines = [f"- `{name}{_signature(thing)}`: {_first_sentence(thing.__doc__)}"]
-    members = _members(thing) if inspect.isclass(thing) else []
-    return [*lines, "", *(f"        {one}" for one in members), ""] if members else lines
+    if not (inspect.isroutine(obj) or inspect.isclass(obj)):
+        if isinstance(obj, (int, str)):
+            return [f"- `{name} = {obj!r}`"]
+        is_type = get_origin(obj) is not None
+        value = re.sub(r"(collections\.abc|typing)\.", "", str(obj)) if is_type else ""
+        return [f"- `{name} = {value}`" if is_type else f"- `{name}: {type(obj).__name__}`"]
+    lines = [f"- `{name}{_signature(obj)}`: {_first_sentence(obj.__doc__)}"]
+    members = _members(obj) if inspect.isclass(obj) else []
+    return [*lines, "", *(f"        {member}" for member in members), ""] if members else lines
 
 
-def _members(thing: type) -> list[str]:
+def _members(obj: type) -> list[str]:
     """The signatures of a class's public methods and properties; none for an error."""
-    found = []
-    for name, member in vars(thing).items():
-        if name[0] == "_" or name in getattr(thing, "_fields", ()) or issubclass(thing, Exception):
+    lines = []
+    for name, member in vars(obj).items():
+        if name[0] == "_" or name in getattr(obj, "_fields", ()) or issubclass(obj, Exception):
             continue
         if isinstance(member, (property, cached_property)):
             function = member.fget if isinstance(member, property) else member.func
-            found.append(f".{name}: {_signature(function).partition(' -> ')[2]}")
+            lines.append(f".{name}: {_signature(function).partition(' -> ')[2]}")
         elif isinstance(member, (classmethod, staticmethod)) or inspect.isfunction(member):
-            found.append(f".{name}{_signature(getattr(member, '__func__', member))}")
-    return found
+            lines.append(f".{name}{_signature(getattr(member, '__func__', member))}")
+    return lines
 
 
-def _signature(thing: Any) -> str:
+def _signature(obj: Any) -> str:
     """The typed signature of a function, or of a class's constructor, as in the source."""
-    (node,) = ast.parse(textwrap.dedent(inspect.getsource(thing))).body
+    (node,) = ast.parse(textwrap.dedent(inspect.getsource(obj))).body
     if isinstance(node, ast.ClassDef):
-        inits = [one for one in node.body if getattr(one, "name", "") == "__init__"]
+        inits = [child for child in node.body if getattr(child, "name", "") == "__init__"]
         if not inits:  # a dataclass, a NamedTuple
-            fields = [ast.unparse(one) for one in node.body if isinstance(one, ast.AnnAssign)]
-            shown = [one for one in fields if one[0] != "_" and "init=False" not in one]
-            return f"({', '.join(one.split(' = field(')[0] for one in shown)})" if shown else ""
+            fields = [ast.unparse(child) for child in node.body if isinstance(child, ast.AnnAssign)]
+            shown = [field for field in fields if field[0] != "_" and "init=False" not in field]
+            return f"({', '.join(field.split(' = field(')[0] for field in shown)})" if shown else ""
         (node,) = inits
-    node.args.args = [one for one in node.args.args if one.arg not in ("self", "cls")]
+    node.args.args = [arg for arg in node.args.args if arg.arg not in ("self", "cls")]
     returned = f" -> {ast.unparse(node.returns)}" if node.returns else ""
     text = f"({ast.unparse(node.args)}){returned}".removesuffix(" -> None")
     return re.sub(r"'([A-Z]\w+)'", r"\1", text)

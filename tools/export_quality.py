@@ -27,11 +27,11 @@ EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances
 
 def mesh_figures(run: Run) -> dict:
     """The figures of the exported mesh; distances only if the run is on demo."""
-    found = surface(run)
-    solid = trimesh.Trimesh(found.vertices, found.faces, process=False)
+    geometry = surface(run)
+    solid = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
     figures = {
-        "faces": len(found.faces),
-        "guessed": round(1 - seen_first(found.faces, found.seen)[1] / len(found.faces), 3),
+        "faces": len(geometry.faces),
+        "guessed": round(1 - seen_first(geometry.faces, geometry.seen)[1] / len(geometry.faces), 3),
         "parts": int(solid.body_count),
         "euler": int(solid.euler_number),
         "roughness": round(float(np.degrees(solid.face_adjacency_angles).mean()), 1),
@@ -45,7 +45,7 @@ def _distances(run, solid):
     away = map_coordinates(distances(run.dev, EXACT), at[:, ::-1].T, order=1, mode="nearest")
     back, _ = cKDTree(points).query(demo_mesh(run.dev)[0])
     both = {"mean": np.abs(away).mean(), "median": np.median(np.abs(away)), "back": back.mean()}
-    return {name: round(float(one) / run.model.grid.voxel_size, 2) for name, one in both.items()}
+    return {name: round(float(gap) / run.model.grid.voxel_size, 2) for name, gap in both.items()}
 
 
 def main() -> int:

@@ -72,10 +72,10 @@ def recorded() -> Iterator[dict[Build, set[str]]]:
     builds, program, launch = {}, Device.program, Program.launch
 
     def build(device, name, **defines):
-        found = program(device, name, **defines)
-        found.build = Build(name, tuple(f"{k}={v}" for k, v in sorted(defines.items())))
-        builds.setdefault(found.build, set())
-        return found
+        built = program(device, name, **defines)
+        built.build = Build(name, tuple(f"{k}={v}" for k, v in sorted(defines.items())))
+        builds.setdefault(built.build, set())
+        return built
 
     def noted(self, kernel_name, /, *args, **arguments):
         builds[self.build].add(kernel_name)
@@ -114,10 +114,10 @@ def record() -> dict[Build, set[str]]:
 def environment() -> dict[str, str]:
     """The environment in which unpacked programs find their libraries and each other."""
     libraries = [str(path) for path in sorted((FOLDER / "usr" / "lib").glob("*-linux-gnu"))]
-    given = [os.environ[name] for name in ("LD_LIBRARY_PATH",) if os.environ.get(name)]
+    inherited = [os.environ[name] for name in ("LD_LIBRARY_PATH",) if os.environ.get(name)]
     programs = [os.environ["PATH"], str(FOLDER / "usr" / "bin")]
-    paths = {"PATH": programs, "LD_LIBRARY_PATH": given + libraries}
-    return {**os.environ, **{name: os.pathsep.join(found) for name, found in paths.items()}}
+    paths = {"PATH": programs, "LD_LIBRARY_PATH": inherited + libraries}
+    return {**os.environ, **{name: os.pathsep.join(folders) for name, folders in paths.items()}}
 
 
 def find(name: str) -> str | None:
@@ -149,8 +149,8 @@ def unpack_missing() -> str:
         for deb in sorted(debs.glob("*.deb")):
             _run(["dpkg", "-x", str(deb), str(FOLDER)])
     except BuildError as error:
-        said = (str(error).splitlines() or ["no reason given"])[-1]
-        return f"apt-get or dpkg failed ({said}); apt-get update may help"
+        reason = (str(error).splitlines() or ["no reason given"])[-1]
+        return f"apt-get or dpkg failed ({reason}); apt-get update may help"
     shutil.rmtree(debs)
     return ""
 
@@ -159,14 +159,14 @@ def missing(target: str, problem: str) -> list[str]:
     """A line for each missing compiler of a target. problem: why it was not fetched."""
     kind = target[:3]
     names = {"sm_": (CLANG, PTXAS), "gfx": (CLANG, LINKER)}.get(kind, (OCLOC,))
-    told = []
+    lines = []
     for name in (*names, *([LIBRARIES[kind]] if kind in LIBRARIES else [])):
         if not find(name):
             mend = "install CUDA's compiler, or nvidia-cuda-nvcc into .venv by pip"
             mend = mend if name == PTXAS else f"it is in Debian's package {PACKAGES[name]}"
             why = f" ({problem})" if problem else ""
-            told.append(f"{target} is not checked: {name} is missing: {mend}{why}")
-    return told
+            lines.append(f"{target} is not checked: {name} is missing: {mend}{why}")
+    return lines
 
 
 def _run(command, folder=None):
@@ -176,10 +176,10 @@ def _run(command, folder=None):
         [path or command[0], *command[1:]],
         cwd=folder, env=environment(), capture_output=True, text=True, errors="replace",
     )  # fmt: skip
-    said = ran.stdout + ran.stderr
-    if ran.returncode or "Build failed" in said:
-        raise BuildError(said.strip())
-    return said
+    output = ran.stdout + ran.stderr
+    if ran.returncode or "Build failed" in output:
+        raise BuildError(output.strip())
+    return output
 
 
 # --------------------------------------------------------------------------------------------------
@@ -213,17 +213,17 @@ def complaints(said: str) -> list[str]:
     for AMD or ocloc printed. AMD's scratch memory also holds arrays whose index is not constant;
     scalar registers spill into vector registers.
     """
-    found, kernel = [], ""
+    problems, kernel = [], ""
     for line in said.splitlines():
         named = re.search(r"entry function '(\w+)'|Function Name: (\w+)|kernel (\w+)\s", line)
         kernel = next(filter(None, named.groups())) if named else kernel
         spill = re.search(SPILL, line)
         local = re.search(r"(\d+) bytes smem|LDS Size \[bytes/block\]: (\d+)", line)
         if spill and int(next(filter(None, spill.groups()))):
-            found.append(f"{kernel}: spills {spill[0]}")
+            problems.append(f"{kernel}: spills {spill[0]}")
         if local and int(local[1] or local[2]) > MOST_LOCAL:
-            found.append(f"{kernel}: {local[0]} of local memory; {MOST_LOCAL} are the most")
-    return found
+            problems.append(f"{kernel}: {local[0]} of local memory; {MOST_LOCAL} are the most")
+    return problems
 
 
 def check(target: str, build: Build, kernels: set[str]) -> list[str]:
@@ -232,8 +232,8 @@ def check(target: str, build: Build, kernels: set[str]) -> list[str]:
     """
     with TemporaryDirectory() as folder:
         try:
-            said = compile_build(target, build, kernel_folder(), Path(folder))
-            wrong = [line for line in complaints(said) if line.partition(":")[0] in kernels]
+            output = compile_build(target, build, kernel_folder(), Path(folder))
+            wrong = [line for line in complaints(output) if line.partition(":")[0] in kernels]
         except BuildError as error:
             wrong = [f"does not build or link: {error}"]
     return [f"{target} {build}: {line}" for line in wrong]

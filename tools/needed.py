@@ -26,13 +26,13 @@ def cells(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """Which cells of the box are in the hull and which have a point, each (x, y, z) bool."""
     views = run.scene("train").splits["train"]
     hull, _ = first_hull(run.dev, run.config, judged(run.dev, run.config, views)[0])
-    grid, found = run.model.grid, []
+    grid, masks = run.model.grid, []
     for of, ids in ((hull.grid, hull.ids), (grid, run.dev.download(run.model.cloud.ids))):
         is_there = np.zeros(of.dims, bool)
         is_there[tuple(of.coordinates(ids).T)] = True
         times = grid.dims[0] // of.dims[0]  # the grid was refined since
-        found.append(is_there.repeat(times, 0).repeat(times, 1).repeat(times, 2))
-    return found[0], found[1]
+        masks.append(is_there.repeat(times, 0).repeat(times, 1).repeat(times, 2))
+    return masks[0], masks[1]
 
 
 def tiles(run: Run) -> tuple[np.ndarray, np.ndarray]:

@@ -23,12 +23,12 @@ KINDS = (".py", ".cl", ".h", ".npz", ".json")
 def digest(root: Path = ROOT) -> str:
     """Hex digest of the files that decide a training in a checkout."""
     files = [file for place in DECIDES for file in _files(root / place)]
-    found = hashlib.sha256()
-    for file in sorted(files, key=lambda one: one.relative_to(root).as_posix()):
+    hasher = hashlib.sha256()
+    for file in sorted(files, key=lambda path: path.relative_to(root).as_posix()):
         if file.suffix in KINDS:
             name, content = file.relative_to(root).as_posix(), file.read_bytes()
-            found.update(f"{name} {len(content)} ".encode() + content)
-    return found.hexdigest()[:16]
+            hasher.update(f"{name} {len(content)} ".encode() + content)
+    return hasher.hexdigest()[:16]
 
 
 def _files(place):
@@ -37,8 +37,8 @@ def _files(place):
 
 def sentence(results: dict) -> str:
     """The sentence that states the commit, date, machine and method of a file of results."""
-    said = f"Commit {results['commit']}, {results['date']}, {results['machine']}"
-    return said + (f"; {results['how']}." if results.get("how") else ".")
+    text = f"Commit {results['commit']}, {results['date']}, {results['machine']}"
+    return text + (f"; {results['how']}." if results.get("how") else ".")
 
 
 def older(folder: Path, now: str) -> list[str]:
@@ -54,9 +54,9 @@ def older(folder: Path, now: str) -> list[str]:
 
 def main(root: Path = ROOT) -> int:
     """Print which figures are older than the code; returns the exit status."""
-    found = older(root / "docs" / "results", digest(root))
-    print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
-    return 1 if found else 0
+    lines = older(root / "docs" / "results", digest(root))
+    print(*lines, sep="\n", end="\n" if lines else "", file=sys.stderr)
+    return 1 if lines else 0
 
 
 if __name__ == "__main__":

@@ -30,14 +30,14 @@ EVALUATED = re.compile(
 
 def commands() -> list[str]:
     """README's commands that train and evaluate the demo, word for word."""
-    found = COMMANDS.findall((ROOT / "README.md").read_text("utf-8"))
-    return [train or evaluate for train, evaluate in found]
+    matches = COMMANDS.findall((ROOT / "README.md").read_text("utf-8"))
+    return [train or evaluate for train, evaluate in matches]
 
 
 def drivers() -> dict[str, int]:
     """{platform: floats in a vector} of the CPU devices that work."""
-    found = [device for _, device, problem in list_devices() if not problem]
-    return {one.platform.name: one.native_vector_width_float for one in found}
+    devices = [device for _, device, problem in list_devices() if not problem]
+    return {device.platform.name: device.native_vector_width_float for device in devices}
 
 
 def machine() -> str:
@@ -47,7 +47,7 @@ def machine() -> str:
 
 def typed(driver: str) -> list[str]:
     """The lines that README's commands print on a driver, in an empty folder."""
-    said = []
+    lines = []
     environment = os.environ | {"PP_DEVICE": driver, "PYTHONPATH": str(ROOT)}
     with tempfile.TemporaryDirectory() as folder:
         for command in commands():
@@ -55,8 +55,8 @@ def typed(driver: str) -> list[str]:
             done = subprocess.run(
                 words, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True
             )
-            said += done.stdout.splitlines()
-    return said
+            lines += done.stdout.splitlines()
+    return lines
 
 
 def row(driver: str, width: int) -> dict:
@@ -64,8 +64,8 @@ def row(driver: str, width: int) -> dict:
     lines = typed(driver)
     numbers = {}
     for form in (TRAINED, EVALUATED):
-        [found] = filter(None, map(form.match, lines))
-        numbers |= found.groupdict()
+        [match] = filter(None, map(form.match, lines))
+        numbers |= match.groupdict()
     head = next(line for line in lines if line.split() == ["psnr", "ssim", "lpips"])
     shown = [head, next(line for line in lines if EVALUATED.match(line))]
     trained = next(line for line in lines if TRAINED.match(line))
@@ -76,7 +76,7 @@ def main() -> int:
     """Measure on every driver and store the rows; returns the exit status."""
     rows = [row(driver, width) for driver, width in drivers().items()]
     # Intel's first: README's own install line installs it
-    rows.sort(key=lambda one: "Intel" not in one["driver"])
+    rows.sort(key=lambda measured: "Intel" not in measured["driver"])
     about = {
         "commit": git("log", "-1", "--format=%h"),
         "date": date.today().isoformat(),

@@ -249,10 +249,10 @@ def train(training: Training, store: Path) -> dict:
     run_program(*PP_CL, "train", scene, *words)
     words = ["--scene", scene_of(training.test)] if training.test else []
     words += [] if training.minutes else ["--metrics"]  # LPIPS takes longer than a short training
-    found = read_found(store, *PP_CL, "eval", run, "--out", run / "all", *words)
+    evaluation = read_found(store, *PP_CL, "eval", run, "--out", run / "all", *words)
     about = read_found(store, *PP_CL, "info", run)
-    psnr = {row["name"]: row["psnr"] for row in found["per_image"]}
-    means = found["mean"]
+    psnr = {row["name"]: row["psnr"] for row in evaluation["per_image"]}
+    means = evaluation["mean"]
     if training.test == ALL_VIEWS:
         means |= {
             "psnr_highlights": fmean(psnr[name] for name in HIGHLIGHTS),
@@ -269,8 +269,8 @@ def train(training: Training, store: Path) -> dict:
         "minutes": round(about["seconds"] / 60, 2),
         **{name: round(value, 4) for name, value in means.items()},
         "points": about["points"]["left"],
-        "frame_ms": round(found["seconds_per_frame"] * 1e3, 1),
-        "computed": round(found["computed_fraction"], 2),
+        "frame_ms": round(evaluation["seconds_per_frame"] * 1e3, 1),
+        "computed": round(evaluation["computed_fraction"], 2),
     }
 
 
@@ -289,9 +289,9 @@ def pytorch(store: Path) -> list[dict]:
     for widths, side in NETWORKS:
         for variant in ("direct", "auto"):
             words = ("--widths", widths, "--size", side, "--variant", variant)
-            found = read_found(store, *TOOL, "tools.compare_torch", *words)
-            times = {f"{p}_{key}": found[p][key] for p in ("forward", "train") for key in found[p]}
-            rows.append(found | times | {"widths": widths})
+            row = read_found(store, *TOOL, "tools.compare_torch", *words)
+            times = {f"{p}_{key}": row[p][key] for p in ("forward", "train") for key in row[p]}
+            rows.append(row | times | {"widths": widths})
     return rows
 
 
@@ -322,10 +322,10 @@ def demo(store: Path) -> list[dict]:
     rows = []
     short, long = (store / key_of(training) for training in TRAININGS[:2])
     for run, steps in ((short, "1,500"), (long, "12,000")):
-        found = read_found(store, *TOOL, "tools.depth_error", run)
-        shares = f"median {found['median']:.1%}, mean {found['mean']:.1%}"
+        errors = read_found(store, *TOOL, "tools.depth_error", run)
+        shares = f"median {errors['median']:.1%}, mean {errors['mean']:.1%}"
         rows.append({"what": f"depths within 1.5 spacings, {steps} steps", "result": shares})
-        rows.append({"what": f"IoU of alpha, {steps} steps", "result": f"{found['overlap']:.3f}"})
+        rows.append({"what": f"IoU of alpha, {steps} steps", "result": f"{errors['overlap']:.3f}"})
     return rows
 
 
@@ -366,8 +366,8 @@ def work(store: Path) -> list[dict]:
     """Rows of work."""
     rows = []
     for name, label in WORKED.items():
-        found = read_found(store, *PP_CL, "info", store / name, "--work")
-        cells, counted = found["cells"], found["work"]
+        info = read_found(store, *PP_CL, "info", store / name, "--work")
+        cells, counted = info["cells"], info["work"]
         fragments, network = counted["fragments"], counted["network"]
         rows.append(
             {
@@ -619,8 +619,8 @@ def plot_speed(figure: "Figure", timed: list[dict]) -> None:
         else:
             axes.set(xlim=(0, 1.3 * most_ms), ylim=(0, 1.3 * most_error))
         for i, kind in enumerate(dict.fromkeys(row["kind"] for row in rows)):
-            some = [row for row in rows if row["kind"] == kind]
-            axes.plot([r["ms"] for r in some], [r["error"] for r in some], "os^"[i], label=kind)
+            dots = [row for row in rows if row["kind"] == kind]
+            axes.plot([r["ms"] for r in dots], [r["error"] for r in dots], "os^"[i], label=kind)
         for row in rows:
             place = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
             axes.annotate(row["label"], (row["ms"], row["error"]), fontsize=7, **place)
@@ -653,17 +653,17 @@ def main() -> int:
         else:
             for name in options.only:
                 measure(store, name)
-        found = {name: measure(store, name) for name in PARTS if (store / f"{name}.json").exists()}
+        parts = {name: measure(store, name) for name in PARTS if (store / f"{name}.json").exists()}
     except UserError as error:
         print(f"results: {error}", file=sys.stderr)
         return 2
     folder = RESULTS / options.kind
     folder.mkdir(parents=True, exist_ok=True)
-    for name, contents in tables(found).items():
-        if options.kind or found.keys() >= OF_TABLE.get(name, {name}):
+    for name, contents in tables(parts).items():
+        if options.kind or parts.keys() >= OF_TABLE.get(name, {name}):
             write_json(folder / f"{name}.json", about | contents)
     if not options.kind:
-        draw(found, about["machine"], ROOT / "docs")
+        draw(parts, about["machine"], ROOT / "docs")
     return 0
 
 

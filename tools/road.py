@@ -73,17 +73,17 @@ def forget_calls(trainer: Trainer) -> None:
 
 def called(function: Callable[[], object]) -> list[Step]:
     """Call a function; returns the engine's functions and kernel files that it uses."""
-    found: dict[Step, None] = {}
+    steps: dict[Step, None] = {}
 
     def watch(frame, event, _):
         code = frame.f_code
         path = Path(code.co_filename)
         if event == "call" and ENGINE in path.parents and not code.co_name.startswith("<"):
-            found[path, code.co_name] = None
+            steps[path, code.co_name] = None
             if code.co_name == "program":
                 name, macros = frame.f_locals["name"], frame.f_locals["defines"]
                 for file in kernel_files(kernel_folder() / f"{name}.cl", macros):
-                    found[file, ""] = None
+                    steps[file, ""] = None
 
     gc.disable()  # its callbacks for unrelated arrays would be listed
     sys.setprofile(watch)
@@ -92,7 +92,7 @@ def called(function: Callable[[], object]) -> list[Step]:
     finally:
         sys.setprofile(None)
         gc.enable()
-    return [*found]
+    return [*steps]
 
 
 @cache
@@ -106,14 +106,14 @@ def python_lines(path: Path) -> dict[str, int]:
         if token.type not in skipped
         for line in range(token.start[0], token.end[0] + 1)
     }
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef):
             doc = node.body[0] if ast.get_docstring(node) else None
-            told = range(doc.lineno, (doc.end_lineno or 0) + 1) if doc else ()
-            lines = code & {*range(node.lineno, (node.end_lineno or 0) + 1)} - {*told}
-            found.setdefault(node.name, len(lines))
-    return found
+            doc_lines = range(doc.lineno, (doc.end_lineno or 0) + 1) if doc else ()
+            lines = code & {*range(node.lineno, (node.end_lineno or 0) + 1)} - {*doc_lines}
+            counts.setdefault(node.name, len(lines))
+    return counts
 
 
 def kernel_files(path: Path, macros: dict[str, Any]) -> list[Path]:
@@ -124,11 +124,11 @@ def kernel_files(path: Path, macros: dict[str, Any]) -> list[Path]:
     def number(word):
         return number(values[word]) if word in values else int(word)
 
-    found: dict[Path, None] = {}
+    headers: dict[Path, None] = {}
     for left, relation, right, name in re.findall(INCLUDE, text):
         if not left or RELATIONS[relation](number(left), number(right or "0")):
-            found |= dict.fromkeys(kernel_files(kernel_folder() / name, macros))
-    return [*found, path]
+            headers |= dict.fromkeys(kernel_files(kernel_folder() / name, macros))
+    return [*headers, path]
 
 
 def kernel_lines(path: Path) -> int:
@@ -155,8 +155,8 @@ def page(steps: list[Step]) -> str:
     for path, functions, lines in rows:
         total += lines
         name = path.relative_to(ROOT).as_posix().removeprefix("pp_cl/engine/")
-        told = f": {', '.join(functions)}" if functions else ""
-        text += f"    {total / LINES_A_MINUTE:3.0f}  {name}{told}\n"
+        suffix = f": {', '.join(functions)}" if functions else ""
+        text += f"    {total / LINES_A_MINUTE:3.0f}  {name}{suffix}\n"
     return text
 
 

@@ -64,18 +64,18 @@ def main():
     if platform.machine() == "x86_64":
         steps.append(install_intel)
 
-    found = devices()
+    lines = devices()
     for step in steps:
-        if works(found, wanted):
+        if works(lines, wanted):
             break
         print(f"no working OpenCL device yet; trying: {step.__doc__.splitlines()[0]}", flush=True)
         try:
             step()
         except subprocess.CalledProcessError as error:
             print(f"  that did not work: {error}", file=sys.stderr)
-        found = devices()
-    print("\n".join(found) or "no OpenCL device found")
-    if works(found, wanted):
+        lines = devices()
+    print("\n".join(lines) or "no OpenCL device found")
+    if works(lines, wanted):
         return 0
     print("no working OpenCL device: docs/install.md says how to install one", file=sys.stderr)
     return 1

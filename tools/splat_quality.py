@@ -45,16 +45,16 @@ def row(run: Run, steps: int, cell: float) -> dict:
     measured: dict[int, list[float]] = {size: [] for size in SIZES}
     for view in evenly(run.scene("test").splits["test"], VIEWS):
         truth, height, width = to_8bit(target.whole(view)), view.camera.height, view.camera.width
-        for size, found in measured.items():
+        for size, values in measured.items():
             large = renderer.render(view.camera.resized(size * width, size * height), run.gamma)
             small = large.reshape(height, size, width, size, 3).mean((1, 3))
-            found.append(psnr(to_8bit(small), truth))
+            values.append(psnr(to_8bit(small), truth))
     return {
         "steps": steps,
         "cell": cell,
         "seconds": round(seconds, 1),
         "gaussians": int((cloud.opacity.get()[:, 0] > LEAST_OPAQUE).sum()),
-        "psnr": {size: round(float(np.mean(found)), 2) for size, found in measured.items()},
+        "psnr": {size: round(float(np.mean(values)), 2) for size, values in measured.items()},
         "beside": round(beside_hull(run, renderer), 4),
     }
 
@@ -73,12 +73,12 @@ def beside_hull(run: Run, renderer: Renderer) -> float:
         across = np.cos(azimuth) * ahead + np.sin(azimuth) * np.cross(up, ahead)
         eye = centre + away * (np.cos(elevation) * across + np.sin(elevation) * up)
         camera = Camera.look_at(eye, centre, up, fx=focal, width=SIDE, height=SIDE)
-        seen = renderer.forward(
+        image = renderer.forward(
             camera, run.gamma, until="weights", depth_range=run.depth_range(camera)
         )
-        through = run.dev.download(seen.transmittance).reshape(seen.size)
+        through = run.dev.download(image.transmittance).reshape(image.size)
         outside = distance_transform_edt(~silhouette(run.model.grid, hull, camera))
-        beside = outside[seen.cropped(through) < 1 - VISIBLE].max(initial=0)
+        beside = outside[image.cropped(through) < 1 - VISIBLE].max(initial=0)
         farthest = max(farthest, float(beside) / (FILLED * SIDE))
     return farthest
 

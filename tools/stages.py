@@ -74,12 +74,12 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     config = run_config(folder, scene, preset, given)
     dev = open_device()
     trainer = open_training(dev, folder, config, stored_state(folder, config)).trainer
-    net, cloud, seen = trainer.model.net, trainer.model.cloud, []
+    net, cloud, per_step = trainer.model.net, trainer.model.cloud, []
     sh, backward = sum(array.nbytes for array in cloud.sh) // cloud.count, trainer.renderer.backward
 
     def watched(result, grad_image, **options):
         products = multiplications(net.layers, *result.size) * result.computed_fraction
-        seen.append(least_bytes(**counts(result), sh=sh) | {"products": products})
+        per_step.append(least_bytes(**counts(result), sh=sh) | {"products": products})
         return backward(result, grad_image, **options)
 
     for _ in range(UNTIMED):
@@ -97,7 +97,7 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     times = interleave({"copy": copy.run, "peak": peak.run})
     copied = copy.bytes / statistics.median(times["copy"])  # bytes a millisecond
     computed = peak.flops / statistics.median(times["peak"])
-    need = {name: statistics.median(row[name] for row in seen) for name in seen[0]}
+    need = {name: statistics.median(row[name] for row in per_step) for name in per_step[0]}
     network = 2 * need.pop("products") / computed  # a multiply-add counts as two
     least = {name: moved / copied for name, moved in need.items()}
     least |= {"network": network, "network backward": 2 * network}
@@ -129,17 +129,17 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the result there too")
     options = parser.parse_args()
     try:
-        found = measure(options.scene, options.out, options.preset)
+        result = measure(options.scene, options.out, options.preset)
     except UserError as error:
         print(f"stages: {error}", file=sys.stderr)
         return 2
-    print("{points:,} points, {size}, {launches} launches".format_map(found))
-    print("{copy_gbs:.1f} GB/s, {gflops:.0f} GFLOP/s".format_map(found))
-    for row in found["stages"]:
+    print("{points:,} points, {size}, {launches} launches".format_map(result))
+    print("{copy_gbs:.1f} GB/s, {gflops:.0f} GFLOP/s".format_map(result))
+    for row in result["stages"]:
         least = f"{row['least_ms']:8.2f}" if "least_ms" in row else ""
         print(f"{row['stage']:18} {row['ms']:8.2f} {least}")
     if options.json:
-        write_json(options.json, found)
+        write_json(options.json, result)
     return 0
 
 

@@ -178,12 +178,15 @@ def bench_conv(
             for n in (side, min(side, CHECK_SIDE))
         )
         uploaded = UploadedLayer(dev, timed)
-        found = {v: checked.computed(dev, v, blocking) for v in uploaded.variants}
+        computed = {v: checked.computed(dev, v, blocking) for v in uploaded.variants}
         shape = [side, side, sum(layer.sources), layer.channels, k]
         for direction in DIRECTIONS:
             yield from variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction},
                 {v: uploaded.runner(v, direction, blocking) for v in uploaded.variants},
-                {v: _direction_errors(checked, results, direction) for v, results in found.items()},
+                {
+                    v: _direction_errors(checked, results, direction)
+                    for v, results in computed.items()
+                },
                 flops=(2 if direction == "forward" else 4) * layer.multiplications(size, size),
             )

@@ -72,7 +72,7 @@ class Renderings:
             )
         self.run, self._members = run, [run, *run.others]
         raster = run.config.raster
-        has_specular = any(one.model.specular for one in self._members)
+        has_specular = any(member.model.specular for member in self._members)
         samples = run.renderer.supersampling**2
         count = len(self._members)
         self.default = Setting(raster.early_stop, samples, 1.0, has_specular, count, AUTO)
@@ -90,10 +90,10 @@ class Renderings:
         that differ from it in one field.
         """
         default = self.default
-        found = [replace(default, early_stop=0.0), default]
+        settings = [replace(default, early_stop=0.0), default]
         for name, values in self.choices.items():
-            found += [replace(default, **{name: value}) for value in values]
-        return list(dict.fromkeys(found))
+            settings += [replace(default, **{name: value}) for value in values]
+        return list(dict.fromkeys(settings))
 
     def varied(self, setting: Setting, index: int = 0) -> Run:
         """The run, or a further member, with a setting; it has its own points and buffers."""
@@ -120,11 +120,11 @@ class Renderings:
     @cached_property
     def _ranked(self):
         """For each member, its points by visibility(), the highest first."""
-        return [np.argsort(-visibility(one), kind="stable") for one in self._members]
+        return [np.argsort(-visibility(member), kind="stable") for member in self._members]
 
     def words(self, setting: Setting) -> str:
         """How a setting differs from the default; for the default, its values."""
-        told = {
+        texts = {
             "early_stop": f"early stop {setting.early_stop:g}",
             "samples": f"{setting.samples} sample{'s' * (setting.samples > 1)} a pixel",
             "points": f"{setting.points:.0%} of the points",
@@ -133,8 +133,8 @@ class Renderings:
             "convolutions": f"convolutions: {setting.convolutions}",
         }
         if changed := self.changed(setting):
-            return ", ".join(told[name] for name in changed)
-        return f"default: {told['early_stop']}, {told['samples']}"
+            return ", ".join(texts[name] for name in changed)
+        return f"default: {texts['early_stop']}, {texts['samples']}"
 
     def changed(self, setting: Setting) -> list[str]:
         """The fields in which a setting differs from the default."""
@@ -148,11 +148,11 @@ def visibility(run: Run) -> np.ndarray:
     single view, 1.6 dB.
     """
     dev, renderer, n = run.dev, run.renderer, run.model.cloud.count
-    weight, seen, total = dev.zeros((n,)), dev.zeros((n,)), np.zeros(n)
+    weight, times_seen, total = dev.zeros((n,)), dev.zeros((n,)), np.zeros(n)
     for camera in run.cameras("train"):
         drawn = renderer.forward(camera, run.gamma, until="weights")
         dev.fill(weight, 0)
-        renderer.record_weights(drawn, weight, seen)
+        renderer.record_weights(drawn, weight, times_seen)
         total += dev.download(weight)
         del drawn  # frees its arrays before the next view needs larger ones
     renderer.release()
@@ -209,11 +209,11 @@ class Measurement:
 
     def _time(self, seconds):
         """Time all settings so far in turn, at least once."""
-        some, end = evenly(self._views, LEAST_VIEWS), time.perf_counter() + seconds
+        views, end = evenly(self._views, LEAST_VIEWS), time.perf_counter() + seconds
         with Progress("timing"):
             while True:
                 for setting in self._found:
-                    self._render(setting, some, self._ms.setdefault(setting, []))
+                    self._render(setting, views, self._ms.setdefault(setting, []))
                 if time.perf_counter() >= end:
                     return
 
@@ -246,12 +246,12 @@ class Measurement:
         """Store the errors of the images; the images of the first call are the exact ones."""
         self._exact = self._exact or images
         errors = [np.abs(a - b) for a, b in zip(images, self._exact, strict=True)]
-        found = {
+        differences = {
             "max_err": max(float(error.max()) for error in errors),
             "mean_err": float(np.mean([error.mean(dtype=np.float64) for error in errors])),
         }
         rows = zip(images, self._views, self._truths, strict=True)
-        self._found[setting] = found | mean(
+        self._found[setting] = differences | mean(
             [self._measure(image, view.ignoring(truth, image)) for image, view, truth in rows]
         )
 
@@ -288,7 +288,7 @@ class Measurement:
     def _marked(self):
         """The rows of measured()."""
         rows, renderings = [], self._renderings
-        for setting, found in self._found.items():
+        for setting, fields in self._found.items():
             changed, times = renderings.changed(setting), self._ms[setting]
             rows.append(
                 {
@@ -298,7 +298,7 @@ class Measurement:
                     "words": renderings.words(setting),
                     "ms": self._median(setting),
                     "ms_range": [min(times), max(times)],
-                    **found,
+                    **fields,
                     "is_default": not changed,
                 }
             )
@@ -317,8 +317,8 @@ def frame(run: Run, camera: Camera) -> np.ndarray:
 
 def release(run: Run) -> None:
     """Free the buffers that a run's renderers keep from view to view."""
-    for one in (run, *run.others):
-        one.renderer.release()
+    for member in (run, *run.others):
+        member.renderer.release()
 
 
 def fastest_row(rows: list[dict]) -> dict:
@@ -362,8 +362,8 @@ def _kept(renderings):
     if the file is not one that a measurement wrote.
     """
     try:
-        found = strict_json(read_json_text(renderings.run.folder.frontier, MOST_KEPT))
-        return _chosen(renderings, found) if found["key"] == _key(renderings) else None
+        result = strict_json(read_json_text(renderings.run.folder.frontier, MOST_KEPT))
+        return _chosen(renderings, result) if result["key"] == _key(renderings) else None
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None
 
@@ -396,7 +396,7 @@ def _key(renderings):
     sums = []
     for member in [renderings.run, *renderings.run.others]:
         with opened_zip(member.folder.checkpoint) as archive:
-            sums.append([[one.filename, one.CRC] for one in archive.infolist()])
+            sums.append([[entry.filename, entry.CRC] for entry in archive.infolist()])
     dev = renderings.run.dev
     about = [sums, asdict(renderings.default), dev.name, dev.info["platform"]]
     return hashlib.sha256(json.dumps(about).encode()).hexdigest()
@@ -413,5 +413,5 @@ def line(row: dict) -> str:
     marks = {"is_default": "the default", "is_frontier": "frontier", "is_fast": "--fast"}
     more = [f"LPIPS {row['lpips']:.4f}"] if "lpips" in row else []
     more += [words for name, words in marks.items() if row[name]]
-    found = f"{row['ms']:.1f}", f"{row['max_err']:.1e}", f"{row['mean_err']:.1e}"
-    return COLUMNS(row["words"], *found, f"{row['psnr']:.2f}", ", ".join(more)).rstrip()
+    figures = f"{row['ms']:.1f}", f"{row['max_err']:.1e}", f"{row['mean_err']:.1e}"
+    return COLUMNS(row["words"], *figures, f"{row['psnr']:.2f}", ", ".join(more)).rstrip()

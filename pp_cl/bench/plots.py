@@ -41,10 +41,10 @@ def plot_time_and_error(rows: list[dict], path: str, title: str = "") -> Any:
         if "max_err" in row:
             words = (row.get(key) for key in ("bench", "variant", "direction", "blend"))
             series.setdefault(" ".join(filter(None, words)), []).append(row)
-    for number, (label, some) in enumerate(series.items()):
-        errors = [max(row.get("rel_l2", row["max_err"]), LEAST_ERROR) for row in some]
+    for number, (label, group) in enumerate(series.items()):
+        errors = [max(row.get("rel_l2", row["max_err"]), LEAST_ERROR) for row in group]
         marker = "os^D"[number // 10 % 4]  # there are ten colours
-        axes.plot([row["ms"] for row in some], errors, marker, label=label)
+        axes.plot([row["ms"] for row in group], errors, marker, label=label)
     axes.grid(True, which="both", alpha=0.3)
     axes.legend(fontsize="small")
     with atomic_file(path) as file:
@@ -77,14 +77,14 @@ def plot_frontier(rows: list[dict], path: str, title: str = "") -> Any:
         axes.set(xlabel="milliseconds a frame", xlim=(0, 1.1 * max(row["ms"] for row in rows)))
         axes.grid(True, alpha=0.3)
 
-        def draw(some, *style, axes=axes, value=value, **options):
-            axes.plot([row["ms"] for row in some], [*map(value, some)], *style, **options)
+        def draw(curve, *style, axes=axes, value=value, **options):
+            axes.plot([row["ms"] for row in curve], [*map(value, curve)], *style, **options)
 
         for knob, (name, _) in KNOBS.items():
-            some = [row for row in rows if row["knob"] == knob]
-            if some and knob in CURVES:
-                some = sorted([*some, default], key=lambda row: row["setting"][knob])
-            draw(some, "o-" if knob in CURVES else "D", label=name if some else None)
+            knob_rows = [row for row in rows if row["knob"] == knob]
+            if knob_rows and knob in CURVES:
+                knob_rows = sorted([*knob_rows, default], key=lambda row: row["setting"][knob])
+            draw(knob_rows, "o-" if knob in CURVES else "D", label=name if knob_rows else None)
         draw([default], "*", color=ink, markersize=14, label="default", zorder=3)
         axes.autoscale_view()
         _label(axes, default, rows, value)

@@ -79,5 +79,5 @@ def line(row: dict) -> str:
         if "host_ms" in row:
             more += f"; host, ms a step: {row['host_ms']:.2f} in {row['launches']} launches"
     variant = row["variant"] if "variant" in row else row["blend"]
-    found = [f"{row[key]:.1e}" if key in row else "" for key in ("rel_l2", "max_err")]
-    return COLUMNS(row["bench"], what, variant, f"{row['ms']:.3f}", *found, more).rstrip()
+    error_texts = [f"{row[key]:.1e}" if key in row else "" for key in ("rel_l2", "max_err")]
+    return COLUMNS(row["bench"], what, variant, f"{row['ms']:.3f}", *error_texts, more).rstrip()

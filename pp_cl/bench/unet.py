@@ -33,7 +33,9 @@ def bench_unet(
     parameters = plain_parameters(net, net.parameters)
     outputs = reference.network(net.layers, parameters, x[:CHECK_SIZE, :CHECK_SIZE])
     part = grad_image[:CHECK_SIZE, :CHECK_SIZE]
-    found = {name: network_errors(nets[name], outputs=outputs, grad_image=part) for name in names}
+    errors_of = {
+        name: network_errors(nets[name], outputs=outputs, grad_image=part) for name in names
+    }
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = 2 * multiplications(net.layers, size, size)
     for direction, factor, grad in (("forward", 1, None), ("train", 3, device_grad)):
@@ -46,7 +48,7 @@ def bench_unet(
         yield from variant_rows(
             about,
             {name: network_runner(nets[name], device_x, grad) for name in names},
-            {name: found[name][direction] for name in names},
+            {name: errors_of[name][direction] for name in names},
             flops=factor * flops,
         )
 

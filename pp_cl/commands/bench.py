@@ -105,10 +105,10 @@ def run(options: argparse.Namespace) -> None:
         require("--plot", "matplotlib")
     if is_run:
         return _bench_run(options)
-    given = {options.what: vars(options)}
+    arguments = {options.what: vars(options)}
     if options.what == "all":
-        given = {name: vars(options) | changes for name, changes in SMALL.items()}
-    benches = {name: _prepared(name, argparse.Namespace(**own)) for name, own in given.items()}
+        arguments = {name: vars(options) | changes for name, changes in SMALL.items()}
+    benches = {name: _prepared(name, argparse.Namespace(**own)) for name, own in arguments.items()}
     dev, rows = open_device(options.device), []
     print(f"{dev.name} [{dev.info['platform']}]\n{HEAD}")
     for name, measure in benches.items():

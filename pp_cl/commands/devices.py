@@ -19,10 +19,10 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.engine.device.quirks import describe
     from pp_cl.speeds import by_speed
 
-    found, harmful = list_devices(again=True), list_left_out()
-    taken = [index for index, _, _ in by_speed(found)]
+    devices, harmful = list_devices(again=True), list_left_out()
+    taken = [index for index, _, _ in by_speed(devices)]
     rows, lines = [], []
-    for index, device, problem in found:
+    for index, device, problem in devices:
         row, is_default = describe(device), [index] == taken[:1]
         rows.append({"index": index, **row, "problem": problem, "default": is_default})
         lines.append(

@@ -61,9 +61,9 @@ def run(options: argparse.Namespace) -> None:
         dev = open_device(options.device)
         given = shared.read_short(options, MASKS) + options.set
         preset_name = options.preset or "tiny"
-        facts, views, hull, found = describe_scene(dev, options.subject, preset_name, given)
+        facts, views, hull, disagreements = describe_scene(dev, options.subject, preset_name, given)
         if options.picture:
-            image = outline_sheet(dev, views, hull, found)
+            image = outline_sheet(dev, views, hull, disagreements)
         rows = _scene_rows(facts)
     lines = [f"{name:12s}{text}" for name, text in rows]
     if image is not None:
@@ -97,14 +97,14 @@ def _run_rows(facts):
     widths = ", ".join(map(str, network["widths"]))
     shape = f"{widths} channels, {network['blocks']} blocks"
     if facts["points"]:
-        initial, left = facts["points"]["initial"], facts["points"]["left"]
+        initial, points_left = facts["points"]["initial"], facts["points"]["left"]
         pruned = facts["points"]["pruned"]
         after = f", after prunings {', '.join(map(str, pruned))}" if pruned else ""
         rows += [
             ("network", f"{shape}, {network['parameters']} parameters"),
             ("views", f"{_sizes(facts['views']['images'])}, kept with their cameras"),
             *(("", note) for note in facts["notes"]),
-            ("points", f"{left} ({initial} at the start{after})"),
+            ("points", f"{points_left} ({initial} at the start{after})"),
             ("grid", _grid_text(facts["grid"])),
             ("cells", _cells_text(facts["cells"])),
         ]
@@ -123,9 +123,9 @@ def _run_rows(facts):
 
 
 def _cells_text(cells):
-    box, hull, left = (cells[name] for name in ("box", "hull", "left"))
+    box, hull, filled = (cells[name] for name in ("box", "hull", "left"))
     return (
-        f"{box} in the box, {hull / box:.1%} of them in the hull, {left / box:.1%} with a point;"
+        f"{box} in the box, {hull / box:.1%} of them in the hull, {filled / box:.1%} with a point;"
         f" all of them would make the checkpoint {_bytes(cells['box_bytes'])},"
         f" not {_bytes(cells['checkpoint_bytes'])}"
     )
@@ -133,12 +133,12 @@ def _cells_text(cells):
 
 def _work_rows(work):
     fragments, step, network = work["fragments"], work["step"], work["network"]
-    found, done, whole = fragments["found"], network["multiplications"], network["whole"]
+    count, done, whole = fragments["found"], network["multiplications"], network["whole"]
     crop = f"crop of {step['side']} pixels" if step["side"] else "step"
     share, billions = f"{done / whole:.1%}", f"{whole / 1e9:.2f} billion multiplications"
     return [
         ("a view", f"{work['drawn']:.0f} points drawn (means of {work['views']} views)"),
-        ("", f"{found:.0f} fragments, {fragments['blended'] / found:.1%} of them blended"),
+        ("", f"{count:.0f} fragments, {fragments['blended'] / count:.1%} of them blended"),
         ("", f"fragments in {network['tiles']:.1%} of the network's tiles, {share} of {billions}"),
         ("a step", f"{step['touched']:.0f} points with gradients in a {crop}"),
         ("", f"{step['with_gradients']:.0f} fragments with gradients"),
@@ -155,8 +155,8 @@ def _scene_rows(facts):
     form = f".{places}f"
     share = "" if masks["object"] is None else f", {masks['object']:.1%} of the image is object"
     rejecting = [
-        f"{one['view']}: its mask rejects {one['share']:.0%} of what others agree on"
-        for one in masks["disagreeing"]
+        f"{mask['view']}: its mask rejects {mask['share']:.0%} of what others agree on"
+        for mask in masks["disagreeing"]
     ] + [
         f"{name}: {share:.0%} of its mask lies beside the object; it is left out"
         for name, share in masks.get("left_out", {}).items()

@@ -74,26 +74,26 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
     facts["network"]["parameters"] = sum(sizes)
     image_files, grid = unpacked_views(header["views"]), header["grid"]
-    initial, left = header["initial_points"], forms["points.ids"].shape[0]
+    initial, points_left = header["initial_points"], forms["points.ids"].shape[0]
     points = [form for name, form in forms.items() if name.startswith("points.")]
     of_point = sum(math.prod(form.shape[1:]) * form.dtype.itemsize for form in points)
     whole, size = math.prod(grid["dims"]), folder.checkpoint.stat().st_size
     refined = sum(at <= header["step"] for at in refine_steps(config.train))
-    cameras = [one.camera.downscaled(config.scene.downscale) for one in image_files]
+    cameras = [image_file.camera.downscaled(config.scene.downscale) for image_file in image_files]
     return facts | {
         "step": header["step"],
         "finished": header["finished"],
         "notes": header.get("notes", []),
         "views": {"count": len(image_files), "images": _image_sizes(image_files)},
-        "points": {"initial": initial, "left": left, "pruned": _prunings(rows)},
+        "points": {"initial": initial, "left": points_left, "pruned": _prunings(rows)},
         "grid": grid | {"voxel_size_pixels": spacing_pixels(Grid.of_header(grid), cameras)},
         # all counts are of cells of the present size
         "cells": {
             "box": whole,
             "hull": initial * 8**refined,
-            "left": left,
+            "left": points_left,
             "checkpoint_bytes": size,
-            "box_bytes": size + (whole - left) * of_point,
+            "box_bytes": size + (whole - points_left) * of_point,
         },
     }
 
@@ -119,7 +119,7 @@ def run_work(dev: Device, folder: RunFolder) -> Facts:
         image = renderer.forward(camera, run.gamma)
         size, computed = image.size, image.computed_fraction
         del image  # frees its arrays before the next forward()
-        found, blended, drawn, tiles = _counted(
+        fragments, blended, drawn, tiles = _counted(
             renderer.forward(camera, run.gamma, until="weights")
         )
         width, height = (min(side or n, n) for n in (camera.width, camera.height))
@@ -127,12 +127,12 @@ def run_work(dev: Device, folder: RunFolder) -> Facts:
         crop = camera.crop(left, top, width, height)
         step = _counted(renderer.forward(crop, run.gamma, until="weights"))
         whole = multiplications(layers, *size)
-        rows.append([found, blended, drawn, tiles, *step[1:3], whole * computed, whole])
+        rows.append([fragments, blended, drawn, tiles, *step[1:3], whole * computed, whole])
     means = np.mean(rows, axis=0).tolist()
-    found, blended, drawn, tiles, with_gradients, touched, done, whole = means
+    fragments, blended, drawn, tiles, with_gradients, touched, done, whole = means
     return {
         "views": len(rows),
-        "fragments": {"found": found, "blended": blended},
+        "fragments": {"found": fragments, "blended": blended},
         "drawn": drawn,
         "step": {"side": side, "touched": touched, "with_gradients": with_gradients},
         "network": {"tiles": tiles, "multiplications": done, "whole": whole},
@@ -203,7 +203,7 @@ def describe_scene(
         right = agreement.views
     except UserError as error:
         problem, is_refused = str(error), isinstance(error, WrongCameras)
-    found = contradicting(views, hull, agreement) if hull else []
+    disagreements = contradicting(views, hull, agreement) if hull else []
     ranges = np.array([view.depth_range for view in right if view.depth_range])
     cameras, stored, lenses = (
         [getattr(view, name) for view in right]
@@ -222,7 +222,7 @@ def describe_scene(
             "y": _angles((lens.height, lens.fy) for lens in lenses),
         },
         "masks": _masks(right)
-        | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]}
+        | {"disagreeing": [{"view": mask.view.name, "share": mask.share} for mask in disagreements]}
         | ({"left_out": agreement.left_out, "forgiven": agreement.forgiven} if hull else {}),
         "depth_range": [float(ranges.min()), float(ranges.max())] if len(ranges) else None,
         "looked_at": centre.tolist(),
@@ -247,7 +247,7 @@ def describe_scene(
             "box": hull.grid.box.tolist(),
             "masks_beside": beside,
         }
-    return facts, views, hull, found
+    return facts, views, hull, disagreements
 
 
 def _range(values):

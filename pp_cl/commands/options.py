@@ -68,12 +68,12 @@ def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
     return read
 
 
-def _parts(text, separator, one, count, what):
+def _parts(text, separator, part_type, count, what):
     """`count` values of another type. what: how to write them."""
     parts = text.split(separator)
     if len(parts) != count:
         raise UserError(f"{quoted(text)}: write {what}")
-    return [one(part) for part in parts]
+    return [part_type(part) for part in parts]
 
 
 def widths(text: str) -> tuple[int, ...]:

@@ -44,8 +44,8 @@ class TrainingProgress:
         if step == self._built:
             self._stages.close()
             done: dict[str, Any] = {"total": self._steps, "unit": "step", "done": step}
-            if given := train.minutes / train.members:
-                done = {"given": given, "done": round(self._training.passed)}
+            if minutes := train.minutes / train.members:
+                done = {"given": minutes, "done": round(self._training.passed)}
             self._shown = self._stages.enter_context(
                 Progress("training", **done, stream=self._stream)
             )

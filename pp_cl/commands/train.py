@@ -74,10 +74,10 @@ def run(options: argparse.Namespace, follow: Callable[["Training"], None] = lamb
     scene = options.scene or load_config(folder.config).scene.path
     config = run_config(folder, scene, preset, given)
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
-    for one, of_one in members(folder, config):
-        if one is not folder:
-            print(f"a training with the next seed, in {one}")
-        _train(one, of_one, options, chosen, follow)
+    for member_folder, member_config in members(folder, config):
+        if member_folder is not folder:
+            print(f"a training with the next seed, in {member_folder}")
+        _train(member_folder, member_config, options, chosen, follow)
 
 
 def _train(folder, config, options, chosen, follow):
@@ -179,8 +179,8 @@ def _images_line(training, chosen):
 
 def _sizes(cameras):
     """WxH of the cameras' images; if they differ, of the smallest and of the largest."""
-    found = sorted({(c.width, c.height) for c in cameras}, key=math.prod)
-    return " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((found[0], found[-1])))
+    sizes = sorted({(c.width, c.height) for c in cameras}, key=math.prod)
+    return " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
 
 
 def _run(training, options):

@@ -152,19 +152,19 @@ def _missed_sphere(dev, rng):
     radius, x = np.float32(1e-3), np.float32(0.01)
     scene = PairedPoints(dev, AXIS, np.array([[x, 0, 3.0]]), radius, kind="sphere")
     scene.blend([0.5], 0.1, np.zeros((1, 16)))
-    found = scene.sphere_gradients(np.ones((1, 1, 16)))
-    yield finite(*found.values())
+    gradients = scene.sphere_gradients(np.ones((1, 1, 16)))
+    yield finite(*gradients.values())
     naive = -radius / np.sqrt(radius * radius - x * x)  # dz/dR
-    yield exact(found["radius"], np.zeros(1), naive=naive.reshape(1))
+    yield exact(gradients["radius"], np.zeros(1), naive=naive.reshape(1))
 
 
 def _on_the_ray(dev, rng):
     """A point in the middle of its pixel, which may move to any side."""
     scene = PairedPoints(dev, AXIS, np.array([[0, 0, 3.0]]), 0.2)
     scene.blend([0.5], 0.1, np.zeros((1, 16)), rule="alpha")
-    found = scene.gradients(np.ones((1, 1, 16)), voxel_size=0.3)["offset"]
+    gradient = scene.gradients(np.ones((1, 1, 16)), voxel_size=0.3)["offset"]
     away = np.zeros((1, 4), np.float32)
-    yield absolute(found, away, 1e-2, naive=away / np.sqrt((away * away).sum()))
+    yield absolute(gradient, away, 1e-2, naive=away / np.sqrt((away * away).sum()))
 
 
 def _offsets(dev, rng):
@@ -213,11 +213,11 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
     grad = rng.normal(size=(camera.width * camera.height, 16))
     scene = PairedGaussians(dev, camera, grid, ids, np.pad(learned, ((0, 0), (0, 7))), radius)
     image = scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
-    found, measured = scene.gradients(grad, voxel_size=grid.voxel_size), scene.geometry()
+    gradients, measured = scene.gradients(grad, voxel_size=grid.voxel_size), scene.geometry()
     blend, fragment = dense.alpha(measured, opacity, stop), measured["fragment"]
     yield relative(image.reshape(-1, 16), dense.features(blend, features), WEIGHT["alpha"])
     expected = np.where(features > 0, blend["weight"] @ grad, 0)
-    yield relative(found["features"], expected, WEIGHT["alpha"])
+    yield relative(gradients["features"], expected, WEIGHT["alpha"])
     vertices = grid.positions(ids)
     expected = dense.gaussians(camera, vertices, grid.voxel_size, learned, radius)["falloff"]
     yield absolute(measured["falloff"][fragment], expected[fragment], WEIGHT["alpha"])
@@ -231,8 +231,8 @@ def _check_gaussians(dev, rng, n, radius, stop, samples):
 
     rows = enumerate(learned)
     numeric = [numeric_gradient(partial(loss, i=i), offset, STEP) for i, offset in rows]
-    yield relative(found["offset"][:, :9], np.array(numeric), DIFFERENCES)
-    yield exact(found["offset"][:, 9:], np.zeros((n, 7)))
+    yield relative(gradients["offset"][:, :9], np.array(numeric), DIFFERENCES)
+    yield exact(gradients["offset"][:, 9:], np.zeros((n, 7)))
 
 
 def _needles(dev, rng):
@@ -242,14 +242,14 @@ def _needles(dev, rng):
     learned[:, 3:6] = -5
     learned[:, 6:8] = 10 ** rng.uniform(2, 4, (8, 1)) * rng.uniform(0.5, 1, (8, 2))
     scene = PairedGaussians(dev, camera, grid, ids, learned, 0.1)
-    fragment, found = scene.fragments(), scene.geometry()["falloff"]
+    fragment, falloff = scene.fragments(), scene.geometry()["falloff"]
     vertices, shapes = grid.positions(ids), learned[:, :9]
     expected = dense.gaussians(camera, vertices, grid.voxel_size, shapes, 0.1)["falloff"]
     lower = np.zeros((8, 3, 3), np.float32)
     lower[:, range(3), range(3)] = 0.1 * np.exp(learned[:, 3:6])
     lower[:, [1, 2, 2], [0, 0, 1]] = 0.1 * learned[:, 6:9]
     naive = _by_determinant(camera, dense.camera_space(camera, vertices), lower)
-    yield absolute(found[fragment], expected[fragment], WEIGHT["alpha"], naive=naive[fragment])
+    yield absolute(falloff[fragment], expected[fragment], WEIGHT["alpha"], naive=naive[fragment])
 
 
 def _by_determinant(camera, centres, lower):
@@ -327,26 +327,26 @@ def _many_fragments(rule, dev, rng):
             yield each(weight, blend["weight"][:, 0], MANY, floor=1e-26)
         yield relative(scene.features.get().reshape(1, 16), dense.features(blend, features), MANY)
         grad = rng.normal(size=(1, 16))
-        found = scene.gradients(grad)
-        yield finite(*found.values())
+        gradients = scene.gradients(grad)
+        yield finite(*gradients.values())
         if rule == "alpha" and not stop:
             expected = dense.gradients(geometry, blend, features, grad)[1]
             naive = _divided(geometry, opacity, features @ grad[0], grad.sum())
-            yield relative(found["opacity"], expected, MANY, naive=naive)
+            yield relative(gradients["opacity"], expected, MANY, naive=naive)
 
 
 def _divided(geometry, opacity, own, background):
     """(N,) float32: a pixel's dL/do, computed from the back: the transmittance in front of a
     fragment is the one behind it divided by 1 - alpha. own, background: as in dense.gradients().
     """
-    falloff, found = geometry["falloff"][:, 0].astype(np.float32), np.zeros(len(own), np.float32)
+    falloff, gradient = geometry["falloff"][:, 0].astype(np.float32), np.zeros(len(own), np.float32)
     alpha, own, behind = opacity * falloff, own.astype(np.float32), np.float32(background)
     T = np.prod(1 - alpha)
     for i in np.argsort(-geometry["depth"][:, 0], kind="stable"):
         T = T / (1 - alpha[i])
-        found[i] = T * falloff[i] * (own[i] - behind)
+        gradient[i] = T * falloff[i] * (own[i] - behind)
         behind = behind + alpha[i] * (own[i] - behind)
-    return found
+    return gradient
 
 
 def _opaque(dev, rng):
@@ -438,16 +438,16 @@ def _depth_loss(dev, rng):
             scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, side=side)
             scene.blend(fine.opacity, 0.1, fine.point_features, **shared)
             view = scene.projected, scene.pairs, scene.weights, scene.shape
-            found = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=3.0)
+            gradient = depth_gradient(dev, Buffers(dev), *view, voxel_size=0.1, weight=3.0)
             expected = _bent(fine, side, 0.1)
-            yield relative(found.get()[:, 0], 3.0 * expected[:, 0], DEPTH)
-            yield relative(found.get()[:, 1], expected[:, 1], DEPTH)
+            yield relative(gradient.get()[:, 0], 3.0 * expected[:, 0], DEPTH)
+            yield relative(gradient.get()[:, 1], expected[:, 1], DEPTH)
             expected[:, 0] *= 3.0 / side**2
             of_each = expected.reshape(*scene.shape, 2).repeat(side, 0).repeat(side, 1)
             fine.grad[:] = 0
             wanted = fine.reference_gradients(depth_gradient=of_each.reshape(-1, 2))[1]
             grad = np.zeros((*scene.shape, 16))
-            gradients = scene.gradients(grad, depth_gradient=found)
+            gradients = scene.gradients(grad, depth_gradient=gradient)
             yield relative(gradients["opacity"], wanted, DEPTH)
 
 
@@ -463,8 +463,8 @@ def _samples(dev, rng):
         expected = dense.features(fine.blend, fine.point_features)
         yield relative(image, _means(expected, scene.shape), WEIGHT["alpha"])
         rest = _means(fine.blend["background"][:, None], scene.shape)
-        found = scene.weights.transmittance.get().reshape(rest.shape)
-        yield absolute(found, rest, WEIGHT["alpha"])
+        computed = scene.weights.transmittance.get().reshape(rest.shape)
+        yield absolute(computed, rest, WEIGHT["alpha"])
         needed = fine.scene.weights.visible.get()
         yield exact(np.isin(needed, scene.weights.visible.get()), np.ones(len(needed), bool))
         grad = rng.normal(size=(*scene.shape, 16))
@@ -474,9 +474,9 @@ def _samples(dev, rng):
         yield relative(gradients["features"], features, GRADIENT)
         yield relative(gradients["opacity"], opacity, GRADIENT)
         distortion = dense.distortion(fine.geometry, fine.blend).sum()
-        found = scene.backward.distortion.get().sum()
+        computed = scene.backward.distortion.get().sum()
         # a pixel with one fragment has only roundings
-        yield each(found, distortion, GRADIENT, floor=1e-3)
+        yield each(computed, distortion, GRADIENT, floor=1e-3)
         if kind == "soft":  # like the offsets of one sample, which _offsets() tests
             expected = fine.scene.gradients(fine.grad, voxel_size=0.3)["offset"]
             yield relative(scene.gradients(grad, voxel_size=0.3)["offset"], expected, GRADIENT)

@@ -31,9 +31,9 @@ def _nonzero(dev, rng):
         flags = rng.integers(1, 256, n) * (rng.random(n) < share)
         indices = dev.empty((n,), np.uint32)
         places = dev.upload(np.full(n, 7), np.uint32)
-        found = dev.empty((1,), np.uint32)
-        nonzero(dev, dev.upload(flags, np.uint8), indices, places, found)
-        total = read_total(dev, found).get()
+        count = dev.empty((1,), np.uint32)
+        nonzero(dev, dev.upload(flags, np.uint8), indices, places, count)
+        total = read_total(dev, count).get()
         yield exact(indices.get()[:total], np.flatnonzero(flags))
         expected = np.where(flags, np.cumsum(flags != 0) - 1, 7)
         yield exact(places.get(), expected)
@@ -46,9 +46,9 @@ def _compact(dev, rng):
         chosen = np.flatnonzero(rng.random(n) < 0.6) if n > 1 else np.zeros(1, int)
         rows = compact_rows(dev, dev.upload(source.view(np.float32)), dev.upload(chosen, np.uint32))
         yield exact(rows.get().view(np.uint32), source[chosen])
-        some = rng.integers(0, n, 3 * n)
-        gathered = gather_rows(dev, dev.upload(source), dev.upload(some, np.uint32))
-        yield exact(gathered.get(), source[some])
+        repeated = rng.integers(0, n, 3 * n)
+        gathered = gather_rows(dev, dev.upload(source), dev.upload(repeated, np.uint32))
+        yield exact(gathered.get(), source[repeated])
 
 
 CASES = (

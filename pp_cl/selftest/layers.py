@@ -252,8 +252,8 @@ def _tiles(dev, rng):
     for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
         odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))
         x = np.where(rng.random((h, w, c)) < 0.02, odd, 1).astype(np.float32)
-        found, naive = tiles.tiles_find(dev, dev.upload(x), 1.0).get(), np.abs(x - 1) > 0
-        yield exact(found, halve((x != 1).any(2), 2), naive=halve(naive.any(2), 2))
+        differing, naive = tiles.tiles_find(dev, dev.upload(x), 1.0).get(), np.abs(x - 1) > 0
+        yield exact(differing, halve((x != 1).any(2), 2), naive=halve(naive.any(2), 2))
         fragments = rng.integers(1, 5, (h, w)) * (rng.random((h, w)) < 0.02)
         offsets = dev.upload(np.concatenate([[0], np.cumsum(fragments)]), np.uint32)
         yield exact(tiles.tiles_covered(dev, offsets, (h, w)).get(), halve(fragments > 0, 2))

@@ -44,9 +44,9 @@ def _loss_checks(dev, prediction, target, weights, *bounds, is_hard=False):
 
 def four_terms(loss: Loss) -> np.ndarray:
     """(4,) terms of the last image: L, L1, 1 - SSIM and the mean squared error."""
-    found = loss.read(1).get()
-    mse = 10 ** (-found["psnr"] / 10)
-    return np.array([found["loss"], found["l1"], 1 - found["ssim"], mse])
+    losses = loss.read(1).get()
+    mse = 10 ** (-losses["psnr"] / 10)
+    return np.array([losses["loss"], losses["l1"], 1 - losses["ssim"], mse])
 
 
 def _flat(dev, rng):
@@ -96,8 +96,8 @@ def _mask_loss(dev, rng):
         _, grad = loss.forward_backward(*images, left, top, alphas=alphas, shortfall=shortfall)
         difference = np.where(ignored, 0, 1 - transmittance[inside] - mask)
         weighted = np.where(difference < 0, shortfall, 1) * difference
-        found, mean = loss.read(1).get(), (weighted * difference).mean()
-        yield each([found["loss"], found["mask"]], [weight * mean, mean], 8 * EPS)
+        losses, mean = loss.read(1).get(), (weighted * difference).mean()
+        yield each([losses["loss"], losses["mask"]], [weight * mean, mean], 8 * EPS)
         expected = np.zeros(size)
         expected[inside] = 2 * weight * weighted / mask.size
         yield relative(grad.get().reshape(size), expected, 8 * EPS)
@@ -130,10 +130,10 @@ def _sum_of_terms(dev, rng):
         for _ in range(2):  # the second sum must not contain the first
             loss.forward_backward(dev.upload(prediction), dev.upload(target))
             values = rng.random(12 * n).astype(np.float32)
-            found = loss.read(1, dev.upload(values), 1.5, scale=1 / n).get()
+            losses = loss.read(1, dev.upload(values), 1.5, scale=1 / n).get()
             added = values.sum(dtype=np.float64) / n
         expected = [terms[0] + 1.5 * added, added]
-        yield each([found["loss"], found["distortion"]], expected, LOSS)
+        yield each([losses["loss"], losses["distortion"]], expected, LOSS)
 
 
 def _exposure(dev, rng, is_full):
@@ -151,7 +151,7 @@ def _exposure(dev, rng, is_full):
         turned = rendered @ (np.eye(3) + 0.2 * rng.normal(size=(3, 3))).T
         image = turned + 0.1 * rng.random(3) * alpha[..., None]
         arrays = (prediction, image + white, alpha)
-        shown_as, shot, mask = (dev.upload(one, np.float32) for one in arrays)
+        shown_as, shot, mask = (dev.upload(array, np.float32) for array in arrays)
         matrix = exposure.state.get()[view, 16:].astype(np.float64)
         expected = (image - alpha[..., None] * matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T
         yield relative(exposure.target(view, shot, mask).get(), expected + white, 32 * EPS)
@@ -166,13 +166,13 @@ def _exposure(dev, rng, is_full):
             sums[view, half, 7, :3] += np.einsum("yx,yxi->i", a, image**2)
         yield relative(exposure.state.get()[:, :16].reshape(sums.shape), sums, 16 * EPS)
         expected = _matrices(sums.sum(1), PRIOR * alpha.size, is_full)
-        found = exposure.state.get()[:, 16:]
-        yield relative(found, expected, FULL if is_full else 32 * EPS)
+        matrices = exposure.state.get()[:, 16:]
+        yield relative(matrices, expected, FULL if is_full else 32 * EPS)
         if not is_full:
-            gains, seen = sums.sum(1).astype(np.float32), range(3)
-            naive = gains[:, [4, 5, 6], seen] / gains[:, seen, seen]
+            gains, rgb = sums.sum(1).astype(np.float32), range(3)
+            naive = gains[:, [4, 5, 6], rgb] / gains[:, rgb, rgb]
             yield relative(
-                found[:, seen, seen], expected[:, seen, seen], 32 * EPS, naive=naive / naive.mean(0)
+                matrices[:, rgb, rgb], expected[:, rgb, rgb], 32 * EPS, naive=naive / naive.mean(0)
             )
 
 
@@ -181,8 +181,8 @@ def _matrices(sums, prior, is_full):
     squares, mixed = sums[:, :4] + prior * np.eye(4), sums[:, 4:7] + prior * np.eye(3, 4)
     if not is_full:
         squares, mixed = squares * np.eye(4), mixed * np.eye(3, 4)
-    found = np.linalg.solve(squares, mixed.swapaxes(1, 2)).swapaxes(1, 2)
-    square = np.concatenate([found, np.tile([[[0.0, 0, 0, 1]]], (len(sums), 1, 1))], 1)
+    matrices = np.linalg.solve(squares, mixed.swapaxes(1, 2)).swapaxes(1, 2)
+    square = np.concatenate([matrices, np.tile([[[0.0, 0, 0, 1]]], (len(sums), 1, 1))], 1)
     return (square @ np.linalg.inv(square.mean(0)))[:, :3]
 
 

@@ -91,8 +91,8 @@ class Cloud:
             state=self.state,
             sh_eps=EPSILONS["sh"],
         )
-        seen = np.isin(np.arange(self.n), visible)
-        grads = {name: np.where(seen, g.T, 0).T for name, g in grads.items()}
+        is_visible = np.isin(np.arange(self.n), visible)
+        grads = {name: np.where(is_visible, g.T, 0).T for name, g in grads.items()}
         grads["offset"] = grads["offset"] * (rates.offset > 0)
         by_basis = vars(rates) | {"sh": np.repeat(rates.sh, (1, 3, 5))}
         self.twin.step(self.steps, grads, by_basis, EPSILONS)
@@ -165,8 +165,8 @@ def adam_steps(
         parts = GradientParts(rows, table, dev.upload(partial.ravel()))
         adam_update(dev, parameter, parts, moments, step=step, **options)
         twin.step(grad, **options)
-    found = {kind: array.get()[:n] for kind, array in moments.items()}
-    return twin, parameter.get()[:n], found
+    moment_values = {kind: array.get()[:n] for kind, array in moments.items()}
+    return twin, parameter.get()[:n], moment_values
 
 
 def _adam_extremes(dev, rng):
@@ -306,10 +306,10 @@ def _from_bounds(dev, rng):
     before = cloud.learned()["opacity"][:, 0]
     yield exact(before, np.arange(257) % 2 == 0)
     cloud.step(grads | {"opacity": -grads["opacity"]}, np.arange(257))
-    found, expected = (x["opacity"][:, 0] for x in (cloud.learned(), cloud.twin.values))
+    opacity, expected = (x["opacity"][:, 0] for x in (cloud.learned(), cloud.twin.values))
     logit, of_logit = np.log(before / (1 - before)), grads["opacity"] * before * (1 - before)
     moved = logit + np.float32(RATES.opacity) * of_logit / (np.abs(of_logit) + np.float32(1e-15))
-    yield absolute(found, expected, 1e-5, naive=1 / (1 + np.exp(-moved)))
+    yield absolute(opacity, expected, 1e-5, naive=1 / (1 + np.exp(-moved)))
 
 
 def _ema(dev, rng):

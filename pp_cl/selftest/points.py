@@ -173,7 +173,7 @@ class PairedPoints:
         """
         grad_features = np.reshape(grad_features, (*self.shape, 16))
         view = self.projected, self.pairs, self.weights
-        found = self.backward = blend_backward(
+        backward = self.backward = blend_backward(
             self.dev,
             self.buffers,
             *view,
@@ -187,9 +187,9 @@ class PairedPoints:
             voxel_size=voxel_size,
             max_weight=max_weight,
         )
-        rows = {"features": found.visible_features, "opacity": found.opacity}
-        if found.offset is not None:
-            rows["offset"] = found.offset
+        rows = {"features": backward.visible_features, "opacity": backward.opacity}
+        if backward.offset is not None:
+            rows["offset"] = backward.offset
         visible, gradients = self.weights.visible.get(), {}
         for name, array in rows.items():  # rows of visible points; all other points have 0
             gradients[name] = np.zeros((self.n, *array.shape[1:]), np.float32)

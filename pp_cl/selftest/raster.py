@@ -184,9 +184,11 @@ def _check_left_out(dev, positions, *, shown=None, slopes=None):
         scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
         yield exact(np.isin(np.arange(n), scene.seen), np.arange(n) < 2, naive=shown)
         features = scene.blend(np.ones(n), 0.01, np.full((n, 16), 2))
-        found = scene.sphere_gradients(ones) if kind == "sphere" else scene.gradients(ones)
-        yield finite(features, *found.values(), naive=slopes)
-        yield exact([gradient[2:].any() for gradient in found.values()], [False] * len(found))
+        gradients = scene.sphere_gradients(ones) if kind == "sphere" else scene.gradients(ones)
+        yield finite(features, *gradients.values(), naive=slopes)
+        yield exact(
+            [gradient[2:].any() for gradient in gradients.values()], [False] * len(gradients)
+        )
 
 
 def _pairs(kind, dev, rng):
@@ -296,15 +298,15 @@ def _shade(dev, rng):
     for n, degree in product(SIZES, SH_DEGREES):
         positions = make_points(rng, n)
         scene = PairedPoints(dev, camera, positions, 0.1)
-        seen, sh = scene.seen[::2], [rng.normal(size=(n, b.count, 16)) for b in sh_blocks(degree)]
+        listed, sh = scene.seen[::2], [rng.normal(size=(n, b.count, 16)) for b in sh_blocks(degree)]
 
-        def shade(sh, points=scene.projected, seen=seen):
-            features = dev.upload(np.full((len(seen) + 3, 16), 7.0), np.float32)
+        def shade(sh, points=scene.projected, listed=listed):
+            features = dev.upload(np.full((len(listed) + 3, 16), 7.0), np.float32)
             shade_forward(
                 dev,
                 points,
-                dev.upload(seen, np.uint32),
-                len(seen),
+                dev.upload(listed, np.uint32),
+                len(listed),
                 [dev.upload(block) for block in sh],
                 visible_features=features,
             )
@@ -313,7 +315,7 @@ def _shade(dev, rng):
         features = shade([block.astype(np.float32) for block in sh])
         expected = dense.shade(positions, camera.eye, np.concatenate(sh, axis=1))
         # nine products of a direction's squares, with 5 roundings each, of values of up to 4
-        yield relative(features[:-3], expected[seen], 1e-5)
+        yield relative(features[:-3], expected[listed], 1e-5)
         yield exact(features[-3:], np.full((3, 16), 7))
         gaussians = replace(scene.projected, footprint="gaussian")
         clamped = shade([block.astype(np.float32) for block in sh], gaussians)
@@ -356,10 +358,10 @@ def _depth_of_samples(dev, rng):
         fine = Blended(dev, rng, n, radius=0.4, rule="alpha", early_stop=stop, kind=kind)
         scene = PairedPoints(dev, fine.camera, fine.positions, fine.radius, kind=kind, side=2)
         scene.blend(fine.opacity, 0.1, fine.point_features, rule="alpha", early_stop=stop)
-        alpha, *depths = (_fours(one, scene.shape) for one in _depths(dev, fine.scene))
-        found = _depths(dev, scene, 0.3)
-        yield absolute(found[0], alpha.mean(1), SUMMED + stop)
-        for samples, depth in zip(depths, found[1:], strict=True):
+        alpha, *depths = (_fours(array, scene.shape) for array in _depths(dev, fine.scene))
+        alpha_and_depths = _depths(dev, scene, 0.3)
+        yield absolute(alpha_and_depths[0], alpha.mean(1), SUMMED + stop)
+        for samples, depth in zip(depths, alpha_and_depths[1:], strict=True):
             near = samples <= samples.min(1, keepdims=True) + np.float32(0.3)
             is_far = np.isinf(samples.min(1))
             yield exact(np.isinf(depth), is_far)
@@ -399,22 +401,22 @@ def _record(rule, dev, rng):
     """
     drops = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **drops)
-    before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
+    before, times_seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
     highest, scene = before.copy(), blended.scene
     listed = list_weights(dev, scene.buffers, scene.pairs, scene.weights)
-    record_weights(dev, scene.pairs, scene.weights, listed, highest, seen)
-    yield exact(seen.get() - np.arange(500), blended.geometry["fragment"].any(axis=1))
+    record_weights(dev, scene.pairs, scene.weights, listed, highest, times_seen)
+    yield exact(times_seen.get() - np.arange(500), blended.geometry["fragment"].any(axis=1))
     tracked = dense.tracked(blended.geometry, blended.blend, 2)
     weight = np.where(tracked, blended.blend["weight"], 0).sum(axis=1)
     least = float(np.sort(weight)[-30:-28].mean())  # 29 points have a higher sum
-    dev.fill(seen, 0)
-    record_weights(dev, scene.pairs, scene.weights, listed, highest, seen, least)
-    yield exact(seen.get(), weight > least)
+    dev.fill(times_seen, 0)
+    record_weights(dev, scene.pairs, scene.weights, listed, highest, times_seen, least)
+    yield exact(times_seen.get(), weight > least)
     is_visible = np.isin(scene.pair_points(), scene.weights.visible.get())
     weights = listed.get()[: scene.pairs.total, 0][is_visible]
     scene.gradients(blended.grad, max_weight=before)
-    left = scene.backward.pair_gradient.get()[: scene.pairs.total, 0]
-    yield exact(left[is_visible], weights)
+    weights_left = scene.backward.pair_gradient.get()[: scene.pairs.total, 0]
+    yield exact(weights_left[is_visible], weights)
     yield relative(highest.get(), np.maximum(2e-3 * np.arange(500), weight), PLACED)
     yield exact(before.get(), highest.get())
 

@@ -65,8 +65,8 @@ def _hull(dev, rng):
         positions = grid.lattice()
         rule = {"least": carver.least, "forgiven": forgiven, "doubts": bool(carver.doubts)}
         expected, border = twin.in_hull(views, positions, MASK_THRESHOLD, **rule)
-        found = carver.carve(grid, forgiven).ravel()
-        yield exact(found[border > BORDER], expected[border > BORDER])
+        carved = carver.carve(grid, forgiven).ravel()
+        yield exact(carved[border > BORDER], expected[border > BORDER])
 
 
 def _target(dev, rng):
@@ -96,16 +96,16 @@ def _target_between(dev, rng):
         ((1, 5), (31, 5), (33, 5), (5, 31), (257, 5)), ((0.125, -0.1), (-0.45, 0.3), (0.0, 0.4))
     ):
         for x0, y0 in ((1, 2), (-3, 33)):
-            found = target.crop(view, (x0, y0, width, height), (across, down))
+            crop = target.crop(view, (x0, y0, width, height), (across, down))
             expected = twin.target_between(
                 image, x0 + across, y0 + down, width=width, height=height
             )
-            yield absolute(found[0].get(), expected[..., :3], TARGET)
-            yield absolute(found[1].get(), expected[..., 3], TARGET)
+            yield absolute(crop[0].get(), expected[..., :3], TARGET)
+            yield absolute(crop[1].get(), expected[..., 3], TARGET)
     nothing = replace(view, image=image * np.array([1, 1, 1, 0], np.uint8))
     for jitter in rng.uniform(-0.125, 0.125, (20, 2)):
-        found = target.crop(nothing, (-3, -3, 60, 33), tuple(jitter))
-        yield exact(found[0].get(), np.ones((33, 60, 3)))
+        crop = target.crop(nothing, (-3, -3, 60, 33), tuple(jitter))
+        yield exact(crop[0].get(), np.ones((33, 60, 3)))
 
 
 def _distortion(dev, rng):
@@ -118,8 +118,8 @@ def _distortion(dev, rng):
         image = rng.integers(0, 256, (height, width, 4), np.uint8)
         image[..., 3] = rng.integers(128, 256, (height, width))
         for factor in range(1, 2 if width < 3 or height > 300 else 4):
-            found = undistort(dev, image, camera, lens, factor)
-            yield absolute(found, twin.undistorted(image, camera, lens, factor), ROUNDED)
+            undistorted = undistort(dev, image, camera, lens, factor)
+            yield absolute(undistorted, twin.undistorted(image, camera, lens, factor), ROUNDED)
 
 
 def _transparent(dev, rng):

@@ -26,15 +26,15 @@ PADDED = 2, 1  # (left, top) of an image within the rendered one
 def random_layer(dev: Device, rng: np.random.Generator) -> tuple[Specular, dict[str, np.ndarray]]:
     """A layer, and its parameters for the float64 twin."""
     layer, parameters = Specular(dev), {}
-    for one in convolutions(layer.layers):
-        shape = one.weight_shape()
+    for convolution in convolutions(layer.layers):
+        shape = convolution.weight_shape()
         weight, bias = rng.normal(size=shape) / np.sqrt(shape[1]), rng.normal(size=shape[0])
         for kind, values, packed in (
             ("weight", weight.astype(np.float32), pack_weights),
             ("bias", bias.astype(np.float32), pack_bias),
         ):
-            parameters[f"{one.name}.{kind}"] = values.astype(np.float64)
-            dev.write(layer.parameters[f"{one.name}.{kind}"], packed(values))
+            parameters[f"{convolution.name}.{kind}"] = values.astype(np.float64)
+            dev.write(layer.parameters[f"{convolution.name}.{kind}"], packed(values))
     return layer, parameters
 
 
@@ -109,7 +109,7 @@ def _batches(dev, rng):
     for n in SIZES:
         rows, expected = dev.zeros((2 * n + 1, ROW)), np.zeros((2 * n + 1, ROW))
         for first, side in ((0, 1), (n + 1, 2)):
-            view, *seen = _view(dev, rng, n + 3, 9, side)
+            view, *rays = _view(dev, rng, n + 3, 9, side)
             left, top = PADDED
             target = rng.random((n, 5, 3)).astype(np.float32)
             y, x = top + np.arange(n), left + rng.integers(0, 5, n)
@@ -119,12 +119,12 @@ def _batches(dev, rng):
             missing = target[y - top, x - left].astype(np.float64) - view.image.get()[y, x]
             with np.errstate(divide="ignore"):
                 lacking = np.where(alpha > 0, missing / alpha, np.inf * np.sign(missing))
-            of_pixels = view.features.get()[y, x], *(of_all[y, x] for of_all in seen), lacking
+            of_pixels = view.features.get()[y, x], *(of_all[y, x] for of_all in rays), lacking
             expected[first : first + n] = np.concatenate(of_pixels, -1)
-        found = rows.get()
+        stored = rows.get()
         usable = np.isfinite(expected).all(1)
-        yield each(found[usable], expected[usable], 8 * EPS, floor=EPS)
-        kept = np.where(usable[:, None], found, 0)
+        yield each(stored[usable], expected[usable], 8 * EPS, floor=EPS)
+        kept = np.where(usable[:, None], stored, 0)
         drawn, unit = rng.integers(0, len(kept), n).astype(np.uint32), 0.3
         inputs, wanted = dev.empty((n, 1, INPUTS)), dev.empty((n, 1, 3))
         draw_batch(dev, dev.upload(kept), dev.upload(drawn), unit, inputs, wanted)

@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_studio.export.formats import check_target, export_run
     from pp_studio.export.length import set_length
 
-    name, folders = options.format, [find_run(one) for one in options.run_folders]
+    name, folders = options.format, [find_run(run_folder) for run_folder in options.run_folders]
     if name not in OF_POINTS:
         shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
     if name not in OF_SPLATS:
@@ -83,8 +83,8 @@ def run(options: argparse.Namespace) -> None:
         raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
     ends = (*options.length[:2], _metres(options.length[2])) if options.length else None
     path = check_target(name, folders[0].path, Path(options.out) if options.out else None)
-    for one in folders:
-        load_config(one.config)  # check that all runs are there before any work
+    for run_folder in folders:
+        load_config(run_folder.config)  # check that all runs are there before any work
     device = open_device(options.device)
 
     def loaded(folder):

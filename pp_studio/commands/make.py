@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> None:
     folder, scene = RunFolder(out / "run"), options.source
     page, video = out / INDEX, VIDEOS[0]
     masks: list[str] = []
-    told: list[str] = []
+    summaries: list[str] = []
     try:
         check_video("mp4")
     except UserError:
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace) -> None:
         def show(state="", split=""):
             run = load(folder.path, options.device) if split else None
             state = state and f"{state} {clock.told}; this page renews itself."
-            facts = {"run": run, "split": split, "scene": scene, "told": told, "state": state}
+            facts = {"run": run, "split": split, "scene": scene, "told": summaries, "state": state}
             write_result(out, clock.title, video, **facts)
 
         def step(name, *words, **more):
@@ -143,8 +143,8 @@ def run(options: argparse.Namespace) -> None:
                 clock.tell_of_capture(options.source)
             step("capture", options.source, "--out", scene, *_hints(options))
             *stages, _ = STAGES  # the last one prints what it has written
-            found = {name: read_json(out / f"scene/capture/{name}.json") for name in stages}
-            told = [f"{name}: {one['line']}" for name, one in found.items()]
+            records = {name: read_json(out / f"scene/capture/{name}.json") for name in stages}
+            summaries = [f"{name}: {record['line']}" for name, record in records.items()]
         preset = ["--preset", options.preset] if options.preset else []
         smooth = [] if is_scene else SMOOTH
         if not folder.checkpoint.exists():
@@ -258,33 +258,33 @@ class _Clock:
     def training(self) -> float:
         """Plan the training: return its minutes, and print how the rest is divided."""
         passed = self.passed
-        left = max(self.minutes - passed, LEAST_LEFT * self.minutes)
-        self._planned, self._until = self.minutes, passed + left
-        return self._divided(left)
+        minutes_left = max(self.minutes - passed, LEAST_LEFT * self.minutes)
+        self._planned, self._until = self.minutes, passed + minutes_left
+        return self._divided(minutes_left)
 
-    def _divided(self, left):
+    def _divided(self, minutes):
         """Return and print the minutes of a training, out of those that are left."""
-        after = min(max(AFTER * left, LEAST_AFTER), MOST_AFTER, (1 - LEAST_TRAINING) * left)
-        told = f"{self.minutes:g} minutes: {self.passed:.1f} have passed"
+        after = min(max(AFTER * minutes, LEAST_AFTER), MOST_AFTER, (1 - LEAST_TRAINING) * minutes)
+        text = f"{self.minutes:g} minutes: {self.passed:.1f} have passed"
         if self._until > self.minutes + 0.05:
-            told += f", which is too long; {self._until:.1f} are taken in all"
+            text += f", which is too long; {self._until:.1f} are taken in all"
         print(
-            f"{told}; {left - after:.1f} for the training, {after:.1f} for evaluation, splat and"
+            f"{text}; {minutes - after:.1f} for the training, {after:.1f} for evaluation, splat and"
             " video",
             flush=True,
         )
-        return left - after
+        return minutes - after
 
     def more(self, folder: "RunFolder") -> float:
         """The minutes in which a finished training goes on; 0 unless more minutes are asked for
         than it was planned for, and some are left.
         """
-        left = self.minutes - self.passed
-        if self._planned >= self.minutes or left < LEAST_MORE or len(folder.rows()) < 2:
+        minutes_left = self.minutes - self.passed
+        if self._planned >= self.minutes or minutes_left < LEAST_MORE or len(folder.rows()) < 2:
             return 0.0
         self._planned, self._until = self.minutes, self.minutes
         self.keep()
-        return self._divided(left)
+        return self._divided(minutes_left)
 
     def extended(self, folder: "RunFolder", minutes: float) -> list[str]:
         """The arguments of a finished training that goes on for these minutes."""
@@ -311,19 +311,19 @@ def _wrote_hull(out, scene, title, options, masks):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the training gives the same warnings
         try:
-            found = hull_gaussians(scene, options.masks if masks else None, options.device)
+            hull = hull_gaussians(scene, options.masks if masks else None, options.device)
         except UserError:
             return False
-    if found:
-        write_model(out, *found, title)
-    return found is not None
+    if hull:
+        write_model(out, *hull, title)
+    return hull is not None
 
 
 def _preset(minutes, share):
     """The preset for the minutes at a share of the processor; prints if other programs lower it."""
     quiet, chosen = (
-        next(name for name, least in PRESET_FROM.items() if one >= least)
-        for one in (minutes, share * minutes)
+        next(name for name, least in PRESET_FROM.items() if duration >= least)
+        for duration in (minutes, share * minutes)
     )
     if chosen != quiet:
         print(
@@ -359,8 +359,8 @@ def _is_scene(source):
     try:
         return bool(scene_format(source))
     except UserError:
-        found = f"{_photographs(source)} photographs" if Path(source).is_dir() else "a video"
-        print(f"{source}: {found}; working out where each was taken, and cutting out the object")
+        content = f"{_photographs(source)} photographs" if Path(source).is_dir() else "a video"
+        print(f"{source}: {content}; working out where each was taken, and cutting out the object")
         return False
 
 

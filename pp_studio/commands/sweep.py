@@ -94,13 +94,13 @@ def run(options: argparse.Namespace) -> None:
                 rows[job.folder], states[job.folder] = row, f"finished: {table.values_text(row)}"
         except UserError as error:  # the job raises it again and reports it in its row
             states[job.folder] = f"will fail: {error}"
-    told = f"{len(jobs)} runs, {len(rows)} of them finished already"
+    summary = f"{len(jobs)} runs, {len(rows)} of them finished already"
     if options.dry_run:
         for job in jobs:
             print(f"{table.run_text(table.failed_row(job, ''))}: {states[job.folder]}")
-        print(f"{told}; nothing was started")
+        print(f"{summary}; nothing was started")
         return
-    print(told, flush=True)
+    print(summary, flush=True)
     missing = [job for job in jobs if job.folder not in rows]
     own(out, [out / name for name in table.TABLES])
     if missing:

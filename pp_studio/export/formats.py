@@ -89,19 +89,19 @@ def export_run(
         made = mesh.coloured_mesh(run, within)
         write = partial(mesh.write_mesh, path, replace(made, vertices=placed(made.vertices)))
         unlit = ", unlit" if path.suffix.lower() == ".glb" else ""
-        told = f"{len(made.vertices)} vertices, {_faces(len(made.faces), made.seen)}{unlit}{unit}"
+        words = f"{len(made.vertices)} vertices, {_faces(len(made.faces), made.seen)}{unlit}{unit}"
     elif name == "textured":
         solid = texture.textured_mesh(run, turn, within)
         solid.apply_scale(metres)
         write = partial(texture.write_textured, path, solid)
         faces = _faces(len(solid.faces), solid.metadata[mesh.SEEN_FACES])
         unlit = ", unlit" if path.suffix.lower() == ".glb" else ", with its .mtl and .png"
-        told = f"{len(solid.vertices)} vertices, {faces}{unlit}{unit}"
+        words = f"{len(solid.vertices)} vertices, {faces}{unlit}{unit}"
     elif name == "html":
         fitted = gaussians.fitted_gaussians(run)
         text = page.page_text(fitted, run.cameras("train"), run.folder.name)
         write = partial(write_text, path, text)
-        told = f"{len(fitted.table)} Gaussians, {len(text) / 1e6:.1f} MB"
+        words = f"{len(fitted.table)} Gaussians, {len(text) / 1e6:.1f} MB"
     elif name in SPLATS:
         if name == "splat-spz":
             require("splat-spz", "gsply")
@@ -112,34 +112,34 @@ def export_run(
             table, times = splat.in_spz(table)
             unit += "" if times == 1 else f", times {times:g}"
             unit += splat.cut_in_spz(table)
-        told = f"{len(table)} Gaussians{unit}"
+        words = f"{len(table)} Gaussians{unit}"
         if name == "splat-glb":
             write = partial(splat.write_splat_glb, path, table, metres * origin)
         else:
             kind = splat.write_splat_ply if name == "splat" else splat.write_splat_spz
             write = partial(kind, path, table)
             if origin.any():
-                told += f", less {', '.join(f'{x:g}' for x in metres * origin)}"
+                words += f", less {', '.join(f'{x:g}' for x in metres * origin)}"
     else:
-        found = points.coloured_points(run, min_weight, within)
-        radius = np.float32(metres) * found.radius
-        found = replace(found, positions=placed(found.positions), radius=radius)
-        told = f"{len(found.rows)} of {count} points{unit}"
+        kept = points.coloured_points(run, min_weight, within)
+        radius = np.float32(metres) * kept.radius
+        kept = replace(kept, positions=placed(kept.positions), radius=radius)
+        words = f"{len(kept.rows)} of {count} points{unit}"
         if name == "ply":
             axes = "turned upright, y up" if axes == VIEWER else "its scene's"
-            write = partial(points.write_ply, path, found, run.model.cloud, f"{axes}{unit}")
+            write = partial(points.write_ply, path, kept, run.model.cloud, f"{axes}{unit}")
         else:
-            colours = gltf.gltf_colours(found.colours / 255)
-            write = partial(gltf.write_glb, path, {"POSITION": found.positions, "COLOR_0": colours})
+            colours = gltf.gltf_colours(kept.colours / 255)
+            write = partial(gltf.write_glb, path, {"POSITION": kept.positions, "COLOR_0": colours})
     if path.parts[-2:] == ("export", FORMATS[name][0]):  # the default folder, without --out
         own(path.parent)
     write()
-    return told
+    return words
 
 
-def _faces(count, seen):
+def _faces(count, shown):
     """The number of faces, and how many of them are guessed, in words."""
-    guessed = f" ({count - seen} of them guessed)" if seen < count else ""
+    guessed = f" ({count - shown} of them guessed)" if shown < count else ""
     return f"{count} faces{guessed}"
 
 
@@ -153,9 +153,12 @@ def renderings(run: Run) -> dict[str, list[View]]:
         splits["test"] = run.image_files("test")
     except UserError as error:
         warnings.warn(f"no test views are exported: {error}", stacklevel=2)
-    found = {}
+    rendered = {}
     for split, listed in splits.items():
-        files, views = image_paths([one.name for one in listed]), run.rendered(listed, opaque=False)
+        files, views = (
+            image_paths([file.name for file in listed]),
+            run.rendered(listed, opaque=False),
+        )
         named = zip(views, files, strict=True)
-        found[split] = [replace(view, name=f"{split}/{file}") for view, file in named]
-    return found
+        rendered[split] = [replace(view, name=f"{split}/{file}") for view, file in named]
+    return rendered

@@ -99,10 +99,10 @@ def closed(grid: Grid, fused: Fused, points: np.ndarray) -> np.ndarray:
     )
     nx, ny, _ = grid.dims
     corner = np.asarray(grid.origin) - points.mean(0)
-    for some in np.array_split(unseen, len(unseen) * len(planes) // PLANES + 1):
-        ijk = np.stack([some % nx, some // nx % ny, some // (nx * ny)], 1)
+    for part in np.array_split(unseen, len(unseen) * len(planes) // PLANES + 1):
+        ijk = np.stack([part % nx, part // nx % ny, part // (nx * ny)], 1)
         places = (corner + grid.voxel_size * ijk).astype(np.float32)
         outside = (places @ normals + offsets.astype(np.float32)).max(1)
         outside /= np.float32(TRUNCATION * grid.voxel_size)
-        distances.flat[some] = np.maximum(distances.flat[some], outside.clip(-1, 1))
+        distances.flat[part] = np.maximum(distances.flat[part], outside.clip(-1, 1))
     return distances

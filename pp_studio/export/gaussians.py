@@ -138,13 +138,13 @@ def fit_gaussians(run: Run, steps: int, cell: float, minutes: float = math.inf) 
     views = _fitted_views(run)
     if len(views) < ENOUGH:
         listed = run.image_files("train")
-        cameras = between([one.camera for one in listed])
-        more = [replace(one, camera=camera) for one, camera in zip(listed, cameras, strict=True)]
+        cameras = between([view.camera for view in listed])
+        more = [replace(view, camera=camera) for view, camera in zip(listed, cameras, strict=True)]
         views = (views or run.rendered(listed, opaque=False)) + run.rendered(more, opaque=False)
     sides = [side for view in views for side in (view.camera.width, view.camera.height)]
     factor = max(1, min(round(max(sides) / LARGEST), min(sides) // MIN_SIDE))
     config = config_of(run, steps)
-    reduced = [one.reduced(factor * one.downscale) for one in views]
+    reduced = [view.reduced(factor * view.downscale) for view in views]
     trainer = Trainer(dev, config, model, reduced, crops=WindowCrops)
     with Progress("fitting Gaussians", steps, "step") as progress:
         while trainer.step < config.train.iterations:
@@ -169,8 +169,8 @@ def fitted_gaussians(run: Run, quality: str | None = None, minutes: float = math
     fit to fewer steps. Raises UserError as check_drawable does.
     """
     check_drawable(run)
-    if found := kept_gaussians(run, [quality] if quality else QUALITIES):
-        return found
+    if gaussians := kept_gaussians(run, [quality] if quality else QUALITIES):
+        return gaussians
     table = _table(run, fit_gaussians(run, *QUALITIES[quality or QUICK], minutes))
     try:
         with atomic_file(run.folder.path / FILE) as file:
@@ -197,7 +197,7 @@ def kept_gaussians(run: Run, qualities: Iterable[str] = QUALITIES) -> Gaussians 
 def _fitted(run, table):
     longest = max(max(camera.width, camera.height) for camera in run.cameras("train"))
     reduced = max(1, round(longest / LARGEST))  # as the fit reduces them
-    least, most = (one / reduced for one in windows(longest / reduced))
+    least, most = (window / reduced for window in windows(longest / reduced))
     return Gaussians(table, run.model.grid.centre, (least, most), LOW_PASS)
 
 
@@ -291,8 +291,8 @@ def _fitted_views(run):
     try:
         views = [] if run.header.get("exposed") else run.scene("train").splits["train"]
     except UserError as error:
-        told = f"the Gaussians are fitted to renderings of the training views alone: {error}"
-        warnings.warn(told, stacklevel=2)
+        message = f"the Gaussians are fitted to renderings of the training views alone: {error}"
+        warnings.warn(message, stacklevel=2)
         return []
     return [view for view in views if view.name not in run.header.get("left_out", ())]
 
@@ -311,26 +311,26 @@ def begun(run: Run, coefficients: np.ndarray, cell: float) -> PointCloud:
     vertices = (grid.positions(ids) - grid.origin) / grid.voxel_size
     places, unit = vertices + moved[:, :3], DEVIATION * run.config.raster.radius
     area = (unit * np.exp(moved[:, 3])) ** 2  # area of a round one, in voxel sizes, over 2 pi
-    one = np.arange(len(rows))  # the Gaussian of each point
+    group = np.arange(len(rows))  # the Gaussian of each point
     if cell:
-        one = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
-    count = one.max() + 1
+        group = np.unique(places // cell, axis=0, return_inverse=True)[1].ravel()
+    count = group.max() + 1
     weight = area * opacity + 1e-6  # above 0, also for a lone invisible point
-    total = np.bincount(one, weight, count)[:, None]
+    total = np.bincount(group, weight, count)[:, None]
 
     def mean(values):
         columns = values.reshape(len(values), -1).T
-        return np.stack([np.bincount(one, weight * each, count) for each in columns], 1) / total
+        return np.stack([np.bincount(group, weight * each, count) for each in columns], 1) / total
 
     middle = mean(places)
-    apart = places - middle[one]
+    apart = places - middle[group]
     spread = mean(apart[:, :, None] * apart[:, None]).reshape(-1, 3, 3)
     spread += mean(area)[..., None] * np.eye(3)
     lengths = np.linalg.eigvalsh(spread)
-    seen = np.sqrt(lengths[:, 1] * lengths[:, 2])  # area over 2 pi of the merged one
-    absorbed = np.bincount(one, -np.log1p(-opacity) * area, count) / seen
+    merged_area = np.sqrt(lengths[:, 1] * lengths[:, 2])  # area over 2 pi of the merged one
+    absorbed = np.bincount(group, -np.log1p(-opacity) * area, count) / merged_area
     # Each Gaussian is kept at the vertex of its first point, which no other one has.
-    first = np.unique(one, return_index=True)[1]
+    first = np.unique(group, return_index=True)[1]
     order = np.argsort(ids[first])
     first, lower = first[order], np.linalg.cholesky(spread)[order] / unit
     offset = np.zeros((count, 9), np.float32)

@@ -38,8 +38,8 @@ class Observation:
     def point_weights(self) -> np.ndarray:
         """(N,) float32: each point's blend weights, summed over the pixels."""
         dev, n = self.run.dev, self.run.model.cloud.count
-        weights, seen = dev.zeros((n,)), dev.zeros((n,))
-        self.run.renderer.record_weights(self.view, weights, seen)
+        weights, times_seen = dev.zeros((n,)), dev.zeros((n,))
+        self.run.renderer.record_weights(self.view, weights, times_seen)
         return weights.get()
 
     @cached_property
@@ -75,12 +75,12 @@ def observe(
     run: Run, cameras: list[Camera], text: str, *, blending: bool = False
 ) -> Iterator[Observation]:
     """Yield the Observation of each camera in turn. text: label of the progress bar."""
-    seen = None
+    observation = None
     for camera in track(cameras, text, "view"):
-        if seen:
-            del seen.view  # frees its arrays before the next view makes larger ones
-        seen = _look(run, camera, blending)
-        yield seen
+        if observation:
+            del observation.view  # frees its arrays before the next view makes larger ones
+        observation = _look(run, camera, blending)
+        yield observation
 
 
 def _look(run, camera, blending):
@@ -112,12 +112,12 @@ def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
     for camera in track(cameras, "colours", "view"):
         rendered = run.render(camera)
         colours = np.float32(rendered.colour - (1 - rendered.alpha)[..., None]).reshape(-1, 3)
-        seen = _look(run, camera, blending=True)
-        at, rows = seen.functions(positions), seen.visible
-        weights = seen.gathered(np.ones_like(colours))[:, :1]
-        b[rows] += at[:, :, None] * seen.gathered(colours)[:, None]
+        observation = _look(run, camera, blending=True)
+        at, rows = observation.functions(positions), observation.visible
+        weights = observation.gathered(np.ones_like(colours))[:, :1]
+        b[rows] += at[:, :, None] * observation.gathered(colours)[:, None]
         blocks[rows] += (weights * at)[:, :, None] * at[:, None]
-        del seen
+        del observation
     ridge = RIDGE * blocks[:, :1, 0] * (np.arange(COUNT) > 0) + LEAST
     diagonal = np.arange(COUNT)
     blocks[:, diagonal, diagonal] += ridge
@@ -129,10 +129,10 @@ def fit_harmonics(run: Run, steps: int, most: int | None = None) -> np.ndarray:
     def product(flat):
         coefficients = flat.reshape(b.shape)
         result = ridge[..., None] * coefficients
-        for seen in observe(run, cameras, "colours by direction", blending=True):
-            at, rows = seen.functions(positions), seen.visible
-            colours, _ = seen.blended(np.einsum("nk,nkc->nc", at, coefficients[rows]))
-            result[rows] += at[:, :, None] * seen.gathered(colours)[:, None]
+        for observation in observe(run, cameras, "colours by direction", blending=True):
+            at, rows = observation.functions(positions), observation.visible
+            colours, _ = observation.blended(np.einsum("nk,nkc->nc", at, coefficients[rows]))
+            result[rows] += at[:, :, None] * observation.gathered(colours)[:, None]
         return result.ravel()
 
     def operator(function):

@@ -67,8 +67,8 @@ def median_colours(
     """(N, 3) in [0, 1]: the median sRGB colour of points (N, 3) over the views that face their
     outward normals (N, 3) and in which nothing hides them. spacing: the distance between points.
     """
-    seen = np.full((len(views), len(positions), 3), np.nan, np.float32)
-    for colours, view in zip(seen, track(views, "colours of the hull", "view"), strict=True):
+    samples = np.full((len(views), len(positions), 3), np.nan, np.float32)
+    for colours, view in zip(samples, track(views, "colours of the hull", "view"), strict=True):
         camera, image = view.camera, shrink(view.image, view.downscale)
         depth = camera.project(positions)[2]
         towards = camera.eye - positions
@@ -86,10 +86,10 @@ def median_colours(
         sure = pixels[:, 3] >= OPAQUE
         colours[chosen[sure]] = pixels[sure, :3] / np.float32(255)
     with Progress("medians of colours"):
-        seen.sort(axis=0)  # NaN comes last; nanmedian() takes ten times as long
-        count = (~np.isnan(seen[:, :, :1])).sum(axis=0, keepdims=True)
+        samples.sort(axis=0)  # NaN comes last; nanmedian() takes ten times as long
+        count = (~np.isnan(samples[:, :, :1])).sum(axis=0, keepdims=True)
         middle = np.maximum([(count - 1) // 2, count // 2], 0)
-        median = np.mean([np.take_along_axis(seen, at, axis=0)[0] for at in middle], axis=0)
+        median = np.mean([np.take_along_axis(samples, at, axis=0)[0] for at in middle], axis=0)
         return np.where(count[0] > 0, median, np.float32(UNSEEN))
 
 

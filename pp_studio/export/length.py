@@ -41,12 +41,12 @@ def set_length(run: Run, first: str, second: str, metres: float) -> float:
     apart = float(np.linalg.norm(surface_point(run, first) - surface_point(run, second)))
     if apart < run.model.grid.voxel_size:
         raise UserError(f"--length {first} {second}: show the same place; name two far apart")
-    found = float(metres) / apart
-    if not SMALLEST <= found <= LARGEST:
-        raise UserError(f"--length {metres:g}: a unit of the scene would be {found:g} m")
-    facts = {"metres_per_unit": found, "between": [first, second], "metres": float(metres)}
+    unit = float(metres) / apart
+    if not SMALLEST <= unit <= LARGEST:
+        raise UserError(f"--length {metres:g}: a unit of the scene would be {unit:g} m")
+    facts = {"metres_per_unit": unit, "between": [first, second], "metres": float(metres)}
     write_json(run.folder.path / FILE, facts)
-    return found
+    return unit
 
 
 def _straight(run, image_file, x, y):
@@ -55,15 +55,15 @@ def _straight(run, image_file, x, y):
         listed = scene_frames(run.config.scene.path, edited=False)
     except UserError:
         return x, y
-    lens = next((one.lens for one in listed if one.name == image_file.name), None)
+    lens = next((frame.lens for frame in listed if frame.name == image_file.name), None)
     if not lens:
         return x, y
     camera = image_file.camera
     there = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-    found = root(lambda place: np.subtract(lens.apply(*place), there), there)
-    if not found.success:  # NaN lies outside every image
+    solution = root(lambda place: np.subtract(lens.apply(*place), there), there)
+    if not solution.success:  # NaN lies outside every image
         return np.nan, np.nan
-    return found.x[0] * camera.fx + camera.cx, found.x[1] * camera.fy + camera.cy
+    return solution.x[0] * camera.fx + camera.cx, solution.x[1] * camera.fy + camera.cy
 
 
 def surface_point(run: Run, text: str) -> np.ndarray:
@@ -71,19 +71,19 @@ def surface_point(run: Run, text: str) -> np.ndarray:
     image's path in the scene or the end of it, and pixels from its upper left corner. Raises
     UserError if there is no such image or pixel, or it does not show the object.
     """
-    found = re.fullmatch(r"(.+):([0-9.]+),([0-9.]+)", text)
+    parsed = re.fullmatch(r"(.+):([0-9.]+),([0-9.]+)", text)
     try:
-        name, x, y = found[1], float(found[2]), float(found[3])  # type: ignore[index]
+        name, x, y = parsed[1], float(parsed[2]), float(parsed[3])  # type: ignore[index]
     except (TypeError, ValueError):
         raise UserError(
             f"--length {shown(text)}: write PHOTO:X,Y, for example a.jpg:812,430"
         ) from None
     refused, image_files = f"--length {shown(text)}: ", run.image_files("train")
-    matches = [one for one in image_files if one.name == name or one.name.endswith(f"/{name}")]
+    matches = [file for file in image_files if file.name == name or file.name.endswith(f"/{name}")]
     if len(matches) > 1:
         raise UserError(f"{refused}{name} is in several folders; write more of its path")
     if not matches:
-        names = [one.name for one in image_files]
+        names = [file.name for file in image_files]
         near = suggestion(name, names).strip() or f"name one such as {names[0]}"
         raise UserError(f"{refused}no training image of that name; {near}")
     stored = matches[0].camera

@@ -90,8 +90,8 @@ def surface(run: Run, box: np.ndarray | None = None) -> Surface:
         map_coordinates(gaussian_filter(field, 1), vertices.T, order=1, mode="nearest")
         for field in (fused.near, fused.scatter)
     )
-    seen = near >= SEEN
-    vertices = fair(vertices, faces, np.where(seen, HELD / (1 + (scatter / SCATTER) ** 4), UNSEEN))
+    shown = near >= SEEN
+    vertices = fair(vertices, faces, np.where(shown, HELD / (1 + (scatter / SCATTER) ** 4), UNSEEN))
     positions = np.asarray(grid.origin) + grid.voxel_size * vertices[:, ::-1]
     faces = faces[inside(positions, box)[faces].all(1)]
     if not len(faces):
@@ -100,7 +100,7 @@ def surface(run: Run, box: np.ndarray | None = None) -> Surface:
             " make it larger"
         )
     used, faces = np.unique(faces, return_inverse=True)
-    return Surface(positions[used], faces.reshape(-1, 3).astype(np.int32), seen[used])
+    return Surface(positions[used], faces.reshape(-1, 3).astype(np.int32), shown[used])
 
 
 def fair(vertices: np.ndarray, faces: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -138,21 +138,21 @@ def _large_parts(faces, vertices):
     sizes = np.bincount(part[faces[:, 0]])
     is_large = sizes >= LOOSE * sizes.max()
     if crumbs := np.count_nonzero(sizes[~is_large]):
-        told = f"the surface: {crumbs} loose parts are left out, {sizes[~is_large].sum()} faces"
-        warnings.warn(f"{told} of {len(faces)}", stacklevel=3)
+        message = f"the surface: {crumbs} loose parts are left out, {sizes[~is_large].sum()} faces"
+        warnings.warn(f"{message} of {len(faces)}", stacklevel=3)
     return faces[is_large[part[faces[:, 0]]]]
 
 
 def coloured_mesh(run: Run, box: np.ndarray | None = None) -> Mesh:
     """surface(), coloured by the nearest points' mean, by weight over squared distance."""
-    found, points = surface(run, box), coloured_points(run)
-    faces, seen = seen_first(found.faces, found.seen)
-    vertices = in_world(found.vertices, run.model.grid.voxel_size)
+    geometry, points = surface(run, box), coloured_points(run)
+    faces, seen_count = seen_first(geometry.faces, geometry.seen)
+    vertices = in_world(geometry.vertices, run.model.grid.voxel_size)
     count = min(NEIGHBOURS, len(points.rows))
     distance, near = cKDTree(points.positions).query(vertices, list(range(1, count + 1)))
     weight = points.weight[near] / (distance**2 + run.model.grid.voxel_size**2)
     mean = (weight[..., None] * points.colours[near]).sum(1) / weight.sum(1, keepdims=True)
-    return Mesh(vertices, faces, np.rint(mean).astype(np.uint8), seen)
+    return Mesh(vertices, faces, np.rint(mean).astype(np.uint8), seen_count)
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:

@@ -74,10 +74,10 @@ def _nearest_axes(deviations, turn):
     # w of the product of two quaternions (x, y, z, w)
     quaternions, others = own.as_quat(), ways.as_quat() * [-1, -1, -1, 1]
     chosen = np.argmax(np.abs(quaternions @ others.T), axis=1)
-    found = (own * ways[chosen]).as_quat(canonical=True)
+    turned = (own * ways[chosen]).as_quat(canonical=True)
     swapped = np.abs(ways.as_matrix())[chosen]
     kept = np.einsum("nji,nj->ni", swapped, deviations)
-    return kept, np.rint(found[:, :3] * TURNED + 128).astype(np.uint8)
+    return kept, np.rint(turned[:, :3] * TURNED + 128).astype(np.uint8)
 
 
 def page_text(gaussians: Gaussians, cameras: Sequence[Camera], title: str, still: str = "") -> str:
@@ -92,7 +92,7 @@ def page_text(gaussians: Gaussians, cameras: Sequence[Camera], title: str, still
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     eye, up = first_look(places + gaussians.origin, centre, cameras)
     # width of a training pixel at the middle of the object
-    pixels = [np.linalg.norm(one.eye - centre) / min(one.fx, one.fy) for one in cameras]
+    pixels = [np.linalg.norm(camera.eye - centre) / min(camera.fx, camera.fy) for camera in cameras]
     header = about | {
         "count": len(rows),
         "origin": (gaussians.origin + corner).tolist(),
@@ -123,18 +123,18 @@ def photographed(
     `ahead` by the right-hand rule, [lowest elevation, highest elevation, degrees beyond BESIDE to
     the nearest camera's azimuth], in whole degrees.
     """
-    offsets = np.stack([one.eye - centre for one in cameras])
+    offsets = np.stack([camera.eye - centre for camera in cameras])
     height, across = offsets @ up, offsets @ np.stack([ahead, np.cross(up, ahead)], axis=1)
     elevations = np.degrees(np.arctan2(height, np.linalg.norm(across, axis=1)))
     azimuths = np.degrees(np.arctan2(across[:, 1], across[:, 0]))
-    found = []
+    sectors = []
     for sector in range(SECTORS):
         apart = np.abs((azimuths - sector * 360 / SECTORS + 180) % 360 - 180)
         near = apart <= max(apart.min(), BESIDE)
         aside = max(0.0, apart.min() - BESIDE)
         row = (elevations[near].min(), elevations[near].max(), aside)
-        found.append([round(float(one)) for one in row])
-    return found
+        sectors.append([round(float(value)) for value in row])
+    return sectors
 
 
 def filled(template: str, parts: dict[str, str], still: str) -> str:
@@ -188,7 +188,7 @@ def first_look(
     from the side of the first camera, RISE above the horizon, or as near to that as cameras were,
     and shows the whole object, also while it turns.
     """
-    up, offsets = up_of(cameras), np.stack([one.eye - centre for one in cameras])
+    up, offsets = up_of(cameras), np.stack([camera.eye - centre for camera in cameras])
     elevations = np.arcsin(offsets @ up / np.linalg.norm(offsets, axis=1))
     rise = np.clip(np.radians(RISE), elevations.min(), elevations.max())
     ahead = level(cameras[0].eye - centre, up)

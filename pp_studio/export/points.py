@@ -55,9 +55,9 @@ def coloured_points(
     cloud, voxel_size = run.model.cloud, run.model.grid.voxel_size
     positions = run.model.positions()
     colours, best = np.zeros((cloud.count, 3), np.uint8), np.zeros(cloud.count, np.float32)
-    for seen in observe(run, run.cameras("train"), "colours"):
-        weights = seen.point_weights()
-        higher, camera = np.flatnonzero(weights > best), seen.camera
+    for observation in observe(run, run.cameras("train"), "colours"):
+        weights = observation.point_weights()
+        higher, camera = np.flatnonzero(weights > best), observation.camera
         best[higher] = weights[higher]
         # a centre just outside the image takes the nearest pixel; its depth is above 0
         column, row, _ = camera.project(positions[higher])
@@ -87,12 +87,12 @@ def inside(positions: np.ndarray, box: np.ndarray | None) -> np.ndarray:
     """
     if box is None:
         return np.ones(len(positions), bool)
-    found = ((positions >= box[0]) & (positions <= box[1])).all(1)
-    if not found.any():
+    is_inside = ((positions >= box[0]) & (positions <= box[1])).all(1)
+    if not is_inside.any():
         ends = (positions.min(0), positions.max(0))
         low, high = (",".join(f"{x:.3g}" for x in corner) for corner in ends)
         raise UserError(f"--box: nothing lies in it; the run reaches from {low} to {high}")
-    return found
+    return is_inside
 
 
 def in_world(positions: np.ndarray, voxel_size: float) -> np.ndarray:

@@ -71,9 +71,9 @@ def write_result(
     views, shown = _later("evaluation"), set()
     if run:
         done = run.folder.checkpoint
-        found: dict[str, Any] = {}
+        evaluation: dict[str, Any] = {}
         if is_newer(run.folder.metrics(split), done):
-            found = json.loads(run.folder.metrics(split).read_text("utf-8"))
+            evaluation = json.loads(run.folder.metrics(split).read_text("utf-8"))
             _copy(run.folder.evaluation(split) / "comparison.png", folder / VIEWS)
             whose = "that the training has not seen" if split != "train" else "of the training"
             text = f"Views {whose}: rendered, photographed, and four times their difference."
@@ -84,14 +84,14 @@ def write_result(
             gaussians = (fitted_gaussians if SPLAT in shown else first_gaussians)(run)
             write_model(folder, gaussians, run.cameras("train"), title)
         shown |= {MODEL, STILL}
-        plan, rows = [], _figures(run, found)
+        plan, rows = [], _figures(run, evaluation)
         told = [*told, *run.header.get("notes", [])]
         if names := run.header.get("left_out"):
             told.append(f"left out, as their masks contradict the others': {', '.join(names)}")
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the training gives the same warnings
-            cameras = [one.camera for one in scene_frames(scene, "train")]
+            cameras = [frame.camera for frame in scene_frames(scene, "train")]
         shown = {MODEL} if (folder / MODEL).exists() else set()
         plan = _plan(folder, Path(scene), cameras)
         rows = [
@@ -176,11 +176,11 @@ def _later(what):
     return f'<p class="later">The {what} is still to come.</p>'
 
 
-def _figures(run, found):
-    """[(name, value)] of the table, including values `found` in metrics.json, if any."""
-    rows = [(LABELS[name], f"{value:.4g}") for name, value in found.get("mean", {}).items()]
+def _figures(run, evaluation):
+    """[(name, value)] of the table. evaluation: the contents of metrics.json, {} if none."""
+    rows = [(LABELS[name], f"{value:.4g}") for name, value in evaluation.get("mean", {}).items()]
     if rows:
-        rows[0] = (rows[0][0], f"{rows[0][1]} (mean of {len(found['per_image'])} views)")
+        rows[0] = (rows[0][0], f"{rows[0][1]} (mean of {len(evaluation['per_image'])} views)")
     cameras = run.cameras("train")
     return [
         *rows,

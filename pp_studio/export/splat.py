@@ -42,9 +42,9 @@ def splats(
     origin = np.zeros(3) if near else np.rint(positions.mean(0))
     table["position"] = positions - origin
     # solve for the coefficients in turned directions, from a sample of directions
-    seen = np.random.default_rng(0).normal(size=(64, 3))
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    before, after = (basis(d)[:, ORDER] * FACTORS for d in (seen, seen @ turn.T))
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before, after = (basis(d)[:, ORDER] * FACTORS for d in (directions, directions @ turn.T))
     matrix = np.linalg.lstsq(after, before, rcond=None)[0]
     table["harmonics"] = np.einsum("jk,nkc->njc", matrix, table["harmonics"])
     axes = Rotation.from_matrix(turn) * Rotation.from_quat(np.roll(table["turn"], -1, axis=1))

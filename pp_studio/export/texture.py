@@ -52,13 +52,13 @@ def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> 
     import fast_simplification
     import xatlas
 
-    found = surface(run, box)
-    middle, faces = found.vertices.mean(0), found.faces
-    whole = vertices = (found.vertices - middle).astype(np.float32)
+    geometry = surface(run, box)
+    middle, faces = geometry.vertices.mean(0), geometry.faces
+    whole = vertices = (geometry.vertices - middle).astype(np.float32)
     if len(faces) > FACES:
         with Progress("simplifying the surface"):
             vertices, faces = fast_simplification.simplify(vertices, faces, target_count=FACES)
-    faces, seen = seen_first(faces, found.seen[cKDTree(whole).query(vertices)[1]])
+    faces, seen_count = seen_first(faces, geometry.seen[cKDTree(whole).query(vertices)[1]])
     solid = trimesh.Trimesh(vertices, faces, process=False)
     normals = solid.vertex_normals.astype(np.float32)
     with Progress("unwrapping the surface"):
@@ -85,7 +85,7 @@ def textured_mesh(run: Run, turn: np.ndarray, box: np.ndarray | None = None) -> 
         faces,
         vertex_normals=normals @ turn.T,
         visual=TextureVisuals(uv, material=material),
-        metadata={SEEN_FACES: seen},
+        metadata={SEEN_FACES: seen_count},
         process=False,
     )
 
@@ -101,21 +101,21 @@ def texels(
     width, height = (np.floor(corners.max(1)).astype(int) - first + 1).T
     a, b, c = corners.transpose(1, 0, 2)
     area = _cross(b - a, c - a)
-    found = []
+    pieces = []
     # faces with boxes of similar sizes go together: each texel of a box is tested for all of them
     order = np.argsort(np.maximum(width, height))
     for group in np.array_split(order, max(1, len(faces) // 4096)):
         columns, rows = width[group].max(initial=0), height[group].max(initial=0)
         for y in range(max(0, rows)):
             for x in range(max(0, columns)):
-                some = group[(x < width[group]) & (y < height[group]) & (area[group] != 0)]
-                at = first[some] + (x, y)
-                toward_b = _cross(at - a[some], c[some] - a[some]) / area[some]
-                toward_c = _cross(b[some] - a[some], at - a[some]) / area[some]
+                tested = group[(x < width[group]) & (y < height[group]) & (area[group] != 0)]
+                at = first[tested] + (x, y)
+                toward_b = _cross(at - a[tested], c[tested] - a[tested]) / area[tested]
+                toward_c = _cross(b[tested] - a[tested], at - a[tested]) / area[tested]
                 shares = np.stack([1 - toward_b - toward_c, toward_b, toward_c], 1)
                 inside = (shares >= -1e-9).all(1) & (at >= 0).all(1) & (at < side).all(1)
-                found.append((at[inside, 1], at[inside, 0], some[inside], shares[inside]))
-    rows, columns, chosen, shares = (np.concatenate(part) for part in zip(*found, strict=True))
+                pieces.append((at[inside, 1], at[inside, 0], tested[inside], shares[inside]))
+    rows, columns, chosen, shares = (np.concatenate(part) for part in zip(*pieces, strict=True))
     return rows, columns, chosen, shares
 
 
@@ -133,15 +133,15 @@ def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     kept = min(VIEWS, len(cameras))
     weights, colours = np.zeros((n, kept), np.float32), np.zeros((n, kept, 3), np.uint8)
     for camera in track(cameras, "texture", "view"):
-        rows, weight, seen = _looked_at(run, camera, positions, normals)
+        rows, weight, colour = _looked_at(run, camera, positions, normals)
         least = weights[rows].argmin(1)
         better = weight > weights[rows, least]
         rows, least = rows[better], least[better]
-        weights[rows, least], colours[rows, least] = weight[better], seen[better]
-    found = np.zeros((n, 3))
+        weights[rows, least], colours[rows, least] = weight[better], colour[better]
+    baked = np.zeros((n, 3))
     for first in range(0, n, AT_ONCE):
-        some = slice(first, first + AT_ONCE)
-        found[some] = agreed(weights[some], colours[some] / np.float32(255))
+        chunk = slice(first, first + AT_ONCE)
+        baked[chunk] = agreed(weights[chunk], colours[chunk] / np.float32(255))
     is_seen = weights.any(1)
     if not is_seen.any():
         raise UserError(f"{run.folder}: no training view shows its surface; train it longer")
@@ -150,8 +150,8 @@ def bake(run: Run, positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
     unseen = np.flatnonzero(~is_seen)
     for part in np.array_split(unseen, len(unseen) // AT_ONCE + 1):
         share = 1 / (cdist(positions[part], positions[rows]) + run.model.grid.voxel_size) ** 4
-        found[part] = share @ found[rows] / share.sum(1, keepdims=True)
-    return found
+        baked[part] = share @ baked[rows] / share.sum(1, keepdims=True)
+    return baked
 
 
 def _looked_at(run, camera, positions, normals):
@@ -173,7 +173,7 @@ def _looked_at(run, camera, positions, normals):
     # rendered over black, as straight colours beside the object are noise
     layers = *np.moveaxis(rendered.over((0.0, 0.0, 0.0)), 2, 0), rendered.alpha
     place = np.stack([y, x])[:, rows_seen] - 0.5
-    *channels, alpha = (map_coordinates(one, place, order=1, mode="nearest") for one in layers)
+    *channels, alpha = (map_coordinates(layer, place, order=1, mode="nearest") for layer in layers)
     colours = to_8bit(np.stack(channels, 1) / np.maximum(alpha, 1 / 255)[:, None])
     weight = cosine[rows] ** SHARPNESS * np.where(jump[row, column], AT_EDGES, 1)
     return rows, weight.astype(np.float32), colours

@@ -43,7 +43,7 @@ def draw(
     if show in OWN_CAMERA:
         if not views:
             raise UserError("the photographs are not there")
-        view = views[nearest_view([one.camera for one in views], camera, run.ball[0])]
+        view = views[nearest_view([photograph.camera for photograph in views], camera, run.ball[0])]
         camera, line, truth = view.camera, view.name, Target(run.dev).whole(view)
     run = most_opaque(run, share) if share < 1 else run
     if show == "photograph":

@@ -126,11 +126,11 @@ class ModelPage:
             self._share = slider(
                 "Points shown, %", 1, 100, 1, 100, hint="the most opaque", visible=not is_training
             )
-            first = [(one, one.value) for one in (self._stop, self._share, self._exposure)]
+            first = [(knob, knob.value) for knob in (self._stop, self._share, self._exposure)]
             gui.add_button("Reset").on_click(
                 lambda _: [setattr(handle, "value", value) for handle, value in first]
             )
-        for handle in (self._show, self._shown, *(one for one, _ in first)):
+        for handle in (self._show, self._shown, *(knob for knob, _ in first)):
             handle.on_update(self._switched)
         series = [{"label": "step"}, {"label": "PSNR", "scale": "dB", "stroke": BLUE}]
         series.append({"label": "loss", "scale": "loss", "stroke": ORANGE})
@@ -148,8 +148,8 @@ class ModelPage:
     # ---- what viser's threads call
 
     async def _connected(self, client):
-        async def moved(seen):
-            if camera := self._space.camera(seen):
+        async def moved(handle):
+            if camera := self._space.camera(handle):
                 tab = self._tabs.get(client.client_id)
                 if tab is None:
                     tab = self._tabs[client.client_id] = Tab(client, camera)
@@ -222,10 +222,10 @@ class ModelPage:
 
     def set_rows(self, rows: Sequence[dict[str, Any]]) -> None:
         """Draw the curve of a log's rows, thinned out to about MOST_ROWS."""
-        found = [[row[key] for key in LOGGED] for row in rows if all(key in row for key in LOGGED)]
-        thinned = found[:: 1 + len(found) // MOST_ROWS]
+        logged = [[row[key] for key in LOGGED] for row in rows if all(key in row for key in LOGGED)]
+        thinned = logged[:: 1 + len(logged) // MOST_ROWS]
         self._curve.data = tuple(np.array(thinned, np.float64).reshape(-1, len(LOGGED)).T.copy())
-        self._curve.visible = bool(found)
+        self._curve.visible = bool(logged)
 
     def draw_next(self) -> bool:
         """Draw for the tab that has waited longest; return whether any was waiting."""
@@ -261,13 +261,13 @@ class ModelPage:
 
     def _gaussians(self):
         """Arguments of viser's add_gaussian_splats, with mean colours; None if none are fitted."""
-        if (found := kept_gaussians(self.run)) is None:
+        if (gaussians := kept_gaussians(self.run)) is None:
             return None
-        table = found.table
+        table = gaussians.table
         turn = Rotation.from_quat(np.roll(table["turn"], -1, axis=1)).as_matrix()
         axes = turn * table["deviations"][:, None] / self._space.radius
         return {
-            "centers": self._space.page(table["position"] + found.origin).astype(np.float32),
+            "centers": self._space.page(table["position"] + gaussians.origin).astype(np.float32),
             "covariances": (axes @ axes.transpose(0, 2, 1)).astype(np.float32),
             "rgbs": (0.5 + CONSTANT * table["harmonics"][:, 0]).clip(0, 1),
             "opacities": table["opacity"][:, None],
@@ -295,11 +295,11 @@ class ModelPage:
                 raise _MovedError
 
         try:
-            found = self._image(camera, on_part)
+            drawn = self._image(camera, on_part)
         except _MovedError:
             return
-        if found:
-            image, line = found
+        if drawn:
+            image, line = drawn
             if self._show.value in OWN_CAMERA:
                 image = framed(image, tab.camera.width / tab.camera.height)
             tab.client.scene.set_background_image(image, "jpeg", jpeg_quality=90)
@@ -317,9 +317,9 @@ class ModelPage:
 
     def _send_image(self, tab):
         """Draw what a tab shows into a file for its user to save."""
-        if found := self._image(self._camera(tab)):
+        if drawn := self._image(self._camera(tab)):
             file = io.BytesIO()
-            Image.fromarray(found[0]).save(file, "PNG")
+            Image.fromarray(drawn[0]).save(file, "PNG")
             run = self.run.folder.name
             name = f"{run}_step_{self.run.header['step']}_{self._show.value}.png"
             tab.client.send_file_download(name, file.getvalue(), save_immediately=True)

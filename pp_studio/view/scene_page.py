@@ -49,7 +49,7 @@ class ScenePage:
             for split in sorted(scene_splits(folder), key=lambda split: split != "train")
         }
         # a view in two splits is one view: the page's list takes each name only once
-        self._cameras = {view.name: view.camera for some in self.splits.values() for view in some}
+        self._cameras = {view.name: view.camera for views in self.splits.values() for view in views}
         cameras = list(self._cameras.values())
         self._points, colours = sparse_points(folder)
         box, _ = self._box()
