@@ -112,7 +112,9 @@ def typed_figures(text: str) -> list[str]:
     by a command.
     """
     paragraphs = re.split(r"\n\n(?!\|)|\n(?=- )", BLOCK.sub("", text).replace(PUBLISHED, ""))
-    return [one for one in paragraphs if CARD.search(one) and FIGURE.search(one)]
+    return [
+        paragraph for paragraph in paragraphs if CARD.search(paragraph) and FIGURE.search(paragraph)
+    ]
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.stem)

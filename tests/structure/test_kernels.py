@@ -63,13 +63,13 @@ def test_a_planted_violation_is_found(check, source, expected):
     ids=lambda check: check.__name__,
 )
 def test_the_rule_holds_everywhere(check):
-    found = {name: check(source) for name, source in SOURCES.items()}
-    assert not {name: complaints for name, complaints in found.items() if complaints}
+    complaints_by_file = {name: check(source) for name, source in SOURCES.items()}
+    assert not {name: complaints for name, complaints in complaints_by_file.items() if complaints}
 
 
 def included(name):
-    found = set(re.findall(r'#include "(.*)"', SOURCES[name]))
-    return found.union(*map(included, found))
+    headers = set(re.findall(r'#include "(.*)"', SOURCES[name]))
+    return headers.union(*map(included, headers))
 
 
 def test_kernels_are_declared_by_the_macro_of_common_h():

@@ -14,21 +14,25 @@ OF_TUPLES, OTHERS = ("_replace", "_asdict", "_fields"), ("self", "cls", "os")
 
 def faults(source, public):
     """Imports from pp_cl that are not public, and uses of names with an underscore."""
-    found = []
+    violations = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            found += [one.name for one in node.names if one.name.partition(".")[0] == "pp_cl"]
+            violations += [
+                alias.name for alias in node.names if alias.name.partition(".")[0] == "pp_cl"
+            ]
         elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "pp_cl":
-            names = {one.name for one in node.names}
+            names = {alias.name for alias in node.names}
             whole = {name for name in names if f"{node.module}.{name}" in public}  # whole modules
-            found += [f"{node.module}.{n}" for n in names - whole - public.get(node.module, set())]
+            violations += [
+                f"{node.module}.{n}" for n in names - whole - public.get(node.module, set())
+            ]
         elif isinstance(node, ast.Attribute) and node.attr[0] == "_" and node.attr[:2] != "__":
             owner = getattr(node.value, "id", None)
             if owner not in OTHERS and node.attr not in OF_TUPLES:
-                found.append(f".{node.attr}")
+                violations.append(f".{node.attr}")
         elif isinstance(node, ast.Constant) and re.fullmatch(r"pp_cl(\.\w+)+", str(node.value)):
-            found.append(f"{node.value!r}")
-    return found
+            violations.append(f"{node.value!r}")
+    return violations
 
 
 PUBLIC = {
@@ -58,8 +62,8 @@ def test_what_is_public_is_none():
 
 def test_the_studio_uses_public_names_alone():
     sources = sorted((ROOT / "pp_studio").rglob("*.py"))
-    found = {str(path): faults(path.read_text("utf-8"), PUBLIC) for path in sources}
-    assert found and not {path: wrong for path, wrong in found.items() if wrong}
+    violations = {str(path): faults(path.read_text("utf-8"), PUBLIC) for path in sources}
+    assert violations and not {path: wrong for path, wrong in violations.items() if wrong}
 
 
 @pytest.mark.parametrize("module", PUBLIC)

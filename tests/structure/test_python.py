@@ -18,20 +18,22 @@ def untyped_functions(source):
     tree = ast.parse(source)
     owners = [n for n in ast.walk(tree) if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
     functions = [n for owner in [tree, *owners] for n in owner.body if isinstance(n, FUNCTIONS)]
-    found = []
+    complaints = []
     for node in (n for n in functions if n.name[0] != "_" or n.name == "__init__"):
         parameters = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
         untyped = [a.arg for a in parameters if not a.annotation and a.arg not in ("self", "cls")]
-        found += [f"{node.name}: {name} has no type" for name in untyped]
-    return found
+        complaints += [f"{node.name}: {name} has no type" for name in untyped]
+    return complaints
 
 
 def test_public_functions_have_types():
     assert untyped_functions("class A:\n    def f(self, a, *, b: int): pass") == [
         "f: a has no type"
     ]
-    found = {path: untyped_functions(path.read_text("utf-8")) for path in ROOT.glob("pp_*/**/*.py")}
-    assert not {str(path): lines for path, lines in found.items() if lines} and found
+    complaints = {
+        path: untyped_functions(path.read_text("utf-8")) for path in ROOT.glob("pp_*/**/*.py")
+    }
+    assert not {str(path): lines for path, lines in complaints.items() if lines} and complaints
 
 
 def test_imports_go_down(monkeypatch):

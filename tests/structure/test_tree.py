@@ -36,7 +36,7 @@ def test_setup_cfg_declares_every_package_that_is_imported():
     setup.read(ROOT / "setup.cfg")
     lists = setup["options"]["install_requires"], *setup["options.extras_require"].values()
     declared = {re.split("[<>=;]", line)[0] for text in lists for line in text.split("\n")}
-    found, names = packages_distributions(), set()
+    distributions, names = packages_distributions(), set()
     for path in (p for top in (*OURS, "tests", "tools") for p in (ROOT / top).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Import):
@@ -44,7 +44,9 @@ def test_setup_cfg_declares_every_package_that_is_imported():
             if isinstance(node, ast.ImportFrom) and not node.level:
                 names.add(node.module.partition(".")[0])
     names -= sys.stdlib_module_names | {*OURS, "tests", "tools", "support"}
-    packages = {name: found.get(name, [name])[0].lower().replace("_", "-") for name in names}
+    packages = {
+        name: distributions.get(name, [name])[0].lower().replace("_", "-") for name in names
+    }
     assert "numpy" in names
     assert set(packages.values()) <= {name.lower() for name in declared}
 
@@ -66,7 +68,7 @@ def test_commands_that_install_work_in_a_checkout_and_with_the_wheel(monkeypatch
     for path in (path for top in OURS for path in (ROOT / top).rglob("*.py")):
         text = path.read_text("utf-8")
         named |= {
-            frozenset(found.split(" ")) for found in re.findall("pip install ([^`{]+)`", text)
+            frozenset(packages.split(" ")) for packages in re.findall("pip install ([^`{]+)`", text)
         }
         required = re.findall(r'    require\("[^"]+", ([^)]+)\)', text)
         named |= {frozenset(re.findall('"([^"]+)"', packages)) for packages in required}
@@ -106,9 +108,9 @@ def packed(folder, tmp_path):
 
 def test_the_source_archive_lacks_what_is_not_free(tmp_path):
     """Images of other authors' scenes are under CC BY-NC-SA, as their pages say."""
-    found = packed(ROOT, tmp_path)
-    assert {"docs/capture.png", "cl/common.h", "pp_cl/engine/step.py"} <= found
-    assert not {"docs/orbits.png", "docs/make.png"} & found
+    files = packed(ROOT, tmp_path)
+    assert {"docs/capture.png", "cl/common.h", "pp_cl/engine/step.py"} <= files
+    assert not {"docs/orbits.png", "docs/make.png"} & files
 
 
 def test_docker_gets_all_that_is_installed(tmp_path):

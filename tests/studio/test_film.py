@@ -31,17 +31,17 @@ def flicker(cameras, views):
     at = np.stack([second.fy * y / z + second.cy, second.fx * x / z + second.cx]) - 0.5
     most = [[second.height - 1], [second.width - 1]]
     nearest = tuple(np.rint(at).astype(int).clip(0, most))
-    seen = np.abs(after.median_depth[nearest] / z - 1) < NEAR
-    seen &= after.alpha[nearest] >= OPAQUE
-    shown = [map_coordinates(after.colour[..., c], at[:, seen], order=1) for c in range(3)]
-    return 255 * np.abs(before.colour[rows, columns][seen] - np.transpose(shown)).mean()
+    visible = np.abs(after.median_depth[nearest] / z - 1) < NEAR
+    visible &= after.alpha[nearest] >= OPAQUE
+    shown = [map_coordinates(after.colour[..., c], at[:, visible], order=1) for c in range(3)]
+    return 255 * np.abs(before.colour[rows, columns][visible] - np.transpose(shown)).mean()
 
 
 def test_a_film_flickers_half_as_much_as_one_of_ten_degrees_a_step(run):
     cameras, points = run.cameras("train"), run.model.positions()
-    found = {}
+    flickers = {}
     for frames in (FRAMES, FPS * SECONDS):
         pair = around("orbit", cameras, points, cameras[0].resized(96, 96), frames)[:2]
-        found[frames] = flicker(pair, [render_large(run, camera) for camera in pair])
+        flickers[frames] = flicker(pair, [render_large(run, camera) for camera in pair])
     assert FPS >= 24
-    assert found[FPS * SECONDS] < 0.5 * found[FRAMES]
+    assert flickers[FPS * SECONDS] < 0.5 * flickers[FRAMES]

@@ -48,8 +48,8 @@ def test_it_is_woven_of_images_at_the_scale_of_the_training(run):
     calls.clear()
     finer = render_large(run, large, samples=4, on_part=lambda: calls.append(1))
     corners = [(x, y) for y in (-0.25, 0.25) for x in (-0.25, 0.25)]
-    seen = [woven(run, large.shifted(*corner), N, lambda: None).alpha for corner in corners]
-    mean = smooth_outlines(replace(whole, alpha=np.mean(seen, 0)), N).alpha
+    alphas = [woven(run, large.shifted(*corner), N, lambda: None).alpha for corner in corners]
+    mean = smooth_outlines(replace(whole, alpha=np.mean(alphas, 0)), N).alpha
     np.testing.assert_allclose(finer.alpha, mean, atol=1e-6)
     assert len(calls) == 64
 

@@ -50,20 +50,20 @@ def test_colours_come_back_as_players_show_them(tmp_path, suffix):
     for i, colour in enumerate(colours):
         frame[:, i * width : (i + 1) * width] = colour
     write_video(path, iter([frame] * 5), 10)
-    said = subprocess.run(
+    log = subprocess.run(
         [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(path)],
         capture_output=True,
         text=True,
         check=False,
     ).stderr
-    assert re.search(r"yuv420p\(tv, bt709[,)]", said), said
+    assert re.search(r"yuv420p\(tv, bt709[,)]", log), log
     read = imageio_ffmpeg.read_frames(
         str(path), output_params=["-vf", "scale=in_color_matrix=bt709:out_range=pc"]
     )
     next(read)
-    found = np.frombuffer(next(read), np.uint8).reshape(*size, 3)
+    decoded = np.frombuffer(next(read), np.uint8).reshape(*size, 3)
     for i, colour in enumerate(colours):
-        middle = found[size[0] // 2, i * width + width // 2]
+        middle = decoded[size[0] // 2, i * width + width // 2]
         assert np.abs(middle.astype(int) - colour).max() <= 3, (i, middle)
 
 

@@ -38,10 +38,10 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 def find_chromium():
     """The path of Chromium; skips the test if there is none."""
-    found = next(filter(None, map(shutil.which, NAMES)), None)
-    if not found:
+    chromium = next(filter(None, map(shutil.which, NAMES)), None)
+    if not chromium:
         pytest.skip("no chromium on PATH; apt install chromium")
-    return found
+    return chromium
 
 
 class Page:
@@ -54,21 +54,21 @@ class Page:
     def call(self, method, **parameters):
         """Call a method of the protocol; returns its result."""
         self._socket.send(json.dumps({"id": 1, "method": method, "params": parameters}))
-        while "id" not in (found := json.loads(self._socket.recv(timeout=SECONDS))):
-            kind, told = found["method"], found["params"]
-            if kind == "Runtime.exceptionThrown" or told.get("type") == "error":
-                self.wrong.append(told)
+        while "id" not in (message := json.loads(self._socket.recv(timeout=SECONDS))):
+            kind, event = message["method"], message["params"]
+            if kind == "Runtime.exceptionThrown" or event.get("type") == "error":
+                self.wrong.append(event)
             if kind in ("Network.requestWillBeSent", "Network.webSocketCreated"):
-                self.asked.append(told.get("url") or told["request"]["url"])
-        return found["result"]
+                self.asked.append(event.get("url") or event["request"]["url"])
+        return message["result"]
 
     def evaluate(self, expression):
         """The value of a JavaScript expression; waits for it if it is a promise."""
-        found = self.call(
+        reply = self.call(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        assert "exceptionDetails" not in reply, reply
+        return reply["result"].get("value")
 
     def open(self, address):
         """Bring the tab to the front and go to an address, noting requests and errors."""

@@ -20,7 +20,7 @@ from pp_cl.selftest.points import some_ids
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
     "pixels": None,
-    "views": [[one.name, packed_camera(one.camera)] for one in demo_frames("train")[:3]],
+    "views": [[frame.name, packed_camera(frame.camera)] for frame in demo_frames("train")[:3]],
     "step": STEP,
     "finished": False,
     "initial_points": 50,

@@ -125,10 +125,10 @@ def run_command(words, run=""):
         status, lines = spoken(words)
     except Exception as error:
         return 1, [repr(error)]
-    told = [line for line in lines if line.startswith(("pp-cl: ", "pp-cl "))]
+    errors = [line for line in lines if line.startswith(("pp-cl: ", "pp-cl "))]
     wrong = [] if status in (0, 2) else [f"status {status}"]
-    if status and (len(told) != 1 or lines[-1] != told[0] or str(run) not in told[0]):
-        wrong.append(f"{len(told)} lines tell of it: {lines[-3:]}")
+    if status and (len(errors) != 1 or lines[-1] != errors[0] or str(run) not in errors[0]):
+        wrong.append(f"{len(errors)} lines tell of it: {lines[-3:]}")
     return status, wrong
 
 
@@ -160,8 +160,8 @@ def leftovers(run):
 def half_written(run):
     """A line for each incomplete file under a final name; a log's last row may be incomplete."""
     paths = [p for p in run.rglob("*") if p.is_file() and p.name not in BESIDE]
-    found = [(path, _problem(path)) for path in paths if not LEFTOVER.match(path.name)]
-    return [f"{path.relative_to(run)}: {problem}" for path, problem in found if problem]
+    problems = [(path, _problem(path)) for path in paths if not LEFTOVER.match(path.name)]
+    return [f"{path.relative_to(run)}: {problem}" for path, problem in problems if problem]
 
 
 def _problem(path):
@@ -184,11 +184,11 @@ def _problem(path):
 
 def differences(run, expected):
     """A line for each file of a run that differs from `expected`, is missing or is new."""
-    found = content(run)
-    names = sorted(n for n in found.keys() | expected.keys() if found.get(n) != expected.get(n))
+    files = content(run)
+    names = sorted(n for n in files.keys() | expected.keys() if files.get(n) != expected.get(n))
     words = {True: "differs", False: "is missing"}
     return [
-        f"{name} {words[name in found] if name in expected else 'is new'}"
+        f"{name} {words[name in files] if name in expected else 'is new'}"
         for name in names
         if name in expected or not PREVIEW.fullmatch(name)
     ]

@@ -23,8 +23,8 @@ def glb(path):
         width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
         assert view["byteOffset"] % 4 == 0
         assert accessor.get("normalized", False) == (dtype == "<u2")
-        found = np.frombuffer(
+        values = np.frombuffer(
             body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], dtype
         )
-        arrays[name] = found.reshape(accessor["count"], width)
+        arrays[name] = values.reshape(accessor["count"], width)
     return gltf, arrays

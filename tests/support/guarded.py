@@ -91,7 +91,7 @@ class GuardedDevice(Device):
         for _, buffer, nbytes in guarded:
             cl.enqueue_copy(self.queue, tail, buffer, src_offset=nbytes)
             assert (tail == CANARY).all(), f"a kernel wrote behind a buffer of {nbytes} bytes"
-        self._guarded = [one for one in guarded if one[0]() is not None]
+        self._guarded = [entry for entry in guarded if entry[0]() is not None]
 
 
 def facts_of(launch):

@@ -52,11 +52,13 @@ def drawn_alone(monkeypatch, renderer):
     return drawn
 
 
-def blend_matrix(seen):
+def blend_matrix(observation):
     """(HW, N) sparse: the blend weight of each point in each pixel of an Observation."""
-    pairs = seen.view.pairs
-    is_listed, point, weight = listed_fragments(pairs, seen.view.weights)
+    pairs = observation.view.pairs
+    is_listed, point, weight = listed_fragments(pairs, observation.view.weights)
     offset = np.concatenate([[0], np.cumsum(is_listed)])[pairs.pixel_offset.get()]
     shape = pairs.pixels, pairs.points
     matrix = csr_array((weight, point.astype(np.int32), offset), shape=shape)
-    return matrix[seen.view.cropped(np.arange(pairs.pixels).reshape(seen.view.size)).ravel()]
+    return matrix[
+        observation.view.cropped(np.arange(pairs.pixels).reshape(observation.view.size)).ravel()
+    ]

@@ -20,6 +20,6 @@ def refusing(*words):
 def failure(*words):
     """Run a command that must end with status 2; returns its error line, the last on stderr."""
     status, lines = spoken(words)
-    told = [line for line in lines if line.startswith("pp-cl")]
-    assert status == 2 and told == lines[-1:], (status, lines)
-    return told[0]
+    errors = [line for line in lines if line.startswith("pp-cl")]
+    assert status == 2 and errors == lines[-1:], (status, lines)
+    return errors[0]

@@ -62,15 +62,15 @@ class Tab:
 
     def image(self, accept=lambda _image: True):
         """The next background image that accept() takes, (H, W, 3) int."""
-        found = []
+        images = []
 
         def take(message):
             image = Image.open(io.BytesIO(message["rgb_data"])).convert("RGB")
-            found.append(np.array(image).astype(int))
-            return accept(found[-1])
+            images.append(np.array(image).astype(int))
+            return accept(images[-1])
 
         self.receive("BackgroundImageMessage", take)
-        return found[-1]
+        return images[-1]
 
     def file(self):
         """(name, content) of the next file that the server sends."""

@@ -14,13 +14,13 @@ PLACE = {"co3d": "object/sequence"}  # where the scene lies in the written folde
 @pytest.mark.parametrize("name", FORMATS)
 def test_what_is_written_comes_back(tmp_path, name):
     many = views(centred=name == "llff", alike=name in ("llff", "nsvf"))
-    given = {"test": many[:4], "train": many[4:9], "val": many[9:]}
+    splits = {"test": many[:4], "train": many[4:9], "val": many[9:]}
     if name in ("colmap", "llff", "neus"):
-        given = held_out(many)
-    convert(given, tmp_path / "scene", name)
+        splits = held_out(many)
+    convert(splits, tmp_path / "scene", name)
     folder = tmp_path / "scene" / PLACE.get(name, ".")
     assert scene_format(str(folder)) == READER.get(name, name)
-    same(folder, given)
+    same(folder, splits)
 
 
 def test_the_command(tmp_path, capsys):

@@ -48,8 +48,8 @@ def test_no_release_states_figures_of_older_code(tmp_path, capsys, name):
     for file, contents in {"old": old, "new": new}.items():
         (results / f"{file}.json").write_text(json.dumps(contents))
     assert provenance.main(tmp_path) == 1
-    told = capsys.readouterr().err
-    assert "old.json: of commit abc" in told and "new.json" not in told
+    printed = capsys.readouterr().err
+    assert "old.json: of commit abc" in printed and "new.json" not in printed
     (results / "old.json").unlink()
     assert provenance.main(tmp_path) == 0 and not capsys.readouterr().err
 
@@ -75,8 +75,8 @@ def test_tables_of_kinds(tmp_path):
     h200 = ["### h200", "H200/trainings", "H200/stages"]
     for own, expected in (([], ["### avx2", "Avx2/trainings", *h200]), (["avx2/trainings"], h200)):
         lines = TOOL.read_tables(tmp_path, own)["kinds"].splitlines()
-        found = [line.partition(".")[0] for line in lines if line.startswith(("#", "A", "H"))]
-        assert found == expected
+        starts = [line.partition(".")[0] for line in lines if line.startswith(("#", "A", "H"))]
+        assert starts == expected
 
 
 def test_settings_and_commands_are_complete():

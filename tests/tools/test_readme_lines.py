@@ -23,9 +23,9 @@ def test_the_lines_are_what_the_commands_print(driver):
     """
     if driver not in DRIVERS:
         pytest.skip(f"{driver} is not installed")
-    stated, found = ROWS[driver], TOOL.row(driver, DRIVERS[driver])
-    if (TOOL.machine(), found["kind"]) == (STATED["machine"], stated["kind"]):
+    stated, measured = ROWS[driver], TOOL.row(driver, DRIVERS[driver])
+    if (TOOL.machine(), measured["kind"]) == (STATED["machine"], stated["kind"]):
         names = ("steps", "points", "initial", "psnr", "ssim", "lpips")
-        assert [found[name] for name in names] == [stated[name] for name in names]
-    assert float(found["psnr"]) == pytest.approx(float(stated["psnr"]), abs=0.02)
-    assert float(found["points"]) == pytest.approx(float(stated["points"]), rel=0.005)
+        assert [measured[name] for name in names] == [stated[name] for name in names]
+    assert float(measured["psnr"]) == pytest.approx(float(stated["psnr"]), abs=0.02)
+    assert float(measured["points"]) == pytest.approx(float(stated["points"]), rel=0.005)

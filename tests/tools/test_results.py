@@ -75,9 +75,9 @@ def test_each_point_of_speed_has_its_name():
         "network of 32, 64, 128 channels, 200x200",
         *["network of 128, 256, 512 channels, 256x256"] * 2,
     ]
-    told = [row["label"].replace("\n", " ") for row in rows]
-    assert told[0] == "grid, 250 k points, 200x200 pixels"
-    assert told[1:] == [
+    labels = [row["label"].replace("\n", " ") for row in rows]
+    assert labels[0] == "grid, 250 k points, 200x200 pixels"
+    assert labels[1:] == [
         "pp-cl, auto (1.40 times PyTorch's speed)",
         "pp-cl, direct (0.60 times PyTorch's speed)",
         "PyTorch",
@@ -103,10 +103,10 @@ def test_others_results_stand_beside_images_of_their_size():
 def test_a_budget_is_given_to_the_training(tmp_path, monkeypatch):
     commands = []
     monkeypatch.setattr(TOOL, "run_program", lambda *words: commands.append(words))
-    found = {"per_image": [], "mean": {}, "views": {"images": ["800x800"]}, "downscale": 1}
-    found |= {"seconds_per_frame": 1, "computed_fraction": 1, "iterations": 9, "seconds": 60}
-    found |= {"points": {"left": 9}}
-    monkeypatch.setattr(TOOL, "read_found", lambda *words: found)
+    metrics = {"per_image": [], "mean": {}, "views": {"images": ["800x800"]}, "downscale": 1}
+    metrics |= {"seconds_per_frame": 1, "computed_fraction": 1, "iterations": 9, "seconds": 60}
+    metrics |= {"points": {"left": 9}}
+    monkeypatch.setattr(TOOL, "read_found", lambda *words: metrics)
     TOOL.train(TOOL.Training("demo", "demo", "tiny", minutes=2), tmp_path)
     assert commands[0][-2:] == ("--minutes", 2)
     assert len({TOOL.key_of(training) for training in TOOL.CURVES}) == len(TOOL.CURVES)
@@ -114,14 +114,14 @@ def test_a_budget_is_given_to_the_training(tmp_path, monkeypatch):
 
 def test_lego_has_its_highlights_apart(tmp_path, monkeypatch):
     views = [{"name": f"test/r_{i}.png", "psnr": 20.0 if 1 <= i <= 13 else 30.0} for i in range(20)]
-    found = {"per_image": views, "mean": {"psnr": 23.5, "ssim": 0.9}, "seconds_per_frame": 0.1}
-    found |= {"computed_fraction": 1.0, "views": {"images": ["800x800"]}, "downscale": 4}
-    found |= {"iterations": 300, "seconds": 7, "points": {"left": 9}}
+    metrics = {"per_image": views, "mean": {"psnr": 23.5, "ssim": 0.9}, "seconds_per_frame": 0.1}
+    metrics |= {"computed_fraction": 1.0, "views": {"images": ["800x800"]}, "downscale": 4}
+    metrics |= {"iterations": 300, "seconds": 7, "points": {"left": 9}}
     monkeypatch.setattr(TOOL, "run_program", lambda *words: None)
-    monkeypatch.setattr(TOOL, "read_found", lambda *words: found)
+    monkeypatch.setattr(TOOL, "read_found", lambda *words: metrics)
     monkeypatch.setattr(TOOL, "scene_of", lambda name: name)
     trainings = (TOOL.TRAININGS[0], *TOOL.lego("tiny", 4, 300))
-    rows = {one.name: TOOL.train(one, tmp_path) for one in trainings}
+    rows = {training.name: TOOL.train(training, tmp_path) for training in trainings}
     cell = next(
         column["cell"] for column in TOOL.columns(TOOL.QUALITY[1]) if "r_13" in column["head"]
     )
@@ -155,9 +155,9 @@ def test_what_fits_into_the_minutes_is_measured(tmp_path, monkeypatch):
 
 def test_hard_cases_beside_naive_formulas(tmp_path, monkeypatch):
     hard = {"what": "1 / 0", "error": 1e-7, "bound": 1e-6}
-    found = [hard | {"naive": naive} for naive in ("nan", "inf", 1234.5)]
-    found.append(hard | {"naive": 1234.0, "error": 0.0, "bound": 0.0})
-    cases = [{"case": "a: b", "hard": one} for one in found]
+    variants = [hard | {"naive": naive} for naive in ("nan", "inf", 1234.5)]
+    variants.append(hard | {"naive": 1234.0, "error": 0.0, "bound": 0.0})
+    cases = [{"case": "a: b", "hard": variant} for variant in variants]
     monkeypatch.setattr(TOOL, "read_found", lambda *words: {"cases": cases})
     rows = TOOL.stability(tmp_path)
     assert [row["naive"] for row in rows] == ["nan", "inf", "1.2e+03", "1234"]

@@ -12,12 +12,12 @@ def test_stages_of_a_finished_run(tmp_path, monkeypatch):
     scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
     train_scene(scene, out, settings=SETTINGS)
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    found = TOOL.measure(scene, out, None)
+    measured = TOOL.measure(scene, out, None)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
-    least = {row["stage"]: row.get("least_ms") for row in found["stages"]}
-    assert all(row["ms"] > 0 for row in found["stages"])
+    least = {row["stage"]: row.get("least_ms") for row in measured["stages"]}
+    assert all(row["ms"] > 0 for row in measured["stages"])
     assert {name for name, ms in least.items() if ms} == {*TOOL.least_bytes(*[1] * 6)} | {
         "network",
         "network backward",
     }
-    assert found["points"] < 500 and found["copy_gbs"] > 0.1 and found["gflops"] > 1
+    assert measured["points"] < 500 and measured["copy_gbs"] > 0.1 and measured["gflops"] > 1

@@ -31,13 +31,13 @@ WRONG = 6.0  # times the true focal length
 
 
 def near():
-    found = []
+    arc_cameras = []
     for i in range(COUNT):
         turn, height, distance = i * np.pi / 18, 0.25 + 0.1 * (i % 3), 3 + 0.25 * (i % 3)
         ahead = [np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)]
         eye, fx = distance * np.array(ahead), cameras(SIZE)[0].fx
-        found.append(Camera.look_at(eye, (0, 0, 0), fx=fx, width=SIZE, height=SIZE))
-    return found
+        arc_cameras.append(Camera.look_at(eye, (0, 0, 0), fx=fx, width=SIZE, height=SIZE))
+    return arc_cameras
 
 
 def photograph(folder):
@@ -89,9 +89,9 @@ def changed(scene):
 
 
 def off(scene, true=None):
-    placed = [one for split in ("train", "test") for one in scene_frames(scene, split)]
-    places = [int(Path(one.name).stem) for one in placed]
-    return align([one.camera for one in placed], [(true or near())[i] for i in places])
+    placed = [view for split in ("train", "test") for view in scene_frames(scene, split)]
+    places = [int(Path(view.name).stem) for view in placed]
+    return align([view.camera for view in placed], [(true or near())[i] for i in places])
 
 
 def test_photographs_become_a_scene(captured):
@@ -116,17 +116,17 @@ def test_the_scene_states_no_digits_that_threads_decide(captured):
 
 def test_nothing_in_the_scene_is_distorted(captured):
     splits = [scene_frames(captured, split) for split in ("train", "test")]
-    one = splits[0][0]
+    first = splits[0][0]
     assert not any(view.lens for split in splits for view in split)
     model = colmap.Reconstruction(captured / "sparse" / "0")
     focal, _, cx, cy = model.camera(1).params
-    assert (focal, cx, cy) == pytest.approx((one.camera.fx, one.camera.cx, one.camera.cy))
+    assert (focal, cx, cy) == pytest.approx((first.camera.fx, first.camera.cx, first.camera.cy))
     bent = colmap.Reconstruction(captured / "capture" / "model")
     k1 = bent.camera(1).params[3]
     assert abs(k1) > 1e-5
-    frame = read_rgba(captured / "capture" / "frames" / Path(one.name).name)
-    straight = undistort(open_device(), frame, one.camera, LensDistortion(k1))
-    np.testing.assert_array_equal(read_rgba(captured / one.name), straight)
+    frame = read_rgba(captured / "capture" / "frames" / Path(first.name).name)
+    straight = undistort(open_device(), frame, first.camera, LensDistortion(k1))
+    np.testing.assert_array_equal(read_rgba(captured / first.name), straight)
 
 
 @pytest.mark.slow
@@ -135,17 +135,19 @@ def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
     work = captured / "capture"
     database = Path(shutil.copy(work / "database.db", tmp_path))
     with quiet(database), colmap.Database.open(database) as db:
-        for one in db.read_all_cameras():
+        for camera in db.read_all_cameras():
             params = [WRONG * cameras(SIZE)[0].fx, SIZE / 2, SIZE / 2, 0]
-            one.params, one.has_prior_focal_length = params, True
-            db.update_camera(one)
+            camera.params, camera.has_prior_focal_length = params, True
+            db.update_camera(camera)
         db.clear_two_view_geometries()
         colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
     taken = found(captured, "frames")["images"]
-    told = poses.place(database, work / "frames", tmp_path / "model", taken, False)
-    assert told["placed"] == COUNT
+    facts = poses.place(database, work / "frames", tmp_path / "model", taken, False)
+    assert facts["placed"] == COUNT
     lens = colmap.Reconstruction(tmp_path / "model").cameras.values()
-    assert [one.params[0] for one in lens] == pytest.approx([cameras(SIZE)[0].fx] * len(lens), 0.1)
+    assert [camera.params[0] for camera in lens] == pytest.approx(
+        [cameras(SIZE)[0].fx] * len(lens), 0.1
+    )
 
 
 def test_wrong_matches_do_not_pull_at_the_cameras():
@@ -156,15 +158,15 @@ def test_wrong_matches_do_not_pull_at_the_cameras():
     model = colmap.synthesize_dataset(
         colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=400)
     )
-    true = [one.camera for one in poses.image_files(model)]
+    true = [image_file.camera for image_file in poses.image_files(model)]
     rng = np.random.default_rng(0)
     for image in model.images.values():
-        for one in image.points2D:
-            if one.has_point3D():
-                one.xy = one.xy + rng.normal(0, 4 if one.point3D_id % 20 == 0 else 0.2, 2)
+        for point in image.points2D:
+            if point.has_point3D():
+                point.xy = point.xy + rng.normal(0, 4 if point.point3D_id % 20 == 0 else 0.2, 2)
     poses.refine(model)
-    found = align([one.camera for one in poses.image_files(model)], true)
-    assert found.position < 0.001 and found.degrees < 0.02
+    alignment = align([image_file.camera for image_file in poses.image_files(model)], true)
+    assert alignment.position < 0.001 and alignment.degrees < 0.02
 
 
 def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
@@ -187,9 +189,9 @@ def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys)
     assert main(words) == 0 and changed(scene) == before
     capsys.readouterr()
     assert main([*words, "--box=-0.5,-0.5,-0.5,0.5,0.5,0.5"]) == 0
-    told = capsys.readouterr().out
-    assert "--box has changed: box and all after it are repeated" in told
-    assert "poses: 12 of 12" in told
+    printed = capsys.readouterr().out
+    assert "--box has changed: box and all after it are repeated" in printed
+    assert "poses: 12 of 12" in printed
     assert found(scene, "masks")["line"].startswith(f"{COUNT} given")
     assert main([*words, "--from", "scene"]) == 0
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
@@ -290,8 +292,8 @@ def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
         assert main(["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]) == 0
     finally:
         later.unlink()
-    told = f"frames: {COUNT} images (done before; later.jpg came later: --from frames takes all"
-    assert told in capsys.readouterr().out
+    expected = f"frames: {COUNT} images (done before; later.jpg came later: --from frames takes all"
+    assert expected in capsys.readouterr().out
 
 
 def strangers(files, folder):
@@ -318,11 +320,11 @@ def test_photographs_of_no_use(shot, tmp_path, make):
 def test_videos(shot, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     sharp = [np.array(Image.open(file)) for file in sorted(shot[0].iterdir())]
-    soft = [np.array(Image.fromarray(one).filter(ImageFilter.GaussianBlur(3))) for one in sharp]
+    soft = [np.array(Image.fromarray(image).filter(ImageFilter.GaussianBlur(3))) for image in sharp]
     frames = [frame for two in zip(soft, sharp, strict=True) for frame in two] * 10
     write_video(tmp_path / "video.mp4", frames, 24)  # 240 frames, every second one sharp
     taken = take_images(tmp_path / "video.mp4", tmp_path / "images")["images"]
-    chosen = [int(one["name"][:6]) for one in taken]
+    chosen = [int(image["name"][:6]) for image in taken]
     assert len(chosen) > 100 and all(number % 2 for number in chosen)
     black = [to_8bit(np.zeros((64, 96, 3)))] * 30
     write_video(tmp_path / "black.mp4", black, 24)
@@ -415,9 +417,9 @@ def test_a_film_on_white_is_placed_and_cut_out_by_itself(dev, tmp_path):
     assert off(scene, true).position < 0.03 and off(scene, true).degrees < 2
     assert "36 before a uniform background" in found(scene, "masks")["line"]
     shares = []
-    for one in poses.image_files(colmap.Reconstruction(scene / "capture" / "model")):
-        number = int(Path(one.name).stem)
-        true = undistorted_mask(dev, read_mask(masks / f"{number:03d}.png"), one) > 127
+    for image_file in poses.image_files(colmap.Reconstruction(scene / "capture" / "model")):
+        number = int(Path(image_file.name).stem)
+        true = undistorted_mask(dev, read_mask(masks / f"{number:03d}.png"), image_file) > 127
         mask = read_mask(scene / "masks" / f"{number:06d}.png") > 127
         shares.append((mask & true).sum() / (mask | true).sum())
     assert np.mean(shares) > 0.95

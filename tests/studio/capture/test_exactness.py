@@ -27,13 +27,13 @@ def test_the_demo_in_a_room_is_as_exact_as_the_page_says(dev, tmp_path):
     write_photographs(dev, tmp_path / "taken", 400)
     photographs, scene = str(tmp_path / "taken/images"), tmp_path / "scene"
     assert main(["capture", photographs, "--out", str(scene)]) == 0
-    placed, found = compare(scene, "photographs")
+    placed, alignment = compare(scene, "photographs")
     assert placed == 64
-    assert found.position < 1.25 * position + 5e-5 and found.degrees < 1.25 * degrees
+    assert alignment.position < 1.25 * position + 5e-5 and alignment.degrees < 1.25 * degrees
     shares = []
     for split in ("train", "test"):
-        for one in scene_frames(scene, split):
-            name = f"{Path(one.name).stem}.png"
+        for image_file in scene_frames(scene, split):
+            name = f"{Path(image_file.name).stem}.png"
             mask, true = (
                 read_mask(f / name) > 127 for f in (scene / "masks", tmp_path / "taken/masks")
             )

@@ -58,16 +58,16 @@ def test_photographs_of_other_programs(shots, folder, tmp_path):
     (folder / "cut off.jpg").write_bytes(content[: len(content) - 3000])
     Image.fromarray(shots[11]).save(folder / "11b.png")
     taken = take_images(folder, tmp_path / "images")
-    made = {one["source"]: one for one in taken["images"]}
+    made = {photo["source"]: photo for photo in taken["images"]}
     assert {"deep.png", "print.jpg", "layers.tif", "turned.jpg"} <= set(made)
     assert {"a.avif", "b.bmp", "c.jfif", "d.heic"} <= set(made)
-    left_out = {one["source"]: one["reason"] for one in taken["left_out"]}
+    left_out = {photo["source"]: photo["reason"] for photo in taken["left_out"]}
     assert left_out.keys() - {"broken.jpg"} == {"cut off.jpg", "11b.png"}
     assert left_out["11b.png"] == "shows the same as 11.png"
-    for one in made.values():
-        size = read_rgba(tmp_path / "images" / one["name"]).shape[1::-1]
-        is_turned = one["source"] in ("turned.jpg", "p3.png")
-        assert size == tuple(one["size"]) == (SIZE[::-1] if is_turned else SIZE)
+    for photo in made.values():
+        size = read_rgba(tmp_path / "images" / photo["name"]).shape[1::-1]
+        is_turned = photo["source"] in ("turned.jpg", "p3.png")
+        assert size == tuple(photo["size"]) == (SIZE[::-1] if is_turned else SIZE)
     colour = read_rgba(tmp_path / "images" / made["p3.png"]["name"])[..., :3].mean((0, 1))
     assert np.abs(colour - in_srgb(plain.reshape(-1, 3).T).mean(1)).max() < 3
     copy = Image.open(tmp_path / "images" / made["turned.jpg"]["name"]).getexif()
@@ -103,15 +103,15 @@ def test_the_focal_length_of_reduced_photographs(shots, folder, tmp_path):
     sensor = dict(zip(frames.SENSOR, (5184, 3456, 5728.0, 2), strict=True))
     lens = {FOCAL: 46.0}
     whole = dict(zip(frames.SENSOR, (64, 64, 30.0, 2), strict=True))
-    told = [lens | sensor, lens | whole, lens, lens | sensor | {FOCAL: 0.0}]
-    told += [lens | sensor | {frames.SENSOR[3]: 7}, lens | sensor | {frames.FOCAL_35: 50}]
+    tags = [lens | sensor, lens | whole, lens, lens | sensor | {FOCAL: 0.0}]
+    tags += [lens | sensor | {frames.SENSOR[3]: 7}, lens | sensor | {frames.FOCAL_35: 50}]
     for i, image in enumerate(shots):
         exif = Image.Exif()
-        exif.get_ifd(frames.EXIF).update(told[i] if i < len(told) else {})
+        exif.get_ifd(frames.EXIF).update(tags[i] if i < len(tags) else {})
         Image.fromarray(image).resize((64, 64)).save(folder / f"{i:02d}.jpg", exif=exif)
     taken = take_images(folder, tmp_path / "images")["images"]
     focal = 46 / 25.4 * 5728 * 64 / 3456
-    assert [one["focal"] for one in taken] == [pytest.approx(focal)] + [None] * (len(shots) - 1)
+    assert [photo["focal"] for photo in taken] == [pytest.approx(focal)] + [None] * (len(shots) - 1)
     database = tmp_path / "database.db"
     find_features(database, tmp_path / "images", taken[:1])
     with pycolmap.Database.open(database) as db:
@@ -124,15 +124,15 @@ def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
     pycolmap = pytest.importorskip("pycolmap")
     taken = [{"name": f"{i}.png", "lens": "", "size": (600, 600), "focal": None} for i in range(9)]
     taken[0]["size"] = 304, 600
-    for i, one in enumerate(taken):
+    for i, photo in enumerate(taken):
         values = rng.integers(0, 256, (75, 75), np.uint8) if i == 1 else np.full((75, 75), 100 + i)
         pixels = np.kron(values, np.ones((8, 8))).astype(np.uint8)
-        Image.fromarray(pixels[:, : one["size"][0]]).save(tmp_path / one["name"])
-    found = find_features(tmp_path / "database.db", tmp_path, taken)
-    assert list(found) == [one["name"] for one in taken] and found["1.png"] > 100
+        Image.fromarray(pixels[:, : photo["size"][0]]).save(tmp_path / photo["name"])
+    counts = find_features(tmp_path / "database.db", tmp_path, taken)
+    assert list(counts) == [photo["name"] for photo in taken] and counts["1.png"] > 100
     with pycolmap.Database.open(tmp_path / "database.db") as db:
         assert db.num_frames() == db.num_images() == 9 and db.num_cameras() == 2
-        ids = [db.read_image_with_name(one["name"]).image_id for one in taken]
+        ids = [db.read_image_with_name(photo["name"]).image_id for photo in taken]
     assert ids == list(range(1, 10))
 
 
@@ -143,7 +143,9 @@ def test_names_that_colmap_can_list(shots, tmp_path):
     names += ["e.png", os.fsdecode(b"foto_\xe9.png"), os.fsdecode(b"foto_\xea.png")]
     for name, image in zip(names, shots, strict=False):
         Image.fromarray(image).save(tmp_path / name)
-    taken = [one["name"].lower() for one in take_images(tmp_path, tmp_path / "images")["images"]]
+    taken = [
+        photo["name"].lower() for photo in take_images(tmp_path, tmp_path / "images")["images"]
+    ]
     assert len({name.rpartition(".")[0] for name in taken}) == len(names)
     assert all(name.isascii() and " " not in name and name[0] != "#" for name in taken)
 
@@ -152,7 +154,7 @@ def test_names_that_colmap_can_list(shots, tmp_path):
 def video(shots, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     write_video(
-        tmp_path / "video.webm", [np.roll(one, k, 0) for one in shots for k in range(4)], 24
+        tmp_path / "video.webm", [np.roll(image, k, 0) for image in shots for k in range(4)], 24
     )
     return tmp_path / "video.webm"
 
@@ -170,8 +172,8 @@ def remade(video, name, *options):
 def test_a_video_that_states_no_length(video, tmp_path):
     """Browsers record such videos."""
     live = remade(video, "live.webm", ["-c", "copy", "-f", "webm", "-live", "1"])
-    whole, found = (take_images(one, tmp_path / one.stem)["images"] for one in (video, live))
-    assert [one["name"] for one in found] == [one["name"] for one in whole] and len(found) > 40
+    whole, other = (take_images(file, tmp_path / file.stem)["images"] for file in (video, live))
+    assert [shot["name"] for shot in other] == [shot["name"] for shot in whole] and len(other) > 40
 
 
 def test_a_video_that_is_shown_turned(video, tmp_path, caplog):
@@ -179,8 +181,8 @@ def test_a_video_that_is_shown_turned(video, tmp_path, caplog):
     fragments = ["-c:v", "libx264", "-f", "mp4", "-movflags", "frag_keyframe+empty_moov"]
     flat = remade(video, "flat.mp4", fragments)
     turned = remade(flat, "turned.mp4", "-display_rotation", "90", ["-c", "copy", *fragments[2:]])
-    found = take_images(turned, tmp_path / "images")["images"]
-    assert {tuple(one["size"]) for one in found} == {SIZE[::-1]} and not caplog.records
+    images = take_images(turned, tmp_path / "images")["images"]
+    assert {tuple(frame["size"]) for frame in images} == {SIZE[::-1]} and not caplog.records
 
 
 def display(colour, transfer):
@@ -217,8 +219,8 @@ def test_a_video_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primar
         np.kron(np.roll(colours, i, 0).reshape(2, 2, 3), np.ones((60, 80, 1))) for i in range(12)
     ]
     raw = b"".join(
-        (np.clip(display(one, transfer), 0, 1) * 65535 + 0.5).astype("<u2").tobytes()
-        for one in frames_
+        (np.clip(display(frame, transfer), 0, 1) * 65535 + 0.5).astype("<u2").tobytes()
+        for frame in frames_
     )
     tags = f"color_primaries={primaries}:color_trc={transfer}:colorspace=bt2020nc:range=tv"
     video = tmp_path / "video.mov"
@@ -232,10 +234,10 @@ def test_a_video_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, transfer, primar
         input=raw,
         check=True,
     )
-    found = take_images(video, tmp_path / "images")["images"]
-    for one in found:
-        image = read_rgba(tmp_path / "images" / one["name"])[..., :3].astype(float)
-        true = frames_[int(one["name"][:6])]
+    images = take_images(video, tmp_path / "images")["images"]
+    for frame in images:
+        image = read_rgba(tmp_path / "images" / frame["name"])[..., :3].astype(float)
+        true = frames_[int(frame["name"][:6])]
         assert np.abs(image.mean((0, 1)) - true.mean((0, 1))).max() < off
         for row, column in ((30, 40), (30, 120), (90, 40), (90, 120)):
             assert np.abs(image[row, column] - true[row, column]).max() < 2 * off
@@ -266,10 +268,10 @@ def test_photographs_of_several_rounds(shots, tmp_path):
     own(tmp_path / "scene")
     taken = take_images(tmp_path, tmp_path / "scene/capture")
     ordered = [*places[:4], *places[8:], *places[4:8]]
-    assert [one["source"] for one in taken["images"]] == ordered
-    names = [one["name"] for one in taken["images"]]
+    assert [photo["source"] for photo in taken["images"]] == ordered
+    names = [photo["name"] for photo in taken["images"]]
     assert names == sorted(names) and names[3] == "000010.png"
-    assert len({one["lens"] for one in taken["images"]}) == 3, "a lens each"
+    assert len({photo["lens"] for photo in taken["images"]}) == 3, "a lens each"
     [raw] = taken["left_out"]
     assert raw["source"] == "low/7.DNG" and "is raw" in raw["reason"]
 
@@ -280,8 +282,8 @@ def test_what_a_film_repeats_takes_the_place_of_no_other_picture(tmp_path, rng):
     """
     shown = rng.integers(0, 256, (40, *SIZE[::-1], 3), np.uint8)
     write_video(tmp_path / "film.webm", [*shown, *[shown[-1]] * 260], 24)
-    found = take_images(tmp_path / "film.webm", tmp_path / "images")
-    assert len(found["images"]) == 40
+    facts = take_images(tmp_path / "film.webm", tmp_path / "images")
+    assert len(facts["images"]) == 40
 
 
 @pytest.fixture
@@ -295,8 +297,10 @@ def moving(tmp_path, rng):
 
 
 def taken(film, tmp_path):
-    found = take_images(film, tmp_path / film.stem)["images"]
-    return [read_rgba(tmp_path / film.stem / one["name"])[..., :3].astype(float) for one in found]
+    images = take_images(film, tmp_path / film.stem)["images"]
+    return [
+        read_rgba(tmp_path / film.stem / frame["name"])[..., :3].astype(float) for frame in images
+    ]
 
 
 def test_pixels_of_a_film_become_square(moving, tmp_path):

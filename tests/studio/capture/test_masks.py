@@ -56,14 +56,14 @@ class Capture:
             image = rgba[..., :3] * rgba[..., 3:] + behind * (1 - rgba[..., 3:])
             if i < spoiled and spoil:
                 spoil(image)
-            one = ImageFile(f"images/{i:02d}.png", camera)
-            Image.fromarray(np.uint8(255 * np.clip(image, 0, 1))).save(folder / one.name)
-            self.image_files.append(one)
+            image_file = ImageFile(f"images/{i:02d}.png", camera)
+            Image.fromarray(np.uint8(255 * np.clip(image, 0, 1))).save(folder / image_file.name)
+            self.image_files.append(image_file)
             self.truth.append(rgba[..., 3] > 0.5)
             whole = Window("", image, camera, (0, 0, SIZE, SIZE))
-            found, rows, columns = whole.inside(self.points)
-            is_shown = self.truth[-1][rows, columns] == (found < self.count)
-            self.seen.append(found[is_shown & (rng.uniform(size=len(found)) < 0.5)])
+            indices, rows, columns = whole.inside(self.points)
+            is_shown = self.truth[-1][rows, columns] == (indices < self.count)
+            self.seen.append(indices[is_shown & (rng.uniform(size=len(indices)) < 0.5)])
 
     def write(self, **options):
         line, _, self.box = write_masks(
@@ -72,8 +72,8 @@ class Capture:
         return line
 
     def agreement(self):
-        found = [read_mask(self.file(i)) > 127 for i in range(len(self.truth))]
-        pairs = zip(found, self.truth, strict=True)
+        masks = [read_mask(self.file(i)) > 127 for i in range(len(self.truth))]
+        pairs = zip(masks, self.truth, strict=True)
         return np.array([(a & b).sum() / (a | b).sum() for a, b in pairs])
 
     def file(self, number):
@@ -100,8 +100,8 @@ def capture(tmp_path):
 
 def given_masks(capture, folder):
     folder.mkdir()
-    for one, mask in zip(capture.image_files, capture.truth, strict=True):
-        Image.fromarray(np.uint8(255 * mask)).save(folder / Path(one.name).name)
+    for image_file, mask in zip(capture.image_files, capture.truth, strict=True):
+        Image.fromarray(np.uint8(255 * mask)).save(folder / Path(image_file.name).name)
     return folder
 
 
@@ -119,7 +119,7 @@ def test_a_box_that_cuts_the_object_grows(capture):
     capture.box = cut_off
     held = (capture.points[: capture.count] < cut_off[1]).all(1)
     is_seen = np.append(held, np.ones(len(capture.points) - capture.count, bool))
-    capture.seen = [seen[is_seen[seen]] for seen in capture.seen]
+    capture.seen = [indices[is_seen[indices]] for indices in capture.seen]
     capture.write()
     assert capture.agreement().min() < 0.8 and (capture.box == cut_off).all()
     for i in range(VIEWS):
@@ -138,7 +138,7 @@ def turned(folder, views, box, surface, wall):
 def without_wall(capture):
     """Removes the wall's points from a Capture."""
     capture.points = capture.points[: capture.count]
-    capture.seen = [seen[seen < capture.count] for seen in capture.seen]
+    capture.seen = [indices[indices < capture.count] for indices in capture.seen]
     return capture
 
 
@@ -159,17 +159,19 @@ def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
     box = [[-0.8, -0.8, -0.8], [0.8, 0.8, 1.4]]
     capture = turned(tmp_path / "scene", views, box, np.zeros((1, 3)), wall)
     windows, masks = [], []
-    for one, *images in zip(capture.image_files, capture.truth, plain, strict=True):
-        windows.append(window(read_rgba(capture.folder / one.name)[..., :3], one, capture.box))
+    for image_file, *images in zip(capture.image_files, capture.truth, plain, strict=True):
+        windows.append(
+            window(read_rgba(capture.folder / image_file.name)[..., :3], image_file, capture.box)
+        )
         masks.append([windows[-1].reduced(np.uint8(image)) > 0 for image in images])
         windows[-1].mask = masks[-1][0]
     beside = [~binary_dilation(mask, iterations=3) for mask, _ in masks]
-    for found, (mask, same), out in zip(
+    for difference, (mask, same), out in zip(
         cut.differences(windows, capture.points, beside), masks, beside, strict=True
     ):
-        assert (found[out] <= cut.SLIGHT).all()
-        assert (found[mask & ~binary_dilation(same, iterations=2)] > 50).all()
-        assert (found[binary_erosion(same, iterations=2)] == cut.UNSEEN).all()
+        assert (difference[out] <= cut.SLIGHT).all()
+        assert (difference[mask & ~binary_dilation(same, iterations=2)] > 50).all()
+        assert (difference[binary_erosion(same, iterations=2)] == cut.UNSEEN).all()
 
 
 def share_held(capture, place, wanted):
@@ -256,24 +258,26 @@ def test_masks_that_contradict_the_others_are_named(capture, tmp_path):
 
 
 def test_alpha_is_the_mask(capture):
-    for one, mask in zip(capture.image_files, capture.truth, strict=True):
-        rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
-        Image.fromarray(np.dstack([rgb, np.uint8(255 * mask)])).save(capture.folder / one.name)
+    for image_file, mask in zip(capture.image_files, capture.truth, strict=True):
+        rgb = np.array(Image.open(capture.folder / image_file.name).convert("RGB"))
+        Image.fromarray(np.dstack([rgb, np.uint8(255 * mask)])).save(
+            capture.folder / image_file.name
+        )
     assert f"{VIEWS} of their alpha" in capture.write()
     assert (capture.agreement() == 1).all()
 
 
 def before_a_screen(capture):
-    for one, mask in zip(capture.image_files, capture.truth, strict=True):
-        rgb = np.array(Image.open(capture.folder / one.name).convert("RGB"))
+    for image_file, mask in zip(capture.image_files, capture.truth, strict=True):
+        rgb = np.array(Image.open(capture.folder / image_file.name).convert("RGB"))
         rgb[~mask] = SCREEN
-        Image.fromarray(rgb).save(capture.folder / one.name)
+        Image.fromarray(rgb).save(capture.folder / image_file.name)
 
 
 def test_a_uniform_background_shows_through_gaps(dev, tmp_path):
     """The object is the demo, whose rings enclose most of the background."""
     around = cameras(2 * SIZE, "turntable")[:: 72 // VIEWS]
-    views = [(one, render(dev, one)) for one in around]
+    views = [(camera, render(dev, camera)) for camera in around]
     surface = demo_mesh(dev, 64)[0][::20]
     capture = turned(tmp_path / "scene", views, OBJECT_BOX, surface, room)
     before_a_screen(capture)
@@ -284,11 +288,11 @@ def test_a_uniform_background_shows_through_gaps(dev, tmp_path):
 def test_an_object_of_the_backgrounds_colour_is_refused(capture):
     """Its points show where it is, but its mask would not contain them."""
     before_a_screen(capture)
-    for one, mask in zip(capture.image_files, capture.truth, strict=True):
-        rgb = np.array(Image.open(capture.folder / one.name))
+    for image_file, mask in zip(capture.image_files, capture.truth, strict=True):
+        rgb = np.array(Image.open(capture.folder / image_file.name))
         rows, columns = np.nonzero(mask)
         rgb[rows[: -len(rows) // 3], columns[: -len(rows) // 3]] = SCREEN
-        Image.fromarray(rgb).save(capture.folder / one.name)
+        Image.fromarray(rgb).save(capture.folder / image_file.name)
     with pytest.raises(UserError, match="another colour, or give masks with --masks"):
         capture.write()
 
@@ -297,13 +301,13 @@ def test_spots_of_the_backgrounds_colour_are_no_gaps(capture):
     """A few views see the spot on the ball, but the others see the ball behind it."""
     before_a_screen(capture)
     spotted = 0
-    for one in capture.image_files:
-        spot = one.camera.project(np.array([[0.75, 0.1, 0.25]]))
-        if spot[2][0] < np.linalg.norm(one.camera.eye) - 0.6:
+    for image_file in capture.image_files:
+        spot = image_file.camera.project(np.array([[0.75, 0.1, 0.25]]))
+        if spot[2][0] < np.linalg.norm(image_file.camera.eye) - 0.6:
             x, y = (int(place[0]) for place in spot[:2])
-            rgb = np.array(Image.open(capture.folder / one.name))
+            rgb = np.array(Image.open(capture.folder / image_file.name))
             rgb[y - 3 : y + 4, x - 3 : x + 4] = SCREEN
-            Image.fromarray(rgb).save(capture.folder / one.name)
+            Image.fromarray(rgb).save(capture.folder / image_file.name)
             spotted += 1
     assert f"{VIEWS} before a uniform background" in capture.write()
     assert spotted == 3 and (capture.agreement() > 0.99).all()
@@ -370,10 +374,10 @@ def test_a_box_without_an_object_is_refused(capture, case):
 
 def test_a_image_beside_the_object_has_an_empty_mask(capture):
     """Videos may have such images at the beginning or end; the others are cut out nevertheless."""
-    one = capture.image_files[3]
-    eye, ahead = 3 * one.camera.eye, one.camera.pose[:, 2] + 0.84 * one.camera.pose[:, 0]
-    camera = Camera.look_at(eye, eye + ahead, fx=one.camera.fx, width=SIZE, height=SIZE)
-    capture.image_files[3] = replace(one, camera=camera)
+    photo = capture.image_files[3]
+    eye, ahead = 3 * photo.camera.eye, photo.camera.pose[:, 2] + 0.84 * photo.camera.pose[:, 0]
+    camera = Camera.look_at(eye, eye + ahead, fx=photo.camera.fx, width=SIZE, height=SIZE)
+    capture.image_files[3] = replace(photo, camera=camera)
     line = capture.write()
     assert f"1 empty, as the object is outside, {VIEWS - 1} cut out" in line
     assert not read_mask(capture.file(3)).any()

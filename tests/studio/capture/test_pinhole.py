@@ -32,7 +32,7 @@ def test_images_are_written_once_in_the_format_of_the_photographs(dev, tmp_path,
     for name, mode in (("a.jpg", "RGB"), ("b.png", "RGB"), ("c.png", "RGBA")):
         with Image.open(images / name) as image:
             assert image.mode == mode and image.size == (96, 64)
-            assert name != "a.jpg" or {one[1:3] for one in image.layer} == {(1, 1)}  # 4:4:4
+            assert name != "a.jpg" or {layer[1:3] for layer in image.layer} == {(1, 1)}  # 4:4:4
         straight = undistort(dev, read_rgba(frames / name), CAMERA, LENS)
         off = np.abs(read_rgba(images / name).astype(int) - straight)
         assert off.max() == 0 if name != "a.jpg" else off.mean() < 3
@@ -52,8 +52,8 @@ def test_masks_move_as_their_photographs_do(dev):
     mask = np.zeros((64, 96), np.uint8)
     mask[10:50, 12:70] = 255
     expected = undistort(dev, np.dstack([mask] * 3 + [mask * 0 + 255]), CAMERA, LENS)[..., 0]
-    [one], [straight] = taken("a.png"), taken("a.png", lens=LensDistortion())
-    assert np.abs(undistorted_mask(dev, mask, one).astype(int) - expected).max() <= 1
+    [bent], [straight] = taken("a.png"), taken("a.png", lens=LensDistortion())
+    assert np.abs(undistorted_mask(dev, mask, bent).astype(int) - expected).max() <= 1
     assert np.array_equal(undistorted_mask(dev, mask, straight), mask)
 
 

@@ -19,11 +19,11 @@ NOISE = 0.3  # pixels
 
 
 def ring(steps=STEPS):
-    found = []
+    cameras = []
     for turn in np.arange(steps) * 2 * np.pi / STEPS:
         eye = DISTANCE * np.array([np.cos(turn) * 0.94, np.sin(turn) * 0.94, 0.34])
-        found.append(Camera.look_at(eye, (0, 0, 0), fx=FOCAL, width=SIZE, height=SIZE))
-    return found
+        cameras.append(Camera.look_at(eye, (0, 0, 0), fx=FOCAL, width=SIZE, height=SIZE))
+    return cameras
 
 
 def matched(folder, rng, k1=0.0, steps=STEPS):
@@ -60,7 +60,7 @@ def test_a_camera_beside_its_place_is_noticed(tmp_path, rng, monkeypatch):
     poses.place(database, images, tmp_path / "model", taken, True)
     model = colmap.Reconstruction(tmp_path / "model")
     assert poses.contradictions(database, model) == []
-    (image,) = (one for one in model.images.values() if one.name == "009.png")
+    (image,) = (image for image in model.images.values() if image.name == "009.png")
     for index, point in enumerate(image.points2D):
         if point.has_point3D():
             model.delete_observation(image.image_id, index)
@@ -77,7 +77,7 @@ def test_a_lens_is_straight_unless_it_distorts(tmp_path, rng, k1):
     database, images, taken = matched(tmp_path, rng, k1)
     assert poses.place(database, images, tmp_path / "model", taken, True)["placed"] == STEPS
     placed = poses.image_files(colmap.Reconstruction(tmp_path / "model"))
-    found = placed[0].lens.k1
-    assert found == pytest.approx(k1, abs=-0.2 * k1)
-    off = align([one.camera for one in placed], ring())
+    distortion = placed[0].lens.k1
+    assert distortion == pytest.approx(k1, abs=-0.2 * k1)
+    off = align([image_file.camera for image_file in placed], ring())
     assert off.position < 0.02 and off.degrees < 0.5

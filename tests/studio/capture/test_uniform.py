@@ -57,9 +57,11 @@ def test_all_images_have_a_mask_where_some_have_alpha(tmp_path, is_uniform):
     Image.fromarray(shown).save(tmp_path / "a.jpg")
     Image.fromarray(np.dstack([shown, np.uint8(255 * (Y < 0))])).save(tmp_path / "b.png")
     write_inside(tmp_path, ["a.jpg", "b.png"], tmp_path / "inside", is_uniform)
-    one, other = (read_mask(tmp_path / "inside" / f"{name}.png") for name in ("a.jpg", "b.png"))
-    np.testing.assert_array_equal(other > 127, Y < 0)
-    assert ((one > 127) == BALL).mean() > 0.98 if is_uniform else one.min() == 255
+    jpeg_mask, png_mask = (
+        read_mask(tmp_path / "inside" / f"{name}.png") for name in ("a.jpg", "b.png")
+    )
+    np.testing.assert_array_equal(png_mask > 127, Y < 0)
+    assert ((jpeg_mask > 127) == BALL).mean() > 0.98 if is_uniform else jpeg_mask.min() == 255
 
 
 def test_no_image_has_a_mask_where_none_tells_the_object(tmp_path):

@@ -33,13 +33,13 @@ def copied(unfinished, tmp_path):
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "mesh"])
 def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(name, copied, capsys):
     assert main(["export", str(copied), "--format", name]) == 0
-    written, said = copied / "export" / FORMATS[name][0], capsys.readouterr()
+    written, printed = copied / "export" / FORMATS[name][0], capsys.readouterr()
     shown = ascii(str(written)).strip("'")
-    assert written.exists() and f"wrote {shown}: " in said.out
-    assert "unfinished, step 20 of 60" in said.out
+    assert written.exists() and f"wrote {shown}: " in printed.out
+    assert "unfinished, step 20 of 60" in printed.out
     # the scene is needed for its test views, and for the images that Gaussians are fitted to
     is_fitted = name.startswith("splat") or name in ("html", "gallery")
-    assert ("/nowhere/at/all" in said.err) == (name == "scene" or is_fitted)
+    assert ("/nowhere/at/all" in printed.err) == (name == "scene" or is_fitted)
     there = [path.name for path in written.parent.iterdir() if path.name[0] != "."]
     assert there == [written.name]
 

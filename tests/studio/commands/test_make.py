@@ -68,7 +68,7 @@ def test_with_more_minutes_a_finished_model_is_trained_on(made, capsys, monkeypa
     passed = json.loads((folder / "make.json").read_text())["passed"]
     words = ["make", scene, "--out", str(folder), "--minutes", f"{passed + 0.25:.3f}"]
     assert main([*words, "--title", "A <ball>"]) == 0
-    steps = [load_header(one / "run")["step"] for one in (before, folder)]
+    steps = [load_header(path / "run")["step"] for path in (before, folder)]
     assert steps[1] > steps[0] and "extends a finished training" in capsys.readouterr().out
     assert "<title>A &lt;ball&gt;</title>" in (folder / "index.html").read_text("utf-8")
     assert "A &lt;ball&gt;" in (folder / "model.html").read_text("utf-8")
@@ -161,8 +161,8 @@ def test_a_third_of_the_minutes_is_the_trainings(tmp_path, minutes, capsys):
 def test_a_preset_that_others_make_smaller_is_told(capsys):
     assert make._preset(15, 1.0) == "small" and not capsys.readouterr().out
     assert make._preset(15, 0.2) == "tiny"
-    told = "other programs take 80% of the processor: the preset is tiny, not small"
-    assert told in capsys.readouterr().out
+    line = "other programs take 80% of the processor: the preset is tiny, not small"
+    assert line in capsys.readouterr().out
 
 
 def test_an_open_page_is_renewed_in_the_training_and_its_bits_are_the_same(
@@ -173,9 +173,9 @@ def test_an_open_page_is_renewed_in_the_training_and_its_bits_are_the_same(
     for name in ("out", "alone"):
         folder = tmp_path / name
         begin_result(folder)
-        given = [(*one, "test") for one in (SETTINGS | {"scene.downscale": 1}).items()]
+        settings = [(*setting, "test") for setting in (SETTINGS | {"scene.downscale": 1}).items()]
         run = RunFolder(folder / "run")
-        run.create(run_config(run, scene, "tiny", given).to_json())
+        run.create(run_config(run, scene, "tiny", settings).to_json())
 
         def preview(training, folder, title, name=name):
             if name == "out":
@@ -256,19 +256,19 @@ class Enough(Exception):
 def test_photographs_are_captured_first(tmp_path, monkeypatch, words, preset):
     steps = []
 
-    def step(name, *given, **_):
-        steps.append((name, given))
+    def step(name, *arguments, **_):
+        steps.append((name, arguments))
         for stage in STAGES if name == "capture" else ():
-            write_json(found / f"{stage}.json", {"line": f"{stage} done"})
+            write_json(folder / f"{stage}.json", {"line": f"{stage} done"})
         if name == "train":
             raise Enough
 
     monkeypatch.setattr(make, "_step", step)
     monkeypatch.setattr(make, "_share", lambda: 1.0)
     monkeypatch.setattr("pp_studio.export.result.write_result", lambda *_, **__: None)
-    photographs, found = tmp_path / "photographs", tmp_path / "out/scene/capture"
+    photographs, folder = tmp_path / "photographs", tmp_path / "out/scene/capture"
     photographs.mkdir()
-    found.mkdir(parents=True)
+    folder.mkdir(parents=True)
     own(tmp_path / "out")
     hints = ["--turntable", "--masks", "M", "--box=-1,-1,-1,1,1,2"]
     with pytest.raises(Enough):

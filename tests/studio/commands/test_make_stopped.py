@@ -29,8 +29,8 @@ def begun(scene, out):
     """
     begin_result(out)
     folder = RunFolder(out / "run")
-    given = {**SETTINGS, "train.iterations": 300, "scene.downscale": 1}
-    config = run_config(folder, scene, "tiny", [(*one, "test") for one in given.items()])
+    settings = {**SETTINGS, "train.iterations": 300, "scene.downscale": 1}
+    config = run_config(folder, scene, "tiny", [(*setting, "test") for setting in settings.items()])
     folder.create(config.to_json())
     return [sys.executable, "-m", "pp_cl", "make", scene, "--out", str(out)]
 
@@ -67,13 +67,13 @@ def test_any_moment_will_do(runs, tmp_path):
             process.send_signal(number)
             start = time.monotonic()
             _, err = process.communicate()
-        told = [line for line in err.splitlines() if line.startswith("pp-cl: ")]
+        lines = [line for line in err.splitlines() if line.startswith("pp-cl: ")]
         late, ended = time.monotonic() - start > LATEST, process.returncode
         stopped += ended == 128 + number
-        if late or (ended, len(told)) not in ((0, 0), (128 + number, 1)):
+        if late or (ended, len(lines)) not in ((0, 0), (128 + number, 1)):
             wrong.append((stage, part, ended, err[-500:]))
     assert wrong == [] and stopped >= 0.6 * MOMENTS
     subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
-    found = result(tmp_path / "out")
-    assert found.keys() == expected.keys()
-    assert [name for name in expected if found[name] != expected[name]] == []
+    files = result(tmp_path / "out")
+    assert files.keys() == expected.keys()
+    assert [name for name in expected if files[name] != expected[name]] == []

@@ -105,8 +105,8 @@ def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys)
     assert main(words) == 0
     assert "rendered 1 of 4 frames" in capsys.readouterr().out
     assert files() == whole
-    told = failure(*words, "--background", "black")
-    assert "holds frames of another model, path or style" in told
+    error = failure(*words, "--background", "black")
+    assert "holds frames of another model, path or style" in error
     assert files() == whole
 
 
@@ -139,8 +139,8 @@ def test_what_frames_cost_decides_how_they_are_drawn(trained, tmp_path, monkeypa
     gaussians = frames("gaussians", "0.01")
     assert asked == [4, 4, 2, 2] and "3D Gaussians" in capsys.readouterr().out
     assert len(whole) == len(coarser) == len(gaussians) == 4
-    for one, other in zip(whole, gaussians, strict=True):
-        assert 20 < psnr(one[..., :3], other[..., :3]) < 60
+    for frame, other in zip(whole, gaussians, strict=True):
+        assert 20 < psnr(frame[..., :3], other[..., :3]) < 60
     (tmp_path / "gaussians/00002.png").unlink()
     again = frames("gaussians", "1")  # continues in the way it began
     assert asked == [] and "as they were begun" in capsys.readouterr().out

@@ -74,8 +74,8 @@ def start(words, **options):
 def first(find, seconds=100):
     last = time.monotonic() + seconds
     while time.monotonic() < last:
-        if found := find():
-            return found
+        if value := find():
+            return value
         time.sleep(0.02)
     raise AssertionError("waited in vain")
 
@@ -102,9 +102,9 @@ def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkey
     words = words_of(scenes, out, "--seeds", "1,2", "--workers", "2")
     with start(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as sweep:
         os.kill(worker_of(first(lambda: checkpoints(out))[0]), signal.SIGKILL)
-        told = sweep.stderr.read().splitlines()
+        lines = sweep.stderr.read().splitlines()
     assert sweep.returncode == 0
-    assert [line[:8] for line in told] == [f"[{i} of 4]" for i in (1, 2, 3, 4)]
+    assert [line[:8] for line in lines] == [f"[{i} of 4]" for i in (1, 2, 3, 4)]
     begun = [line for log in out.glob("*/*.log") for line in log.read_text().splitlines()]
     assert len(begun) == 5  # one run began twice
     rows = json.loads((out / "sweep.json").read_text())["runs"]
@@ -135,9 +135,9 @@ def test_a_signal_ends_a_sweep_and_its_workers_soon(scenes, tmp_path, number):
         begun = time.monotonic()
         sweep.send_signal(number)
         sweep.wait()
-        took, told = time.monotonic() - begun, sweep.stderr.read().splitlines()
+        took, lines = time.monotonic() - begun, sweep.stderr.read().splitlines()
     assert sweep.returncode == 128 + number and took < 5
-    assert len([line for line in told if line.startswith("pp-cl: ")]) == 1
+    assert len([line for line in lines if line.startswith("pp-cl: ")]) == 1
     assert psutil.wait_procs(workers, timeout=20)[1] == []
     (header, _) = load_checkpoint(checkpoints(out)[0])
     assert not header["finished"]
@@ -152,8 +152,8 @@ def scheduler():
         [*tool, "scheduler", "--port", "0", *local], stderr=subprocess.PIPE, text=True
     ) as process:
         try:
-            said = iter(process.stderr.readline, "")
-            address = next(m[0] for line in said if (m := re.search(r"tcp://127\S+", line)))
+            lines = iter(process.stderr.readline, "")
+            address = next(m[0] for line in lines if (m := re.search(r"tcp://127\S+", line)))
             worker = [*tool, "worker", address, "--nthreads", "1", *local]
             with subprocess.Popen(worker, cwd=ROOT, stderr=subprocess.DEVNULL) as other:
                 yield address
@@ -170,9 +170,9 @@ def test_a_scheduler_started_by_hand(scenes, scheduler, tmp_path, capsys):
     (broken / "transforms_train.json").write_text("{")
     words = words_of([broken, scenes[0]], out, "--scheduler", scheduler)
     assert main(words) == 1
-    told = capsys.readouterr()
-    assert told.err.splitlines()[-1].startswith("pp-cl: 1 of 2 runs failed")
+    printed = capsys.readouterr()
+    assert printed.err.splitlines()[-1].startswith("pp-cl: 1 of 2 runs failed")
     bad, good = json.loads((out / "sweep.json").read_text())["runs"]
     assert "transforms_train.json" in bad["error"] and "psnr" not in bad
     assert 5 < good["psnr"] < 40
-    assert "| broken |        0 of 1 |" in told.out and "1 of 2 scenes" in told.out
+    assert "| broken |        0 of 1 |" in printed.out and "1 of 2 scenes" in printed.out

@@ -59,8 +59,8 @@ def test_the_address_works_and_a_signal_ends_it_cleanly(begun, what, number):
 def test_a_busy_port_is_one_line_and_status_2(begun):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        told = failure("view", begun, "--port", port)
-    assert f"--port {port}: " in told and "give another" in told
+        error = failure("view", begun, "--port", port)
+    assert f"--port {port}: " in error and "give another" in error
 
 
 def test_another_host_warns_and_one_that_is_not_ours_is_refused(begun, capsys):

@@ -16,16 +16,16 @@ from pp_studio.export.splat import Y_DOWN, Y_UP, upright
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_it_is_written_where_it_belongs_and_twice_alike(name, run, tmp_path):
-    said, contents = [], []
+    lines, contents = [], []
     for _ in range(2):
         path = check_target(name, tmp_path, None)
         assert path.parent == tmp_path / "export"
-        said.append(export_run(run, name, path))
+        lines.append(export_run(run, name, path))
         files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
         contents.append([file.read_bytes() for file in files])
         shutil.rmtree(tmp_path / "export")
-    assert said[0] == said[1] and contents[0] == contents[1] and contents[0]
-    assert any(character.isdigit() for character in said[0])
+    assert lines[0] == lines[1] and contents[0] == contents[1] and contents[0]
+    assert any(character.isdigit() for character in lines[0])
 
 
 def test_a_path_may_be_a_text_and_a_format_that_there_is_not_is_one_line(run, tmp_path):
@@ -43,8 +43,8 @@ def test_a_box_holds_a_part_and_axes_turn_it(name, run, tmp_path):
         path = tmp_path / f"{axes}{suffix}"
         export_run(run, name, path, box=box, axes=axes)
         read = trimesh.load(path, process=False)
-        [some] = read.geometry.values() if suffix == ".glb" else [read]
-        places[axes] = some.vertices
+        [geometry] = read.geometry.values() if suffix == ".glb" else [read]
+        places[axes] = geometry.vertices
     voxel_size = run.model.grid.voxel_size
     assert places["scene"][:, 2].max() == pytest.approx(0.25, abs=2 * voxel_size)
     assert places["scene"][:, 2].min() < -0.5, "there is more of the ball below"

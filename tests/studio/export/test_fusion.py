@@ -43,8 +43,8 @@ def test_the_sign_is_that_of_the_ball(views):
 def test_slabs_change_nothing(views, monkeypatch):
     whole = fuse(GRID, views[:3])
     monkeypatch.setattr(fusion, "SLAB", 3000)
-    for one, other in zip(fuse(GRID, views[:3]), whole, strict=True):
-        assert np.array_equal(one, other)
+    for field, other in zip(fuse(GRID, views[:3]), whole, strict=True):
+        assert np.array_equal(field, other)
 
 
 def test_a_ray_that_slips_through_hollows_nothing(views):
@@ -68,8 +68,8 @@ def test_views_that_agree_do_not_scatter(views):
     assert surface.sum() > 1000 and least < 1
     apart = [3 * GRID.voxel_size * (i % 2) for i in range(len(views))]
     moved = [
-        (camera, replace(one, median_depth=one.median_depth + far))
-        for (camera, one), far in zip(views, apart, strict=True)
+        (camera, replace(view, median_depth=view.median_depth + far))
+        for (camera, view), far in zip(views, apart, strict=True)
     ]
     expected = np.hypot(1.5, least)
     assert np.median(fuse(GRID, moved).scatter[surface]) == pytest.approx(expected, abs=0.2)

@@ -19,9 +19,9 @@ def test_the_functions_of_the_basis_are_orthogonal():
     np.testing.assert_allclose(product / np.outer(lengths, lengths), np.eye(9), atol=1e-6)
 
 
-def drawn(run, coefficients, seen):
+def drawn(run, coefficients, observation):
     """(HW, 3) image of coefficients (N, 9, 3), blended over white."""
-    towards, matrix = run.model.positions() - seen.camera.eye, blend_matrix(seen)
+    towards, matrix = run.model.positions() - observation.camera.eye, blend_matrix(observation)
     at = basis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
     return matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
 
@@ -33,22 +33,24 @@ def test_images_of_known_harmonics_are_reproduced(run, rng, monkeypatch):
     ).astype(np.float32)
 
     def rendered(camera):
-        (seen,) = observe(run, [camera], "")
-        image = drawn(run, known, seen).reshape(30, 30, 3)
-        alpha = blend_matrix(seen).sum(1).reshape(30, 30)
+        (observation,) = observe(run, [camera], "")
+        image = drawn(run, known, observation).reshape(30, 30, 3)
+        alpha = blend_matrix(observation).sum(1).reshape(30, 30)
         return RenderedView(image, alpha, alpha, alpha)
 
     with monkeypatch.context() as patch:
         patch.setattr(run, "render", rendered)
-        found = fit_harmonics(run, 3)
-    for seen in observe(run, run.cameras("train")[::4], ""):
-        error = np.abs(drawn(run, found, seen) - drawn(run, known, seen))
+        fitted = fit_harmonics(run, 3)
+    for observation in observe(run, run.cameras("train")[::4], ""):
+        error = np.abs(drawn(run, fitted, observation) - drawn(run, known, observation))
         assert error.mean() < 0.0016 and error.max() < 0.035  # the ridge causes 0.0008 and 0.017
 
 
 def test_points_that_no_view_shows_keep_zero(run):
-    found = fit_harmonics(run, 3)
-    weights = sum(seen.point_weights() for seen in observe(run, run.cameras("train"), ""))
+    fitted = fit_harmonics(run, 3)
+    weights = sum(
+        observation.point_weights() for observation in observe(run, run.cameras("train"), "")
+    )
     hidden = weights == 0
-    assert found[hidden] == pytest.approx(0)
-    assert np.abs(found[~hidden]).max() > 0.1
+    assert fitted[hidden] == pytest.approx(0)
+    assert np.abs(fitted[~hidden]).max() > 0.1

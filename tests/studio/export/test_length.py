@@ -22,36 +22,36 @@ def mine(run, run_folder, tmp_path):
     return load(tmp_path / "run", run.dev)
 
 
-def text_of(one, position):
-    x, y, _ = one.camera.project(position)
-    return f"{one.name}:{x:.3f},{y:.3f}"
+def text_of(photo, position):
+    x, y, _ = photo.camera.project(position)
+    return f"{photo.name}:{x:.3f},{y:.3f}"
 
 
-def rims(one, share):
+def rims(photo, share):
     """Two points on the ball, left and right of its middle in an image, and their distance."""
-    towards = one.camera.eye / np.linalg.norm(one.camera.eye)
-    right = np.cross(one.camera.pose[:, 1], towards)
+    towards = photo.camera.eye / np.linalg.norm(photo.camera.eye)
+    right = np.cross(photo.camera.pose[:, 1], towards)
     right /= np.linalg.norm(right)
     ends = [RADIUS * (np.sqrt(1 - share**2) * towards + s * share * right) for s in (-1, 1)]
     return ends, 2 * share * RADIUS
 
 
 def test_pixels_tell_where_the_surface_is(mine):
-    one = mine.image_files("train")[2]
-    ends, length = rims(one, 0.6)
-    found = [surface_point(mine, text_of(one, end)) for end in ends]
-    assert np.linalg.norm(found[0] - found[1]) == pytest.approx(length, rel=0.08)
+    photo = mine.image_files("train")[2]
+    ends, length = rims(photo, 0.6)
+    points = [surface_point(mine, text_of(photo, end)) for end in ends]
+    assert np.linalg.norm(points[0] - points[1]) == pytest.approx(length, rel=0.08)
     assert metres_per_unit(mine) == 1
 
 
 def test_pixels_are_those_of_the_image_as_the_lens_has_it(mine, monkeypatch):
-    lens, one = LensDistortion(k1=-0.25, p1=0.01), mine.image_files("train")[2]
-    camera, x, y = one.camera, 20.4, 35.6
-    straight = surface_point(mine, f"{one.name}:{x},{y}")
+    lens, photo = LensDistortion(k1=-0.25, p1=0.01), mine.image_files("train")[2]
+    camera, x, y = photo.camera, 20.4, 35.6
+    straight = surface_point(mine, f"{photo.name}:{x},{y}")
     listed = [replace(each, lens=lens) for each in mine.image_files("train")]
     monkeypatch.setattr("pp_studio.export.length.scene_frames", lambda *_, **__: listed)
     x, y = lens.apply((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
-    bent = f"{one.name}:{x * camera.fx + camera.cx:.3f},{y * camera.fy + camera.cy:.3f}"
+    bent = f"{photo.name}:{x * camera.fx + camera.cx:.3f},{y * camera.fy + camera.cy:.3f}"
     assert surface_point(mine, bent) == pytest.approx(straight, abs=1e-3)
 
 
@@ -65,8 +65,8 @@ def test_exports_are_in_metres(mine, tmp_path, name):
         return [np.ptp(vertex[axis]) for axis in "xyz"]
 
     before = spans(tmp_path / "a.ply")
-    one = mine.image_files("train")[0]
-    first, second = (text_of(one, end) for end in rims(one, 0.6)[0])
+    photo = mine.image_files("train")[0]
+    first, second = (text_of(photo, end) for end in rims(photo, 0.6)[0])
     apart = np.linalg.norm(surface_point(mine, first) - surface_point(mine, second))
     assert set_length(mine, first, second, 0.24) == pytest.approx(0.24 / apart)
     assert spans(tmp_path / "b.ply") == pytest.approx(np.multiply(before, 0.24 / apart), rel=1e-3)
@@ -76,16 +76,16 @@ def test_exports_are_in_metres(mine, tmp_path, name):
 
 
 def test_what_tells_no_length_is_refused(mine):
-    one = mine.image_files("train")[0]
-    good = text_of(one, mine.model.positions().mean(0))
+    photo = mine.image_files("train")[0]
+    good = text_of(photo, mine.model.positions().mean(0))
     with refusing("PHOTO:X,Y"):
         surface_point(mine, "a.jpg")
-    with refusing(f"no training image of that name; did you mean {one.name}?"):
-        surface_point(mine, f"{one.name}x:1,2")
+    with refusing(f"no training image of that name; did you mean {photo.name}?"):
+        surface_point(mine, f"{photo.name}x:1,2")
     with refusing("60x60"):
-        surface_point(mine, f"{one.name}:60,2")
+        surface_point(mine, f"{photo.name}:60,2")
     with refusing("no object"):
-        surface_point(mine, f"{one.name}:0,0")
+        surface_point(mine, f"{photo.name}:0,0")
     with refusing("the same place"):
         set_length(mine, good, good, 1.0)
     file = mine.folder.path / "length.json"

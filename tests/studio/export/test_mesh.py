@@ -71,12 +71,12 @@ def test_fairing_smooths_noise_and_keeps_what_is_held(rng):
         return trimesh.Trimesh(vertices, ball.faces).face_adjacency_angles.mean()
 
     held = np.where(ball.vertices[:, 2] > 0, 1e3, 0.01)
-    found = fair(noisy, ball.faces, held)
+    faired = fair(noisy, ball.faces, held)
     firm = ball.vertices[:, 2] > 1
-    assert np.abs(found - noisy)[firm].max() < 0.02
-    away = [np.abs(np.linalg.norm(v, axis=1) - 10)[~firm].mean() for v in (noisy, found)]
+    assert np.abs(faired - noisy)[firm].max() < 0.02
+    away = [np.abs(np.linalg.norm(v, axis=1) - 10)[~firm].mean() for v in (noisy, faired)]
     assert away[1] < 0.7 * away[0]  # smoothing does not shrink the ball
-    assert roughness(found) < 0.75 * roughness(noisy)
+    assert roughness(faired) < 0.75 * roughness(noisy)
 
 
 def test_what_no_view_shows_comes_last_and_is_said(run, mesh, tmp_path):
@@ -84,11 +84,11 @@ def test_what_no_view_shows_comes_last_and_is_said(run, mesh, tmp_path):
     height = mesh.vertices[mesh.faces].mean(1)[:, 2]
     assert len(height) / 2 < mesh.seen < len(height)
     assert height[mesh.seen :].max() < 0 < height[: mesh.seen].max()
-    said = f"seen_faces {mesh.seen}: "
+    comment = f"seen_faces {mesh.seen}: "
     for suffix in ("ply", "obj", "glb"):
         write_mesh(tmp_path / f"a.{suffix}", mesh)
-    assert plyfile.PlyData.read(tmp_path / "a.ply").comments[0].startswith(said)
-    assert (tmp_path / "a.obj").read_text().startswith(f"# {said}")
+    assert plyfile.PlyData.read(tmp_path / "a.ply").comments[0].startswith(comment)
+    assert (tmp_path / "a.obj").read_text().startswith(f"# {comment}")
     assert glb(tmp_path / "a.glb")[0]["meshes"] == [
         {"primitives": ANY, "extras": {"seen_faces": mesh.seen}}
     ]
@@ -116,5 +116,5 @@ def test_crumbs_are_left_out_and_said(run, monkeypatch):
     monkeypatch.setattr(module, "fuse", with_a_crumb)
     monkeypatch.setattr(module, "LOOSE", 0.2)  # the ball is small
     with pytest.warns(UserWarning, match="1 loose parts are left out"):
-        found = surface(run)
-    assert trimesh.Trimesh(found.vertices, found.faces).body_count == 1
+        ball = surface(run)
+    assert trimesh.Trimesh(ball.vertices, ball.faces).body_count == 1

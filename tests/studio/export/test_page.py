@@ -172,8 +172,8 @@ def test_a_browser_draws_the_same_far_from_the_origin(run, page, tmp_path):
     header |= {name: (header[name] + by).tolist() for name in ("origin", "centre", "eye")}
     other.write_text(page.read_text("utf-8").replace(text, json.dumps(header)))
     images = []
-    for file, seen in ((page, camera), (other, camera.moved(by))):
-        script = f"ppcl.setCamera({page_camera(seen)}); return ppcl.canvas.toDataURL();"
+    for file, file_camera in ((page, camera), (other, camera.moved(by))):
+        script = f"ppcl.setCamera({page_camera(file_camera)}); return ppcl.canvas.toDataURL();"
         images.append(image_of(ask(file, script)).astype(int))
     assert np.abs(images[0] - images[1]).max() <= 1 and images[0].min() < 200
 
@@ -232,16 +232,16 @@ CONTROLS = """
     return { seen, address };"""
 
 
-def in_address(found, name):
-    words = re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")
+def in_address(effects, name):
+    words = re.search(rf"{name}=([^&]+)", effects["address"])[1].split(",")
     return np.array([float(word) for word in words])
 
 
 def test_mouse_and_keys_move_the_camera(page):
-    found = ask(page, CONTROLS)
-    assert len(set(found["seen"])) == 4 and found["seen"][0] == found["seen"][4]
+    effects = ask(page, CONTROLS)
+    assert len(set(effects["seen"])) == 4 and effects["seen"][0] == effects["seen"][4]
     header = header_of(page)
-    eye, target = (in_address(found, name) for name in ("eye", "target"))
+    eye, target = (in_address(effects, name) for name in ("eye", "target"))
     centre, first = (np.array(header[name]) for name in ("centre", "eye"))
     assert target == pytest.approx(centre, abs=1e-5)
     distances = [np.linalg.norm(at - centre) for at in (eye, first)]

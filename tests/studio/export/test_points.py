@@ -13,7 +13,7 @@ from pp_studio.export.points import coloured_points, write_ply
 
 def test_colours_are_those_of_the_best_view(run):
     points, cameras = coloured_points(run), run.cameras("train")
-    weights = np.stack([seen.point_weights() for seen in observe(run, cameras, "")])
+    weights = np.stack([observation.point_weights() for observation in observe(run, cameras, "")])
     images = [to_8bit(run.render(camera).rgba()[..., :3]) for camera in cameras]
     positions = run.model.positions()
     assert points.rows.tolist() == np.flatnonzero(weights.max(0) > 0).tolist()

@@ -32,8 +32,8 @@ def test_before_the_training_it_shows_cameras_and_masks(tmp_path):
     (scene / "capture").mkdir()
     folder = tmp_path / "made"
     begin_result(folder)
-    told = {"scene": str(scene), "told": ["poses: 7 of 9 images"], "state": "3 minutes left"}
-    write_result(folder, "Ball", "video.mp4", **told)
+    facts = {"scene": str(scene), "told": ["poses: 7 of 9 images"], "state": "3 minutes left"}
+    write_result(folder, "Ball", "video.mp4", **facts)
     text, named = shown(folder)
     assert named == {"cameras.png"} and "poses: 7 of 9 images" in text and "3 minutes" in text
     drawn = read_rgba(folder / "cameras.png")
@@ -113,7 +113,7 @@ def test_on_a_phone_one_finger_scrolls_past_the_model_and_turns_it(begun):
 
 def test_a_hull_has_the_colours_of_its_photographs(runs):
     gaussians, cameras = hull_gaussians(runs.ball(views=12, size=60))
-    assert [(one.width, one.height) for one in cameras] == [(60, 60)] * 12
+    assert [(camera.width, camera.height) for camera in cameras] == [(60, 60)] * 12
     positions = gaussians.table["position"] + gaussians.origin
     radii = np.linalg.norm(positions, axis=1)
     assert 0.75 < np.median(radii) < 0.95  # the ball's radius is 0.8

@@ -83,16 +83,16 @@ def test_the_header_is_that_of_the_training_code(ply):
 
 
 def test_what_is_no_colour(run, ply):
-    vertex, found = plyfile.PlyData.read(str(ply))["vertex"], read_splats(ply)
+    vertex, ply_splats = plyfile.PlyData.read(str(ply))["vertex"], read_splats(ply)
     up, grid = up_of(run.cameras("train")), run.model.grid
     turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
     vertices = grid.positions(run.model.cloud.ids.get())
-    apart = cKDTree(vertices).query(found["positions"] @ turn, p=np.inf)[0]
+    apart = cKDTree(vertices).query(ply_splats["positions"] @ turn, p=np.inf)[0]
     assert apart.max() < (MOST_OF_GAUSSIANS + 1e-4) * grid.voxel_size
     assert 0.3 * len(vertices) < len(apart) <= len(vertices)
     assert turn @ up == pytest.approx([0, -1, 0])
-    assert found["opacity"].min() > 1 / 255 and found["opacity"].max() < 0.991
-    size = np.linalg.eigvalsh(found["covariance"]) ** 0.5
+    assert ply_splats["opacity"].min() > 1 / 255 and ply_splats["opacity"].max() < 0.991
+    size = np.linalg.eigvalsh(ply_splats["covariance"]) ** 0.5
     size /= DEVIATION * run.config.raster.radius * grid.voxel_size
     assert size.min() > 0.02 and size.max() < 2 * np.exp(MOST_OF_GAUSSIANS)
     assert np.median(size[:, 2] / size[:, 0]) > 1.1  # most are no longer balls
@@ -101,23 +101,25 @@ def test_what_is_no_colour(run, ply):
 
 def likeness(run, path, scale):
     """Mean PSNR of test views that are drawn `scale` times as large and averaged."""
-    found, measured = read_splats(path), []
+    ply_splats, measured = read_splats(path), []
     for camera in run.cameras("test"):
         large = turned(run, camera.resized(scale * camera.width, scale * camera.height))
-        blocks = draw_splats(found, large).reshape(camera.height, scale, camera.width, scale, 3)
+        blocks = draw_splats(ply_splats, large).reshape(
+            camera.height, scale, camera.width, scale, 3
+        )
         measured.append(psnr(to_8bit(blocks.mean((1, 3))), to_8bit(run.render(camera).colour)))
     return np.mean(measured)
 
 
 def test_the_engine_draws_them_as_viewers_do(run, ply):
-    found, kept = read_splats(ply), fitted_gaussians(run)
+    ply_splats, kept = read_splats(ply), fitted_gaussians(run)
     least, most = kept.windows
     drawn = drawn_by(run, kept)
     for scale in (least, 3, most):
         camera = run.cameras("test")[0]
         camera = camera.resized(round(scale * camera.width), round(scale * camera.height))
         view = drawn.render(window_camera(camera, scale, kept))
-        viewers = draw_splats(found, turned(run, camera))
+        viewers = draw_splats(ply_splats, turned(run, camera))
         assert psnr(to_8bit(view.colour), to_8bit(viewers)) > 50
         np.testing.assert_array_equal(view.alpha == 0, np.isinf(view.depth))
     small = run.cameras("test")[0]  # viewers would draw them too wide here
@@ -195,12 +197,12 @@ def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatc
             fit_gaussians(run, 1, 0.0)
         return fitted.call_args[0][3]
 
-    images, found = run.scene("train").splits["train"], views()
-    assert len(found) == 2 * len(images)
-    for one, other in zip(images, found, strict=False):
-        assert one.name == other.name and (one.image == other.image).all()
+    images, fit_views = run.scene("train").splits["train"], views()
+    assert len(fit_views) == 2 * len(images)
+    for view, other in zip(images, fit_views, strict=False):
+        assert view.name == other.name and (view.image == other.image).all()
     rendered = [view.image.shape for view in run.rendered(run.image_files("train"), opaque=True)]
-    assert [view.image.shape for view in found[len(images) :]] == rendered
+    assert [view.image.shape for view in fit_views[len(images) :]] == rendered
     with monkeypatch.context() as patch:  # pretend that the images are large, and enough
         patch.setattr("pp_cl.engine.views.MIN_SIDE", 8)
         patch.setattr(gaussians, "MIN_SIDE", 8)
@@ -209,8 +211,8 @@ def test_they_are_fitted_to_the_images_that_the_run_learned_from(run, monkeypatc
         assert [(view.name, view.camera.width) for view in views()] == [
             (view.name, 15) for view in images
         ]
-    monkeypatch.setitem(run.header, "left_out", [found[0].name])
-    assert [view.name for view in views()][:2] == [found[1].name, found[2].name]
+    monkeypatch.setitem(run.header, "left_out", [fit_views[0].name])
+    assert [view.name for view in views()][:2] == [fit_views[1].name, fit_views[2].name]
     monkeypatch.setitem(run.header, "exposed", True)
     assert [view.image.shape for view in views()] == 2 * rendered
     monkeypatch.delitem(run.header, "exposed")
@@ -225,16 +227,16 @@ def test_the_spz_says_the_same_with_y_up(y_up, ply, tmp_path):
     """
     table, _ = y_up
     write_splat_spz(tmp_path / "a.spz", table)
-    found = gsply.read_spz(tmp_path / "a.spz")
+    spz = gsply.read_spz(tmp_path / "a.spz")
     smallest = float(table["deviations"].max(1).min())
-    assert found.means == pytest.approx(table["position"], abs=0.51 * smallest)
-    assert 1 / (1 + np.exp(-found.opacities)) == pytest.approx(table["opacity"], abs=3e-3)
-    assert found.scales == pytest.approx(np.log(table["deviations"]), abs=0.04)
-    same = np.abs((found.quats * table["turn"]).sum(1)) / np.linalg.norm(found.quats, axis=1)
+    assert spz.means == pytest.approx(table["position"], abs=0.51 * smallest)
+    assert 1 / (1 + np.exp(-spz.opacities)) == pytest.approx(table["opacity"], abs=3e-3)
+    assert spz.scales == pytest.approx(np.log(table["deviations"]), abs=0.04)
+    same = np.abs((spz.quats * table["turn"]).sum(1)) / np.linalg.norm(spz.quats, axis=1)
     assert same.min() > 0.999  # cosine of half an angle
-    assert found.sh0 == pytest.approx(table["harmonics"][:, 0], abs=0.02)
+    assert spz.sh0 == pytest.approx(table["harmonics"][:, 0], abs=0.02)
     rest = table["harmonics"][:, 1:].clip(-127 / 128, 127 / 128)  # the range of 8 bits
-    assert np.abs(found.shN - rest).max() < 0.0392
+    assert np.abs(spz.shN - rest).max() < 0.0392
     assert (tmp_path / "a.spz").stat().st_size < ply.stat().st_size / 9
 
 
@@ -248,12 +250,12 @@ def test_the_spz_holds_objects_of_any_size(y_up, unit, sign, tmp_path):
     table["deviations"] *= unit
     scaled, times = in_spz(table)
     write_splat_spz(tmp_path / "a.spz", scaled)
-    found = gsply.read_spz(tmp_path / "a.spz")
+    spz = gsply.read_spz(tmp_path / "a.spz")
     widest = table["deviations"].max(1)
     assert np.sign(np.log10(times)) == sign
-    away = np.abs(found.means / times - table["position"]).max(1)
+    away = np.abs(spz.means / times - table["position"]).max(1)
     assert (away < 0.6 * widest).all()
-    assert np.exp(found.scales).max(1) / times == pytest.approx(widest, rel=0.04)
+    assert np.exp(spz.scales).max(1) / times == pytest.approx(widest, rel=0.04)
 
 
 def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
@@ -266,21 +268,21 @@ def test_the_glb_says_the_same_with_y_up(y_up, ply, tmp_path, rng):
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
     }
-    prefix, found = "KHR_gaussian_splatting:", read_splats(ply)
+    prefix, ply_splats = "KHR_gaussian_splatting:", read_splats(ply)
     flip = np.array([1, -1, -1])  # a half turn around x
-    assert arrays["POSITION"] * flip == pytest.approx(found["positions"], abs=1e-5)
+    assert arrays["POSITION"] * flip == pytest.approx(ply_splats["positions"], abs=1e-5)
     assert gltf["accessors"][0]["max"] == pytest.approx(arrays["POSITION"].max(0))
-    assert arrays[prefix + "OPACITY"][:, 0] == pytest.approx(found["opacity"], abs=1e-5)
+    assert arrays[prefix + "OPACITY"][:, 0] == pytest.approx(ply_splats["opacity"], abs=1e-5)
     axes = Rotation.from_quat(arrays[prefix + "ROTATION"]).as_matrix()
     axes *= arrays[prefix + "SCALE"][:, None]
     covariance = flip[:, None] * (axes @ axes.transpose(0, 2, 1)) * flip
-    assert covariance == pytest.approx(found["covariance"], abs=1e-6 * covariance.max())
+    assert covariance == pytest.approx(ply_splats["covariance"], abs=1e-6 * covariance.max())
     names = [(d, k) for d in range(3) for k in range(2 * d + 1)]
     harmonics = np.stack([arrays[f"{prefix}SH_DEGREE_{d}_COEF_{k}"] for d, k in names], 1)
     assert len(arrays) == 5 + 9
     towards = rng.normal(size=(len(harmonics), 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    ours, theirs = colours(harmonics, towards), colours(found["harmonics"], towards * flip)
+    ours, theirs = colours(harmonics, towards), colours(ply_splats["harmonics"], towards * flip)
     assert ours == pytest.approx(theirs, abs=1e-4)
 
 

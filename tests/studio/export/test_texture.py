@@ -40,11 +40,11 @@ def test_far_from_the_origin_the_file_has_the_same_shape(tmp_path):
 
 def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
-    said = export_run(run, "textured", tmp_path / "a.glb")
+    line = export_run(run, "textured", tmp_path / "a.glb")
     solid = trimesh.load(tmp_path / "a.glb", force="mesh")
-    seen = glb(tmp_path / "a.glb")[0]["meshes"][0]["extras"]["seen_faces"]
-    told = f"{len(solid.faces)} faces ({len(solid.faces) - seen} of them guessed)"
-    assert said == f"{len(solid.vertices)} vertices, {told}, unlit"
+    seen_faces = glb(tmp_path / "a.glb")[0]["meshes"][0]["extras"]["seen_faces"]
+    faces_text = f"{len(solid.faces)} faces ({len(solid.faces) - seen_faces} of them guessed)"
+    assert line == f"{len(solid.vertices)} vertices, {faces_text}, unlit"
     assert 300 < len(solid.faces) <= 600 and solid.visual.uv.shape == (len(solid.vertices), 2)
     gltf, stored = glb(tmp_path / "a.glb")
     # unlit, as the texture already contains the light of the photographs
@@ -57,7 +57,7 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
     turn = Rotation.align_vectors([(0, 1, 0)], [up])[0].as_matrix()
     assert np.abs(turn @ up - (0, 1, 0)).max() < 1e-6
     # the cameras look down at the ball, so faces below are guessed
-    assert seen > len(solid.faces) / 2 and solid.triangles_center[seen:, 1].max() < 0
+    assert seen_faces > len(solid.faces) / 2 and solid.triangles_center[seen_faces:, 1].max() < 0
     solid.vertices = solid.vertices @ turn
     for camera in run.cameras("test"):
         rendered, rays = run.render(camera), camera.rays().reshape(-1, 3)
@@ -65,22 +65,22 @@ def test_it_shows_the_run_with_y_up(run, tmp_path, monkeypatch):
         places, ray, face = solid.ray.intersects_location(eyes, rays, multiple_hits=False)
         shares = trimesh.triangles.points_to_barycentric(solid.triangles[face], places)
         uv = (solid.visual.uv[solid.faces[face]] * shares[..., None]).sum(1)
-        found = image[((1 - uv[:, 1]) * 256).astype(int) % 256, (uv[:, 0] * 256).astype(int) % 256]
+        texel = image[((1 - uv[:, 1]) * 256).astype(int) % 256, (uv[:, 0] * 256).astype(int) % 256]
         shown = rendered.rgba().reshape(-1, 4)[ray]
         sure = shown[:, 3] > 0.95
-        assert sure.sum() > 150 and np.abs(found - shown[:, :3])[sure].mean() < 0.06
+        assert sure.sum() > 150 and np.abs(texel - shown[:, :3])[sure].mean() < 0.06
 
 
 def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
     monkeypatch.setattr(texture, "FACES", 600)
     path = tmp_path / "a.obj"
-    said = export_run(run, "textured", path)
+    line = export_run(run, "textured", path)
     export_run(run, "textured", tmp_path / "a.glb")
-    assert said.endswith("with its .mtl and .png")
-    assert {one.name for one in tmp_path.iterdir()} == {"a.obj", "a.mtl", "a.png", "a.glb"}
+    assert line.endswith("with its .mtl and .png")
+    assert {file.name for file in tmp_path.iterdir()} == {"a.obj", "a.mtl", "a.png", "a.glb"}
     obj, glb_mesh = (trimesh.load(tmp_path / name, force="mesh") for name in ("a.obj", "a.glb"))
     assert obj.triangles == pytest.approx(glb_mesh.triangles, abs=1e-5)
-    uv = [one.visual.uv[one.faces] for one in (obj, glb_mesh)]
+    uv = [mesh.visual.uv[mesh.faces] for mesh in (obj, glb_mesh)]
     assert uv[0] == pytest.approx(uv[1], abs=1e-5)
     images = obj.visual.material.image, glb_mesh.visual.material.baseColorTexture
     assert np.array_equal(*(np.asarray(image.convert("RGB")) for image in images))
@@ -89,8 +89,8 @@ def test_an_obj_has_its_texture_beside_it(run, tmp_path, monkeypatch):
     path.unlink()  # its companions may be a user's now
     with pytest.raises(UserError, match=r"a\.(mtl|png): pp-cl did not write this"):
         check_target("textured", run.folder.path, path)
-    for one in companions(path):
-        one.unlink()
+    for file in companions(path):
+        file.unlink()
     assert check_target("textured", run.folder.path, path) == path
 
 
@@ -100,8 +100,8 @@ def test_highlights_are_left_out(rng):
     colours[:, ::3] = 0.95
     weights = rng.uniform(0.8, 1, (50, 10))
     weights[40:] = 0
-    found = agreed(weights, colours)
-    assert np.abs(found[:40] - (0.4, 0.3, 0.2)).max() < 0.04 and not found[40:].any()
-    one = np.zeros((50, 10))
-    one[:, 0] = 1e-3
-    assert agreed(one, colours) == pytest.approx(0.95)
+    means = agreed(weights, colours)
+    assert np.abs(means[:40] - (0.4, 0.3, 0.2)).max() < 0.04 and not means[40:].any()
+    first_weights = np.zeros((50, 10))
+    first_weights[:, 0] = 1e-3
+    assert agreed(first_weights, colours) == pytest.approx(0.95)

@@ -30,7 +30,7 @@ def test_every_combination_is_a_run_of_its_own(tmp_path, scenes):
     ]
     job = jobs[2]
     assert job.varied == {"points.count": "1000", "network.widths": "32,32,32"}
-    assert [given[:2] for given in job.given] == [
+    assert [setting[:2] for setting in job.given] == [
         ("points.count", "1000"),
         ("network.widths", "32,32,32"),
         ("train.seed", "1"),

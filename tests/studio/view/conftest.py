@@ -19,5 +19,5 @@ def copied(trained, tmp_path):
 @pytest.fixture
 def served():
     """(viser's server with an empty page, its address)."""
-    with started("test", port=0) as found:
-        yield found
+    with started("test", port=0) as pair:
+        yield pair

@@ -56,9 +56,9 @@ def test_a_share_of_the_points_is_of_each_member_and_keeps_the_specular_layer(ru
     run.model.specular = Specular(run.dev)
     count = run.model.cloud.count
     thinned = most_opaque(run.varied(others=[run.varied()]), 0.25)
-    for one in (thinned, *thinned.others):
-        assert one.model.cloud.count == round(count / 4)
-        assert one.model.specular is run.model.specular
+    for member in (thinned, *thinned.others):
+        assert member.model.cloud.count == round(count / 4)
+        assert member.model.specular is run.model.specular
 
 
 def test_fragments_are_those_of_the_pairs(run, monkeypatch):

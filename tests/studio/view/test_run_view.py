@@ -27,9 +27,9 @@ CAMERA = ring_cameras(3, 96)[2]  # for tabs: finer than the training's images, s
 
 @pytest.fixture
 def view(served, dev, copied):
-    found = RunView(served[0], dev, RunFolder(copied))
-    found.look()
-    return found
+    run_view = RunView(served[0], dev, RunFolder(copied))
+    run_view.look()
+    return run_view
 
 
 @contextlib.contextmanager
@@ -130,10 +130,10 @@ def test_a_path_is_one_that_render_takes(view, served, tmp_path):
 
 
 def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
-    with looking(view, served[1]) as one, looking(view, served[1]) as other:
+    with looking(view, served[1]) as opened, looking(view, served[1]) as other:
         wait(lambda: len(view.page._tabs) == 2)
         drawn(view)
-        assert one.image().shape == other.image().shape
+        assert opened.image().shape == other.image().shape
         other.look(CAMERA, view.page._space)
     wait(lambda: not view.page._tabs)
     assert not view.page.draw_next()
@@ -141,10 +141,10 @@ def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(view, served):
 
 def test_a_rendering_that_is_not_wanted_any_more_is_given_up(view, served, monkeypatch):
     with looking(view, served[1]) as opened:
-        [seen] = view.page._tabs.values()
+        [page_tab] = view.page._tabs.values()
 
         def move(*_, on_part, **__):
-            seen.moved = time.monotonic()
+            page_tab.moved = time.monotonic()
             on_part()
 
         monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
@@ -161,18 +161,18 @@ def test_the_browser_draws_the_gaussians_where_drafts_are_slow(served, dev, copi
     view.look()
     monkeypatch.setattr("pp_studio.view.model_page.STILL", 1e9)
     with looking(view, served[1]):
-        [seen] = view.page._tabs.values()
-        assert seen.splat.visible  # until a rendering is drawn
-        assert seen.splat.buffer.shape[0] == len(table)
-        assert view.page.draw_next() and not seen.splat.visible
+        [page_tab] = view.page._tabs.values()
+        assert page_tab.splat.visible  # until a rendering is drawn
+        assert page_tab.splat.buffer.shape[0] == len(table)
+        assert view.page.draw_next() and not page_tab.splat.visible
         view.page._took = 1e9
-        seen.moved = time.monotonic()
+        page_tab.moved = time.monotonic()
         assert not view.page.draw_next(), "no draft is drawn"
         monkeypatch.setattr("pp_studio.view.model_page.STILL", 0)
-        assert view.page.draw_next() and not seen.splat.visible
+        assert view.page.draw_next() and not page_tab.splat.visible
         os.utime(copied / "checkpoint.npz", ns=(1, 1))
         view.look()
-        assert seen.splat is None, "they are of the checkpoint before"
+        assert page_tab.splat is None, "they are of the checkpoint before"
 
 
 def test_a_new_checkpoint_is_taken_up_and_a_broken_one_is_not(served, dev, copied):

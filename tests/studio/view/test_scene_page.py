@@ -29,8 +29,8 @@ def page(served, folder):
 
 @pytest.fixture
 def opened(page, served):
-    with tab(served[1]) as found:
-        yield found
+    with tab(served[1]) as opened_tab:
+        yield opened_tab
 
 
 def edits(folder):
